@@ -1,0 +1,57 @@
+# Every target installs what it needs into .venv first. `make PYTHON=python3.12 install` chooses the interpreter,
+# PIP_FLAGS passes options on to pip, for instance an index with CPU or CUDA builds of PyTorch.
+PYTHON ?= python3
+PIP_FLAGS ?=
+
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt $(PIP_FLAGS)
+STAMP := .venv/.stamp-install
+DOCS_STAMP := .venv/.stamp-docs
+DEMO := runs/demo
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test test-all lint docs bench clean
+
+help:  ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*## /\1: /p' Makefile
+
+install: $(STAMP)  ## create .venv with everything for use and development
+
+$(STAMP): pyproject.toml constraints.txt
+	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	@echo "Installing PyTorch (a large download the first time) ..."
+	@$(PIP) torch==2.13.0
+	@echo "Installing torchmpm and its tools ..."
+	@$(PIP) -e ".[dev,video]"
+	@touch $@
+
+$(DOCS_STAMP): $(STAMP)
+	@echo "Installing the documentation tools ..."
+	@$(PIP) -e ".[docs]"
+	@touch $@
+
+demo: install  ## train a small policy on SHAPE MATCH, with a video and a learning curve at the end
+	$(BIN)/python -m cfp.train --task shapematch --preset quick --seed 0 --out $(DEMO) --resume
+	@echo "Video: $(DEMO)/video.mp4   Learning curve: $(DEMO)/curve.png"
+
+test: install  ## fast tests
+	$(BIN)/python -m pytest
+
+test-all: install  ## all tests, slow ones and those for CUDA included
+	$(BIN)/python -m pytest -m ""
+
+lint: install  ## style, formatting, types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+docs: $(DOCS_STAMP)  ## build the site into docs/_build/html, warnings are errors
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "Open docs/_build/html/index.html"
+
+bench: install  ## milliseconds a substep
+	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-columns=min,median,iqr,rounds --benchmark-sort=name
+
+clean:  ## remove what was built, keep .venv and runs
+	rm -rf build dist docs/_build docs/gallery *.egg-info .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find . -path ./.venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +

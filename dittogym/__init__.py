@@ -1,0 +1,15 @@
+"""DittoGym's tasks: robots of soft, plastic matter that change their shape while they work.
+
+Importing this package registers the Gymnasium ids ``dittogym/{task}-{coarse|fine}-v0``.
+"""
+
+from dittogym.env import Env
+from dittogym.registration import register
+from dittogym.spec import TaskSpec
+from dittogym.tasks import TASKS, make_spec
+from dittogym.torch_env import TorchEnv
+from dittogym.vector import BatchEnv
+
+register()
+
+__all__ = ["TASKS", "BatchEnv", "Env", "TaskSpec", "TorchEnv", "make_spec"]

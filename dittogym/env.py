@@ -1,0 +1,126 @@
+"""The single Gymnasium environment: a :class:`dittogym.TorchEnv` with a batch of one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+
+from dittogym.spec import TaskSpec
+from dittogym.torch_env import TorchEnv
+from torchmpm import ParticleState
+
+RENDER_MODES = ("rgb_array", "human")
+#: Pictures per second of a video; a control step is 0.01 s, so motion is shown three times slower.
+RENDER_FPS = 30
+
+
+def spaces(env: TorchEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+    """Observation and action space of one simulation."""
+    return (
+        gymnasium.spaces.Box(0, 255, env.observation_shape, np.uint8),
+        gymnasium.spaces.Box(-1.0, 1.0, env.action_shape, np.float32),
+    )
+
+
+def as_tensor(action: Any, env: TorchEnv) -> torch.Tensor:
+    """A NumPy action batch as a tensor, or a clear error.
+
+    Raises:
+        ValueError: Not numbers, or not of shape (B, 2, R, R).
+    """
+    array = np.asarray(action)
+    expected = (env.num_envs, *env.action_shape)
+    if array.dtype.kind not in "fiu" or array.shape != expected:
+        wanted = expected[1:] if env.num_envs == 1 else expected
+        raise ValueError(f"action must be numbers of shape {wanted}, got {array.dtype} of shape {np.shape(action)}")
+    return torch.as_tensor(array, dtype=env.dtype, device=env.device)
+
+
+def as_numpy(info: dict[str, Any]) -> dict[str, Any]:
+    """Tensors of an ``info`` as arrays with a leading B, nested dictionaries included."""
+    return {k: as_numpy(v) if isinstance(v, dict) else v.detach().cpu().numpy() for k, v in info.items()}
+
+
+def element(info: dict[str, Any], index: int) -> dict[str, Any]:
+    """One element of an ``info`` of arrays; numbers come out as Python numbers."""
+    picked: dict[str, Any] = {}
+    for key, value in info.items():
+        if isinstance(value, dict):
+            picked[key] = element(value, index)
+        else:
+            picked[key] = value[index].item() if value[index].ndim == 0 else value[index]
+    return picked
+
+
+class Env(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One simulation behind the Gymnasium interface.
+
+    Args:
+        task: Task name or specification.
+        render_mode: ``None``, ``"rgb_array"`` or ``"human"`` (a window; needs pygame).
+        render_muscles: Colour the robot by its muscles in pictures.
+        options: All arguments of :class:`dittogym.TorchEnv` but ``num_envs``.
+
+    Raises:
+        ValueError: Unknown render mode, or as in :class:`dittogym.TorchEnv`.
+        ImportError: ``render_mode="human"`` without pygame.
+    """
+
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": RENDER_FPS}
+
+    def __init__(
+        self, task: str | TaskSpec, *, render_mode: str | None = None, render_muscles: bool = False, **options: Any
+    ) -> None:
+        if render_mode not in (None, *RENDER_MODES):
+            raise ValueError(f"render_mode must be None or one of {RENDER_MODES}, got {render_mode!r}")
+        self.torch_env = TorchEnv(task, 1, **options)
+        self.observation_space, self.action_space = spaces(self.torch_env)
+        self.render_mode, self.render_muscles = render_mode, render_muscles
+        self._screen = None
+        if render_mode == "human":
+            from dittogym.window_system import Screen  # pygame is an extra
+
+            self._screen = Screen("dittogym: " + self.torch_env.spec.name, RENDER_FPS)
+
+    @property
+    def state(self) -> ParticleState:
+        """The particles, batch of one."""
+        return self.torch_env.state
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        """Start a new episode; see :meth:`dittogym.TorchEnv.reset`."""
+        super().reset(seed=seed)
+        with torch.no_grad():
+            observation, info = self.torch_env.reset(seed=seed, options=options)
+        self._show()
+        return observation[0].cpu().numpy(), element(as_numpy(info), 0)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Advance by one control step; see :meth:`dittogym.TorchEnv.step`.
+
+        Args:
+            action: (2, R, R) in [-1, 1].
+        """
+        with torch.no_grad():
+            batch = as_tensor(np.asarray(action)[None], self.torch_env)
+            observation, reward, terminated, truncated, info = self.torch_env.step(batch)
+        self._show()
+        picked = element(as_numpy(info), 0)
+        return observation[0].cpu().numpy(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), picked
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """The picture (512, 512, 3) uint8 in mode ``"rgb_array"``, else nothing."""
+        return self.torch_env.render(muscles=self.render_muscles) if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._screen is not None:
+            self._screen.close()
+            self._screen = None
+
+    def _show(self) -> None:
+        if self._screen is not None:
+            self._screen.show(self.torch_env.render(muscles=self.render_muscles))

@@ -1,0 +1,82 @@
+"""Obstacles: one list feeds physics (velocity rules), observation (drawn pixels) and picture (shown boxes)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from torchmpm import VelocityRule
+from torchmpm.boundary import Range
+
+#: Nodes per metre of every DittoGym window.
+NODES = 128
+#: Top of the floor in nodes; the surface lies between this node and the next.
+FLOOR_NODE = 19
+
+
+@dataclass(frozen=True)
+class Box:
+    """Open axis-aligned box in the world, m; an infinite bound leaves a side open."""
+
+    left: float = -math.inf
+    right: float = math.inf
+    bottom: float = -math.inf
+    top: float = math.inf
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """Something that does not move.
+
+    Attributes:
+        name: For messages and docs.
+        rules: What it does to matter; of several rules for one direction on a node the first in the task's list counts.
+        drawn: What the robot sees of it: boxes whose pixels are set in the occupancy channel. Some obstacles of the
+            reference implementation are invisible to the robot; they have none.
+        shown: What a person sees of it in :meth:`dittogym.TorchEnv.render`.
+    """
+
+    name: str
+    rules: tuple[VelocityRule, ...]
+    drawn: tuple[Box, ...] = ()
+    shown: tuple[Box, ...] = ()
+
+
+def floor(friction: float = math.inf) -> Obstacle:
+    """Ground up to node 19; sticky by default, as published (the reference's Coulomb branch never acts)."""
+    surface = (FLOOR_NODE + 1) / NODES
+    return Obstacle("floor", (VelocityRule("-y", j=(None, FLOOR_NODE), friction=friction),), shown=(Box(top=surface),))
+
+
+def ceiling(node: int) -> Obstacle:
+    """Upper end of the world: from this node on, nothing rises."""
+    return Obstacle("ceiling", (VelocityRule("+y", j=(node, None)),), shown=(Box(bottom=node / NODES),))
+
+
+def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True) -> Obstacle:
+    """A box of nodes that matter cannot enter: one-sided faces left, right, below and above.
+
+    Args:
+        name: For messages and docs.
+        i: Inclusive range of world node indices in x.
+        j: Inclusive range of world node indices in y; ``None`` leaves an end open.
+        visible: Whether the robot sees it.
+
+    Raises:
+        ValueError: The box is narrower than four nodes, so that its faces would overlap.
+    """
+    (left, right), (low, high) = i, j
+    if right - left < 3 or (low is not None and high is not None and high - low < 3):
+        raise ValueError(f"solid needs at least 4 nodes in each direction, got i={i}, j={j}")
+    rules = [VelocityRule("+x", (left, left + 1), j), VelocityRule("-x", (right - 1, right), j)]
+    if low is not None:
+        rules.append(VelocityRule("+y", i, (low, low + 1)))
+    if high is not None:
+        rules.append(VelocityRule("-y", i, (high - 1, high)))
+    box = Box(
+        left / NODES,
+        right / NODES,
+        -math.inf if low is None else low / NODES,
+        math.inf if high is None else high / NODES,
+    )
+    return Obstacle(name, tuple(rules), (box,) if visible else (), (box,))

@@ -1,0 +1,205 @@
+"""A task as data: what is in the world, how it is seen and driven, and what is rewarded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from torch import Tensor
+
+from dittogym.geometry import Obstacle
+from torchmpm import ParticleState, sampling
+from torchmpm.sampling import Points
+
+#: Rewards per step of an element whose state is no longer finite; its episode ends.
+FAILURE_REWARD = -16.0
+
+
+class Shape(Protocol):
+    """Where the particles of a body start.
+
+    ``draws`` is the number of uniform random numbers a particle takes in the reference implementation: 4 where each
+    coordinate is a magnitude and a sign, 2 where it is one number, 0 for a lattice.
+    """
+
+    draws: int
+
+    def positions(self, numbers: Points) -> Points:
+        """World positions (N, 2) in m from N points of the unit square (N, 2)."""
+
+
+@dataclass(frozen=True)
+class Disc:
+    """Disc with the chord density of the reference, given like there by its bounding square.
+
+    Attributes:
+        corner: Lower left corner of the bounding square in the world, m.
+        diameter: m.
+    """
+
+    corner: tuple[float, float]
+    diameter: float
+    draws: int = 4
+
+    def positions(self, numbers: Points) -> Points:
+        """World positions (N, 2) in m."""
+        radius = 0.5 * self.diameter
+        return sampling.chord_disc(numbers, (self.corner[0] + radius, self.corner[1] + radius), radius)
+
+
+@dataclass(frozen=True)
+class Body:
+    """Particles of one kind.
+
+    Attributes:
+        shape: Where they start.
+        count: Particles at full size.
+        mass: Mass of a particle at full size, kg.
+    """
+
+    shape: Shape
+    count: int
+    mass: float = 2.0
+
+
+class Measurement(NamedTuple):
+    """Averages over bodies at one moment.
+
+    Attributes:
+        com: (B, 2) mean position of the robot's particles in the world, m.
+        velocity: (B, 2) mean velocity of the robot's particles, m/s.
+        split: (B,) spread of the robot, sqrt(Var x + Var y), m.
+        object_com: (B, 2) the same for the object; ``None`` in tasks without one.
+        object_velocity: (B, 2), m/s.
+    """
+
+    com: Tensor
+    velocity: Tensor
+    split: Tensor
+    object_com: Tensor | None = None
+    object_velocity: Tensor | None = None
+
+
+class Moment(NamedTuple):
+    """What a task's own terms may look at after a step.
+
+    Attributes:
+        particles: The state.
+        robot: Number of robot particles; they come first.
+        now: Averages after the step.
+        start: Averages right after the reset.
+        observation: (B, 3, 64, 64) uint8.
+        memory: What the task remembers, tensors with a leading B.
+    """
+
+    particles: ParticleState
+    robot: int
+    now: Measurement
+    start: Measurement
+    observation: Tensor
+    memory: Mapping[str, Tensor]
+
+
+class Outcome(NamedTuple):
+    """A task's own judgement of a step.
+
+    Attributes:
+        terms: Named reward terms, (B,) each, already weighted.
+        terminated: (B,) bool, the task's own reasons to end; ``None`` for none.
+        success: (B,) bool; ``None`` where success is not defined.
+        info: Further quantities for ``info``, leading B.
+        memory: Replaces the memory; ``None`` keeps it.
+    """
+
+    terms: Mapping[str, Tensor]
+    terminated: Tensor | None = None
+    success: Tensor | None = None
+    info: Mapping[str, Tensor] = {}
+    memory: Mapping[str, Tensor] | None = None
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of the reward terms."""
+
+    location: float = 0.0
+    velocity: float = 0.0
+    split: float = 0.0
+    action: float = 0.0
+    alive: float = 0.0
+
+
+@dataclass(frozen=True)
+class Window:
+    """Where the 1 m x 1 m simulated window lies in the world.
+
+    Attributes:
+        left: Its left end for a fixed window, m.
+        follow: For a moving window the distance of the robot's centre from its left end, m; then ``left`` is unused.
+    """
+
+    left: float = 0.0
+    follow: float | None = None
+
+
+#: Centre (x, y) in window coordinates, m; ``None`` stands for the robot's centre.
+Centre = tuple[float | None, float | None]
+
+
+@dataclass(frozen=True)
+class TaskSpec:
+    """Everything that makes a task.
+
+    Attributes:
+        name: Part of the environment id.
+        horizon: Control steps of an episode.
+        robot: The robot.
+        mu: Second Lame parameter of robot and elastic object, Pa.
+        lam: First Lame parameter, Pa.
+        yield_stress: Of the robot, Pa.
+        max_actuation: Muscle stress at action 1, Pa.
+        judge: The task's own reward terms, termination and success.
+        weights: Weights of the terms that all tasks share, and of the task's own.
+        objects: Bodies beside the robot, at most one; elastic, with the robot's Lame parameters.
+        gravity: (x, y), m/s^2.
+        damping: Factor on node velocities in every substep.
+        window: Fixed or moving window.
+        view: Centre of the observed half-window.
+        reach: Centre of the patch of nodes on which actions act.
+        patch: Its width in nodes.
+        obstacles: Static geometry, in order of precedence.
+        coarse, fine: Action resolutions.
+        split_limit: Spread at which the episode ends, m; ``None`` for never.
+        remember: What to keep from the start of an episode, tensors with a leading B.
+        target: (64, 64) bool picture to match, centred on the robot, row 0 at the top; for pictures of the task.
+    """
+
+    name: str
+    horizon: int
+    robot: Body
+    mu: float
+    yield_stress: float
+    max_actuation: float
+    judge: Callable[[Moment, Weights], Outcome]
+    weights: Weights
+    objects: tuple[Body, ...] = ()
+    lam: float = 50.0
+    gravity: tuple[float, float] = (0.0, 0.0)
+    damping: float = 1.0
+    window: Window = Window()
+    view: Centre = (None, None)
+    reach: Centre = (None, None)
+    patch: int = 64
+    obstacles: tuple[Obstacle, ...] = ()
+    coarse: int = 8
+    fine: int = 16
+    split_limit: float | None = None
+    remember: Callable[[Moment], Mapping[str, Tensor]] = field(default=lambda moment: {})
+    target: np.ndarray | None = field(default=None, compare=False)
+
+    @property
+    def bodies(self) -> tuple[Body, ...]:
+        """Robot and objects in particle order."""
+        return (self.robot, *self.objects)

@@ -1,0 +1,101 @@
+"""Pictures for SHAPE MATCH: four drawn here, or the user's own."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+
+#: The name of a drawn target, the path of an image file, or an array.
+TargetLike: TypeAlias = "str | os.PathLike[str] | np.ndarray"
+
+#: Pixels per axis of a target.
+SIZE = 64
+#: Grey values from this on belong to the shape.
+THRESHOLD = 125
+#: A centroid further than this from the middle is worth a warning, pixels.
+OFF_CENTRE = 3.0
+
+# Corners (column, row) of filled polygons, several for a shape that is a union.
+_OUTLINES: dict[str, list[list[tuple[int, int]]]] = {
+    "star": [[(31, 15), (36, 25), (45, 26), (40, 34), (43, 48), (32, 41), (22, 48), (25, 35), (18, 26), (27, 25)]],
+    "I": [
+        [(15, 17), (46, 17), (46, 19), (15, 19)],
+        [(26, 20), (34, 20), (34, 39), (26, 39)],
+        [(15, 40), (46, 40), (46, 44), (15, 44)],
+    ],
+    "M": [
+        [(15, 22), (20, 22), (20, 42), (15, 42)],
+        [(45, 22), (50, 22), (50, 42), (45, 42)],
+        [(21, 22), (32, 33), (33, 33), (44, 22), (44, 28), (33, 40), (32, 40), (21, 28)],
+    ],
+    "T": [[(15, 21), (48, 21), (48, 27), (15, 27)], [(28, 28), (35, 28), (35, 51), (28, 51)]],
+}
+
+
+def load_target(target: TargetLike) -> np.ndarray:
+    """A target as a (64, 64) bool array, row 0 at the top.
+
+    Args:
+        target: The name of a drawn target (``"star"``, ``"I"``, ``"M"``, ``"T"``), the path of an image that OpenCV reads,
+            or an array (H, W), (H, W, 3) or (H, W, 4): bool, uint8 0..255, or floating point 0..1. Pictures of another
+            size are resized to 64 x 64 by area; grey values from 125 of 255 belong to the shape.
+
+    Raises:
+        ValueError: Neither a name nor a readable image, an array of another kind, or a picture without any pixel set or
+            unset.
+    """
+    if isinstance(target, np.ndarray):
+        grey = _grey(target)
+    elif str(target) in _OUTLINES:
+        grey = np.zeros((SIZE, SIZE), np.uint8)
+        for outline in _OUTLINES[str(target)]:
+            cv2.fillPoly(grey, [np.array(outline)], 255)
+    else:
+        grey = _read(target)
+    if grey.shape != (SIZE, SIZE):
+        grey = cv2.resize(grey, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
+    mask = grey >= THRESHOLD
+    if not mask.any() or mask.all():
+        raise ValueError(f"target must have pixels both of the shape and of the ground, got {mask.sum()} of {mask.size}")
+    offset = np.argwhere(mask).mean(0) - (SIZE - 1) / 2
+    if np.abs(offset).max() > OFF_CENTRE:
+        warnings.warn(
+            f"the target's centroid is {offset[0]:+.1f} rows and {offset[1]:+.1f} columns off the middle; the robot's "
+            "centre stays in the middle of the picture, so it cannot cover this target well",
+            stacklevel=2,
+        )
+    return mask
+
+
+def _read(path: str | os.PathLike[str]) -> np.ndarray:
+    names = ", ".join(repr(name) for name in _OUTLINES)
+    if not os.path.isfile(path):
+        raise ValueError(f"target must be {names}, an array or the path of an image, got {os.fspath(path)!r}: no such file")
+    image = cv2.imread(os.fspath(path), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise ValueError(f"target {os.fspath(path)!r} cannot be read as an image")
+    return _grey(image)
+
+
+def _grey(image: np.ndarray) -> np.ndarray:
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (3, 4)) or 0 in image.shape:
+        raise ValueError(f"target array must have shape (H, W), (H, W, 3) or (H, W, 4), got {image.shape}")
+    if image.dtype == bool:
+        image = image * np.uint8(255)
+    elif np.issubdtype(image.dtype, np.floating):
+        if not np.isfinite(image).all() or image.min() < 0 or image.max() > 1:
+            raise ValueError("target array of floating point numbers must lie in [0, 1]")
+        image = np.round(image * 255).astype(np.uint8)
+    elif image.dtype == np.uint16:
+        image = (image // 257).astype(np.uint8)
+    elif image.dtype != np.uint8:
+        raise ValueError(f"target array must be bool, uint8, uint16 or floating point, got {image.dtype}")
+    if image.ndim == 2:
+        return image
+    grey = cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_BGR2GRAY)
+    # What is transparent is ground.
+    return (grey * (image[..., 3] / 255.0)).astype(np.uint8) if image.shape[2] == 4 else grey

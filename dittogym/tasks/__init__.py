@@ -1,0 +1,37 @@
+"""The registry of tasks: a name, and a function that returns its :class:`dittogym.spec.TaskSpec`."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+
+from dittogym.spec import TaskSpec
+from dittogym.tasks.run import run
+from dittogym.tasks.shapematch import shapematch
+
+#: Functions by task name; their keyword arguments are the task's own options.
+TASKS: dict[str, Callable[..., TaskSpec]] = {"shapematch": shapematch, "run": run}
+
+
+def make_spec(task: str | TaskSpec, **options: object) -> TaskSpec:
+    """The specification of a task.
+
+    Args:
+        task: A name from :data:`TASKS`, or a specification, which is returned as it is.
+        options: Options of that task, such as ``target`` of SHAPE MATCH.
+
+    Raises:
+        ValueError: No such task.
+        TypeError: The task has no such option.
+    """
+    if isinstance(task, TaskSpec):
+        if options:
+            raise TypeError(f"a TaskSpec takes no options, got {sorted(options)}")
+        return task
+    if task not in TASKS:
+        raise ValueError(f"task must be one of {', '.join(sorted(TASKS))}, got {task!r}")
+    known = list(inspect.signature(TASKS[task]).parameters)
+    for name in options:
+        if name not in known:
+            raise TypeError(f"task {task!r} has no option {name!r}; its options are: {', '.join(known) or 'none'}")
+    return TASKS[task](**options)

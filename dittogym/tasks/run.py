@@ -1,0 +1,59 @@
+"""RUN: run to the right, as far and as fast as possible."""
+
+from __future__ import annotations
+
+from torchmpm import VelocityRule
+
+from dittogym.geometry import NODES, Box, Obstacle, ceiling, floor
+from dittogym.reward import signed_quadratic
+from dittogym.spec import Body, Disc, Moment, Outcome, TaskSpec, Weights, Window
+
+#: Displacement from which the location term no longer grows, m; reaching it counts as success (our definition).
+GOAL = 1.70
+#: The episode ends when the robot's centre gets behind this, m.
+REAR_LIMIT = -0.2
+
+# Invisible to the robot: nothing in the observation tells of it.
+HANGING_BLOCK = Obstacle(
+    "hanging block",
+    (
+        VelocityRule("+x", (32, 34), (61, None)),
+        VelocityRule("-x", (46, 47), (61, None)),
+        VelocityRule("+y", (33, 46), (59, 60)),
+    ),
+    shown=(Box(32 / NODES, 47 / NODES, 59 / NODES),),
+)
+
+
+def judge(moment: Moment, weights: Weights) -> Outcome:
+    """Displacement from the start and present speed, both saturating."""
+    travelled = moment.now.com[:, 0] - moment.start.com[:, 0]
+    location = signed_quadratic(travelled, 5.0).clamp(-20.0, 20.0)
+    velocity = signed_quadratic(moment.now.velocity[:, 0], 5.0).clamp(-20.0, 20.0)
+    return Outcome(
+        terms={"location": weights.location * location, "velocity": weights.velocity * velocity},
+        terminated=moment.now.com[:, 0] < REAR_LIMIT,
+        success=travelled >= GOAL,
+        info={"displacement": travelled},
+    )
+
+
+def run() -> TaskSpec:
+    """The task RUN."""
+    return TaskSpec(
+        name="run",
+        horizon=800,
+        robot=Body(Disc((0.0, 0.16), 0.18), count=22000),
+        mu=650.0,
+        yield_stress=90.0,
+        max_actuation=45.0,
+        gravity=(0.0, -9.0),
+        damping=0.999,
+        window=Window(follow=0.4),
+        view=(None, 0.28),
+        reach=(None, 0.28),
+        obstacles=(HANGING_BLOCK, floor(), ceiling(119)),
+        split_limit=0.10,
+        judge=judge,
+        weights=Weights(location=1.0, velocity=4.0, split=1.0, action=2e-4, alive=3.0),
+    )

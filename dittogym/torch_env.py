@@ -1,0 +1,286 @@
+"""Batched, differentiable environments: torch in, torch out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dittogym import dynamics
+from dittogym.action import Layout, to_grid_layout
+from dittogym.dynamics import EnvState
+from dittogym.layout import LayoutSampler, Particles, particle_counts
+from dittogym.render import frame
+from dittogym.spec import TaskSpec
+from dittogym.tasks import make_spec
+from dittogym.window import window_origin
+from torchmpm import ParticleState, diagnostics
+
+Parity = Literal["clean", "reference"]
+_DTYPES = {"float32": torch.float32, "float64": torch.float64}
+_RESET_OPTIONS = ("positions", "reset_mask")
+
+
+class TorchEnv:
+    """``num_envs`` independent simulations of one task, advanced together.
+
+    Rewards and states keep their autograd graph as long as gradients are enabled: differentiate through
+    :meth:`step`, cut the graph with :meth:`detach`, or run under ``torch.no_grad()``. The observation is an integer image
+    and has no gradient. Nothing is reset by itself: an element that has ended goes on until :meth:`reset` is called
+    with a mask. Element i of a batch reset with seed s is the single environment reset with seed s + i.
+
+    Args:
+        task: A task name or a :class:`dittogym.spec.TaskSpec`.
+        num_envs: B, the number of simulations.
+        resolution: ``"coarse"``, ``"fine"``, or R itself, at most the task's patch.
+        particles: ``"full"``, ``"lite"`` (2,000, evenly spread), the robot's number, or (robot, object).
+        substeps: Substeps of 1e-4 s in a control step.
+        dtype: ``"float32"`` or ``"float64"``.
+        device: Where it runs.
+        backend: Of the solver, see :class:`torchmpm.Solver`.
+        action_layout: ``"image"``: action pixel (row, column) acts where observation pixel (row, column) looks;
+            ``"grid"``: (x, y), as in the reference implementation. ``None``: ``"image"``, with reference parity ``"grid"``.
+        parity: ``"clean"``, or ``"reference"`` to bring back the reference's stale observation and action centre
+            after a reset, its random layout, unit particle volume and pixel raster at every particle count.
+        resample: Draw new particles at every reset, not only at a seeded one.
+        task_options: Options of the task, such as ``target`` of SHAPE MATCH.
+
+    Attributes:
+        spec: The task.
+        num_envs: B.
+        action_shape: (2, R, R).
+        state: The :class:`torchmpm.ParticleState` of all simulations.
+
+    Raises:
+        ValueError: An argument is out of range.
+        TypeError: The task has no such option.
+    """
+
+    observation_shape = (3, 64, 64)
+
+    def __init__(
+        self,
+        task: str | TaskSpec,
+        num_envs: int = 1,
+        resolution: str | int = "coarse",
+        *,
+        particles: Particles = "full",
+        substeps: int = 100,
+        dtype: str = "float32",
+        device: str | torch.device = "cpu",
+        backend: str = "auto",
+        action_layout: Layout | None = None,
+        parity: Parity = "clean",
+        resample: bool = False,
+        **task_options: Any,
+    ) -> None:
+        self.spec = make_spec(task, **task_options)
+        for name, value, allowed in (
+            ("dtype", dtype, tuple(_DTYPES)),
+            ("parity", parity, ("clean", "reference")),
+            ("action_layout", action_layout, ("image", "grid", None)),
+        ):
+            if value not in allowed:
+                raise ValueError(f"{name} must be one of {allowed}, got {value!r}")
+        for name, number in (("num_envs", num_envs), ("substeps", substeps)):
+            if number < 1:
+                raise ValueError(f"{name} must be at least 1, got {number}")
+        self.num_envs, self.dtype, self.device = num_envs, _DTYPES[dtype], torch.device(device)
+        if self.device.type == "cuda" and not torch.cuda.is_available():
+            raise ValueError(f"device must be available, got {device!r}, but torch finds no CUDA device")
+        self.action_resolution = self._resolution(resolution)
+        self.action_shape = (2, self.action_resolution, self.action_resolution)
+        self._stale = parity == "reference"
+        self._layout: Layout = action_layout or ("grid" if self._stale else "image")
+        self._resample = resample
+        self._counts = particle_counts(self.spec, particles)
+        full = self._counts == particle_counts(self.spec, "full")
+        self._spread = not (full or self._stale)
+        self.model = dynamics.make_model(
+            self.spec, self._counts, substeps=substeps, backend=backend, unscaled=self._stale
+        )
+        self._samplers: list[LayoutSampler] | None = None
+        self._positions: Tensor | None = None
+        self._env_state: EnvState | None = None
+        self._observation: Tensor | None = None
+        self._field: Tensor | None = None
+
+    def _resolution(self, resolution: str | int) -> int:
+        named = {"coarse": self.spec.coarse, "fine": self.spec.fine}
+        size = named.get(resolution) if isinstance(resolution, str) else resolution
+        if size is None or not 1 <= size <= self.spec.patch:
+            raise ValueError(f"resolution must be 'coarse', 'fine' or 1 to {self.spec.patch}, got {resolution!r}")
+        return size
+
+    @property
+    def num_particles(self) -> int:
+        """N, particles of all bodies."""
+        return sum(self._counts)
+
+    @property
+    def env_state(self) -> EnvState:
+        """Everything that moves, for :mod:`dittogym.dynamics`; assign to it to branch or restore."""
+        if self._env_state is None:
+            raise RuntimeError("call reset() first: the environment has no state yet")
+        return self._env_state
+
+    @env_state.setter
+    def env_state(self, value: EnvState) -> None:
+        self._env_state = value
+
+    @property
+    def state(self) -> ParticleState:
+        """The particles of all simulations."""
+        return self.env_state.particles
+
+    def detach(self) -> None:
+        """Cut the autograd graph: gradients do not reach back beyond this moment."""
+        self.env_state = self.env_state.detach()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
+        """Start new episodes.
+
+        Args:
+            seed: Seeds element i with ``seed + i`` and draws its particles anew. Without it the last layout is used again,
+                unless ``resample`` was asked for.
+            options: ``"positions"``: (N, 2) or (B, N, 2) world positions in m, robot first, used until the next seed;
+                ``"reset_mask"``: (B,) bool, reset only these elements.
+
+        Returns:
+            The observation (B, 3, 64, 64) uint8 of all elements, and ``info``.
+
+        Raises:
+            ValueError: An option is unknown, has the wrong shape, or puts particles outside the window.
+        """
+        options = dict(options or {})
+        for name in options:
+            if name not in _RESET_OPTIONS:
+                raise ValueError(f"options may hold {', '.join(_RESET_OPTIONS)}, got {name!r}")
+        mask = self._mask(options.get("reset_mask"))
+        positions = self._draw(seed, mask, options.get("positions"))
+        fresh = dynamics.initial(self.model, positions)
+        old = self._env_state
+        everyone = bool(mask.all())
+        if old is None and not everyone:
+            raise ValueError("reset_mask must reset all elements the first time")
+        if old is not None and self._stale:
+            fresh = replace(fresh, centre=old.centre.detach())
+        self._positions = positions
+        self._env_state = fresh if everyone or old is None else fresh.where(mask, old)
+        self._field = None
+        if self._observation is None or not self._stale:
+            self._observation = dynamics.observe(self.model, self._env_state)
+        now = dynamics.measure(self.state, self.model.robot)
+        info = {"com": now.com, "split": now.split, "finite": diagnostics.finite(self.state)}
+        return self._observation, {name: value.detach() for name, value in info.items()}
+
+    def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Advance every simulation by one control step.
+
+        Args:
+            action: (B, 2, R, R), muscle actuation in units of the task's maximum; ``[:, 0]`` along material x. Values
+                beyond [-1, 1] saturate after the interpolation.
+
+        Returns:
+            observation (B, 3, 64, 64) uint8; reward (B,); terminated (B,) bool; truncated (B,) bool, at the horizon; and
+            ``info`` with ``reward_terms`` by name, ``com``, ``split``, ``finite``, ``is_success`` where the task defines
+            it, and the task's own quantities, all with a leading B.
+
+        Raises:
+            ValueError: The action has the wrong shape or type or is not finite.
+        """
+        action = self._checked(action)
+        state, field = dynamics.transition(self.model, self.env_state, to_grid_layout(action, self._layout))
+        observation = dynamics.observe(self.model, state)
+        state, outcome = dynamics.judge(self.model, state, field, observation)
+        self._env_state, self._observation, self._field = state, observation, field.detach()
+        info: dict[str, Any] = {"reward_terms": dict(outcome.terms), **outcome.info}
+        if outcome.success is not None:
+            info["is_success"] = outcome.success
+        reward = torch.stack(tuple(outcome.terms.values())).sum(0)
+        assert outcome.terminated is not None
+        return observation, reward, outcome.terminated, state.steps >= self.spec.horizon, info
+
+    def render(self, index: int = 0, *, muscles: bool = False, size: int = 512) -> np.ndarray:
+        """Picture of one simulation, (size, size, 3) uint8 RGB.
+
+        Args:
+            index: Which element of the batch.
+            muscles: Colour the robot by the actuation of the last step: contraction red, expansion blue.
+            size: Pixels per side.
+        """
+        field = self._field if muscles else None
+        return frame(self.model, self.env_state, index, field, size)
+
+    def _mask(self, given: Any) -> Tensor:
+        if given is None:
+            return torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        mask = torch.as_tensor(given, device=self.device)
+        if mask.dtype != torch.bool or mask.shape != (self.num_envs,):
+            raise ValueError(
+                f"reset_mask must be bool of shape ({self.num_envs},), got {mask.dtype} of shape {tuple(mask.shape)}"
+            )
+        return mask
+
+    def _draw(self, seed: int | None, mask: Tensor, given: Any) -> Tensor:
+        """Starting positions (B, N, 2) of all elements; those outside ``mask`` keep theirs."""
+        chosen = mask.tolist()
+        if seed is not None or self._samplers is None:
+            samplers = list(self._samplers or [None] * self.num_envs)
+            for i in range(self.num_envs):
+                if chosen[i]:
+                    element_seed = None if seed is None else seed + i
+                    samplers[i] = LayoutSampler(self.spec, self._counts, element_seed, spread=self._spread)
+            self._samplers = samplers
+            redraw = True
+        else:
+            redraw = self._resample
+        if given is not None:
+            positions = self._given(given)
+        elif self._positions is None or redraw:
+            drawn = [s.draw() if chosen[i] else None for i, s in enumerate(self._samplers)]
+            empty = np.zeros((self.num_particles, 2))
+            stacked = np.stack([empty if d is None else d for d in drawn])
+            positions = torch.as_tensor(stacked, dtype=self.dtype, device=self.device)
+        else:
+            return self._positions
+        if self._positions is None:
+            return positions
+        return torch.where(mask[:, None, None], positions, self._positions)
+
+    def _given(self, given: Any) -> Tensor:
+        positions = torch.as_tensor(given, dtype=self.dtype, device=self.device)
+        shape = (self.num_particles, 2)
+        if tuple(positions.shape) not in (shape, (self.num_envs, *shape)):
+            raise ValueError(
+                f"positions must have shape {shape} or {(self.num_envs, *shape)}, got {tuple(positions.shape)}"
+            )
+        positions = positions.expand(self.num_envs, *shape)
+        com = positions[:, : self.model.robot].mean(1)
+        origin = window_origin(self.spec, com)
+        relative = positions - origin[:, None]
+        inside = self.model.solver.grid.contains(positions[..., 0], origin[:, 0:1])
+        inside = inside & (relative[..., 1] > 0) & (relative[..., 1] < 1)
+        if not bool(inside.all()):
+            element, particle = (~inside).nonzero()[0].tolist()
+            where = positions[element, particle].tolist()
+            raise ValueError(
+                f"positions must lie inside the window ({origin[element, 0]:.3f} < x < {origin[element, 0] + 1:.3f}, "
+                f"0 < y < 1), got {where} for particle {particle} of element {element}"
+            )
+        return positions
+
+    def _checked(self, action: Tensor) -> Tensor:
+        if not isinstance(action, Tensor) or not action.is_floating_point():
+            kind = action.dtype if isinstance(action, Tensor) else type(action).__name__
+            raise ValueError(f"action must be a floating point tensor, got {kind}")
+        expected = (self.num_envs, *self.action_shape)
+        if tuple(action.shape) != expected:
+            raise ValueError(f"action must have shape {expected}, got {tuple(action.shape)}")
+        if not bool(torch.isfinite(action).all()):
+            count = int((~torch.isfinite(action)).sum())
+            raise ValueError(f"action must be finite, got {count} entries that are NaN or infinite")
+        return action.to(self.device, self.dtype)

@@ -1,0 +1,130 @@
+"""The batched Gymnasium environment: many simulations advanced in one call."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from dittogym.env import RENDER_FPS, RENDER_MODES, as_numpy, as_tensor, spaces
+from dittogym.spec import TaskSpec
+from dittogym.torch_env import TorchEnv
+from torchmpm import ParticleState
+
+
+class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """``num_envs`` simulations behind Gymnasium's vector interface.
+
+    Args:
+        task: Task name or specification.
+        num_envs: Number of simulations.
+        autoreset_mode: ``SAME_STEP`` (an ended episode starts anew in the same call; the last observation and info are in
+            ``info["final_obs"]`` and ``info["final_info"]``), ``NEXT_STEP`` (in the next call, whose action it ignores),
+            or ``DISABLED`` (``reset(options={"reset_mask": ...})``).
+        render_mode: ``None`` or ``"rgb_array"``.
+        render_muscles: Colour the robots by their muscles in pictures.
+        max_episode_steps: Horizon if it is to differ from the task's.
+        options: All other arguments of :class:`dittogym.TorchEnv`.
+
+    Raises:
+        ValueError: Unknown mode, or as in :class:`dittogym.TorchEnv`.
+    """
+
+    metadata = {"render_modes": list(RENDER_MODES[:1]), "render_fps": RENDER_FPS}
+
+    def __init__(
+        self,
+        task: str | TaskSpec,
+        num_envs: int = 1,
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        render_mode: str | None = None,
+        render_muscles: bool = False,
+        max_episode_steps: int | None = None,
+        **options: Any,
+    ) -> None:
+        if render_mode not in (None, RENDER_MODES[0]):
+            raise ValueError(f"render_mode must be None or {RENDER_MODES[0]!r} for a batch, got {render_mode!r}")
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps}")
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
+        self.torch_env = TorchEnv(task, num_envs, **options)
+        self.num_envs, self.render_mode, self.render_muscles = num_envs, render_mode, render_muscles
+        self._horizon = max_episode_steps or self.torch_env.spec.horizon
+        self.single_observation_space, self.single_action_space = spaces(self.torch_env)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._ended = np.zeros(num_envs, dtype=bool)
+
+    @property
+    def state(self) -> ParticleState:
+        """The particles of all simulations."""
+        return self.torch_env.state
+
+    @torch.no_grad()
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        """Start new episodes, of all elements or of ``options["reset_mask"]``; see :meth:`dittogym.TorchEnv.reset`."""
+        super().reset(seed=seed)
+        observation, info = self.torch_env.reset(seed=seed, options=options)
+        mask = (options or {}).get("reset_mask")
+        self._ended = np.zeros(self.num_envs, dtype=bool) if mask is None else self._ended & ~np.asarray(mask)
+        return observation.cpu().numpy(), _with_masks(as_numpy(info), np.ones(self.num_envs, dtype=bool))
+
+    @torch.no_grad()
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Advance all simulations; see :meth:`dittogym.TorchEnv.step`.
+
+        Args:
+            actions: (B, 2, R, R) in [-1, 1].
+        """
+        fresh = self._ended.copy()
+        observation, reward, terminated, truncated, raw = self.torch_env.step(as_tensor(actions, self.torch_env))
+        info = as_numpy(raw)
+        rewards, ends = reward.double().cpu().numpy(), terminated.cpu().numpy()
+        limits = (self.torch_env.env_state.steps >= self._horizon).cpu().numpy()
+        observations = observation.cpu().numpy()
+        if self.autoreset_mode is AutoresetMode.DISABLED:
+            self._ended = fresh | ends | limits
+            return observations, rewards, ends, limits, _with_masks(info, np.ones(self.num_envs, dtype=bool))
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            self._ended = (ends | limits) & ~fresh
+            if fresh.any():
+                observations, _ = self._restart(fresh)
+                rewards, ends, limits = rewards * ~fresh, ends & ~fresh, limits & ~fresh
+            return observations, rewards, ends, limits, _with_masks(info, ~fresh)
+        done = ends | limits
+        result = _with_masks(info, np.ones(self.num_envs, dtype=bool))
+        if done.any():
+            final = np.empty(self.num_envs, dtype=object)
+            for i in np.flatnonzero(done):
+                final[i] = observations[i]
+            last = {"final_obs": final, "_final_obs": done, "final_info": _with_masks(info, done), "_final_info": done}
+            observations, start = self._restart(done)
+            result = {**result, **last}
+            for name, value in start.items():
+                shape = (-1, *[1] * (value.ndim - 1))
+                result[name] = np.where(done.reshape(shape), value, result[name])
+        return observations, rewards, ends, limits, result
+
+    def _restart(self, mask: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
+        observation, info = self.torch_env.reset(options={"reset_mask": torch.as_tensor(mask)})
+        return observation.cpu().numpy(), as_numpy(info)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """One picture per simulation in mode ``"rgb_array"``, else nothing."""
+        if self.render_mode is None:
+            return None
+        return tuple(self.torch_env.render(i, muscles=self.render_muscles) for i in range(self.num_envs))
+
+
+def _with_masks(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
+    """Gymnasium's form: beside each entry, under ``_name``, for which elements it holds."""
+    result: dict[str, Any] = {}
+    for name, value in info.items():
+        result[name] = _with_masks(value, mask) if isinstance(value, dict) else value
+        result["_" + name] = mask.copy()
+    return result

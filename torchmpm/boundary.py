@@ -1,0 +1,144 @@
+"""Velocity rules on grid nodes: floors, ceilings, walls and boxes, from data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torchmpm.grid import PAD, Grid
+
+#: Inclusive range of node indices; ``None`` at an end leaves it open.
+Range = tuple[int | None, int | None]
+Direction = Literal["+x", "-x", "+y", "-y"]
+_DIRECTIONS: tuple[Direction, ...] = ("+x", "-x", "+y", "-y")
+
+
+@dataclass(frozen=True)
+class VelocityRule:
+    """On a box of nodes, forbid one direction of motion.
+
+    Where the velocity component points in the forbidden direction it becomes zero, and the tangential component is
+    reduced by ``friction`` times the removed speed (Coulomb); ``friction=math.inf`` sticks: the whole velocity becomes
+    zero. Motion the other way is free. Of several rules for one direction the first that covers a node counts.
+
+    Attributes:
+        direction: The component that is removed, ``"-y"`` for a floor.
+        i: Inclusive range of node indices in x.
+        j: Inclusive range of node indices in y.
+        friction: Coulomb coefficient, 0 = frictionless, ``math.inf`` = sticky.
+        frame: ``"world"``: the ranges count nodes from the world's origin, so an obstacle stays where it is while the
+            window moves (by whole cells: the window's origin is truncated to nodes). ``"window"``: they count from the
+            window's corner.
+
+    Raises:
+        ValueError: Unknown direction or frame, negative friction, or an empty range.
+    """
+
+    direction: Direction
+    i: Range = (None, None)
+    j: Range = (None, None)
+    friction: float = 0.0
+    frame: Literal["world", "window"] = "world"
+
+    def __post_init__(self) -> None:
+        if self.direction not in _DIRECTIONS:
+            raise ValueError(f"direction must be one of {_DIRECTIONS}, got {self.direction!r}")
+        if self.frame not in ("world", "window"):
+            raise ValueError(f"frame must be 'world' or 'window', got {self.frame!r}")
+        if not self.friction >= 0:
+            raise ValueError(f"friction must not be negative, got {self.friction}")
+        for name, (low, high) in (("i", self.i), ("j", self.j)):
+            if low is not None and high is not None and low > high:
+                raise ValueError(f"{name} must be an inclusive range (low, high) with low <= high, got {(low, high)}")
+
+
+def fixed(i: Range = (None, None), j: Range = (None, None), frame: Literal["world", "window"] = "world"):
+    """Rules that hold the nodes of a box at rest, whatever direction they would move in."""
+    return tuple(VelocityRule(direction, i, j, 0.0, frame) for direction in _DIRECTIONS)
+
+
+@dataclass(frozen=True, eq=False)
+class Face:
+    """All rules against one direction, as masks over the padded grid for the present place of the window.
+
+    Attributes:
+        axis: 0 for x, 1 for y.
+        sign: +1 or -1, the sign of the removed component.
+        active: (1 or B, cells) nodes with a rule.
+        stick: (1 or B, cells) nodes of these that stick, or ``None`` if there are none.
+        friction: (1 or B, cells) Coulomb coefficients, or ``None`` if all are zero.
+    """
+
+    axis: int
+    sign: int
+    active: Tensor
+    stick: Tensor | None
+    friction: Tensor | None
+
+
+def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Face, ...]:
+    """Turn rules into masks; the window does not move during a step, so this is done once a step.
+
+    Args:
+        rules: The rules, in their order of precedence.
+        grid: The window.
+        origin: (B, 2) lower left corner of the window in the world, m.
+    """
+    window = torch.arange(-PAD, grid.resolution + PAD, device=origin.device)[None]
+    shift = torch.trunc(origin.detach() * (1.0 / grid.h)).to(torch.int64)
+    result = []
+    for direction in dict.fromkeys(rule.direction for rule in rules):
+        active = torch.zeros(1, grid.width, grid.width, dtype=torch.bool, device=origin.device)
+        stick, friction = active, torch.zeros_like(active, dtype=origin.dtype)
+        for rule in rules:
+            if rule.direction != direction:
+                continue
+            inside = []
+            for axis, (low, high) in enumerate((rule.i, rule.j)):
+                bounded = low is not None or high is not None
+                node = window + shift[:, axis : axis + 1] if bounded and rule.frame == "world" else window
+                inside.append((node >= (-math.inf if low is None else low)) & (node <= (math.inf if high is None else high)))
+            new = inside[0][:, :, None] & inside[1][:, None, :] & ~active
+            active = active | new
+            if math.isinf(rule.friction):
+                stick = stick | new
+            elif rule.friction:
+                friction = torch.where(new, rule.friction, friction)
+        result.append(
+            Face(
+                axis="xy".index(direction[1]),
+                sign=1 if direction[0] == "+" else -1,
+                active=active.flatten(1),
+                stick=stick.flatten(1) if stick.any() else None,
+                friction=friction.flatten(1) if friction.any() else None,
+            )
+        )
+    return tuple(result)
+
+
+def constrain(faces: Sequence[Face], velocity: Tensor) -> Tensor:
+    """Apply the rules to node velocities.
+
+    Rules of different directions commute as long as none has a finite friction, so the order of directions only
+    matters in a corner of two rubbing walls.
+
+    Args:
+        faces: Masks from :func:`faces`.
+        velocity: (2, B, cells), m/s.
+    """
+    component = list(velocity.unbind(0))
+    for face in faces:
+        normal, tangent = component[face.axis], component[1 - face.axis]
+        hit = face.active & (normal > 0 if face.sign > 0 else normal < 0)
+        if face.friction is not None:
+            left = (tangent.abs() - face.friction * normal.abs()).clamp_min(0.0)
+            tangent = torch.where(hit, torch.copysign(left, tangent), tangent)
+        if face.stick is not None:
+            tangent = torch.where(hit & face.stick, 0.0, tangent)
+        component[face.axis], component[1 - face.axis] = torch.where(hit, 0.0, normal), tangent
+    return torch.stack(component)

@@ -1,0 +1,85 @@
+"""Balances of a simulation: mass, momentum, energy, and whether its numbers are still numbers."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchmpm.boundary import constrain
+from torchmpm.material import column
+from torchmpm.solver import MASS_EPSILON, Solver
+from torchmpm.state import ParticleState
+
+
+def masses(solver: Solver, state: ParticleState) -> Tensor:
+    """Mass of every particle, (B, N), kg."""
+    return solver.per_particle(state, "mass") * torch.ones_like(state.Jp)
+
+
+def mass(solver: Solver, state: ParticleState) -> Tensor:
+    """Total mass, (B,), kg."""
+    return masses(solver, state).sum(-1)
+
+
+def momentum(solver: Solver, state: ParticleState) -> Tensor:
+    """Linear momentum, (B, 2), kg m/s."""
+    return (masses(solver, state)[..., None] * state.v).sum(1)
+
+
+def angular_momentum(solver: Solver, state: ParticleState) -> Tensor:
+    """Angular momentum about the world's origin, (B,), kg m^2/s, with the spin in the affine matrices (h^2/4 each)."""
+    orbit = state.x[..., 0] * state.v[..., 1] - state.x[..., 1] * state.v[..., 0]
+    spin = 0.25 * solver.grid.h**2 * (state.C[..., 1, 0] - state.C[..., 0, 1])
+    return (masses(solver, state) * (orbit + spin)).sum(-1)
+
+
+def kinetic_energy(solver: Solver, state: ParticleState) -> Tensor:
+    """Energy of motion of the particles, without the affine part, (B,), J."""
+    return 0.5 * (masses(solver, state) * state.v.square().sum(-1)).sum(-1)
+
+
+def elastic_energy(solver: Solver, state: ParticleState) -> Tensor:
+    """Energy stored in deformation, (B,), J; muscles are not counted."""
+    total = torch.zeros_like(state.Jp[:, 0])
+    for body, part in solver.parts():
+        F = state.F[:, part]
+        planes = (F[..., 0, 0], F[..., 0, 1], F[..., 1, 0], F[..., 1, 1])
+        Jp = state.Jp[:, part]
+        total = total + (column(body.volume, Jp, "volume") * body.material.energy(planes, Jp)).sum(-1)
+    return total
+
+
+def potential_energy(solver: Solver, state: ParticleState) -> Tensor:
+    """Energy of position under gravity relative to the world's origin, (B,), J."""
+    gravity = torch.as_tensor(solver.gravity, dtype=state.dtype, device=state.device).reshape(-1, 1, 2)
+    return -(masses(solver, state) * (state.x * gravity).sum(-1)).sum(-1)
+
+
+def finite(state: ParticleState) -> Tensor:
+    """Which simulations consist of finite numbers only, (B,) bool."""
+    return torch.stack([torch.isfinite(plane).all(-1) for plane in state.planes()]).all(0)
+
+
+def impulses(
+    solver: Solver, state: ParticleState, actuation: Tensor | None = None, origin: Tensor | None = None
+) -> dict[str, Tensor]:
+    """Momentum that each outer influence adds in the substep that starts at ``state``.
+
+    Args:
+        solver: The solver.
+        state: Where the substep starts.
+        actuation: As in :meth:`torchmpm.Solver.step`.
+        origin: As in :meth:`torchmpm.Solver.step`.
+
+    Returns:
+        ``"gravity"``, ``"damping"`` and ``"boundary"``, each (B, 2), kg m/s. Their sum is the change of
+        :func:`momentum` over the substep while all particles are in the window. Internal forces and muscles cancel.
+    """
+    scene = solver.scene(state, actuation, origin)
+    grid = solver.to_grid(scene, state.planes()).momentum
+    before = grid[1:] * (scene.inside / (grid[0] + MASS_EPSILON))
+    accelerated = before + scene.gravity
+    damped = accelerated * scene.damping
+    after = constrain(scene.faces, damped)
+    stages = {"gravity": (before, accelerated), "damping": (accelerated, damped), "boundary": (damped, after)}
+    return {name: (grid[0] * (new - old)).sum(-1).T for name, (old, new) in stages.items()}

@@ -1,0 +1,57 @@
+"""The background grid: a square window of nodes that may follow the particles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+#: Rows of nodes kept around the window so that every 3x3 stencil has an address. They collect what would fall
+#: outside and carry zero velocity: contributions to nodes that do not exist are dropped, never stored elsewhere.
+PAD = 3
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Square window of ``resolution`` x ``resolution`` nodes, node (i, j) at ``origin + (i, j) * spacing``.
+
+    Where the window lies in the world (its ``origin``) is an argument of each step, because it moves.
+
+    Attributes:
+        resolution: Nodes per axis.
+        spacing: Distance h between nodes in m; ``None`` means ``1 / resolution`` (a window of one metre).
+        margin: Particles closer than this to the left or right end of the window (m) take no part.
+
+    Raises:
+        ValueError: ``resolution`` is below 4 or ``spacing`` is not positive.
+    """
+
+    resolution: int = 128
+    spacing: float | None = None
+    margin: float = 1e-5
+
+    def __post_init__(self) -> None:
+        if self.resolution < 4:
+            raise ValueError(f"resolution must be at least 4 nodes per axis, got {self.resolution}")
+        if self.spacing is not None and not self.spacing > 0:
+            raise ValueError(f"spacing must be positive, got {self.spacing}")
+
+    @property
+    def h(self) -> float:
+        """Distance between nodes, m."""
+        return 1.0 / self.resolution if self.spacing is None else self.spacing
+
+    @property
+    def width(self) -> int:
+        """Nodes per axis including the padding."""
+        return self.resolution + 2 * PAD
+
+    def contains(self, x: Tensor, origin_x: Tensor) -> Tensor:
+        """Which particles take part: the window test in x, false for a position that is not a number.
+
+        Args:
+            x: (B, N) horizontal positions, m.
+            origin_x: (B, 1) left end of the window, m.
+        """
+        offset = x - origin_x
+        return (offset > self.margin) & (offset < self.resolution * self.h - self.margin)

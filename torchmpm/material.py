@@ -1,0 +1,184 @@
+"""Constitutive laws: elastic and von Mises elasto-plastic matter."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Protocol, TypeAlias
+
+import torch
+from torch import Tensor
+
+from torchmpm.linalg import Mat2, det, polar, split
+
+#: A number, or a tensor of shape (), (B,) for one value per simulation, or (B, N) for one per particle.
+Value: TypeAlias = "float | Tensor"
+#: Planes (xx, xy, yy) of a symmetric matrix.
+Sym2: TypeAlias = tuple[Tensor, Tensor, Tensor]
+
+#: Principal stretches below this count as this in the yield test.
+STRETCH_FLOOR = 0.05
+#: Constant under the square root of the norm of the deviatoric strain.
+NORM_EPSILON = 1e-8
+
+
+class Material(Protocol):
+    """What the solver asks of a material."""
+
+    def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
+        """Project the trial deformation gradient (planes (B, N)) onto the elastic range."""
+
+    def stress(self, F: Mat2, Jp: Tensor) -> Sym2:
+        """Kirchhoff stress of the projected deformation gradient, planes (B, N), Pa."""
+
+    def energy(self, F: Mat2, Jp: Tensor) -> Tensor:
+        """Stored energy per unit volume, (B, N), J/m^2 (two-dimensional)."""
+
+
+def lame(young: Value, poisson: Value) -> tuple[Value, Value]:
+    """Lame parameters (mu, lam) from Young's modulus (Pa) and Poisson's ratio, plane strain."""
+    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+
+
+def column(value: Value, like: Tensor, name: str = "value") -> Value:
+    """Bring a material value to a shape that broadcasts against planes (B, N).
+
+    Raises:
+        ValueError: A tensor has a shape other than (), (B,), (B, N) or (1, N).
+    """
+    if not isinstance(value, Tensor):
+        return value
+    value = value.to(like)
+    batch, count = like.shape
+    if value.ndim == 1 and value.shape[0] == batch:
+        return value[:, None]
+    if value.ndim == 0 or (value.ndim == 2 and value.shape[0] in (1, batch) and value.shape[1] in (1, count)):
+        return value
+    raise ValueError(f"{name} must be a number or have shape (), ({batch},) or ({batch}, {count}), got {value.shape}")
+
+
+def corotated_stress(F: Mat2, mu: Value, lam: Value) -> Sym2:
+    """Kirchhoff stress of the fixed corotated solid, 2 mu (F - R) F^T + lam J (J - 1) I (Stomakhin et al., 2012)."""
+    a, b, c, d = F
+    r = polar(F)
+    e, f, g, h = a - r[0], b - r[1], c - r[2], d - r[3]
+    J = det(F)
+    pressure = lam * (J * (J - 1.0))
+    mu2 = 2.0 * mu
+    return mu2 * (e * a + f * b) + pressure, mu2 * (e * c + f * d), mu2 * (g * c + h * d) + pressure
+
+
+def corotated_energy(F: Mat2, mu: Value, lam: Value) -> Tensor:
+    """Energy mu |F - R|^2 + lam/2 (J - 1)^2 whose derivative is :func:`corotated_stress`."""
+    distance = sum((f - r).square() for f, r in zip(F, polar(F), strict=True))
+    return mu * distance + 0.5 * lam * (det(F) - 1.0).square()
+
+
+def _sqrt(value: Value) -> Value:
+    return value.sqrt() if isinstance(value, Tensor) else math.sqrt(value)
+
+
+def _exp(value: Value) -> Value:
+    return value.exp() if isinstance(value, Tensor) else math.exp(value)
+
+
+def von_mises_return(F: Mat2, limit: Value) -> Mat2:
+    """Closest point on the von Mises yield surface in principal logarithmic strains.
+
+    With e_1 >= e_2 the logarithms of the principal stretches (floored at 0.05), the deviator has the norm
+    ``sqrt((e_1 - e_2)^2 / 2 + 1e-8)``. Where it exceeds ``limit`` = yield stress / (2 mu), the difference e_1 - e_2 is
+    brought back to its value at yield and the volume is kept: plastic flow is isochoric. Elsewhere F is returned as it
+    came. Without logarithm or SVD: the test compares stretch ratios, and sum and difference of the returned stretches
+    rescale the rotation and the reflection part of F (see :mod:`torchmpm.linalg`).
+
+    The derivative jumps at the yield surface; exactly on it this returns the elastic side.
+
+    Args:
+        F: Trial deformation gradient, planes (B, N).
+        limit: Yield stress / (2 mu), a number or broadcastable to (B, N).
+    """
+    excess = 2.0 * (limit * limit - NORM_EPSILON)
+    gap = _sqrt(excess.clamp_min(NORM_EPSILON) if isinstance(excess, Tensor) else max(excess, NORM_EPSILON))
+    ratio = _exp(gap)  # of the principal stretches at yield
+    slope = (ratio - 1.0) / (ratio + 1.0)  # difference over sum of the stretches at yield
+    p, q, r, s = split(F)
+    rotation, reflection = p.square() + q.square(), r.square() + s.square()
+    proper = rotation >= reflection
+    large, small = torch.where(proper, rotation, reflection), torch.where(proper, reflection, rotation)
+    beyond = small > slope * slope * large
+    # Elsewhere harmless numbers go through the square roots, so that no infinite derivative meets a zero.
+    total = torch.where(beyond, large, 1.0).sqrt()
+    difference = torch.where(beyond, small, 0.25).sqrt()
+    major = (0.5 * (total + difference)).clamp_min(STRETCH_FLOOR)
+    minor = (0.5 * (total - difference)).clamp_min(STRETCH_FLOOR)
+    yields = beyond & (major > minor * ratio)
+    mean = (major * minor).sqrt()
+    root = _sqrt(ratio)
+    grow_total, grow_difference = mean * (root + 1.0 / root) / total, mean * (root - 1.0 / root) / difference
+    of_rotation = 0.5 * torch.where(proper, grow_total, grow_difference)
+    of_reflection = 0.5 * torch.where(proper, grow_difference, grow_total)
+    return (
+        torch.where(yields, p * of_rotation + r * of_reflection, F[0]),
+        torch.where(yields, s * of_reflection - q * of_rotation, F[1]),
+        torch.where(yields, q * of_rotation + s * of_reflection, F[2]),
+        torch.where(yields, p * of_rotation - r * of_reflection, F[3]),
+    )
+
+
+def _check_not_negative(material: Elastic | VonMises) -> None:
+    for field in fields(material):
+        value = getattr(material, field.name)
+        if not isinstance(value, Tensor) and not value >= 0:
+            raise ValueError(f"{field.name} must not be negative, got {value}")
+
+
+@dataclass(frozen=True, eq=False)
+class Elastic:
+    """Fixed corotated elastic solid.
+
+    Attributes:
+        mu: Second Lame parameter (shear modulus), Pa.
+        lam: First Lame parameter, Pa.
+
+    Raises:
+        ValueError: A value is negative.
+    """
+
+    mu: Value
+    lam: Value
+
+    def __post_init__(self) -> None:
+        _check_not_negative(self)
+
+    def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
+        """Nothing flows: the trial deformation is kept."""
+        return F, Jp
+
+    def stress(self, F: Mat2, Jp: Tensor) -> Sym2:
+        """Kirchhoff stress, planes (B, N), Pa; see :func:`corotated_stress`."""
+        return corotated_stress(F, column(self.mu, Jp, "mu"), column(self.lam, Jp, "lam"))
+
+    def energy(self, F: Mat2, Jp: Tensor) -> Tensor:
+        """Stored energy per unit volume, (B, N)."""
+        return corotated_energy(F, column(self.mu, Jp, "mu"), column(self.lam, Jp, "lam"))
+
+
+@dataclass(frozen=True, eq=False)
+class VonMises(Elastic):
+    """Fixed corotated solid that flows plastically once its deviatoric strain reaches a limit.
+
+    The robot material of DittoGym (Huang et al., ICLR 2024): soft enough to be driven by muscles, plastic enough to
+    keep a new shape.
+
+    Attributes:
+        mu: Second Lame parameter, Pa.
+        lam: First Lame parameter, Pa.
+        yield_stress: von Mises yield stress, Pa; the deviatoric strain at yield is ``yield_stress / (2 mu)``.
+    """
+
+    yield_stress: Value
+
+    def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
+        """Isochoric return to the yield surface; see :func:`von_mises_return`."""
+        limit = column(self.yield_stress, Jp, "yield_stress") / (2.0 * column(self.mu, Jp, "mu"))
+        return von_mises_return(F, limit), Jp

@@ -1,0 +1,273 @@
+"""The material point method: one substep, and steps of many."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchmpm import muscle, transfer
+from torchmpm.boundary import Face, VelocityRule, constrain, faces
+from torchmpm.grid import PAD, Grid
+from torchmpm.linalg import Mat2, matmul
+from torchmpm.material import Material, Sym2, Value, column
+from torchmpm.rollout import repeated
+from torchmpm.spline import Stencil, stencil
+from torchmpm.state import ParticleState
+
+#: Added to the mass of a node before the division, kg, so that an empty node has velocity zero.
+MASS_EPSILON = 1e-10
+
+BACKENDS = ("auto", "eager")
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A run of consecutive particles of one material.
+
+    Attributes:
+        count: Number of particles.
+        material: Constitutive law, such as :class:`torchmpm.VonMises`.
+        mass: Mass of a particle, kg; a number or a tensor of shape (), (B,) or (B, count).
+        volume: Undeformed volume of a particle, m^2 (two-dimensional); same shapes.
+        muscle: Whether the actuation field acts on it.
+
+    Raises:
+        ValueError: ``count`` is below 1, or ``mass`` or ``volume`` is not positive.
+    """
+
+    count: int
+    material: Material
+    mass: Value = 1.0
+    volume: Value = 1.0
+    muscle: bool = False
+
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise ValueError(f"count must be at least 1, got {self.count}")
+        for name in ("mass", "volume"):
+            value = getattr(self, name)
+            if not isinstance(value, Tensor) and not value > 0:
+                raise ValueError(f"{name} must be positive, got {value}")
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What stays the same during one step, in the form the substep wants it.
+
+    Attributes:
+        grid: The window.
+        origin: (B, 2) lower left corner of the window, m.
+        mass: (B or 1, N) particle masses, kg.
+        inside: (1, cells) 1 on nodes that exist, 0 on the padding.
+        gravity: (2, B or 1, cells) velocity gained by gravity in a substep, m/s.
+        damping: Factor on node velocities in a substep.
+        faces: Velocity rules as masks.
+        actuation: (2, B, cells) muscle actuation on the nodes, Pa, or ``None``.
+    """
+
+    grid: Grid
+    origin: Tensor
+    mass: Tensor
+    inside: Tensor
+    gravity: Tensor
+    damping: float
+    faces: tuple[Face, ...]
+    actuation: Tensor | None
+
+
+class Scattered(NamedTuple):
+    """What the first half of a substep yields.
+
+    Attributes:
+        nodes: The stencils.
+        inside: (B, N) which particles take part.
+        F: Planes (B, N) of the returned deformation gradient.
+        Jp: (B, N) plastic volume ratio.
+        momentum: (3, B, cells) mass (kg) and momentum (kg m/s) on the nodes.
+    """
+
+    nodes: Stencil
+    inside: Tensor
+    F: Mat2
+    Jp: Tensor
+    momentum: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Solver:
+    """Explicit MLS-MPM with APIC transfers and quadratic B-splines on a window of nodes.
+
+    A description without state: wherever a material value, a mass or gravity is a tensor, results are differentiable
+    in it, and a tensor of shape (B,) gives each simulation of the batch its own value.
+
+    Attributes:
+        grid: The window of nodes.
+        bodies: The particles in their order; their counts add up to N.
+        gravity: Acceleration (x, y), m/s^2: two numbers, or a tensor of shape (2,) or (B, 2).
+        damping: Factor on every node velocity in every substep (1 = none).
+        rules: Velocity rules, see :class:`torchmpm.VelocityRule`.
+        dt: Duration of a substep, s.
+        backend: ``"eager"``, or ``"auto"`` for the fastest that is available.
+
+    Raises:
+        ValueError: No bodies, ``dt`` not positive, or an unknown backend.
+    """
+
+    grid: Grid
+    bodies: tuple[Body, ...]
+    gravity: tuple[float, float] | Tensor = (0.0, 0.0)
+    damping: float = 1.0
+    rules: tuple[VelocityRule, ...] = ()
+    dt: float = 1e-4
+    backend: str = "auto"
+
+    def __post_init__(self) -> None:
+        if not self.bodies:
+            raise ValueError("bodies must hold at least one Body, got none")
+        if not self.dt > 0:
+            raise ValueError(f"dt must be positive, got {self.dt}")
+        if self.backend not in BACKENDS:
+            raise ValueError(f"backend must be one of {BACKENDS}, got {self.backend!r}")
+
+    @property
+    def num_particles(self) -> int:
+        """N, the number of particles of all bodies."""
+        return sum(body.count for body in self.bodies)
+
+    def step(
+        self,
+        state: ParticleState,
+        actuation: Float[Tensor, "B 2 G G"] | None = None,
+        *,
+        substeps: int = 1,
+        origin: Float[Tensor, "B 2"] | None = None,
+        segment: int | None = 10,
+    ) -> ParticleState:
+        """Advance all simulations by ``substeps * dt`` seconds.
+
+        Particles outside the window in x keep everything they have until the window comes back to them.
+
+        Args:
+            state: Where they are.
+            actuation: (B, 2, G, G) muscle actuation in Pa on the nodes of the window, ``[:, 0]`` along material x,
+                indices (i, j) rightwards and upwards; constant during the step. ``None`` for none.
+            substeps: Number of substeps.
+            origin: (B, 2) lower left corner of the window in the world, m; ``None`` for (0, 0).
+            segment: Substeps between checkpoints when gradients are enabled, see :func:`torchmpm.repeated`.
+
+        Returns:
+            The new state, differentiable in state, actuation, material values, masses and gravity.
+
+        Raises:
+            ValueError: Shapes, dtypes or devices do not fit together.
+        """
+        scene = self.scene(state, actuation, origin)
+
+        def substep(planes: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+            return self.substep(scene, planes)
+
+        return ParticleState.from_planes(repeated(substep, state.planes(), substeps, segment=segment))
+
+    def scene(self, state: ParticleState, actuation: Tensor | None = None, origin: Tensor | None = None) -> Scene:
+        """Check the arguments of a step and prepare what its substeps share; see :meth:`step`."""
+        batch, nodes = state.batch_size, self.grid.resolution
+        if state.num_particles != self.num_particles:
+            raise ValueError(f"state has {state.num_particles} particles, the bodies of the solver {self.num_particles}")
+        field_shape = (batch, 2, nodes, nodes)
+        for name, value, shape in (("actuation", actuation, field_shape), ("origin", origin, (batch, 2))):
+            if value is None:
+                continue
+            if (tuple(value.shape), value.dtype, value.device) != (shape, state.dtype, state.device):
+                raise ValueError(
+                    f"{name} must be {state.dtype} on {state.device} of shape {shape}, "
+                    f"got {value.dtype} on {value.device} of shape {tuple(value.shape)}"
+                )
+        origin = state.x.new_zeros(batch, 2) if origin is None else origin
+        inside = pad(state.x.new_ones(nodes, nodes), [PAD] * 4).flatten()[None]
+        if actuation is not None:
+            actuation = pad(actuation, [PAD] * 4).flatten(2).transpose(0, 1).contiguous()
+        gravity = torch.as_tensor(self.gravity, dtype=state.dtype, device=state.device)
+        return Scene(
+            grid=self.grid,
+            origin=origin,
+            mass=self.per_particle(state, "mass"),
+            inside=inside,
+            gravity=(self.dt * gravity).reshape(-1, 2).T[..., None] * inside,
+            damping=self.damping,
+            faces=faces(self.rules, self.grid, origin),
+            actuation=actuation,
+        )
+
+    def substep(self, scene: Scene, planes: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """One substep on component planes (see :meth:`ParticleState.planes`): transfer, grid, transfer back."""
+        x, y = planes[:2]
+        grid = self.to_grid(scene, planes)
+        v, C = transfer.grid_to_particles(self.grid, grid.nodes, grid_velocity(scene, grid.momentum))
+        moved = (x + self.dt * v[0], y + self.dt * v[1], *v, *C, *grid.F, grid.Jp)
+        return tuple(torch.where(grid.inside, new, old) for new, old in zip(moved, planes, strict=True))
+
+    def to_grid(self, scene: Scene, planes: tuple[Tensor, ...]) -> Scattered:
+        """First half of a substep: deform the particles, find their forces, collect mass and momentum on the nodes."""
+        x, y, vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, Jp = planes
+        inside = self.grid.contains(x, scene.origin[:, 0:1])
+        nodes = stencil(self.grid, x, y, scene.origin)
+        growth = (1.0 + self.dt * c0, self.dt * c1, self.dt * c2, 1.0 + self.dt * c3)
+        F, Jp, force = self._internal_force(scene, nodes, matmul(growth, (f0, f1, f2, f3)), Jp)
+        momentum = transfer.particles_to_grid(
+            self.grid, nodes, inside.to(x.dtype), (vx, vy), (c0, c1, c2, c3), scene.mass, force
+        )
+        return Scattered(nodes, inside, F, Jp, momentum)
+
+    def _internal_force(self, scene: Scene, nodes: Stencil, trial: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor, Sym2]:
+        """Return-mapped deformation and ``-dt V 4/h^2 tau`` of all bodies."""
+        parts: list[tuple[Tensor, ...]] = []
+        for body, part in self.parts():
+            a, b, c, d = trial
+            F, Jp_body = body.material.return_map((a[:, part], b[:, part], c[:, part], d[:, part]), Jp[:, part])
+            xx, xy, yy = body.material.stress(F, Jp_body)
+            if body.muscle and scene.actuation is not None:
+                pull = muscle.muscle_stress(F, muscle.sample(nodes.part(part), scene.actuation))
+                xx, xy, yy = xx + pull[0], xy + pull[1], yy + pull[2]
+            factor = -self.dt * (4.0 / self.grid.h**2) * column(body.volume, Jp_body, "volume")
+            parts.append((*F, Jp_body, factor * xx, factor * xy, factor * yy))
+        f0, f1, f2, f3, Jp, xx, xy, yy = (p[0] if len(p) == 1 else torch.cat(p, dim=1) for p in zip(*parts, strict=True))
+        return (f0, f1, f2, f3), Jp, (xx, xy, yy)
+
+    def parts(self) -> Iterator[tuple[Body, slice]]:
+        """The bodies with their places among the particles."""
+        start = 0
+        for body in self.bodies:
+            yield body, slice(start, start + body.count)
+            start += body.count
+
+    def per_particle(self, state: ParticleState, name: str) -> Tensor:
+        """A value of the bodies, ``"mass"`` or ``"volume"``, as a plane over all particles, (1 or B, N)."""
+        like = state.Jp.detach()
+        columns = []
+        for body, part in self.parts():
+            value = column(getattr(body, name), like[:, part], name)
+            columns.append(value * torch.ones_like(like[: 1 if not isinstance(value, Tensor) else None, part]))
+        batch = max(len(c) for c in columns)
+        return torch.cat([c.expand(batch, -1) for c in columns], dim=1)
+
+
+def grid_velocity(scene: Scene, momentum: Tensor) -> Tensor:
+    """Velocity of the nodes: normalise, accelerate, damp, constrain.
+
+    Args:
+        scene: The shared data of the step.
+        momentum: (3, B, cells) mass and momentum from :func:`torchmpm.transfer.particles_to_grid`.
+
+    Returns:
+        (2, B, cells) velocities, m/s; zero on padding nodes.
+    """
+    velocity = momentum[1:] * (scene.inside / (momentum[0] + MASS_EPSILON)) + scene.gravity
+    if scene.damping != 1.0:
+        velocity = velocity * scene.damping
+    return constrain(scene.faces, velocity)

@@ -1,0 +1,92 @@
+"""Quadratic B-spline weights, node addresses, and the one scatter and gather built on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchmpm.grid import PAD, Grid
+
+
+def quadratic_weights(f: Tensor) -> Tensor:
+    """Weights of the three nodes around a point (Jiang et al., "The affine particle-in-cell method", 2015).
+
+    Args:
+        f: (..., N) distance from the first of the three nodes in cells, in [0.5, 1.5) for an interior point.
+
+    Returns:
+        (..., 3, N) weights; they sum to one for every ``f``.
+    """
+    return torch.stack((0.5 * (1.5 - f).square(), 0.75 - (f - 1.0).square(), 0.5 * (f - 0.5).square()), dim=-2)
+
+
+@dataclass(frozen=True, eq=False)
+class Stencil:
+    """The 3x3 nodes around each particle.
+
+    Attributes:
+        ids: (B, 9N) addresses in the padded grid, first offset p (x) slowest, then q (y), then particle.
+        wx, wy: (B, 3, N) weights per axis.
+        fx, fy: (B, N) distance from the first node in cells.
+        cells: Number of addresses.
+    """
+
+    ids: Tensor
+    wx: Tensor
+    wy: Tensor
+    fx: Tensor
+    fy: Tensor
+    cells: int
+
+    @property
+    def weights(self) -> Tensor:
+        """(B, 3, 3, N) products of the weights of both axes."""
+        return self.wx[:, :, None] * self.wy[:, None]
+
+    def part(self, particles: slice) -> Stencil:
+        """The stencils of some of the particles."""
+        if particles == slice(0, self.fx.shape[-1]):
+            return self
+        ids = self.ids.unflatten(-1, (9, -1))[..., particles].flatten(-2)
+        return Stencil(ids, *(t[..., particles] for t in (self.wx, self.wy, self.fx, self.fy)), cells=self.cells)
+
+
+def stencil(grid: Grid, x: Tensor, y: Tensor, origin: Tensor) -> Stencil:
+    """Find the nodes and weights of particles.
+
+    The base node is ``trunc(u - 1/2)`` like in the reference implementation of DittoGym: in the outermost half
+    cell of the window the weights are extrapolated from the first three nodes.
+
+    Args:
+        grid: The window.
+        x: (B, N) horizontal positions, m.
+        y: (B, N) vertical positions, m.
+        origin: (B, 2) lower left corner of the window, m.
+    """
+    node, weight, fraction = [], [], []
+    for position, start in ((x, origin[:, 0:1]), (y, origin[:, 1:2])):
+        u = (position - start) * (1.0 / grid.h)
+        base = torch.trunc(u.detach() - 0.5)
+        f = u - base
+        fraction.append(f)
+        weight.append(quadratic_weights(f))
+        # Clamped as integers: also the conversion of a NaN ends at an address that exists.
+        node.append(base.to(torch.int64).clamp(-PAD, grid.resolution) + PAD)
+    offset = torch.arange(3, device=x.device)
+    ids = (node[0][:, None, None] + offset[:, None, None]) * grid.width + node[1][:, None, None] + offset[:, None]
+    return Stencil(ids.flatten(1), *weight, *fraction, cells=grid.width**2)
+
+
+def scatter(stencil: Stencil, values: Tensor) -> Tensor:
+    """Add particle contributions to nodes: (R, B, 3, 3, N) -> (R, B, cells)."""
+    rows, batch = values.shape[:2]
+    target = values.new_zeros(rows, batch, stencil.cells)
+    return target.scatter_add(-1, stencil.ids.expand(rows, -1, -1), values.reshape(rows, batch, -1))
+
+
+def gather(stencil: Stencil, field: Tensor) -> Tensor:
+    """Read node values at the stencils: (R, B, cells) -> (R, B, 3, 3, N)."""
+    rows = field.shape[0]
+    return torch.gather(field, -1, stencil.ids.expand(rows, -1, -1)).unflatten(-1, (3, 3, -1))

@@ -1,0 +1,143 @@
+"""The moving part of a simulation: one batch of particles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+#: Trailing shape of every field after the leading (B, N).
+_TRAILING = {"x": (2,), "v": (2,), "C": (2, 2), "F": (2, 2), "Jp": ()}
+
+
+@dataclass(frozen=True, eq=False)
+class ParticleState:
+    """Positions, velocities and deformation of B independent simulations with N particles each.
+
+    The solver stores the components of a vector or matrix as separate planes behind these shapes (strides, not
+    copies), because whole planes are what its arithmetic runs over.
+
+    Attributes:
+        x: (B, N, 2) positions in the world, m.
+        v: (B, N, 2) velocities, m/s.
+        C: (B, N, 2, 2) affine velocity matrix of APIC, row = velocity component, 1/s.
+        F: (B, N, 2, 2) elastic part of the deformation gradient, dimensionless.
+        Jp: (B, N) plastic volume ratio, dimensionless; only soil changes it.
+
+    Raises:
+        ValueError: A field has the wrong shape, or dtype or device differ between fields.
+    """
+
+    x: Float[Tensor, "B N 2"]
+    v: Float[Tensor, "B N 2"]
+    C: Float[Tensor, "B N 2 2"]
+    F: Float[Tensor, "B N 2 2"]
+    Jp: Float[Tensor, "B N"]
+
+    def __post_init__(self) -> None:
+        if self.x.ndim != 3 or self.x.shape[-1] != 2:
+            raise ValueError(f"x must have shape (B, N, 2), got {tuple(self.x.shape)}")
+        for name, trailing in _TRAILING.items():
+            field = getattr(self, name)
+            if field.shape != (*self.x.shape[:2], *trailing):
+                raise ValueError(
+                    f"{name} must have shape {(*self.x.shape[:2], *trailing)} to go with x of shape "
+                    f"{tuple(self.x.shape)}, got {tuple(field.shape)}"
+                )
+            if field.dtype != self.x.dtype or field.device != self.x.device:
+                raise ValueError(
+                    f"{name} is {field.dtype} on {field.device}, but x is {self.x.dtype} on {self.x.device}"
+                )
+
+    @classmethod
+    def at_rest(cls, x: Float[Tensor, "*B N 2"]) -> ParticleState:
+        """Undeformed particles without velocity: v = C = 0, F = I, Jp = 1.
+
+        Args:
+            x: (B, N, 2) or (N, 2) positions in m; the latter becomes a batch of one.
+        """
+        if x.ndim == 2:
+            x = x[None]
+        batch, count = x.shape[:2]
+        identity = torch.eye(2, dtype=x.dtype, device=x.device)
+        return cls(
+            x=x,
+            v=torch.zeros_like(x),
+            C=x.new_zeros(batch, count, 2, 2),
+            F=identity.expand(batch, count, 2, 2),
+            Jp=x.new_ones(batch, count),
+        )
+
+    @property
+    def batch_size(self) -> int:
+        """B, the number of independent simulations."""
+        return self.x.shape[0]
+
+    @property
+    def num_particles(self) -> int:
+        """N, the number of particles of each simulation."""
+        return self.x.shape[1]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Floating point type shared by all fields."""
+        return self.x.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Device shared by all fields."""
+        return self.x.device
+
+    def to(self, *args, **kwargs) -> ParticleState:
+        """Copy to another dtype or device; takes the arguments of :meth:`torch.Tensor.to`."""
+        return self._map(lambda t: t.to(*args, **kwargs))
+
+    def detach(self) -> ParticleState:
+        """The same numbers, cut off from the autograd graph."""
+        return self._map(Tensor.detach)
+
+    def clone(self) -> ParticleState:
+        """An independent copy, for branching a simulation."""
+        return self._map(Tensor.clone)
+
+    def __getitem__(self, index) -> ParticleState:
+        """Select batch elements; an integer keeps a batch dimension of one."""
+        if isinstance(index, int):
+            index = slice(index, index + 1 or None)
+        return self._map(lambda t: t[index])
+
+    def where(self, mask: Bool[Tensor, " B"], other: ParticleState) -> ParticleState:
+        """Take whole batch elements: this state where ``mask`` (B,) holds, ``other`` elsewhere."""
+        return ParticleState(
+            *(
+                torch.where(mask.view(-1, *[1] * (mine.ndim - 1)), mine, theirs)
+                for mine, theirs in zip(self._tensors(), other._tensors(), strict=True)
+            )
+        )
+
+    def planes(self) -> tuple[Tensor, ...]:
+        """The 13 component planes, each (B, N): x, v, C and F row by row, Jp."""
+        return (
+            *self.x.unbind(-1),
+            *self.v.unbind(-1),
+            *self.C.flatten(-2).unbind(-1),
+            *self.F.flatten(-2).unbind(-1),
+            self.Jp,
+        )
+
+    @classmethod
+    def from_planes(cls, planes: tuple[Tensor, ...]) -> ParticleState:
+        """Inverse of :meth:`planes`; the planes stay contiguous behind the documented shapes."""
+        stacked = torch.stack(planes)
+        vector, matrix = (lambda p: p.movedim(0, -1)), (lambda p: p.movedim(0, -1).unflatten(-1, (2, 2)))
+        return cls(
+            vector(stacked[0:2]), vector(stacked[2:4]), matrix(stacked[4:8]), matrix(stacked[8:12]), stacked[12]
+        )
+
+    def _tensors(self) -> list[Tensor]:
+        return [getattr(self, f.name) for f in fields(self)]
+
+    def _map(self, function) -> ParticleState:
+        return ParticleState(*map(function, self._tensors()))

@@ -1,0 +1,67 @@
+"""Particles to grid and grid to particles (affine particle-in-cell, MLS-MPM)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchmpm.grid import Grid
+from torchmpm.linalg import Mat2
+from torchmpm.material import Sym2
+from torchmpm.spline import Stencil, gather, scatter
+
+
+def particles_to_grid(
+    grid: Grid,
+    stencil: Stencil,
+    active: Tensor,
+    v: tuple[Tensor, Tensor],
+    C: Mat2,
+    mass: Tensor,
+    force: Sym2,
+) -> Tensor:
+    """Mass and momentum on the nodes after the internal forces of one substep.
+
+    A node at the offset d from a particle receives ``w m`` and ``w (m v + P d)`` with ``P = m C - dt V 4/h^2 tau``
+    (Hu et al., "A moving least squares material point method", 2018).
+
+    Args:
+        grid: The window.
+        stencil: Stencils of the particles.
+        active: (B, N) 1 for particles that take part, else 0.
+        v: Planes of the velocity.
+        C: Planes of the affine velocity matrix.
+        mass: (1 or B, N) particle masses, kg.
+        force: Planes of ``-dt V 4/h^2 tau``, kg/s.
+
+    Returns:
+        (3, B, cells): mass, momentum in x, momentum in y.
+    """
+    offset = torch.arange(3, device=active.device, dtype=active.dtype)[:, None]
+    dx, dy = (offset - stencil.fx[:, None]) * grid.h, (offset - stencil.fy[:, None]) * grid.h
+    xx, xy = force[0] + mass * C[0], force[1] + mass * C[1]
+    yx, yy = force[1] + mass * C[2], force[2] + mass * C[3]
+    weight = (stencil.wx * active[:, None])[:, :, None] * stencil.wy[:, None]
+    momentum_x = ((mass * v[0])[:, None] + xx[:, None] * dx)[:, :, None] + (xy[:, None] * dy)[:, None]
+    momentum_y = ((mass * v[1])[:, None] + yx[:, None] * dx)[:, :, None] + (yy[:, None] * dy)[:, None]
+    masses = weight * mass[:, None, None]
+    return scatter(stencil, torch.stack((masses, weight * momentum_x, weight * momentum_y)))
+
+
+def grid_to_particles(grid: Grid, stencil: Stencil, velocity: Tensor) -> tuple[tuple[Tensor, Tensor], Mat2]:
+    """New velocity and affine matrix of particles: ``v = sum w v_i``, ``C = 4/h sum w v_i (offset in cells)^T``.
+
+    Args:
+        grid: The window.
+        stencil: The stencils of the scatter.
+        velocity: (2, B, cells) velocity on the nodes, m/s.
+    """
+    nodes = gather(stencil, velocity)
+    offset = torch.arange(3, device=velocity.device, dtype=velocity.dtype)[:, None]
+    wy_dy = stencil.wy * (offset - stencil.fy[:, None])
+    wx_dx = stencil.wx * (offset - stencil.fx[:, None])
+    across = (nodes * stencil.wy[:, None]).sum(3)  # (2, B, 3, N): summed over y
+    v = (across * stencil.wx).sum(2)
+    slope_x = (across * wx_dx).sum(2) * (4.0 / grid.h)
+    slope_y = ((nodes * wy_dy[:, None]).sum(3) * stencil.wx).sum(2) * (4.0 / grid.h)
+    return (v[0], v[1]), (slope_x[0], slope_y[0], slope_x[1], slope_y[1])
