@@ -39,16 +39,14 @@ class EnvState:
     def where(self, mask: Tensor, other: EnvState) -> EnvState:
         """Whole batch elements from this state where ``mask`` (B,) holds, from ``other`` elsewhere."""
 
-        def choose(mine, theirs):
-            if mine is None:
-                return None
+        def choose(mine: Tensor, theirs: Tensor) -> Tensor:
             return torch.where(mask.view(-1, *[1] * (mine.ndim - 1)), mine, theirs)
 
         return EnvState(
             particles=self.particles.where(mask, other.particles),
             origin=choose(self.origin, other.origin),
             centre=choose(self.centre, other.centre),
-            start=Measurement(*map(choose, self.start, other.start)),
+            start=self.start.map(choose, other.start),
             memory={name: choose(value, other.memory[name]) for name, value in self.memory.items()},
             steps=choose(self.steps, other.steps),
         )
@@ -60,7 +58,7 @@ class EnvState:
             particles=self.particles.detach(),
             origin=self.origin.detach(),
             centre=self.centre.detach(),
-            start=Measurement(*(value if value is None else value.detach() for value in self.start)),
+            start=self.start.map(Tensor.detach),
             memory={name: value.detach() for name, value in self.memory.items()},
         )
 
@@ -92,8 +90,8 @@ def make_model(
 ) -> Model:
     """Build the physics of a task.
 
-    Mass and volume of particles are scaled by full-size over actual count of the robot, so that density and stiffness of
-    the bodies mean the same at every tier.
+    Mass and volume of particles are scaled by full-size over actual count of the robot, so that density and stiffness
+    of the bodies mean the same at every tier.
 
     Args:
         spec: The task.
@@ -170,8 +168,8 @@ def observe(model: Model, state: EnvState) -> Tensor:
 def judge(model: Model, state: EnvState, field: Tensor, observation: Tensor) -> tuple[EnvState, Outcome]:
     """Reward terms, termination and success after a transition.
 
-    Elements whose state is not finite end with the single term ``failure`` = :data:`dittogym.spec.FAILURE_REWARD`; their
-    neighbours are not touched.
+    Elements whose state is not finite end with the single term ``failure`` = :data:`dittogym.spec.FAILURE_REWARD`;
+    their neighbours are not touched.
 
     Returns:
         The state with the task's memory brought up to date, and the outcome with ``terminated`` always given and

@@ -69,7 +69,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         ImportError: ``render_mode="human"`` without pygame.
     """
 
-    metadata = {"render_modes": list(RENDER_MODES), "render_fps": RENDER_FPS}
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": RENDER_FPS}
 
     def __init__(
         self, task: str | TaskSpec, *, render_mode: str | None = None, render_muscles: bool = False, **options: Any
@@ -90,7 +90,9 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         """The particles, batch of one."""
         return self.torch_env.state
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start a new episode; see :meth:`dittogym.TorchEnv.reset`."""
         super().reset(seed=seed)
         with torch.no_grad():
@@ -111,7 +113,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         picked = element(as_numpy(info), 0)
         return observation[0].cpu().numpy(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), picked
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """The picture (512, 512, 3) uint8 in mode ``"rgb_array"``, else nothing."""
         return self.torch_env.render(muscles=self.render_muscles) if self.render_mode == "rgb_array" else None
 

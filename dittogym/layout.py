@@ -49,9 +49,9 @@ def particle_counts(spec: TaskSpec, particles: Particles) -> tuple[int, ...]:
 class LayoutSampler:
     """Draws the starting positions of one batch element; holds its random generator.
 
-    At full size particles are thrown at random like in the reference implementation: the layout of seed s is the one that
-    it draws after ``numpy.random.seed(s)``. With fewer particles random throws would leave holes in the body, so there
-    the numbers come from a scrambled Sobol sequence.
+    At full size particles are thrown at random like in the reference implementation: the layout of seed s is the one
+    that it draws after ``numpy.random.seed(s)``. With fewer particles random throws would leave holes in the body, so
+    there the numbers come from a scrambled Sobol sequence.
 
     Args:
         spec: The task.

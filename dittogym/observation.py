@@ -14,9 +14,10 @@ from torchmpm.spline import quadratic_weights
 SIZE, BLOCK, RASTER = 64, 8, 1024
 #: Velocities are doubled and clipped to this before averaging.
 CLIP = 10.0
-#: Occupancy of a cell that expects n full-size particles: 1 - exp(-n / SATURATION). Particles thrown at random into the
-#: 64 fine pixels of a cell would give 63.5; fitted to the silhouettes (>= 80 / 255) of full-size rasters it is this.
-SATURATION = 65.9
+#: Occupancy of a cell in which n full-size particles are expected: 1 - exp(-n / SATURATION). Thrown at random into the
+#: 64 fine pixels of a cell they would give 63.5. Fitted so that the silhouette (occupancy >= 80 / 255) begins at
+#: n = 25, where it differs least from the silhouette of the pixel raster.
+SATURATION = 66.4
 
 
 def crop_corner(centre: Tensor) -> tuple[Tensor, Tensor]:
@@ -53,7 +54,8 @@ def pixel_means(position: Tensor, velocity: Tensor, seen: Tensor, row: Tensor, c
         position: (B, N, 2) window coordinates, m.
         velocity: (B, N, 2) doubled, clipped velocities.
         seen: (B, N) bool, particles that are drawn.
-        row, column: First fine row and column of the crop, (B, 1).
+        row: First fine row of the crop, (B, 1).
+        column: First fine column of the crop, (B, 1).
         mask: (B, 512, 512) background.
 
     Returns:
@@ -89,8 +91,16 @@ def splat_means(
     expect in a pixel; the share of its fine pixels that they hit is ``1 - exp(-n / SATURATION)``.
 
     Args:
-        position, velocity, seen, row, column, mask: As in :func:`pixel_means`.
+        position: (B, N, 2) window coordinates, m.
+        velocity: (B, N, 2) doubled, clipped velocities.
+        seen: (B, N) bool, particles that are drawn.
+        row: First fine row of the crop, (B, 1).
+        column: First fine column of the crop, (B, 1).
+        mask: (B, 512, 512) background.
         share: Full-size particles that one particle stands for.
+
+    Returns:
+        (B, 3, 64, 64) means over image pixels of occupancy and both velocities.
     """
     batch = len(seen)
     u = position[..., 0] * (RASTER / BLOCK) - column / BLOCK - 0.5

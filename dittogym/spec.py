@@ -24,7 +24,9 @@ class Shape(Protocol):
     coordinate is a magnitude and a sign, 2 where it is one number, 0 for a lattice.
     """
 
-    draws: int
+    @property
+    def draws(self) -> int:
+        """Uniform numbers per particle in the reference."""
 
     def positions(self, numbers: Points) -> Points:
         """World positions (N, 2) in m from N points of the unit square (N, 2)."""
@@ -80,6 +82,12 @@ class Measurement(NamedTuple):
     split: Tensor
     object_com: Tensor | None = None
     object_velocity: Tensor | None = None
+
+    def map(self, function: Callable[..., Tensor], *others: Measurement) -> Measurement:
+        """Apply ``function`` to every field that is there, together with the same field of ``others``."""
+        return Measurement(
+            *(None if mine is None else function(mine, *theirs) for mine, *theirs in zip(self, *others, strict=True))  # type: ignore[arg-type]
+        )
 
 
 class Moment(NamedTuple):

@@ -40,9 +40,9 @@ def load_target(target: TargetLike) -> np.ndarray:
     """A target as a (64, 64) bool array, row 0 at the top.
 
     Args:
-        target: The name of a drawn target (``"star"``, ``"I"``, ``"M"``, ``"T"``), the path of an image that OpenCV reads,
-            or an array (H, W), (H, W, 3) or (H, W, 4): bool, uint8 0..255, or floating point 0..1. Pictures of another
-            size are resized to 64 x 64 by area; grey values from 125 of 255 belong to the shape.
+        target: The name of a drawn target (``"star"``, ``"I"``, ``"M"``, ``"T"``), the path of an image that OpenCV
+            reads, or an array (H, W), (H, W, 3) or (H, W, 4): bool, uint8 0..255, or floating point 0..1. Pictures of
+            another size are resized to 64 x 64 by area; grey values from 125 of 255 belong to the shape.
 
     Raises:
         ValueError: Neither a name nor a readable image, an array of another kind, or a picture without any pixel set or
@@ -60,7 +60,7 @@ def load_target(target: TargetLike) -> np.ndarray:
         grey = cv2.resize(grey, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
     mask = grey >= THRESHOLD
     if not mask.any() or mask.all():
-        raise ValueError(f"target must have pixels both of the shape and of the ground, got {mask.sum()} of {mask.size}")
+        raise ValueError(f"target must have pixels of the shape and of the ground, got {mask.sum()} of {mask.size}")
     offset = np.argwhere(mask).mean(0) - (SIZE - 1) / 2
     if np.abs(offset).max() > OFF_CENTRE:
         warnings.warn(
@@ -74,7 +74,7 @@ def load_target(target: TargetLike) -> np.ndarray:
 def _read(path: str | os.PathLike[str]) -> np.ndarray:
     names = ", ".join(repr(name) for name in _OUTLINES)
     if not os.path.isfile(path):
-        raise ValueError(f"target must be {names}, an array or the path of an image, got {os.fspath(path)!r}: no such file")
+        raise ValueError(f"target must be {names}, an array or the path of an image; no such file: {os.fspath(path)!r}")
     image = cv2.imread(os.fspath(path), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise ValueError(f"target {os.fspath(path)!r} cannot be read as an image")

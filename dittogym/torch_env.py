@@ -14,6 +14,7 @@ from dittogym.action import Layout, to_grid_layout
 from dittogym.dynamics import EnvState
 from dittogym.layout import LayoutSampler, Particles, particle_counts
 from dittogym.render import frame
+from dittogym.reward import measure
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
 from dittogym.window import window_origin
@@ -28,9 +29,9 @@ class TorchEnv:
     """``num_envs`` independent simulations of one task, advanced together.
 
     Rewards and states keep their autograd graph as long as gradients are enabled: differentiate through
-    :meth:`step`, cut the graph with :meth:`detach`, or run under ``torch.no_grad()``. The observation is an integer image
-    and has no gradient. Nothing is reset by itself: an element that has ended goes on until :meth:`reset` is called
-    with a mask. Element i of a batch reset with seed s is the single environment reset with seed s + i.
+    :meth:`step`, cut the graph with :meth:`detach`, or run under ``torch.no_grad()``. The observation is an integer
+    image and has no gradient. Nothing is reset by itself: an element that has ended goes on until :meth:`reset` is
+    called with a mask. Element i of a batch reset with seed s is the single environment reset with seed s + i.
 
     Args:
         task: A task name or a :class:`dittogym.spec.TaskSpec`.
@@ -42,7 +43,8 @@ class TorchEnv:
         device: Where it runs.
         backend: Of the solver, see :class:`torchmpm.Solver`.
         action_layout: ``"image"``: action pixel (row, column) acts where observation pixel (row, column) looks;
-            ``"grid"``: (x, y), as in the reference implementation. ``None``: ``"image"``, with reference parity ``"grid"``.
+            ``"grid"``: (x, y), as in the reference implementation. ``None``: ``"grid"`` with reference parity, else
+            ``"image"``.
         parity: ``"clean"``, or ``"reference"`` to bring back the reference's stale observation and action centre
             after a reset, its random layout, unit particle volume and pixel raster at every particle count.
         resample: Draw new particles at every reset, not only at a seeded one.
@@ -102,7 +104,7 @@ class TorchEnv:
         self.model = dynamics.make_model(
             self.spec, self._counts, substeps=substeps, backend=backend, unscaled=self._stale
         )
-        self._samplers: list[LayoutSampler] | None = None
+        self._samplers: dict[int, LayoutSampler] = {}
         self._positions: Tensor | None = None
         self._env_state: EnvState | None = None
         self._observation: Tensor | None = None
@@ -144,8 +146,8 @@ class TorchEnv:
         """Start new episodes.
 
         Args:
-            seed: Seeds element i with ``seed + i`` and draws its particles anew. Without it the last layout is used again,
-                unless ``resample`` was asked for.
+            seed: Seeds element i with ``seed + i`` and draws its particles anew. Without it the last layout is used
+                again, unless ``resample`` was asked for.
             options: ``"positions"``: (N, 2) or (B, N, 2) world positions in m, robot first, used until the next seed;
                 ``"reset_mask"``: (B,) bool, reset only these elements.
 
@@ -173,7 +175,7 @@ class TorchEnv:
         self._field = None
         if self._observation is None or not self._stale:
             self._observation = dynamics.observe(self.model, self._env_state)
-        now = dynamics.measure(self.state, self.model.robot)
+        now = measure(self.state, self.model.robot)
         info = {"com": now.com, "split": now.split, "finite": diagnostics.finite(self.state)}
         return self._observation, {name: value.detach() for name, value in info.items()}
 
@@ -185,9 +187,9 @@ class TorchEnv:
                 beyond [-1, 1] saturate after the interpolation.
 
         Returns:
-            observation (B, 3, 64, 64) uint8; reward (B,); terminated (B,) bool; truncated (B,) bool, at the horizon; and
-            ``info`` with ``reward_terms`` by name, ``com``, ``split``, ``finite``, ``is_success`` where the task defines
-            it, and the task's own quantities, all with a leading B.
+            observation (B, 3, 64, 64) uint8; reward (B,); terminated (B,) bool; truncated (B,) bool, at the horizon;
+            and ``info`` with ``reward_terms`` by name, ``com``, ``split``, ``finite``, ``is_success`` where the task
+            defines it, and the task's own quantities, all with a leading B.
 
         Raises:
             ValueError: The action has the wrong shape or type or is not finite.
@@ -228,20 +230,15 @@ class TorchEnv:
     def _draw(self, seed: int | None, mask: Tensor, given: Any) -> Tensor:
         """Starting positions (B, N, 2) of all elements; those outside ``mask`` keep theirs."""
         chosen = mask.tolist()
-        if seed is not None or self._samplers is None:
-            samplers = list(self._samplers or [None] * self.num_envs)
-            for i in range(self.num_envs):
-                if chosen[i]:
-                    element_seed = None if seed is None else seed + i
-                    samplers[i] = LayoutSampler(self.spec, self._counts, element_seed, spread=self._spread)
-            self._samplers = samplers
-            redraw = True
-        else:
-            redraw = self._resample
+        redraw = seed is not None or not self._samplers
+        if redraw:
+            for i in np.flatnonzero(chosen).tolist():
+                element_seed = None if seed is None else seed + i
+                self._samplers[i] = LayoutSampler(self.spec, self._counts, element_seed, spread=self._spread)
         if given is not None:
             positions = self._given(given)
-        elif self._positions is None or redraw:
-            drawn = [s.draw() if chosen[i] else None for i, s in enumerate(self._samplers)]
+        elif self._positions is None or redraw or self._resample:
+            drawn = [self._samplers[i].draw() if chosen[i] else None for i in range(self.num_envs)]
             empty = np.zeros((self.num_particles, 2))
             stacked = np.stack([empty if d is None else d for d in drawn])
             positions = torch.as_tensor(stacked, dtype=self.dtype, device=self.device)

@@ -21,9 +21,9 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     Args:
         task: Task name or specification.
         num_envs: Number of simulations.
-        autoreset_mode: ``SAME_STEP`` (an ended episode starts anew in the same call; the last observation and info are in
-            ``info["final_obs"]`` and ``info["final_info"]``), ``NEXT_STEP`` (in the next call, whose action it ignores),
-            or ``DISABLED`` (``reset(options={"reset_mask": ...})``).
+        autoreset_mode: ``SAME_STEP`` (an ended episode starts anew in the same call; the last observation and info are
+            in ``info["final_obs"]`` and ``info["final_info"]``), ``NEXT_STEP`` (in the next call, whose action it
+            ignores), or ``DISABLED`` (``reset(options={"reset_mask": ...})``).
         render_mode: ``None`` or ``"rgb_array"``.
         render_muscles: Colour the robots by their muscles in pictures.
         max_episode_steps: Horizon if it is to differ from the task's.
@@ -33,7 +33,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         ValueError: Unknown mode, or as in :class:`dittogym.TorchEnv`.
     """
 
-    metadata = {"render_modes": list(RENDER_MODES[:1]), "render_fps": RENDER_FPS}
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES[:1]), "render_fps": RENDER_FPS}
 
     def __init__(
         self,
@@ -66,7 +66,9 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self.torch_env.state
 
     @torch.no_grad()
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start new episodes, of all elements or of ``options["reset_mask"]``; see :meth:`dittogym.TorchEnv.reset`."""
         super().reset(seed=seed)
         observation, info = self.torch_env.reset(seed=seed, options=options)
@@ -82,7 +84,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             actions: (B, 2, R, R) in [-1, 1].
         """
         fresh = self._ended.copy()
-        observation, reward, terminated, truncated, raw = self.torch_env.step(as_tensor(actions, self.torch_env))
+        observation, reward, terminated, _, raw = self.torch_env.step(as_tensor(actions, self.torch_env))
         info = as_numpy(raw)
         rewards, ends = reward.double().cpu().numpy(), terminated.cpu().numpy()
         limits = (self.torch_env.env_state.steps >= self._horizon).cpu().numpy()

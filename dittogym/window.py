@@ -10,7 +10,8 @@ from dittogym.spec import Centre, TaskSpec
 
 def window_origin(spec: TaskSpec, com: Tensor) -> Tensor:
     """Lower left corner (B, 2) of the window for a robot centred on ``com`` (B, 2)."""
-    left = torch.full_like(com[:, 0], spec.window.left) if spec.window.follow is None else com[:, 0] - spec.window.follow
+    follow = spec.window.follow
+    left = torch.full_like(com[:, 0], spec.window.left) if follow is None else com[:, 0] - follow
     return torch.stack((left, torch.zeros_like(left)), dim=1)
 
 

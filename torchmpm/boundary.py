@@ -57,7 +57,9 @@ class VelocityRule:
                 raise ValueError(f"{name} must be an inclusive range (low, high) with low <= high, got {(low, high)}")
 
 
-def fixed(i: Range = (None, None), j: Range = (None, None), frame: Literal["world", "window"] = "world"):
+def fixed(
+    i: Range = (None, None), j: Range = (None, None), frame: Literal["world", "window"] = "world"
+) -> tuple[VelocityRule, ...]:
     """Rules that hold the nodes of a box at rest, whatever direction they would move in."""
     return tuple(VelocityRule(direction, i, j, 0.0, frame) for direction in _DIRECTIONS)
 
@@ -102,7 +104,8 @@ def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Fa
             for axis, (low, high) in enumerate((rule.i, rule.j)):
                 bounded = low is not None or high is not None
                 node = window + shift[:, axis : axis + 1] if bounded and rule.frame == "world" else window
-                inside.append((node >= (-math.inf if low is None else low)) & (node <= (math.inf if high is None else high)))
+                first, last = (-math.inf if low is None else low), (math.inf if high is None else high)
+                inside.append((node >= first) & (node <= last))
             new = inside[0][:, :, None] & inside[1][:, None, :] & ~active
             active = active | new
             if math.isinf(rule.friction):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import TypeVar
 
 import torch
@@ -18,6 +19,10 @@ def _segmented(function: Callable[[State], State], state: State) -> State:
     if not torch.is_grad_enabled():
         return function(state)
     return checkpoint(function, state, use_reentrant=False, preserve_rng_state=False)
+
+
+def _apply(step: Callable[[State, Input], State], value: Input, state: State) -> State:
+    return step(state, value)
 
 
 def repeated(step: Callable[[State], State], state: State, times: int, *, segment: int | None = None) -> State:
@@ -44,7 +49,7 @@ def repeated(step: Callable[[State], State], state: State, times: int, *, segmen
         return state
     for start in range(0, times, segment):
         length = min(segment, times - start)
-        state = _segmented(lambda s, length=length: repeated(step, s, length), state)
+        state = _segmented(partial(repeated, step, times=length), state)
     return state
 
 
@@ -53,7 +58,7 @@ def trajectory(
     state: State,
     inputs: Iterable[Input],
     *,
-    observe: Callable[[State], Output] = lambda state: state,
+    observe: Callable[[State], Output],
     checkpointed: bool = True,
 ) -> tuple[State, list[Output]]:
     """Advance ``state`` once per input and collect what ``observe`` sees after each step.
@@ -62,7 +67,7 @@ def trajectory(
         step: ``step(state, input) -> state``, for example ``lambda s, a: solver.step(s, a, substeps=100)``.
         state: The start.
         inputs: One entry a step, for example actuation fields.
-        observe: What to keep of each state; by default the state itself.
+        observe: What to keep of each state, for example ``lambda s: s.x.mean(1)``.
         checkpointed: With gradients enabled, keep only the states between steps and replay each step in the backward
             pass. Nests with the ``segment`` of :meth:`torchmpm.Solver.step`.
 
@@ -72,7 +77,7 @@ def trajectory(
     outputs = []
     for value in inputs:
         if checkpointed:
-            state = _segmented(lambda s, value=value: step(s, value), state)
+            state = _segmented(partial(_apply, step, value), state)
         else:
             state = step(state, value)
         outputs.append(observe(state))

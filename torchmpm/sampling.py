@@ -1,7 +1,7 @@
 """Particle positions in simple shapes, from numbers that the caller supplies.
 
-Each shape is a map of the unit square: give it ``uniform(count, generator)`` for random, ``sobol(count, seed)`` for evenly
-spread particles. No function here touches a global generator.
+Each shape is a map of the unit square: give it ``uniform(count, generator)`` for random, ``sobol(count, seed)`` for
+evenly spread particles. No function here touches a global generator.
 """
 
 from __future__ import annotations

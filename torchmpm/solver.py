@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchmpm import muscle, transfer
+from torchmpm.backends import BACKENDS, compiler_found, substep_function
 from torchmpm.boundary import Face, VelocityRule, constrain, faces
 from torchmpm.grid import PAD, Grid
 from torchmpm.linalg import Mat2, matmul
@@ -22,8 +23,6 @@ from torchmpm.state import ParticleState
 
 #: Added to the mass of a node before the division, kg, so that an empty node has velocity zero.
 MASS_EPSILON = 1e-10
-
-BACKENDS = ("auto", "eager")
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +112,10 @@ class Solver:
         damping: Factor on every node velocity in every substep (1 = none).
         rules: Velocity rules, see :class:`torchmpm.VelocityRule`.
         dt: Duration of a substep, s.
-        backend: ``"eager"``, or ``"auto"`` for the fastest that is available.
+        backend: ``"eager"``, ``"compile"`` or ``"auto"``, see :func:`torchmpm.backends.substep_function`.
 
     Raises:
-        ValueError: No bodies, ``dt`` not positive, or an unknown backend.
+        ValueError: No bodies, ``dt`` not positive, or an unknown or unavailable backend.
     """
 
     grid: Grid
@@ -134,6 +133,8 @@ class Solver:
             raise ValueError(f"dt must be positive, got {self.dt}")
         if self.backend not in BACKENDS:
             raise ValueError(f"backend must be one of {BACKENDS}, got {self.backend!r}")
+        if self.backend == "compile" and not compiler_found():
+            raise ValueError("backend 'compile' needs a C++ compiler (g++, clang++ or $CXX), found none: use 'eager'")
 
     @property
     def num_particles(self) -> int:
@@ -167,18 +168,14 @@ class Solver:
         Raises:
             ValueError: Shapes, dtypes or devices do not fit together.
         """
-        scene = self.scene(state, actuation, origin)
-
-        def substep(planes: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-            return self.substep(scene, planes)
-
+        substep = substep_function(self, self.scene(state, actuation, origin))
         return ParticleState.from_planes(repeated(substep, state.planes(), substeps, segment=segment))
 
     def scene(self, state: ParticleState, actuation: Tensor | None = None, origin: Tensor | None = None) -> Scene:
         """Check the arguments of a step and prepare what its substeps share; see :meth:`step`."""
         batch, nodes = state.batch_size, self.grid.resolution
         if state.num_particles != self.num_particles:
-            raise ValueError(f"state has {state.num_particles} particles, the bodies of the solver {self.num_particles}")
+            raise ValueError(f"state has {state.num_particles} particles, the solver's bodies {self.num_particles}")
         field_shape = (batch, 2, nodes, nodes)
         for name, value, shape in (("actuation", actuation, field_shape), ("origin", origin, (batch, 2))):
             if value is None:
@@ -236,7 +233,8 @@ class Solver:
                 xx, xy, yy = xx + pull[0], xy + pull[1], yy + pull[2]
             factor = -self.dt * (4.0 / self.grid.h**2) * column(body.volume, Jp_body, "volume")
             parts.append((*F, Jp_body, factor * xx, factor * xy, factor * yy))
-        f0, f1, f2, f3, Jp, xx, xy, yy = (p[0] if len(p) == 1 else torch.cat(p, dim=1) for p in zip(*parts, strict=True))
+        planes = zip(*parts, strict=True)
+        f0, f1, f2, f3, Jp, xx, xy, yy = (p[0] if len(p) == 1 else torch.cat(p, dim=1) for p in planes)
         return (f0, f1, f2, f3), Jp, (xx, xy, yy)
 
     def parts(self) -> Iterator[tuple[Body, slice]]:

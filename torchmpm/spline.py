@@ -50,7 +50,8 @@ class Stencil:
         if particles == slice(0, self.fx.shape[-1]):
             return self
         ids = self.ids.unflatten(-1, (9, -1))[..., particles].flatten(-2)
-        return Stencil(ids, *(t[..., particles] for t in (self.wx, self.wy, self.fx, self.fy)), cells=self.cells)
+        wx, wy, fx, fy = (t[..., particles] for t in (self.wx, self.wy, self.fx, self.fy))
+        return Stencil(ids, wx, wy, fx, fy, self.cells)
 
 
 def stencil(grid: Grid, x: Tensor, y: Tensor, origin: Tensor) -> Stencil:
@@ -76,7 +77,7 @@ def stencil(grid: Grid, x: Tensor, y: Tensor, origin: Tensor) -> Stencil:
         node.append(base.to(torch.int64).clamp(-PAD, grid.resolution) + PAD)
     offset = torch.arange(3, device=x.device)
     ids = (node[0][:, None, None] + offset[:, None, None]) * grid.width + node[1][:, None, None] + offset[:, None]
-    return Stencil(ids.flatten(1), *weight, *fraction, cells=grid.width**2)
+    return Stencil(ids.flatten(1), weight[0], weight[1], fraction[0], fraction[1], grid.width**2)
 
 
 def scatter(stencil: Stencil, values: Tensor) -> Tensor:

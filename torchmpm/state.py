@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -90,7 +92,7 @@ class ParticleState:
         """Device shared by all fields."""
         return self.x.device
 
-    def to(self, *args, **kwargs) -> ParticleState:
+    def to(self, *args: Any, **kwargs: Any) -> ParticleState:
         """Copy to another dtype or device; takes the arguments of :meth:`torch.Tensor.to`."""
         return self._map(lambda t: t.to(*args, **kwargs))
 
@@ -102,7 +104,7 @@ class ParticleState:
         """An independent copy, for branching a simulation."""
         return self._map(Tensor.clone)
 
-    def __getitem__(self, index) -> ParticleState:
+    def __getitem__(self, index: Any) -> ParticleState:
         """Select batch elements; an integer keeps a batch dimension of one."""
         if isinstance(index, int):
             index = slice(index, index + 1 or None)
@@ -132,12 +134,10 @@ class ParticleState:
         """Inverse of :meth:`planes`; the planes stay contiguous behind the documented shapes."""
         stacked = torch.stack(planes)
         vector, matrix = (lambda p: p.movedim(0, -1)), (lambda p: p.movedim(0, -1).unflatten(-1, (2, 2)))
-        return cls(
-            vector(stacked[0:2]), vector(stacked[2:4]), matrix(stacked[4:8]), matrix(stacked[8:12]), stacked[12]
-        )
+        return cls(vector(stacked[0:2]), vector(stacked[2:4]), matrix(stacked[4:8]), matrix(stacked[8:12]), stacked[12])
 
     def _tensors(self) -> list[Tensor]:
         return [getattr(self, f.name) for f in fields(self)]
 
-    def _map(self, function) -> ParticleState:
+    def _map(self, function: Callable[[Tensor], Tensor]) -> ParticleState:
         return ParticleState(*map(function, self._tensors()))

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from torchmpm import VelocityRule
-
 from dittogym.geometry import NODES, Box, Obstacle, ceiling, floor
 from dittogym.reward import signed_quadratic
 from dittogym.spec import Body, Disc, Moment, Outcome, TaskSpec, Weights, Window
+from torchmpm import VelocityRule
 
 #: Displacement from which the location term no longer grows, m; reaching it counts as success (our definition).
 GOAL = 1.70
