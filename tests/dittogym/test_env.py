@@ -1,0 +1,158 @@
+"""The Gymnasium faces: registered ids, checkers, vector environments."""
+
+import sys
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+import dittogym
+
+IDS = [f"dittogym/{task}-{resolution}-v0" for task in dittogym.TASKS for resolution in ("coarse", "fine")]
+SMALL = {"particles": 200, "substeps": 2}
+
+
+def make_vec(num_envs: int = 2, name: str = IDS[0], **options) -> gymnasium.vector.VectorEnv:
+    return gymnasium.make_vec(name, num_envs=num_envs, vectorization_mode="vector_entry_point", **{**SMALL, **options})
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_checkers_have_nothing_to_say(name: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gymnasium.make(name, render_mode="rgb_array", **SMALL).unwrapped)
+        check_env_sb3(gymnasium.make(name, **SMALL))
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_spaces_and_horizon(name: str) -> None:
+    env = gymnasium.make(name, **SMALL)
+    spec = env.unwrapped.torch_env.spec
+    resolution = spec.fine if "fine" in name else spec.coarse
+    assert env.action_space.shape == (2, resolution, resolution) and env.action_space.dtype == np.float32
+    assert env.observation_space.shape == (3, 64, 64) and env.observation_space.dtype == np.uint8
+    assert env.spec.max_episode_steps == spec.horizon
+
+
+def test_step_and_info() -> None:
+    env = gymnasium.make("dittogym/run-coarse-v0", **SMALL)
+    observation, info = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    assert info["finite"] is True and info["com"].shape == (2,)
+    _, reward, terminated, truncated, info = env.step(np.zeros((2, 8, 8), np.float32))
+    assert isinstance(reward, float) and terminated is False and truncated is False
+    assert reward == pytest.approx(sum(info["reward_terms"].values()), abs=1e-5)
+    assert set(info["reward_terms"]) == {"location", "velocity", "split", "action", "alive", "failure"}
+    assert info["is_success"] is False
+    assert env.unwrapped.state.x.shape == (1, 200, 2)
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros((2, 8, 9)), r"action must be numbers of shape \(2, 8, 8\), got float64 of shape"),
+        (np.full((2, 8, 8), "a"), "action must be numbers"),
+        (np.full((2, 8, 8), np.nan), "action must be finite"),
+    ],
+)
+def test_bad_actions(action: np.ndarray, message: str) -> None:
+    env = gymnasium.make("dittogym/run-coarse-v0", disable_env_checker=True, **SMALL)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+
+
+def test_unknown_task_names_the_tasks() -> None:
+    with pytest.raises(ValueError, match="task must be one of run, shapematch, got 'swim'"):
+        dittogym.Env("swim")
+
+
+def test_vector_environment_equals_single_ones() -> None:
+    vector = make_vec(3)
+    singles = [gymnasium.make(IDS[0], **SMALL) for _ in range(3)]
+    seen, _ = vector.reset(seed=11)
+    vector.action_space.seed(0)
+    for i, env in enumerate(singles):
+        assert np.array_equal(env.reset(seed=11 + i)[0], seen[i])
+    actions = vector.action_space.sample()
+    seen, reward, terminated, truncated, info = vector.step(actions)
+    for i, env in enumerate(singles):
+        one = env.step(actions[i])
+        assert np.array_equal(one[0], seen[i])
+        assert one[1] == pytest.approx(reward[i], abs=1e-5)
+        assert one[4]["com"] == pytest.approx(info["com"][i], abs=1e-6)
+    assert not terminated.any() and not truncated.any()
+    assert vector.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+
+
+def episode(vector: gymnasium.vector.VectorEnv, steps: int) -> list[tuple]:
+    first, _ = vector.reset(seed=0)
+    action = np.zeros(vector.action_space.shape, np.float32)
+    action[0] = 1.0
+    return [(first, None, None, None, {})] + [vector.step(action) for _ in range(steps)]
+
+
+def test_same_step_autoreset() -> None:
+    rows = episode(make_vec(autoreset_mode="SameStep", max_episode_steps=3), 4)
+    first, last = rows[0][0], rows[3]
+    assert last[3].tolist() == [True, True] and not rows[2][3].any()
+    assert np.array_equal(last[0], first)
+    assert last[4]["_final_obs"].all() and not np.array_equal(last[4]["final_obs"][0], first[0])
+    assert not np.array_equal(last[4]["final_info"]["com"], last[4]["com"])
+    assert "reward_terms" in last[4]["final_info"]
+    assert "final_obs" not in rows[4][4] and not rows[4][3].any()
+
+
+def test_next_step_autoreset() -> None:
+    rows = episode(make_vec(autoreset_mode=AutoresetMode.NEXT_STEP, max_episode_steps=3), 5)
+    assert rows[3][3].all() and not np.array_equal(rows[3][0], rows[0][0])
+    assert np.array_equal(rows[4][0], rows[0][0]) and not rows[4][1].any() and not rows[4][3].any()
+    assert not np.array_equal(rows[5][0], rows[0][0]) and rows[5][1].all()
+
+
+def test_disabled_autoreset_with_a_mask() -> None:
+    vector = make_vec(autoreset_mode="Disabled", max_episode_steps=2)
+    rows = episode(vector, 2)
+    assert rows[2][3].all()
+    seen, _ = vector.reset(options={"reset_mask": np.array([True, False])})
+    assert np.array_equal(seen[0], rows[0][0][0]) and np.array_equal(seen[1], rows[2][0][1])
+
+
+def test_record_video_and_statistics_wrappers(tmp_path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    env = gymnasium.make("dittogym/run-coarse-v0", render_mode="rgb_array", max_episode_steps=3, **SMALL)
+    env = gymnasium.wrappers.RecordEpisodeStatistics(env)
+    env.reset(seed=0)
+    ended, info = False, {}
+    while not ended:
+        *_, ended, info = env.step(env.action_space.sample())
+    assert info["episode"]["l"] == 3
+    assert env.render().shape == (512, 512, 3)
+
+
+def test_render_modes(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match="render_mode must be None or one of"):
+        dittogym.Env("run", render_mode="ansi")
+    with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array'"):
+        make_vec(render_mode="human")
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    monkeypatch.delitem(sys.modules, "dittogym.window_system", raising=False)
+    with pytest.raises(ImportError, match=r"needs pygame: pip install 'torchmpm\[human\]'"):
+        dittogym.Env("run", render_mode="human")
+
+
+def test_human_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # pygame's own imports
+        pytest.importorskip("pygame")
+        env = dittogym.Env("run", render_mode="human", **SMALL)
+    env.reset(seed=0)
+    env.step(np.zeros((2, 8, 8), np.float32))
+    assert env.render() is None
+    env.close()
+    env.close()

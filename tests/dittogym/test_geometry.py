@@ -1,0 +1,39 @@
+"""Obstacles and task specifications as data."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+import dittogym
+from dittogym.geometry import floor, solid
+
+
+def test_a_solid_box_stops_matter() -> None:
+    """A task of one's own: RUN with a wall, without gravity; a robot thrown at it does not get through."""
+    base = dittogym.make_spec("run")
+    wall = solid("wall", (30, 40), (None, None))
+    assert wall.drawn and wall.shown and not solid("glass", (30, 40), (0, 9), visible=False).drawn
+    spec = dataclasses.replace(base, name="wall", gravity=(0.0, 0.0), obstacles=(wall, floor()))
+    env = dittogym.TorchEnv(spec, 1, particles=500)
+    observation, _ = env.reset(seed=0)
+    assert (observation[0, 0] == 255).any()  # the wall is seen
+    env.state.v[..., 0] = 3.0
+    with torch.no_grad():
+        for _ in range(8):
+            env.step(torch.zeros(1, 2, 8, 8))
+    assert env.state.x[..., 0].max() < 33 / 128
+
+
+def test_bad_geometry() -> None:
+    with pytest.raises(ValueError, match="at least 4 nodes"):
+        solid("thin", (3, 5), (0, 9))
+    with pytest.raises(ValueError, match="friction must not be negative"):
+        floor(-1.0)
+    assert floor().rules[0].friction == math.inf
+
+
+def test_specifications_take_no_options() -> None:
+    with pytest.raises(TypeError, match="takes no options"):
+        dittogym.make_spec(dittogym.make_spec("run"), target="star")

@@ -1,0 +1,37 @@
+"""Recorded episodes of the reference implementation, replayed."""
+
+import numpy as np
+import pytest
+import reference
+import torch
+
+TASKS = ("run", "shapematch")
+RECORDED = ("run-coarse-full-sine-f32", "run-coarse-full-zeros-f32", "shapematch-coarse-full-zeros-f32")
+
+
+def check(name: str, errors: dict[str, float], bounds: dict[str, float], table: list) -> None:
+    table += [(name, quantity, error, bounds[quantity]) for quantity, error in errors.items() if quantity in bounds]
+    exceeded = {q: (errors[q], bound) for q, bound in bounds.items() if not errors[q] <= bound}
+    assert not exceeded, f"{name}: (error, bound) {exceeded}"
+
+
+@pytest.mark.parametrize("task", TASKS)
+@torch.no_grad()
+def test_substeps_in_float64(task: str, parity_table: list) -> None:
+    name = f"{task}-coarse-small-f64"
+    check(name, reference.substep_errors(reference.load(name)), reference.SMALL, parity_table)
+
+
+@pytest.mark.parametrize("name", [f"{task}-coarse-small-f64" for task in TASKS] + list(RECORDED))
+@torch.no_grad()
+def test_episode(name: str, parity_table: list) -> None:
+    check(name, reference.episode_errors(reference.load(name)), reference.EPISODE, parity_table)
+
+
+@torch.no_grad()
+def test_the_comparison_can_fail() -> None:
+    """Actions one percent stronger exceed the bounds."""
+    data = reference.load("run-coarse-small-f64")
+    data["actions"] = data["actions"] * np.float32(1.01)
+    errors = reference.episode_errors(data)
+    assert any(errors[quantity] > bound for quantity, bound in reference.EPISODE.items())

@@ -1,0 +1,50 @@
+"""Pictures."""
+
+import numpy as np
+import pytest
+import torch
+
+from dittogym import TorchEnv
+from dittogym.render import BODIES, CONTRACT, SOLID
+
+
+def near(image: np.ndarray, colour) -> np.ndarray:
+    return (np.abs(image.astype(int) - np.asarray(colour)).max(-1) < 12).nonzero()
+
+
+@pytest.mark.parametrize("particles", ["full", "lite"])
+def test_body_and_floor_are_where_they_should_be(particles: str) -> None:
+    env = TorchEnv("run", 1, particles=particles)
+    env.reset(seed=0)
+    image = env.render()
+    assert image.shape == (512, 512, 3) and image.dtype == np.uint8
+    rows, columns = near(image, BODIES[0])
+    area = np.pi * (0.09 * 512) ** 2
+    assert 0.85 * area < len(rows) < 1.15 * area
+    assert columns.mean() == pytest.approx(0.4 * 512, abs=3)
+    assert rows.mean() == pytest.approx((1 - 0.25) * 512, abs=3)
+    ground = near(image, SOLID)[0]
+    assert ground.max() == 511 and (ground > (1 - 20 / 128) * 512 - 2).mean() > 0.9
+
+
+def test_muscles_target_and_size() -> None:
+    env = TorchEnv("shapematch", 2, particles=500, substeps=1)
+    env.reset(seed=0)
+    plain = env.render(1, size=128)
+    assert plain.shape == (128, 128, 3)
+    assert np.array_equal(plain, env.render(1, muscles=True, size=128))  # nothing acts yet
+    env.step(torch.ones(2, *env.action_shape))
+    red = near(env.render(1, muscles=True), CONTRACT)[0]
+    assert len(red) > 1000
+    with pytest.raises(IndexError, match="index must be between 0 and 1, got 2"):
+        env.render(2)
+    with pytest.raises(ValueError, match="size must be at least 16"):
+        env.render(size=3)
+
+
+def test_particles_that_are_not_finite_are_left_out() -> None:
+    env = TorchEnv("run", 1, particles=100)
+    env.reset(seed=0)
+    env.state.x[0, :50] = torch.nan
+    env.render(muscles=True)
+    assert len(near(env.render(), BODIES[0])[0]) > 0

@@ -1,0 +1,288 @@
+"""The batched environment: resets, batches, gradients, bad input."""
+
+import numpy as np
+import pytest
+import torch
+
+import dittogym
+from dittogym import TorchEnv, layout
+from dittogym.spec import FAILURE_REWARD
+
+TASKS = ("run", "shapematch")
+
+
+def small(task: str = "run", num_envs: int = 1, **options) -> TorchEnv:
+    options = {"particles": 300, "substeps": 10, "dtype": "float64", **options}
+    return TorchEnv(task, num_envs, **options)
+
+
+def actions(env: TorchEnv, steps: int, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return 2 * torch.rand(steps, env.num_envs, *env.action_shape, generator=generator, dtype=env.dtype) - 1
+
+
+@pytest.mark.parametrize("task", TASKS)
+@torch.no_grad()
+def test_batch_equals_single_environments_with_a_partial_reset(task: str) -> None:
+    batch = small(task, 3)
+    singles = [small(task) for _ in range(3)]
+    drive = actions(batch, 6)
+    seen, _ = batch.reset(seed=7)
+    single_seen = [env.reset(seed=7 + i)[0] for i, env in enumerate(singles)]
+    assert torch.equal(seen, torch.cat(single_seen))
+    for t in range(6):
+        if t == 3:
+            batch.reset(options={"reset_mask": torch.tensor([False, True, False])})
+            singles[1].reset()
+        seen, reward, terminated, truncated, info = batch.step(drive[t])
+        for i, env in enumerate(singles):
+            one_seen, one_reward, one_end, one_limit, one_info = env.step(drive[t, i : i + 1])
+            for name in ("x", "v", "C", "F"):
+                ours, theirs = getattr(batch.state, name)[i], getattr(env.state, name)[0]
+                assert (ours - theirs).abs().max() <= 1e-12 * max(1.0, float(theirs.abs().max())), name
+            assert torch.equal(seen[i], one_seen[0])
+            assert float(reward[i]) == pytest.approx(float(one_reward), abs=1e-12)
+            assert terminated[i] == one_end[0] and truncated[i] == one_limit[0]
+            assert info["com"][i].tolist() == pytest.approx(one_info["com"][0].tolist(), abs=1e-13)
+    assert batch.env_state.steps.tolist() == [6, 3, 6]
+
+
+def test_layouts_follow_seeds() -> None:
+    env = small(num_envs=2)
+    env.reset(seed=1)
+    first = env.state.x
+    env.reset()
+    assert torch.equal(env.state.x, first)
+    env.reset(seed=2)
+    assert torch.equal(env.state.x[0], first[1])
+    assert not torch.equal(env.state.x[1], first[1])
+    other = small(num_envs=2, resample=True)
+    other.reset(seed=1)
+    assert torch.equal(other.state.x, first)
+    other.reset()
+    assert not torch.equal(other.state.x, first)
+    assert not torch.equal(small(num_envs=2).reset()[0], small(num_envs=2).reset()[0])  # entropy of the system
+
+
+def test_masked_seed_draws_only_the_masked_elements() -> None:
+    env = small(num_envs=3)
+    env.reset(seed=0)
+    before = env.state.x
+    env.reset(seed=50, options={"reset_mask": torch.tensor([False, False, True])})
+    assert torch.equal(env.state.x[:2], before[:2])
+    reference = small(num_envs=3)
+    reference.reset(seed=50)
+    assert torch.equal(env.state.x[2], reference.state.x[2])
+
+
+def test_global_generators_are_left_alone() -> None:
+    np.random.seed(5)
+    torch.manual_seed(5)
+    wanted = np.random.rand(), torch.rand(1)
+    np.random.seed(5)
+    torch.manual_seed(5)
+    for particles in ("lite", 300):
+        env = small(particles=particles)
+        env.reset(seed=0)
+        env.step(torch.zeros(1, *env.action_shape))
+    assert (np.random.rand(), torch.rand(1)) == wanted
+
+
+def test_reset_is_fresh_and_reference_parity_is_stale() -> None:
+    for parity in ("clean", "reference"):
+        env = small(parity=parity, action_layout="grid")
+        first, _ = env.reset(seed=0)
+        for action in actions(env, 4):
+            last = env.step(action)[0]
+        centre = env.env_state.centre
+        again, _ = env.reset()
+        assert not torch.equal(first, last)
+        assert torch.equal(again, first if parity == "clean" else last)
+        assert torch.equal(env.env_state.centre, env.env_state.start.com if parity == "clean" else centre)
+
+
+def test_positions_option() -> None:
+    env = small(num_envs=2)
+    mine = np.stack((np.linspace(0.4, 0.6, 300), np.full(300, 0.3)), axis=1)
+    observation, info = env.reset(seed=3, options={"positions": mine})
+    assert env.state.x[1].numpy() == pytest.approx(mine)
+    assert info["com"][0].tolist() == pytest.approx([0.5, 0.3])
+    env.step(torch.zeros(2, *env.action_shape))
+    assert torch.equal(env.reset()[0], observation)
+
+
+@pytest.mark.parametrize(
+    ("positions", "message"),
+    [
+        (np.zeros((299, 2)), r"positions must have shape \(300, 2\)"),
+        (np.full((300, 2), np.nan), "inside the window"),
+        (np.linspace((0.0, 0.5), (2.0, 0.5), 300), "inside the window"),
+        (np.linspace((0.4, -0.5), (0.5, 0.5), 300), "inside the window"),
+    ],
+)
+def test_bad_positions(positions: np.ndarray, message: str) -> None:
+    env = small()
+    env.reset(seed=0)
+    before = env.state
+    with pytest.raises(ValueError, match=message):
+        env.reset(options={"positions": positions})
+    assert env.state is before
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (torch.zeros(1, 2, 8, 7), r"shape \(1, 2, 8, 8\), got \(1, 2, 8, 7\)"),
+        (torch.full((1, 2, 8, 8), torch.nan), "finite, got 128 entries"),
+        (torch.zeros(1, 2, 8, 8, dtype=torch.int64), "floating point"),
+        (np.zeros((1, 2, 8, 8)), "floating point tensor, got ndarray"),
+    ],
+)
+def test_bad_actions(action: object, message: str) -> None:
+    env = small()
+    env.reset(seed=0)
+    before = env.state
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+    assert env.state is before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"task": "fly"}, ValueError, "task must be one of run, shapematch, got 'fly'"),
+        ({"target": "star"}, TypeError, "task 'run' has no option 'target'"),
+        ({"particles": 0}, ValueError, "particles must be at least 1"),
+        ({"particles": -3}, ValueError, "particles must be at least 1"),
+        ({"particles": "huge"}, ValueError, "particles must be 'full', 'lite'"),
+        ({"particles": (10, 10)}, ValueError, "1 number"),
+        ({"num_envs": 0}, ValueError, "num_envs must be at least 1"),
+        ({"substeps": 0}, ValueError, "substeps must be at least 1"),
+        ({"dtype": "float16"}, ValueError, "dtype must be one of"),
+        ({"parity": "exact"}, ValueError, "parity must be one of"),
+        ({"action_layout": "xy"}, ValueError, "action_layout must be one of"),
+        ({"resolution": "finest"}, ValueError, "resolution must be"),
+        ({"resolution": 65}, ValueError, "resolution must be"),
+        ({"backend": "magic"}, ValueError, "backend must be one of"),
+    ],
+)
+def test_bad_arguments(arguments: dict, error: type, message: str) -> None:
+    with pytest.raises(error, match=message):
+        TorchEnv(**{"task": "run", **arguments})
+
+
+def test_bad_resets() -> None:
+    env = small(num_envs=2)
+    with pytest.raises(RuntimeError, match=r"call reset\(\) first"):
+        env.step(torch.zeros(2, 2, 8, 8))
+    with pytest.raises(ValueError, match="first time"):
+        env.reset(options={"reset_mask": [True, False]})
+    with pytest.raises(ValueError, match="reset_mask must be bool"):
+        env.reset(options={"reset_mask": [1, 0]})
+    with pytest.raises(ValueError, match="options may hold positions, reset_mask, got 'position'"):
+        env.reset(options={"position": 0})
+    with pytest.raises(ValueError, match="seed must be between"):
+        env.reset(seed=-1)
+
+
+def test_failed_element_ends_alone() -> None:
+    env, twin = small(num_envs=3), small(num_envs=3)
+    for e in (env, twin):
+        e.reset(seed=0)
+    env.state.v[1, 5] = torch.inf
+    drive = actions(env, 2)
+    for t in range(2):
+        observation, reward, terminated, _, info = env.step(drive[t])
+        other, other_reward, *_ = twin.step(drive[t])
+    assert info["finite"].tolist() == [True, False, True]
+    assert terminated.tolist() == [False, True, False]
+    assert float(reward[1]) == FAILURE_REWARD
+    assert torch.isfinite(torch.stack(tuple(info["reward_terms"].values()))).all()
+    for i in (0, 2):
+        assert torch.equal(observation[i], other[i]) and reward[i] == other_reward[i]
+        assert torch.equal(env.state.x[i], twin.state.x[i])
+    env.reset(options={"reset_mask": ~info["finite"]})
+    assert env.step(drive[0])[-1]["finite"].all()
+
+
+def test_reward_is_differentiable_in_actions_of_all_steps() -> None:
+    env = small(substeps=20)
+    drive = (0.5 * actions(env, 3)).requires_grad_()
+
+    def total(drive: torch.Tensor) -> torch.Tensor:
+        env.reset(seed=0)
+        return torch.stack([env.step(action)[1] for action in drive]).sum()
+
+    (gradient,) = torch.autograd.grad(total(drive), drive)
+    direction = actions(env, 3, seed=1)
+    with torch.no_grad():
+        step = 1e-5
+        difference = (total(drive + step * direction) - total(drive - step * direction)) / (2 * step)
+    assert float((gradient * direction).sum()) == pytest.approx(float(difference), rel=1e-5)
+    assert all(g.abs().max() > 0 for g in gradient)
+    assert env.state.x.grad_fn is None  # the last two rollouts ran without gradients
+
+
+def test_detach_cuts_the_graph() -> None:
+    env = small()
+    env.reset(seed=0)
+    first, second = (torch.zeros(1, 2, 8, 8, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    env.step(first)
+    env.detach()
+    env.step(second)[1].sum().backward()
+    assert first.grad is None and second.grad is not None
+
+
+def test_truncation_at_the_horizon() -> None:
+    env = small("shapematch", substeps=1, particles=20)
+    env.reset(seed=0)
+    limits = [bool(env.step(torch.zeros(1, *env.action_shape, dtype=env.dtype))[3]) for _ in range(31)]
+    assert limits == [False] * 29 + [True] * 2
+
+
+def test_image_layout_acts_where_it_looks() -> None:
+    """A contraction in the upper left pixels moves only matter in the upper left."""
+    moved = {}
+    for name in ("image", "grid"):
+        env = small("shapematch", particles=4000, resolution=8, action_layout=name)
+        env.reset(seed=0)
+        start = env.state.x.clone()
+        action = torch.zeros(1, 2, 8, 8, dtype=env.dtype)
+        action[..., :4, :4] = 1.0  # rows from the top and columns, or x and y
+        env.step(action)
+        weight = (env.state.x - start).square().sum(-1)[0]
+        moved[name] = (weight[:, None] * (start[0] - env.env_state.start.com[0])).sum(0) / weight.sum()
+    assert moved["image"][0] < -0.01 and moved["image"][1] > 0.01
+    assert moved["grid"][0] < -0.01 and moved["grid"][1] < -0.01
+
+
+@torch.no_grad()
+def test_run_displacement_is_the_same_at_every_tier() -> None:
+    """A gentle drive over ten steps: centre of mass and reward of the lite tier against full size."""
+    results = {}
+    for particles in ("full", "lite"):
+        env = TorchEnv("run", 1, particles=particles)
+        env.reset(seed=0)
+        y, x = torch.meshgrid(torch.arange(8.0), torch.arange(8.0), indexing="ij")
+        for t in range(10):
+            wave = torch.sin(0.3 * t + 0.7 * x + 1.1 * y)
+            reward, *_, info = env.step(torch.stack((wave, -wave))[None])[1:]
+        results[particles] = info["com"][0], float(reward), float(info["split"])
+    assert (results["full"][0] - results["lite"][0]).abs().max() < 1e-3
+    assert results["full"][1] == pytest.approx(results["lite"][1], abs=0.15)
+    assert results["full"][2] == pytest.approx(results["lite"][2], abs=1e-3)
+
+
+def test_particle_counts() -> None:
+    spec = dittogym.make_spec("run")
+    assert layout.particle_counts(spec, "full") == (22000,)
+    assert layout.particle_counts(spec, "lite") == (2000,)
+    assert layout.particle_counts(spec, (123,)) == (123,)
+
+
+def test_density_is_the_same_at_every_tier() -> None:
+    totals = []
+    for particles in ("full", "lite", 777):
+        body = small(particles=particles).model.solver.bodies[0]
+        totals.append((body.count * body.mass, body.count * body.volume))
+    assert totals[0] == pytest.approx(totals[1]) and totals[0] == pytest.approx(totals[2])
