@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Protocol, TypeAlias
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -22,6 +22,7 @@ STRETCH_FLOOR = 0.05
 NORM_EPSILON = 1e-8
 
 
+@runtime_checkable
 class Material(Protocol):
     """What the solver asks of a material."""
 

@@ -105,8 +105,14 @@ class ParticleState:
         return self._map(Tensor.clone)
 
     def __getitem__(self, index: Any) -> ParticleState:
-        """Select batch elements; an integer keeps a batch dimension of one."""
+        """Select batch elements; an integer keeps a batch dimension of one.
+
+        Raises:
+            IndexError: There is no such batch element.
+        """
         if isinstance(index, int):
+            if not -self.batch_size <= index < self.batch_size:
+                raise IndexError(f"index {index} is out of range for a batch of {self.batch_size}")
             index = slice(index, index + 1 or None)
         return self._map(lambda t: t[index])
 

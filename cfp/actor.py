@@ -1,0 +1,176 @@
+"""The actors: a plain one, and one that refines a frozen coarser one (paper, Section 4.2)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from cfp.networks import (
+    IMAGE_SIZE,
+    RESOLUTIONS,
+    Encoder,
+    Interpolation,
+    PairEncoder,
+    initialise,
+    make_head,
+    normalise_image,
+    upsample,
+)
+
+STD_BOUNDS = (0.1, 6.0)
+"""Bounds of the standard deviation before tanh: sampling never becomes deterministic."""
+
+
+@dataclass(frozen=True)
+class ActorSpec:
+    """What an actor is made of, as plain data: enough to build it again before its weights are loaded.
+
+    Attributes:
+        resolutions: Action grid R of every level, coarsest first; one entry is a plain (stage 1) actor.
+        gate_bias: Bias added to the gate's logit, one per residual level (``len(resolutions) - 1`` of them).
+        split: Separate narrow encoders for observation and action (DIG, where the two images do not overlap).
+        gate_scale: Largest gate value; the reference uses 0.25 with split encoders and 1 otherwise.
+        interpolation: Bicubic upsampling inside the networks: ``"half_pixel"`` is what the environment uses on
+            actions, ``"aligned"`` (aligned corners) is what the reference implementation uses here.
+    """
+
+    resolutions: tuple[int, ...]
+    gate_bias: tuple[float, ...] = ()
+    split: bool = False
+    gate_scale: float = 1.0
+    interpolation: Interpolation = "half_pixel"
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> ActorSpec:
+        """Undo ``dataclasses.asdict`` after a trip through JSON, which has lists for tuples."""
+        plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        return cls(**plain)
+
+    def __post_init__(self) -> None:
+        """Check the lengths and the resolutions.
+
+        Raises:
+            ValueError: A resolution has no head, the ladder does not grow, or biases and levels do not match.
+        """
+        for resolution in self.resolutions:
+            if resolution not in RESOLUTIONS:
+                raise ValueError(f"action resolution: got {resolution}, allowed {', '.join(map(str, RESOLUTIONS))}")
+        if not self.resolutions or list(self.resolutions) != sorted(set(self.resolutions)):
+            raise ValueError(f"resolutions: got {self.resolutions}, allowed is a growing ladder such as (8, 16)")
+        if len(self.gate_bias) != len(self.resolutions) - 1:
+            raise ValueError(
+                f"gate_bias: got {len(self.gate_bias)} values for resolutions {self.resolutions}, "
+                f"allowed is one per residual level ({len(self.resolutions) - 1})"
+            )
+
+
+class Sample(NamedTuple):
+    """One draw from an actor.
+
+    Attributes:
+        action: What is executed, (B, 2, R, R). A composed action may leave [-1, 1] a little and is not clipped.
+        log_prob: Log-density of the sampled part (a residual actor's own action only), (B,).
+        gate: Weight of the residual action, (B, 2, R, R), or None for a plain actor.
+    """
+
+    action: Tensor
+    log_prob: Tensor
+    gate: Tensor | None
+
+
+def squashed_log_prob(noise: Tensor, std: Tensor, action: Tensor) -> Tensor:
+    """Log-density (B,) of ``action = tanh(mean + std * noise)`` summed over all 2 R R entries.
+
+    ln N(x; m, s^2) - ln(1 - a^2 + 1e-6), where (x - m)/s is the noise itself.
+    """
+    normal = -0.5 * noise.square() - std.log() - 0.5 * math.log(2 * math.pi)
+    return (normal - torch.log(1 - action.square() + 1e-6)).flatten(1).sum(1)
+
+
+class Actor(nn.Module):
+    """Stage-1 actor: a tanh-Gaussian over (2, R, R), from the observation alone.
+
+    With head outputs z_m and z_s: mean m = z_m, std s = clip(softplus(3 z_s - 1), 0.1, 6), action tanh(m + s eps).
+    """
+
+    optimizer: torch.optim.Optimizer
+
+    def __init__(self, resolution: int) -> None:
+        """Create encoder (width 32 in every task) and the heads for mean and std."""
+        super().__init__()
+        self.resolution = resolution
+        self.encoder: nn.Module = Encoder(3, 32)
+        self.mean = make_head(resolution)
+        self.std = make_head(resolution)
+        initialise(self)
+
+    def trainable_parameters(self) -> list[nn.Parameter]:
+        """Parameters that an optimiser may change: all but those of frozen coarser levels."""
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def own_action(self, latent: Tensor, deterministic: bool) -> tuple[Tensor, Tensor]:
+        """Draw tanh(m + s eps) and its log-density from a latent (B, 32, 4, 4); deterministic means eps = 0."""
+        mean: Tensor = self.mean(latent)
+        std = F.softplus(3 * self.std(latent) - 1).clamp(*STD_BOUNDS)
+        noise = torch.zeros_like(mean) if deterministic else torch.randn_like(mean)
+        action = torch.tanh(mean + std * noise)
+        return action, squashed_log_prob(noise, std, action)
+
+    def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
+        """Draw an action for uint8 observations (B, 3, 64, 64)."""
+        latent = self.encoder(normalise_image(observation))
+        return Sample(*self.own_action(latent, deterministic), None)
+
+    def forward(self, observation: Tensor, deterministic: bool = False) -> Tensor:
+        """The action (B, 2, R, R) for uint8 observations (B, 3, 64, 64)."""
+        return self.sample(observation, deterministic).action
+
+    def action_log_prob(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Flat actions (B, 2 R R) and log-densities (B,): what stable-baselines3's own SAC asks of an actor."""
+        action, log_prob, _ = self.sample(observation)
+        return action.flatten(1), log_prob
+
+    def set_training_mode(self, mode: bool) -> None:
+        """Switch between training and evaluation; without effect on these layers, asked for by stable-baselines3."""
+        self.train(mode)
+
+
+class ResidualActor(Actor):
+    """Stage-2 actor: refines the action of a frozen coarser actor through a gate (paper, Section 4.2).
+
+    ``a = g * a_res + (1 - g) * up(a_coarse)`` with ``g = gate_scale * sigmoid(z_g + gate_bias)``, one gate value per
+    cell and muscle. The coarser actor is drawn anew at every call, may itself be residual, and is never trained.
+    """
+
+    def __init__(self, coarse: Actor, resolution: int, gate_bias: float, spec: ActorSpec) -> None:
+        """Wrap and freeze ``coarse``; the spec says how images are merged and interpolated."""
+        super().__init__(resolution)
+        self.interpolation = spec.interpolation
+        self.gate_bias, self.gate_scale = gate_bias, spec.gate_scale
+        self.encoder = PairEncoder(spec.split)
+        self.gate = make_head(resolution)
+        initialise(self.gate)
+        self.coarse = coarse.requires_grad_(False)
+
+    def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
+        """Draw a composed action; log_prob belongs to the residual part alone, as in the reference."""
+        with torch.no_grad():
+            coarse = upsample(self.coarse(observation, deterministic), self.resolution, self.interpolation)
+        patch = upsample(coarse, IMAGE_SIZE, self.interpolation)
+        latent = self.encoder(normalise_image(observation), patch)
+        residual, log_prob = self.own_action(latent, deterministic)
+        gate = self.gate_scale * torch.sigmoid(self.gate(latent) + self.gate_bias)
+        return Sample(gate * residual + (1 - gate) * coarse, log_prob, gate)
+
+
+def build_actor(spec: ActorSpec) -> Actor:
+    """Build the actor of the finest level with all coarser ones inside it, freshly initialised."""
+    actor = Actor(spec.resolutions[0])
+    for resolution, bias in zip(spec.resolutions[1:], spec.gate_bias, strict=True):
+        actor = ResidualActor(actor, resolution, bias, spec)
+    return actor

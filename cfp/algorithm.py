@@ -1,0 +1,266 @@
+"""CFP: soft actor-critic with the update rule of the DittoGym reference implementation (paper, Appendix B).
+
+What differs from stable-baselines3's SAC: rewards are centred and scaled by running statistics, every parameter
+tensor's gradient is clipped by itself, the gate of a residual actor is penalised, the temperature is a constant, the
+random phase and the start of the updates are two settings, and nothing that is not finite is stored or learned from.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
+from stable_baselines3.common.utils import polyak_update
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from cfp.actor import Actor
+from cfp.errors import NonFiniteError
+from cfp.networks import TwinCritic
+from cfp.policy import CFPPolicy
+from cfp.replay import ReplayRing
+
+METRICS: dict[str, str] = {
+    "train/critic_loss": "sum of both critics' mean squared errors, in normalised rewards",
+    "train/actor_loss": "mean of alpha log pi - min Q, plus the gate penalty",
+    "train/q": "mean of min(Q1, Q2) at the actor's own actions, in normalised rewards",
+    "train/q_target": "mean of the critics' regression target",
+    "train/entropy": "mean of -log pi of the sampled (in stage 2: residual) action, summed over all 2 R R entries",
+    "train/reward_mean": "running mean of raw rewards that is subtracted before learning",
+    "train/reward_std": "running standard deviation of raw rewards that they are divided by",
+    "train/gate": "mean gate of the residual actor: 0 keeps the coarse action, 1 replaces it",
+    "train/gate_penalty": "gate penalty inside the actor loss",
+    "train/n_updates": "gradient updates so far in this stage",
+    "train/learning_rate": "learning rate of actor and critics",
+}
+"""Every scalar that `CFP.train` logs, and what it means."""
+
+
+class RewardStatistics(nn.Module):
+    """Running mean and variance of raw rewards, updated from every replay batch before they are used.
+
+    ``M <- m M + (1 - m) mean(r)``, ``V <- m V + (1 - m) var(r)`` (unbiased), starting at 0 and 1;
+    ``normalised r = (r - M) / (sqrt(V) + 1e-8)``.
+    """
+
+    mean: Tensor
+    variance: Tensor
+
+    def __init__(self, momentum: float = 0.99) -> None:
+        """Start at mean 0 and variance 1."""
+        super().__init__()
+        self.momentum = momentum
+        self.register_buffer("mean", torch.zeros(()))
+        self.register_buffer("variance", torch.ones(()))
+
+    def forward(self, rewards: Tensor) -> Tensor:
+        """Update the statistics with a batch of raw rewards (any shape) and return the rewards normalised."""
+        with torch.no_grad():
+            self.mean.lerp_(rewards.mean(), 1 - self.momentum)
+            self.variance.lerp_(rewards.var(), 1 - self.momentum)
+            return (rewards - self.mean) / (self.variance.sqrt() + 1e-8)
+
+
+def clip_each(parameters: list[nn.Parameter], limit: float) -> None:
+    """Scale the gradient of every parameter tensor, each by itself, to a norm of at most ``limit``."""
+    for parameter in parameters:
+        nn.utils.clip_grad_norm_(parameter, limit)
+
+
+class CFP(SAC):
+    """Soft actor-critic as the coarse-to-fine policy uses it, on stable-baselines3's loop and replay buffer.
+
+    Stage 1 is a `CFPPolicy` with a plain actor; stage 2 one with a residual actor whose coarser level is frozen. The
+    coarse action is drawn anew in every update, and the entropy counts the residual part only, as in the reference.
+
+    Args:
+        policy: `CFPPolicy` or its name.
+        env: A vectorised environment with actions (2, R, R) in [-1, 1].
+        learning_rate: Adam's step size.
+        buffer_size: Transitions in the replay ring.
+        update_start: Updates begin when more transitions than this are stored.
+        random_steps: Actions are uniform in [-1, 1] while fewer environment steps than this have been taken.
+        batch_size: Transitions in an update.
+        tau: Polyak factor of the target critics.
+        gamma: Discount factor.
+        gradient_steps: Updates after each batched environment step.
+        alpha: Temperature, a constant.
+        gate_penalty: Weight rho of ``mean ||g||_2 / R`` in the actor loss (stage 2).
+        reward_momentum: Momentum of the reward statistics.
+        max_grad_norm: Largest gradient norm of one parameter tensor.
+        sac_options: Further options of stable-baselines3's SAC.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CFPPolicy": CFPPolicy}
+    reward_statistics: RewardStatistics
+
+    def __init__(
+        self,
+        policy: str | type[CFPPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 200_000,
+        *,
+        update_start: int = 256,
+        random_steps: int = 500,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        gradient_steps: int = 1,
+        alpha: float = 0.01,
+        gate_penalty: float = 0.0,
+        reward_momentum: float = 0.99,
+        max_grad_norm: float = 10.0,
+        **sac_options: Any,
+    ) -> None:
+        """Create networks, replay buffer and reward statistics."""
+        self.random_steps = random_steps
+        self.gate_penalty = gate_penalty
+        self.reward_momentum = reward_momentum
+        self.max_grad_norm = max_grad_norm
+        sac_options.setdefault("replay_buffer_class", ReplayRing)
+        sac_options.setdefault("replay_buffer_kwargs", {"seed": sac_options.get("seed")})
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts=update_start,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            gradient_steps=gradient_steps,
+            ent_coef=alpha,
+            **sac_options,
+        )
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.reward_statistics = RewardStatistics(self.reward_momentum).to(self.device)
+
+    def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
+        """Actor, critics and target critics with their own types."""
+        assert isinstance(self.policy, CFPPolicy)
+        return self.policy.networks()
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Do some updates: critics, then actor, then target critics.
+
+        Args:
+            gradient_steps: How many.
+            batch_size: Transitions in each.
+
+        Raises:
+            NonFiniteError: A loss is not finite; the optimiser step is not taken.
+        """
+        assert self.replay_buffer is not None
+        actor, critic, _ = self.networks()
+        self.policy.set_training_mode(True)
+        self._update_learning_rate([actor.optimizer, critic.optimizer])
+        for _ in range(gradient_steps):
+            scalars = self.update(self.replay_buffer.sample(batch_size))
+            self._n_updates += 1
+            for name, value in scalars.items():
+                self.logger.record_mean(f"train/{name}", value.item())
+        self.logger.record("train/n_updates", self._n_updates)
+
+    def update(self, batch: ReplayBufferSamples) -> dict[str, Tensor]:
+        """Do one update on a batch and return what it is judged by (0-dimensional tensors, see `METRICS`)."""
+        _, critic, target = self.networks()
+        rewards = self.reward_statistics(batch.rewards)
+        scalars = self._update_critic(batch, rewards)
+        scalars |= self._update_actor(batch.observations)
+        polyak_update(critic.parameters(), target.parameters(), self.tau)
+        scalars["reward_mean"] = self.reward_statistics.mean
+        scalars["reward_std"] = self.reward_statistics.variance.sqrt()
+        return scalars
+
+    def critic_target_values(self, batch: ReplayBufferSamples, rewards: Tensor) -> Tensor:
+        """Regression target ``y = r + c gamma (min Q'(s', a') - alpha log pi(a'|s'))``, (B, 1), without gradient.
+
+        The continuation flag c is ``1 - batch.dones``; a time limit does not end the task.
+        """
+        actor, _, target = self.networks()
+        with torch.no_grad():
+            action, log_prob, _ = actor.sample(batch.next_observations)
+            value = torch.minimum(*target(batch.next_observations, action))
+            soft_value = value - self.ent_coef_tensor * log_prob[:, None]
+            return rewards + (1 - batch.dones) * self.gamma * soft_value
+
+    def _update_critic(self, batch: ReplayBufferSamples, rewards: Tensor) -> dict[str, Tensor]:
+        _, critic, _ = self.networks()
+        wanted = self.critic_target_values(batch, rewards)
+        values = critic(batch.observations, batch.actions)
+        loss = torch.stack([F.mse_loss(value, wanted) for value in values]).sum()
+        self._descend(loss, critic.optimizer, list(critic.parameters()), "critic")
+        return {"critic_loss": loss.detach(), "q_target": wanted.mean()}
+
+    def _update_actor(self, observations: Tensor) -> dict[str, Tensor]:
+        actor, critic, _ = self.networks()
+        critic.requires_grad_(False)  # spares the critics' weight gradients, which would be thrown away
+        action, log_prob, gate = actor.sample(observations)
+        value = torch.minimum(*critic(observations, action))
+        loss = (self.ent_coef_tensor * log_prob[:, None] - value).mean()
+        scalars = {"q": value.detach().mean(), "entropy": -log_prob.detach().mean()}
+        if gate is not None:
+            penalty = self.gate_penalty * gate.flatten(1).norm(dim=1).mean() / actor.resolution
+            loss = loss + penalty
+            scalars |= {"gate": gate.detach().mean(), "gate_penalty": penalty.detach()}
+        self._descend(loss, actor.optimizer, actor.trainable_parameters(), "actor")
+        critic.requires_grad_(True)
+        return scalars | {"actor_loss": loss.detach()}
+
+    def _descend(self, loss: Tensor, optimizer: torch.optim.Optimizer, weights: list[nn.Parameter], name: str) -> None:
+        if not torch.isfinite(loss):
+            raise NonFiniteError(
+                f"the {name} loss became {loss.item()} at update {self._n_updates + 1} "
+                f"({self.num_timesteps} environment steps into the stage); the last checkpoint is untouched"
+            )
+        optimizer.zero_grad()
+        loss.backward()
+        clip_each(weights, self.max_grad_norm)
+        optimizer.step()
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        # stable-baselines3 ties the random phase to the start of the updates; here they are two settings.
+        return super()._sample_action(self.random_steps, action_noise, n_envs)
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        for name, values in (("reward", reward), ("action", buffer_action)):
+            finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
+            if not finite.all():
+                raise NonFiniteError(
+                    f"the {name} of environment {int(np.argmin(finite))} is not finite at step {self.num_timesteps} of "
+                    "the stage; nothing of this step was stored and the last checkpoint is untouched"
+                )
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        modules, tensors = super()._get_torch_save_params()
+        return [*modules, "reward_statistics"], tensors
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "reward_statistics"]
+
+    @property
+    def action_resolution(self) -> int:
+        """Action grid R."""
+        assert isinstance(self.action_space, spaces.Box)
+        return int(self.action_space.shape[-1])

@@ -1,0 +1,225 @@
+"""Everything a run needs to go on after a stop or a crash: one state file and the replay chunks that it names."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.vec_env import VecMonitor
+
+from cfp.algorithm import CFP
+from cfp.config import Config, to_json
+from cfp.errors import CheckpointError, ConfigError
+from cfp.files import write_atomically
+from cfp.replay import ReplayArchive, ReplayRing
+from cfp.vec_env import TorchVecEnv
+
+VERSION = 1
+
+CHANGEABLE = ("steps", "device", "report.", "environment.backend")
+"""Options that a resumed run may change (a dot at the end: the whole group)."""
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where in the ladder a run stands.
+
+    Attributes:
+        level: Index of the level in training, 0 is the coarsest.
+        offset: Environment steps that the levels before it took.
+    """
+
+    level: int = 0
+    offset: int = 0
+
+
+class Checkpoint:
+    """The ``checkpoint`` folder of a run.
+
+    The state file is replaced in one move and names its replay chunks, which are immutable: a crash at any moment
+    leaves the previous checkpoint whole.
+
+    Args:
+        folder: ``RUN/checkpoint``.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.path = folder / "state.pt"
+        self.archive = ReplayArchive(folder / "replay", 0)
+
+    def exists(self) -> bool:
+        """Whether a whole checkpoint is there."""
+        return self.path.exists()
+
+    def save(self, model: CFP, config: Config, position: Position) -> None:
+        """Write networks, optimisers, statistics, counters, random generators and new replay rows.
+
+        Args:
+            model: Between two rollouts, so that every step taken is stored.
+            config: The run's options, compared at resume.
+            position: Where in the ladder the run stands.
+        """
+        if position.level != self.archive.level:
+            self.archive = ReplayArchive(self.archive.folder, position.level)
+        assert model.replay_buffer is not None
+        rows = model.num_timesteps // model.n_envs
+        state = {
+            "version": VERSION,
+            "config": json.dumps(to_json(config)),
+            "level": position.level,
+            "offset": position.offset,
+            "rows": rows,
+            "chunks": self.archive.save(model.replay_buffer, rows),
+            "model": model_state(model),
+        }
+        write_atomically(self.path, lambda file: torch.save(state, file))
+        self.archive.prune()
+
+    def load(self) -> dict[str, Any]:
+        """Read the state file.
+
+        Raises:
+            CheckpointError: It is missing, damaged, or of another version.
+        """
+        try:
+            state = torch.load(self.path, map_location="cpu", weights_only=True)
+        except FileNotFoundError as error:
+            raise CheckpointError(f"{self.path}: there is no checkpoint") from error
+        except (OSError, RuntimeError, ValueError, KeyError, EOFError, pickle.UnpicklingError) as error:
+            raise CheckpointError(
+                f"{self.path}: the checkpoint is damaged ({type(error).__name__}) and cannot be resumed; "
+                "the policy.safetensors of the run may still be whole"
+            ) from error
+        if not isinstance(state, dict) or state.get("version") != VERSION:
+            found = state.get("version") if isinstance(state, dict) else type(state).__name__
+            raise CheckpointError(f"{self.path}: got checkpoint version {found}, allowed {VERSION}")
+        return state
+
+    def restore(self, model: CFP, state: dict[str, Any]) -> None:
+        """Put a state into a freshly made model of the same configuration.
+
+        Raises:
+            CheckpointError: The state does not fit the model, or a replay chunk is missing or damaged.
+        """
+        assert model.replay_buffer is not None
+        self.archive = ReplayArchive(self.archive.folder, state["level"])
+        try:
+            self.archive.load(model.replay_buffer, state["rows"], state["chunks"])
+            restore_model(model, state["model"])
+        except (KeyError, RuntimeError, ValueError, TypeError) as error:
+            raise CheckpointError(f"{self.path}: the checkpoint does not fit this program ({error})") from error
+
+
+def model_state(model: CFP) -> dict[str, Any]:
+    """All that `CFP` learns and counts, as tensors and plain values."""
+    actor, critic, _ = model.networks()
+    return {
+        "policy": model.policy.state_dict(),
+        "actor_optimizer": actor.optimizer.state_dict(),
+        "critic_optimizer": critic.optimizer.state_dict(),
+        "reward_statistics": model.reward_statistics.state_dict(),
+        "num_timesteps": model.num_timesteps,
+        "episodes": model._episode_num,
+        "updates": model._n_updates,
+        "recent": [{key: float(value) for key, value in info.items()} for info in model.ep_info_buffer or ()],
+        "successes": [bool(success) for success in model.ep_success_buffer or ()],
+        "environment": environment_state(model),
+        "random": random_state(model),
+    }
+
+
+def restore_model(model: CFP, state: dict[str, Any]) -> None:
+    """Undo `model_state`."""
+    actor, critic, _ = model.networks()
+    model.policy.load_state_dict(state["policy"])
+    actor.optimizer.load_state_dict(state["actor_optimizer"])
+    critic.optimizer.load_state_dict(state["critic_optimizer"])
+    model.reward_statistics.load_state_dict(state["reward_statistics"])
+    model.num_timesteps = state["num_timesteps"]
+    model._episode_num = state["episodes"]
+    model._n_updates = state["updates"]
+    model.ep_info_buffer = deque(state["recent"], maxlen=model._stats_window_size)
+    model.ep_success_buffer = deque(state["successes"], maxlen=model._stats_window_size)
+    restore_environment(model, state["environment"])
+    restore_random(model, state["random"])
+
+
+def environment_state(model: CFP) -> dict[str, Any]:
+    """The episodes in progress: the matter, the sums of their rewards, and what the policy sees next."""
+    monitor, env = _environments(model)
+    return {
+        "episodes": env.state_dict(),
+        "returns": torch.from_numpy(monitor.episode_returns.copy()),
+        "lengths": torch.from_numpy(monitor.episode_lengths.copy()),
+        "observation": torch.from_numpy(np.array(model._last_obs)),
+    }
+
+
+def restore_environment(model: CFP, state: dict[str, Any]) -> None:
+    """Undo `environment_state`; the environment is reset first, so that later episodes start as they would have."""
+    monitor, env = _environments(model)
+    monitor.reset()
+    env.load_state_dict(state["episodes"])
+    monitor.episode_returns = state["returns"].numpy().copy()
+    monitor.episode_lengths = state["lengths"].numpy().copy()
+    model._last_obs = state["observation"].numpy().copy()
+
+
+def _environments(model: CFP) -> tuple[VecMonitor, TorchVecEnv]:
+    monitor = model.get_env()
+    assert isinstance(monitor, VecMonitor)
+    assert isinstance(monitor.venv, TorchVecEnv)
+    return monitor, monitor.venv
+
+
+def random_state(model: CFP) -> dict[str, Any]:
+    """States of every generator that training draws from: torch's, the replay memory's, the action space's."""
+    assert isinstance(model.replay_buffer, ReplayRing)
+    state: dict[str, Any] = {
+        "torch": torch.get_rng_state(),
+        "replay": json.dumps(model.replay_buffer.generator.bit_generator.state),
+        "actions": json.dumps(model.action_space.np_random.bit_generator.state),
+    }
+    if model.device.type == "cuda":
+        state["cuda"] = torch.cuda.get_rng_state(model.device)
+    return state
+
+
+def restore_random(model: CFP, state: dict[str, Any]) -> None:
+    """Undo `random_state`."""
+    assert isinstance(model.replay_buffer, ReplayRing)
+    torch.set_rng_state(state["torch"])
+    model.replay_buffer.generator.bit_generator.state = json.loads(state["replay"])
+    model.action_space.np_random.bit_generator.state = json.loads(state["actions"])
+    if "cuda" in state and model.device.type == "cuda":
+        torch.cuda.set_rng_state(state["cuda"], model.device)
+
+
+def check_same(stored: dict[str, Any], given: Config) -> None:
+    """Compare the options of a checkpoint with those of the command that wants to resume it.
+
+    Raises:
+        ConfigError: Naming the first option that differs and may not, with both values.
+    """
+    old, new = _flatten(stored), _flatten(json.loads(json.dumps(to_json(given))))
+    for name in {**old, **new}:
+        if name.startswith(CHANGEABLE) or old.get(name) == new.get(name):
+            continue
+        raise ConfigError(
+            f"{name.split('.')[-1]}: the run was started with {old.get(name)!r}, got {new.get(name)!r}; "
+            "a resumed run may change only steps, device, backend and what is reported"
+        )
+
+
+def _flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat

@@ -1,0 +1,260 @@
+"""All options of a run as frozen dataclasses, and their JSON form."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any, Literal
+
+from cfp.actor import ActorSpec
+from cfp.errors import ConfigError
+from cfp.networks import RESOLUTIONS, Interpolation
+
+Preset = Literal["quick", "paper"]
+
+
+@dataclass(frozen=True)
+class EnvironmentConfig:
+    """Where the robot lives: options of `dittogym.TorchEnv`."""
+
+    num_envs: int = 16
+    """Robots simulated side by side."""
+    particles: Literal["full", "lite"] | int | tuple[int, int] = "lite"
+    """Particles: full (the paper's), lite (about 2,000), a count, or one count for robot and one for object."""
+    substeps: int = 100
+    """Physics steps in one environment step."""
+    dtype: Literal["float32", "float64"] = "float32"
+    """Precision of the physics."""
+    backend: str = "auto"
+    """How the physics is computed: auto, eager, compile, ..."""
+    action_layout: Literal["image", "grid"] | None = None
+    """Orientation of the action array: image (as the observation) or grid (the reference's); None: by parity."""
+    parity: Literal["clean", "reference"] = "clean"
+    """clean: the reference's faults that only hide the truth are mended; reference: they are kept."""
+    resample: bool = False
+    """Draw the particles anew at every reset."""
+    target: str | None = None
+    """SHAPE MATCH: star, I, M, T or the path of an image; None: the task's default."""
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Choices inside the networks."""
+
+    interpolation: Interpolation = "half_pixel"
+    """Bicubic upsampling: half_pixel (as the environment does) or aligned (aligned corners, the reference's)."""
+    split: bool = False
+    """Separate narrow encoders for observation and action (DIG)."""
+    gate_scale: float = 1.0
+    """Largest gate value (the reference: 0.25 with split encoders)."""
+
+
+@dataclass(frozen=True)
+class LearningConfig:
+    """Soft actor-critic."""
+
+    learning_rate: float = 3e-4
+    """Adam's step size for actor and critics."""
+    gamma: float = 0.99
+    """Discount factor."""
+    tau: float = 0.005
+    """Polyak factor of the target critics."""
+    batch_size: int = 256
+    """Transitions in an update."""
+    buffer_size: int = 200_000
+    """Transitions in the replay ring."""
+    gradient_steps: int = 1
+    """Updates after each batched step of num_envs robots."""
+    update_start: int = 256
+    """Updates begin when more transitions than this are stored."""
+    reward_momentum: float = 0.99
+    """Momentum of the running reward mean and variance."""
+    max_grad_norm: float = 10.0
+    """Largest gradient norm of one parameter tensor."""
+
+
+@dataclass(frozen=True)
+class ReportConfig:
+    """What is measured and written while training."""
+
+    eval_every: int = 10_000
+    """Environment steps between evaluations; 0: none."""
+    eval_episodes: int = 5
+    """Episodes of an evaluation and of the final table."""
+    eval_deterministic: bool = False
+    """Evaluate without action noise (the reference does so in SHAPE MATCH only)."""
+    checkpoint_every: int = 1_000
+    """Environment steps between checkpoints."""
+    log_every: int = 500
+    """Environment steps between rows of progress.csv and TensorBoard points."""
+    video: bool = True
+    """Record video.mp4 at the end."""
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """One level of the ladder, as `Config.stage` cuts it out."""
+
+    resolution: int
+    steps: int
+    random_steps: int
+    alpha: float
+    gate_penalty: float
+
+
+@dataclass(frozen=True)
+class Config:
+    """A training run. Levels are listed coarsest first; one value per level unless said otherwise."""
+
+    task: str = "shapematch"
+    """Which task: see the presets."""
+    preset: Preset = "quick"
+    """Where defaults come from: quick (minutes on two cores) or paper (the published numbers)."""
+    seed: int = 0
+    """Controls everything that is random."""
+    device: str = "auto"
+    """cpu, cuda, or auto."""
+    steps: int = 20_000
+    """Environment steps of all levels together."""
+    handover: tuple[int, ...] = (10_000,)
+    """Environment steps after which each level hands over to the next (one less than levels)."""
+    resolutions: tuple[int, ...] = (8, 16)
+    """Action grids R of the levels."""
+    random_steps: tuple[int, ...] = (500, 100)
+    """Uniformly random environment steps at the start of each level."""
+    alpha: tuple[float, ...] = (0.01, 0.01)
+    """Entropy temperature of each level."""
+    gate_bias: tuple[float, ...] = (-1.0,)
+    """Bias of the gate's logit (one less than levels)."""
+    gate_penalty: tuple[float, ...] = (0.01,)
+    """Weight of the gate penalty (one less than levels)."""
+    environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    learning: LearningConfig = field(default_factory=LearningConfig)
+    report: ReportConfig = field(default_factory=ReportConfig)
+
+    def actor_spec(self, level: int) -> ActorSpec:
+        """The networks of the actor at a level (0 is the coarsest), with all coarser ones."""
+        return ActorSpec(
+            self.resolutions[: level + 1],
+            self.gate_bias[:level],
+            self.network.split,
+            self.network.gate_scale,
+            self.network.interpolation,
+        )
+
+    def stage(self, level: int) -> StageConfig:
+        """What the training of one level needs."""
+        bounds = (0, *self.handover, self.steps)
+        return StageConfig(
+            self.resolutions[level],
+            bounds[level + 1] - bounds[level],
+            self.random_steps[level],
+            self.alpha[level],
+            self.gate_penalty[level - 1] if level else 0.0,
+        )
+
+    def check(self) -> None:
+        """Check what the types cannot.
+
+        Raises:
+            ConfigError: Naming the option, what was given and what is allowed.
+        """
+        levels = len(self.resolutions)
+        growing = list(self.resolutions) == sorted(set(self.resolutions))
+        if not levels or not growing or not set(self.resolutions) <= set(RESOLUTIONS):
+            raise ConfigError(f"resolutions: got {self.resolutions}, allowed is a growing choice of {RESOLUTIONS}")
+        counts = {"random_steps": levels, "alpha": levels, "handover": levels - 1}
+        counts |= {"gate_bias": levels - 1, "gate_penalty": levels - 1}
+        for name, count in counts.items():
+            given = len(getattr(self, name))
+            if given != count:
+                raise ConfigError(f"{name}: got {given} values, allowed {count} for resolutions {self.resolutions}")
+        if any(late <= early for early, late in pairwise((0, *self.handover, self.steps))):
+            raise ConfigError(f"handover: got {self.handover} of {self.steps} steps, allowed are growing steps between")
+        self._check_ranges()
+
+    def _check_ranges(self) -> None:
+        counts = {
+            "num_envs": self.environment.num_envs,
+            "substeps": self.environment.substeps,
+            "batch_size": self.learning.batch_size,
+            "buffer_size": self.learning.buffer_size,
+            "gradient_steps": self.learning.gradient_steps,
+            "eval_episodes": self.report.eval_episodes,
+            "checkpoint_every": self.report.checkpoint_every,
+            "log_every": self.report.log_every,
+        }
+        for name, value in counts.items():
+            if value < 1:
+                raise ConfigError(f"{name}: got {value}, allowed 1 or more")
+        shares = {"gamma": self.learning.gamma, "tau": self.learning.tau, "momentum": self.learning.reward_momentum}
+        for name, share in shares.items():
+            if not 0 <= share <= 1:
+                raise ConfigError(f"{name}: got {share}, allowed 0 to 1")
+        if self.report.eval_every < 0:
+            raise ConfigError(f"eval_every: got {self.report.eval_every}, allowed 0 (never) or more")
+        if self.learning.learning_rate <= 0:
+            raise ConfigError(f"learning_rate: got {self.learning.learning_rate}, allowed more than 0")
+        if self.learning.update_start < 1:
+            raise ConfigError(f"update_start: got {self.learning.update_start}, allowed 1 or more")
+
+
+def to_json(config: Config) -> dict[str, Any]:
+    """A configuration as plain JSON values."""
+    return dataclasses.asdict(config)
+
+
+def merge(base: Any, values: Any, path: str = "") -> Any:
+    """Put JSON values over a dataclass, recursively.
+
+    Args:
+        base: What the values leave out is taken from here.
+        values: An object with named values.
+        path: Where in the whole configuration this is, for the messages.
+
+    Raises:
+        ConfigError: An unknown name or a value of the wrong type.
+    """
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path or 'configuration'}: got {values!r}, allowed an object with named values")
+    kinds = typing.get_type_hints(type(base))
+    changes: dict[str, Any] = {}
+    for name, value in values.items():
+        where = f"{path}.{name}" if path else name
+        if name not in kinds:
+            raise ConfigError(f"{where}: no such option, allowed {', '.join(kinds)}")
+        old = getattr(base, name)
+        changes[name] = (
+            merge(old, value, where) if dataclasses.is_dataclass(old) else _convert(value, kinds[name], where)
+        )
+    return replace(base, **changes)
+
+
+def _convert(value: Any, kind: Any, where: str) -> Any:
+    """Check a JSON value against a field's type and make lists tuples and integers floats where asked for."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Literal:
+        if value in arguments:
+            return value
+    elif origin is tuple:
+        if isinstance(value, list | tuple):
+            item = arguments[0]
+            fixed = arguments[-1] is not Ellipsis
+            if not fixed or len(value) == len(arguments):
+                return tuple(_convert(each, item, where) for each in value)
+    elif arguments:  # a union: the first kind that fits
+        for choice in arguments:
+            if choice is type(None) and value is None:
+                return None
+            try:
+                return _convert(value, choice, where)
+            except ConfigError:
+                continue
+    elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    elif isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
+        return value
+    raise ConfigError(f"{where}: got {value!r}, allowed {kind.__name__ if isinstance(kind, type) else kind}")

@@ -1,0 +1,57 @@
+"""From a run's options to environments."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from stable_baselines3.common.vec_env import VecMonitor
+
+from cfp.config import Config
+from cfp.errors import ConfigError
+from cfp.vec_env import monitored
+from dittogym import TorchEnv
+
+EVALUATION_SEED = 10_000
+"""Added to a run's seed for evaluations, so that they start from particle layouts not trained on."""
+
+
+def choose_device(name: str) -> str:
+    """Resolve ``"auto"`` to CUDA where there is one.
+
+    Raises:
+        ConfigError: CUDA is asked for and there is none, or torch does not know the name.
+    """
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        kind = torch.device(name).type
+    except RuntimeError as error:
+        raise ConfigError(f"device: got {name!r}, allowed auto, cpu or cuda") from error
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(f"device: got {name!r}, but torch finds no CUDA device; allowed here: auto, cpu")
+    return name
+
+
+def make_env(config: Config, resolution: int, num_envs: int | None = None) -> VecMonitor:
+    """Build the environment of a run.
+
+    Args:
+        config: The run's options.
+        resolution: Action grid R.
+        num_envs: Robots side by side; the run's own number if None.
+
+    Raises:
+        ConfigError: The environment refuses an option; the message is its own.
+    """
+    options = dataclasses.asdict(config.environment)
+    own = options.pop("num_envs")
+    target = options.pop("target")
+    if target is not None:
+        options["target"] = target
+    device = choose_device(config.device)
+    try:
+        env = TorchEnv(config.task, num_envs or own, resolution, device=device, **options)
+    except (ValueError, TypeError, OSError) as error:
+        raise ConfigError(" ".join(str(error).split())) from error
+    return monitored(env)

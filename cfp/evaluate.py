@@ -1,0 +1,71 @@
+"""``python -m cfp.evaluate RUN_FOLDER``: how good is a trained policy; works while training goes on."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import tyro
+
+from cfp.errors import CFPError, CheckpointError, ConfigError
+from cfp.evaluation import compare, format_table, to_rows
+from cfp.process import keep_memory
+from cfp.runner import make_video, read_config, stage_files
+from cfp.weights import load
+
+
+@dataclass(frozen=True)
+class Command:
+    """Evaluate the policies in a run folder beside zero and random action, on the same particle layouts."""
+
+    folder: tyro.conf.Positional[Path]
+    """A folder that cfp.train wrote or is writing."""
+    episodes: int = 5
+    """Episodes of each policy."""
+    seed: int | None = None
+    """Seed of layouts and noise; the run's own if not given."""
+    device: str = "auto"
+    """cpu, cuda, or auto."""
+    json: bool = False
+    """Print JSON instead of a table."""
+    video: Path | None = None
+    """Also film one episode of the newest policy into this MP4 file."""
+
+
+def run(command: Command) -> str:
+    """Do what a command says and return what it prints.
+
+    Raises:
+        CFPError: There is no run, it has no policy yet, or a file is damaged.
+    """
+    if command.episodes < 1:
+        raise ConfigError(f"episodes: got {command.episodes}, allowed 1 or more")
+    config = replace(read_config(command.folder), device=command.device)
+    if command.seed is not None:
+        config = replace(config, seed=command.seed)
+    files = stage_files(command.folder, len(config.resolutions))
+    if not files:
+        raise CheckpointError(f"{command.folder}: no policy has been written yet")
+    policies = {name: load(path) for name, path in files.items()}
+    results = compare(config, policies, command.episodes)
+    if command.video is not None:
+        make_video(config, list(policies.values())[-1], command.video)
+    return json.dumps(to_rows(results), indent=2) if command.json else format_table(config, results)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line entry; returns the exit code."""
+    keep_memory()
+    try:
+        print(run(tyro.cli(Command, prog="python -m cfp.evaluate", args=arguments)))
+    except CFPError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,132 @@
+"""Writing files so that a crash at any moment leaves either the old file or the new one, whole."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from stable_baselines3.common.logger import KVWriter, TensorBoardOutputFormat, filter_excluded_keys
+from torch.utils.tensorboard import SummaryWriter
+
+
+def write_atomically(path: Path, write: Callable[[BinaryIO], Any]) -> None:
+    """Write a file aside, flush it to disk, and move it into place.
+
+    Args:
+        path: Where it ends up; the folder is created.
+        write: Called with the open binary file.
+
+    Raises:
+        OSError: The disk is full or the folder cannot be written; the old file, if any, is untouched.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(path.name + ".part")
+    with open(aside, "wb") as file:
+        write(file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(aside, path)
+    _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename itself durable; some systems (Windows) cannot open a folder and need nothing here."""
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON with an indent, atomically."""
+    text = json.dumps(value, indent=2) + "\n"
+    write_atomically(path, lambda file: file.write(text.encode()))
+
+
+class Table:
+    """A CSV file that grows row by row, also over several sessions, and can take new columns on the way.
+
+    Args:
+        path: The file; what it holds is kept.
+        last_step: Rows whose ``step`` is beyond this are dropped: they belong to work that a resumed run repeats.
+    """
+
+    def __init__(self, path: Path, last_step: int | None = None) -> None:
+        """Read the file if it is there."""
+        self.path = path
+        self.rows = read_table(path)
+        if last_step is not None:
+            self.rows = [row for row in self.rows if float(row["step"]) <= last_step]
+        self.columns = list(dict.fromkeys(key for row in self.rows for key in row))
+        if self.columns or path.exists():
+            self._rewrite()
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Append one row; a key seen for the first time becomes a new column, empty in older rows."""
+        text = {key: "" if value is None else str(value) for key, value in row.items()}
+        self.rows.append(text)
+        new = [key for key in text if key not in self.columns]
+        if new:
+            self.columns += new
+            self._rewrite()
+            return
+        with open(self.path, "a", newline="") as file:
+            csv.DictWriter(file, self.columns).writerow(text)
+
+    def _rewrite(self) -> None:
+        text = io.StringIO()
+        writer = csv.DictWriter(text, self.columns)
+        writer.writeheader()
+        writer.writerows(self.rows)
+        write_atomically(self.path, lambda file: file.write(text.getvalue().encode()))
+
+
+def read_table(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV file as text, none if it does not exist; a last line cut short by a crash is left out."""
+    if not path.exists():
+        return []
+    with open(path, newline="") as file:
+        text = file.read()
+    complete = text[: text.rfind("\n") + 1]
+    return [row for row in csv.DictReader(io.StringIO(complete)) if row.get("step")]
+
+
+class ProgressTable(KVWriter):
+    """A logger output that appends to ``progress.csv`` (stable-baselines3's own starts the file anew).
+
+    Wall-clock values are left out, so that two runs with one seed write the same file.
+    """
+
+    def __init__(self, table: Table) -> None:
+        """Write into a table."""
+        self.table = table
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """Append one row."""
+        values = filter_excluded_keys(key_values, key_excluded, "csv")
+        self.table.add({"step": step, **{key: values[key] for key in sorted(values)}})
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+class EventFile(TensorBoardOutputFormat):
+    """TensorBoard events that, on a resumed run, replace what was logged past the checkpoint.
+
+    Args:
+        folder: Where event files go.
+        step: The step this session starts at.
+    """
+
+    def __init__(self, folder: Path, step: int) -> None:
+        """Open a new event file."""
+        self.writer = SummaryWriter(log_dir=str(folder), purge_step=step + 1 if step else None)
+        self._is_closed = False

@@ -1,0 +1,135 @@
+"""The stable-baselines3 face of the networks: a `SACPolicy` whose actor is a ladder of action resolutions."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.sac import policies as sac_policies
+
+from cfp.actor import Actor, ActorSpec, build_actor
+from cfp.networks import IMAGE_SIZE, TwinCritic
+
+
+def observation_space() -> spaces.Box:
+    """The image that every network reads: occupancy and velocity, uint8 (3, 64, 64)."""
+    return spaces.Box(0, 255, (3, IMAGE_SIZE, IMAGE_SIZE), np.uint8)
+
+
+def action_space(resolution: int) -> spaces.Box:
+    """Muscle activations in [-1, 1], float32 (2, R, R)."""
+    return spaces.Box(-1.0, 1.0, (2, resolution, resolution), np.float32)
+
+
+class CFPPolicy(sac_policies.SACPolicy):
+    """Actor, twin critics and target critics of the coarse-to-fine policy.
+
+    Coarser levels live inside the actor as frozen submodules, so ``state_dict`` and ``predict`` cover the whole
+    ladder. The actor reads uint8 images itself (``normalize_images`` is off). ``predict`` does not clip: a composed
+    action may leave [-1, 1] by the overshoot of the cubic interpolation, as in the reference implementation.
+
+    Args:
+        observation_space: uint8 (3, 64, 64).
+        action_space: float32 (2, R, R) in [-1, 1].
+        lr_schedule: Learning rate of both optimisers as a function of the remaining progress.
+        spec: The actor's ladder; a plain actor of the action space's resolution if None.
+        use_sde: Accepted because stable-baselines3 passes it; must be False.
+        optimizer_class: Optimiser of actor and critics.
+        optimizer_kwargs: Its options except the learning rate; a fused Adam if None.
+
+    Raises:
+        ValueError: The spec's finest resolution is not the action space's, or ``use_sde`` is set.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        spec: ActorSpec | None = None,
+        use_sde: bool = False,
+        optimizer_class: type[torch.optim.Optimizer] = torch.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        """Build the networks and their optimisers."""
+        if use_sde:
+            raise ValueError("use_sde: got True, allowed False (the policy has its own exploration noise)")
+        resolution = action_space.shape[-1]
+        self.spec = spec or ActorSpec((resolution,))
+        if action_space.shape != (2, self.spec.resolutions[-1], self.spec.resolutions[-1]):
+            raise ValueError(
+                f"action space: got shape {action_space.shape}, allowed for a ladder {self.spec.resolutions} is "
+                f"{(2, self.spec.resolutions[-1], self.spec.resolutions[-1])}"
+            )
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            normalize_images=False,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs={"fused": True} if optimizer_kwargs is None else optimizer_kwargs,
+        )
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        """Create networks and optimisers; the frozen levels of the actor get no optimiser."""
+        rate = lr_schedule(1)
+        options = dict(self.optimizer_kwargs, lr=rate)
+        actor, critic, target = build_actor(self.spec), self._new_critic(), self._new_critic()
+        actor.optimizer = self.optimizer_class(actor.trainable_parameters(), **options)
+        critic.optimizer = self.optimizer_class(critic.parameters(), **options)
+        target.load_state_dict(critic.state_dict())
+        target.requires_grad_(False)
+        target.set_training_mode(False)
+        # They offer what SAC asks of its own actor and critic, without being subclasses of those.
+        self.actor = cast(sac_policies.Actor, actor)
+        self.critic = cast(ContinuousCritic, critic)
+        self.critic_target = cast(ContinuousCritic, target)
+
+    def _new_critic(self) -> TwinCritic:
+        return TwinCritic(self.spec.resolutions[-1], self.spec.split, self.spec.interpolation)
+
+    def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
+        """Actor, critics and target critics with their own types."""
+        return cast(Actor, self.actor), cast(TwinCritic, self.critic), cast(TwinCritic, self.critic_target)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {
+            "observation_space": self.observation_space,
+            "action_space": self.action_space,
+            "lr_schedule": self._dummy_schedule,
+            "spec": self.spec,
+            "optimizer_class": self.optimizer_class,
+            "optimizer_kwargs": self.optimizer_kwargs,
+        }
+
+
+class ActorPolicy(BasePolicy):
+    """An actor alone, with stable-baselines3's ``predict``: what `cfp.load` returns.
+
+    Args:
+        spec: The actor's ladder.
+        deterministic_by_default: How the run that trained it evaluates: SHAPE MATCH without, other tasks with noise.
+    """
+
+    action_space: spaces.Box
+
+    def __init__(self, spec: ActorSpec, deterministic_by_default: bool = False) -> None:
+        """Build the actor; its weights are random until a state is loaded."""
+        space = action_space(spec.resolutions[-1])
+        super().__init__(observation_space(), space, normalize_images=False, squash_output=True)
+        self.spec = spec
+        self.deterministic_by_default = deterministic_by_default
+        self.description: dict[str, Any] = {}
+        self.actor = build_actor(spec).requires_grad_(False)
+
+    def forward(self, observation: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
+        """Actions (B, 2, R, R) for uint8 observations (B, 3, 64, 64)."""
+        action: torch.Tensor = self.actor(observation, deterministic)
+        return action
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
+        return self(cast(torch.Tensor, observation), deterministic)

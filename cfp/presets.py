@@ -1,0 +1,117 @@
+"""The presets of the eight tasks.
+
+The numbers of the ``paper`` presets are those of the reference implementation's configuration files and of the
+paper's figures (Section 5 and Appendix B of DittoGym, ICLR 2024).
+"""
+
+from __future__ import annotations
+
+import typing
+from dataclasses import dataclass, replace
+from typing import Any
+
+from cfp.config import Config, EnvironmentConfig, LearningConfig, NetworkConfig, Preset, ReportConfig, merge
+from cfp.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class TaskNumbers:
+    """Published hyper-parameters of one task.
+
+    Attributes:
+        alpha: Temperature of stage 1 and 2.
+        gate_bias: Bias of the gate's logit.
+        gate_penalty: Weight rho of the gate penalty.
+        steps: Environment steps plotted in the paper.
+        handover: Step at which the paper's curves change from stage 1 to stage 2.
+        seed: Seed of the published weights.
+        resolutions: Action grid of stage 1 and 2.
+        random_steps: Uniformly random steps of stage 1 and 2.
+        split: Split encoders with a gate of at most 0.25.
+    """
+
+    alpha: tuple[float, float]
+    gate_bias: float
+    gate_penalty: float
+    steps: int
+    handover: int
+    seed: int = 0
+    resolutions: tuple[int, int] = (8, 16)
+    random_steps: tuple[int, int] = (6000, 100)
+    split: bool = False
+
+
+# For GROW and CATCH no stage-2 configuration was published: stage 1's values are taken.
+TASKS: dict[str, TaskNumbers] = {
+    "shapematch": TaskNumbers((0.01, 0.0), -2.0, 0.8, 400_000, 142_000, resolutions=(32, 64), random_steps=(500, 100)),
+    "run": TaskNumbers((0.01, 0.01), -1.0, 0.01, 550_000, 301_000),
+    "grow": TaskNumbers((0.01, 0.01), -1.0, 0.01, 600_000, 407_000),
+    "kick": TaskNumbers((0.05, 0.05), -1.0, 0.0, 550_000, 132_000),
+    "dig": TaskNumbers((0.05, 0.05), 0.0, 3.0, 780_000, 567_000, split=True),
+    "obstacle": TaskNumbers((0.05, 0.05), -1.0, 0.04, 700_000, 530_000),
+    "catch": TaskNumbers((0.1, 0.1), -1.0, 0.01, 380_000, 243_000, seed=2),
+    "slot": TaskNumbers((0.05, 0.05), -2.0, 0.1, 600_000, 293_000, seed=1),
+}
+
+
+def preset(task: str, name: str = "quick") -> Config:
+    """The defaults of a task.
+
+    Args:
+        task: One of `TASKS`.
+        name: ``"paper"``: one robot at full size, the published numbers, the reference's interpolation and faults.
+            ``"quick"``: sixteen robots at the lite tier, larger steps, minutes instead of days.
+
+    Raises:
+        ConfigError: No such task or preset.
+    """
+    if task not in TASKS:
+        raise ConfigError(f"task: got {task!r}, allowed {', '.join(TASKS)}")
+    if name not in typing.get_args(Preset):
+        raise ConfigError(f"preset: got {name!r}, allowed {', '.join(typing.get_args(Preset))}")
+    numbers = TASKS[task]
+    paper = Config(
+        task=task,
+        preset="paper",
+        seed=numbers.seed,
+        steps=numbers.steps,
+        handover=(numbers.handover,),
+        resolutions=numbers.resolutions,
+        random_steps=numbers.random_steps,
+        alpha=numbers.alpha,
+        gate_bias=(numbers.gate_bias,),
+        gate_penalty=(numbers.gate_penalty,),
+        environment=EnvironmentConfig(num_envs=1, particles="full", parity="reference"),
+        network=NetworkConfig("aligned", numbers.split, 0.25 if numbers.split else 1.0),
+        report=ReportConfig(eval_deterministic=task == "shapematch"),
+    )
+    return paper if name == "paper" else _quick(paper)
+
+
+def _quick(paper: Config) -> Config:
+    """Shrink a published configuration to minutes: many small robots, small batches, a shorter horizon of credit."""
+    quick = replace(
+        paper,
+        preset="quick",
+        seed=0,
+        steps=20_000,
+        handover=(12_000,),
+        random_steps=(1_000, 100),
+        environment=EnvironmentConfig(),
+        network=replace(paper.network, interpolation="half_pixel"),
+        learning=LearningConfig(batch_size=64, learning_rate=1e-3, gamma=0.95, buffer_size=20_000, gradient_steps=4),
+        report=replace(paper.report, eval_every=4_000, checkpoint_every=4_000, log_every=480),
+    )
+    return quick
+
+
+def from_json(values: dict[str, Any]) -> Config:
+    """A configuration from JSON values; what they leave out comes from the preset they name.
+
+    Raises:
+        ConfigError: An unknown name or a value of the wrong type.
+    """
+    base = preset(values.get("task", "shapematch"), values.get("preset", "quick"))
+    merged: Config = merge(base, values)
+    merged.check()
+    return merged

@@ -1,0 +1,79 @@
+"""A film of one episode, H.264 in MP4, which every browser plays."""
+
+from __future__ import annotations
+
+import os
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.type_aliases import PolicyPredictor
+
+from cfp.config import Config
+from cfp.environments import EVALUATION_SEED, make_env
+from cfp.vec_env import TorchVecEnv
+
+FRAMES_PER_SECOND = 10
+MISSING = "no video: it needs imageio with ffmpeg; install them with: pip install 'torchmpm[video]'"
+
+
+class VideoUnavailable(RuntimeError):
+    """The optional packages that write videos are not installed."""
+
+
+def film(config: Config, policy: PolicyPredictor, resolution: int, deterministic: bool) -> list[np.ndarray]:
+    """Pictures of one episode, uint8 (512, 512, 3): the start, then one per environment step.
+
+    Args:
+        config: The run's options.
+        policy: Anything with stable-baselines3's ``predict``.
+        resolution: Its action grid R.
+        deterministic: Act without noise.
+    """
+    venv = make_env(config, resolution, 1).venv
+    assert isinstance(venv, TorchVecEnv)
+    venv.seed(config.seed + EVALUATION_SEED)
+    observation = venv.reset()
+    frames = [venv.torch_env.render(0)]
+    done = False
+    with torch.random.fork_rng(devices=list(range(torch.cuda.device_count()))), torch.no_grad():
+        torch.manual_seed(config.seed + EVALUATION_SEED)
+        while not done:
+            assert isinstance(observation, np.ndarray)
+            action, _ = policy.predict(observation, deterministic=deterministic)
+            tensors = venv.torch_env.step(torch.as_tensor(action, device=venv.torch_env.device))
+            observation, _, terminated, truncated, _ = (_numpy(value) for value in tensors)
+            frames.append(venv.torch_env.render(0))  # before a reset can replace the last picture
+            done = bool(terminated[0] or truncated[0])
+    return frames
+
+
+def _numpy(value: object) -> np.ndarray:
+    return value.cpu().numpy() if isinstance(value, torch.Tensor) else np.empty(0)
+
+
+def write_video(path: Path, frames: list[np.ndarray], hold: int = FRAMES_PER_SECOND) -> None:
+    """Write an MP4 file.
+
+    Args:
+        path: Where; replaced in one move once it is whole.
+        frames: uint8 (H, W, 3), even H and W.
+        hold: How often the last picture is repeated at the end.
+
+    Raises:
+        VideoUnavailable: imageio or its ffmpeg is not installed; the message says how to install them.
+    """
+    if not (find_spec("imageio") and find_spec("imageio_ffmpeg")):
+        raise VideoUnavailable(MISSING)
+    import imageio.v2 as imageio
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(f".{path.stem}.part.mp4")
+    options: dict[str, Any] = {"codec": "libx264", "pixelformat": "yuv420p", "macro_block_size": 2, "quality": 8}
+    writer: Any = imageio.get_writer(aside, format="FFMPEG", fps=FRAMES_PER_SECOND, **options)
+    with writer:
+        for frame in [*frames, *frames[-1:] * hold]:
+            writer.append_data(frame)
+    os.replace(aside, path)

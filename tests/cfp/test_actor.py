@@ -1,0 +1,137 @@
+import pytest
+import torch
+from torch import distributions
+from torch.nn import functional as F
+
+from cfp.actor import ActorSpec, build_actor
+from cfp.networks import normalise_image, upsample
+
+
+def images(count=3, seed=0):
+    return torch.randint(0, 256, (count, 3, 64, 64), dtype=torch.uint8, generator=torch.Generator().manual_seed(seed))
+
+
+def widen(actor):
+    """Give the heads outputs of some size, so that bounds and signs matter."""
+    with torch.no_grad():
+        for name in ("mean", "std", "gate"):
+            if hasattr(actor, name):
+                getattr(actor, name)[-1].weight.mul_(30)
+
+
+def test_log_prob_is_that_of_a_squashed_gaussian():
+    torch.manual_seed(0)
+    actor = build_actor(ActorSpec((8,))).double()
+    widen(actor)
+    image = normalise_image(images()).double()
+    action, log_prob, gate = actor.sample(image)
+    latent = actor.encoder(image)
+    mean, raw = actor.mean(latent), actor.std(latent)
+    std = torch.log1p(torch.exp(3 * raw - 1)).clamp(0.1, 6)
+    assert (std == 0.1).any()
+    assert (std > 0.5).any()
+    inside = action.abs() < 0.99
+    squashed = distributions.TransformedDistribution(distributions.Normal(mean, std), distributions.TanhTransform())
+    # The 1e-6 in the reference's density is felt only where the action saturates.
+    expected = squashed.log_prob(torch.where(inside, action, 0.0))
+    x = torch.atanh(action.clamp(-1 + 1e-12, 1 - 1e-12))
+    by_hand = distributions.Normal(mean, std).log_prob(x) - torch.log(1 - action.square() + 1e-6)
+    torch.testing.assert_close(by_hand[inside], expected[inside], rtol=1e-4, atol=1e-4)
+    unsaturated = action.abs() < 1 - 1e-9
+    if unsaturated.all():
+        torch.testing.assert_close(log_prob, by_hand.flatten(1).sum(1), rtol=1e-6, atol=1e-6)
+    assert gate is None
+    assert log_prob.shape == (3,)
+
+
+def test_small_actions_have_the_exact_log_prob():
+    torch.manual_seed(1)
+    actor = build_actor(ActorSpec((16,))).double()
+    image = normalise_image(images()).double()
+    action, log_prob, _ = actor.sample(image)
+    latent = actor.encoder(image)
+    std = F.softplus(3 * actor.std(latent) - 1).clamp(0.1, 6)
+    squashed = distributions.TransformedDistribution(
+        distributions.Normal(actor.mean(latent), std), distributions.TanhTransform()
+    )
+    torch.testing.assert_close(log_prob, squashed.log_prob(action).flatten(1).sum(1), rtol=1e-5, atol=1e-3)
+
+
+def test_deterministic_action_is_the_tanh_of_the_mean():
+    actor = build_actor(ActorSpec((8,)))
+    image = images()
+    expected = torch.tanh(actor.mean(actor.encoder(normalise_image(image))))
+    assert torch.equal(actor(image, deterministic=True), expected)
+    assert not torch.equal(actor(image), expected)
+
+
+@pytest.mark.parametrize(("split", "scale"), [(False, 1.0), (True, 0.25)])
+@pytest.mark.parametrize("interpolation", ["half_pixel", "aligned"])
+def test_gate_blends_residual_and_coarse(split, scale, interpolation):
+    torch.manual_seed(0)
+    actor = build_actor(ActorSpec((8, 16), (-0.5,), split, scale, interpolation))
+    widen(actor)
+    image = images()
+    action, _, gate = actor.sample(image, deterministic=True)
+    coarse = actor.coarse(image, deterministic=True)
+    lifted = F.interpolate(coarse, size=(16, 16), mode="bicubic", align_corners=interpolation == "aligned")
+    patch = F.interpolate(lifted, size=(64, 64), mode="bicubic", align_corners=interpolation == "aligned")
+    latent = actor.encoder(normalise_image(image), patch)
+    expected_gate = scale / (1 + torch.exp(-(actor.gate(latent) - 0.5)))
+    expected = expected_gate * torch.tanh(actor.mean(latent)) + (1 - expected_gate) * lifted
+    torch.testing.assert_close(gate, expected_gate, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(action, expected, rtol=1e-4, atol=1e-5)
+    assert gate.shape == (3, 2, 16, 16)
+    assert gate.max() <= scale
+
+
+@pytest.mark.parametrize("resolutions", [(8, 16), (32, 64), (4, 8, 16, 32, 64)])
+def test_closed_gates_leave_the_coarsest_action(resolutions):
+    torch.manual_seed(0)
+    actor = build_actor(ActorSpec(resolutions, (-100.0,) * (len(resolutions) - 1)))
+    image = images()
+    coarsest = actor
+    while hasattr(coarsest, "coarse"):
+        coarsest = coarsest.coarse
+    expected = coarsest(image, deterministic=True)
+    for resolution in resolutions[1:]:
+        expected = upsample(expected, resolution, "half_pixel")
+    torch.testing.assert_close(actor(image, deterministic=True), expected, rtol=0, atol=1e-6)
+
+
+def test_composed_action_is_not_clipped():
+    torch.manual_seed(0)
+    actor = build_actor(ActorSpec((8, 16), (-100.0,)))
+    with torch.no_grad():
+        actor.coarse.mean[-1].weight.mul_(1000)
+    assert actor(images(), deterministic=True).abs().max() > 1.001
+
+
+def test_coarser_levels_are_frozen_and_drawn_anew():
+    torch.manual_seed(0)
+    actor = build_actor(ActorSpec((8, 16), (0.0,)))
+    image = images()
+    action, log_prob, gate = actor.sample(image)
+    (action.square().sum() + log_prob.sum()).backward()
+    assert all(parameter.grad is None for parameter in actor.coarse.parameters())
+    assert all(parameter.grad is not None for parameter in actor.trainable_parameters())
+    assert gate.requires_grad
+    state = torch.get_rng_state()
+    first = actor.coarse(image)
+    torch.set_rng_state(state)
+    torch.testing.assert_close(actor.coarse(image), first)
+    assert not torch.equal(actor.coarse(image), first)
+
+
+@pytest.mark.parametrize(
+    ("resolutions", "bias", "message"),
+    [
+        ((7,), (), "resolution: got 7, allowed 4, 8, 16, 32, 64"),
+        ((16, 8), (0.0,), "growing ladder"),
+        ((), (), "growing ladder"),
+        ((8, 16), (), "got 0 values"),
+    ],
+)
+def test_impossible_ladders_are_refused(resolutions, bias, message):
+    with pytest.raises(ValueError, match=message):
+        ActorSpec(resolutions, bias)

@@ -1,0 +1,301 @@
+"""The update rule, against a hand-written float64 computation that shares no code with the networks."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from fakes import FakeEnv
+from stable_baselines3 import SAC
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from torch.nn import functional as F
+
+from cfp.actor import ActorSpec
+from cfp.algorithm import CFP, METRICS, RewardStatistics, clip_each
+from cfp.errors import NonFiniteError
+from cfp.policy import CFPPolicy
+from cfp.vec_env import monitored
+
+ALPHA, RHO, GAMMA, LIMIT = 0.03, 0.7, 0.9, 0.05
+
+
+def make_model(spec, env=None, **options):
+    env = env or FakeEnv(num_envs=2, resolution=spec.resolutions[-1])
+    settings = {"buffer_size": 400, "batch_size": 8, "seed": 0, "device": "cpu", "policy_kwargs": {"spec": spec}}
+    model = CFP(CFPPolicy, monitored(env), **(settings | options))
+    model.set_logger(Logger(None, []))
+    return model
+
+
+def make_batch(resolution, count=6):
+    generator = torch.Generator().manual_seed(3)
+    images = torch.randint(0, 256, (2, count, 3, 64, 64), dtype=torch.uint8, generator=generator)
+    action = torch.rand(count, 2 * resolution**2, generator=generator) * 2 - 1
+    done = torch.tensor([0.0, 1.0] * (count // 2))[:, None]
+    reward = torch.randn(count, 1, generator=generator) * 3 + 2
+    return ReplayBufferSamples(images[0], action, images[1], done, reward)
+
+
+# The same networks once more, in float64, from the names of their weights.
+
+
+def coordinates(count):
+    line = (torch.arange(64, dtype=torch.float64) - 32) / 32
+    return torch.stack(torch.meshgrid(line, line, indexing="ij")).expand(count, 2, 64, 64)
+
+
+def encode(weights, prefix, image):
+    x = torch.cat([image, coordinates(len(image))], dim=1)
+    for name, stride in (("first", 4), ("rest.1", 2), ("rest.3", 1)):
+        x = F.elu(F.conv2d(x, weights[f"{prefix}.{name}.weight"], weights[f"{prefix}.{name}.bias"], stride=stride))
+    return x
+
+
+def decode(weights, prefix, latent, strides):
+    for index, stride in enumerate(strides):
+        layer = f"{prefix}.{2 * index}"
+        x = F.elu(latent) if index else latent
+        latent = F.conv_transpose2d(x, weights[f"{layer}.weight"], weights[f"{layer}.bias"], stride=stride, padding=1)
+    return latent
+
+
+def lift(action, size, aligned):
+    return F.interpolate(action, size=(size, size), mode="bicubic", align_corners=aligned)
+
+
+def squash(weights, prefix, latent, strides, noise):
+    mean = decode(weights, f"{prefix}mean", latent, strides)
+    std = torch.log1p(torch.exp(3 * decode(weights, f"{prefix}std", latent, strides) - 1)).clamp(0.1, 6)
+    action = torch.tanh(mean + std * noise)
+    density = -0.5 * noise**2 - torch.log(std * math.sqrt(2 * math.pi)) - torch.log(1 - action**2 + 1e-6)
+    return action, density.sum((1, 2, 3))
+
+
+def act(weights, image, noises: Iterator[torch.Tensor], residual):
+    """Action, log-density and gate of an 8x8 actor, or of an 8x8 -> 16x16 one with aligned corners."""
+    if not residual:
+        return *squash(weights, "", encode(weights, "encoder", image), (2, 1, 1), next(noises)), None
+    coarse_latent = encode(weights, "coarse.encoder", image)
+    coarse = squash(weights, "coarse.", coarse_latent, (2, 1, 1), next(noises))[0].detach()
+    coarse = lift(coarse, 16, True)
+    latent = encode(weights, "encoder.encoders.0", torch.cat([image, lift(coarse, 64, True)], dim=1))
+    action, density = squash(weights, "", latent, (2, 2, 1), next(noises))
+    gate = 1 / (1 + torch.exp(-decode(weights, "gate", latent, (2, 2, 1)) + 1.5))
+    return gate * action + (1 - gate) * coarse, density, gate
+
+
+def judge(weights, image, action, aligned):
+    values = []
+    for index in range(2):
+        prefix = f"critics.{index}"
+        x = encode(
+            weights, f"{prefix}.encoder.encoders.0", torch.cat([image, lift(action, 64, aligned)], dim=1)
+        ).flatten(1)
+        for layer in (1, 3, 5):
+            x = F.linear(x, weights[f"{prefix}.value.{layer}.weight"], weights[f"{prefix}.value.{layer}.bias"])
+            x = F.elu(x) if layer < 5 else x
+        values.append(x)
+    return values
+
+
+def doubles(module, grad):
+    return {name: value.detach().double().requires_grad_(grad) for name, value in module.state_dict().items()}
+
+
+@pytest.mark.parametrize("residual", [False, True])
+def test_one_update_equals_the_float64_computation(residual, monkeypatch):
+    spec = (
+        ActorSpec((8, 16), (-1.5,), interpolation="aligned") if residual else ActorSpec((8,), interpolation="aligned")
+    )
+    model = make_model(spec, alpha=ALPHA, gate_penalty=RHO, gamma=GAMMA, max_grad_norm=LIMIT, tau=0.25)
+    resolution = spec.resolutions[-1]
+    batch = make_batch(resolution)
+    actor, critic, target = model.networks()
+    with torch.no_grad():
+        for parameter in target.parameters():
+            parameter.mul_(0.9)  # so that target and critic differ
+    sizes = [8, 16] * 2 if residual else [8, 8]
+    generator = torch.Generator().manual_seed(5)
+    noises = [torch.randn(6, 2, r, r, generator=generator, dtype=torch.float64) for r in sizes]
+    queue = iter(noises)
+    monkeypatch.setattr("cfp.actor.torch.randn_like", lambda like: next(queue).to(like))
+
+    weights, values, targets = doubles(actor, True), doubles(critic, True), doubles(target, False)
+    now, later = (image.double() / 255 * 2 - 1 for image in (batch.observations, batch.next_observations))
+    mean, variance = 0.01 * batch.rewards.double().mean(), 0.99 + 0.01 * batch.rewards.double().var()
+    reward = (batch.rewards.double() - mean) / (variance.sqrt() + 1e-8)
+    source = iter(noises)
+    action, density, _ = act(weights, later, source, residual)
+    smaller = torch.minimum(*judge(targets, later, action, True))
+    wanted = (reward + (1 - batch.dones.double()) * GAMMA * (smaller - ALPHA * density[:, None])).detach()
+    stored = batch.actions.double().view(-1, 2, resolution, resolution)
+    critic_loss = sum(((value - wanted) ** 2).mean() for value in judge(values, now, stored, True))
+    critic_gradients = dict(zip(values, torch.autograd.grad(critic_loss, list(values.values())), strict=True))
+
+    scalars = model.update(batch)
+
+    assert scalars["critic_loss"].item() == pytest.approx(critic_loss.item(), rel=1e-4)
+    assert scalars["q_target"].item() == pytest.approx(wanted.mean().item(), rel=1e-4)
+    assert scalars["reward_mean"].item() == pytest.approx(mean.item(), rel=1e-5)
+    assert scalars["reward_std"].item() == pytest.approx(variance.sqrt().item(), rel=1e-5)
+    compare_gradients(critic, critic_gradients)
+
+    # The actor sees the critics after their step.
+    action, density, gate = act(weights, now, source, residual)
+    smaller = torch.minimum(*judge(doubles(critic, False), now, action, True))
+    actor_loss = (ALPHA * density[:, None] - smaller).mean()
+    if residual:
+        actor_loss = actor_loss + RHO * gate.flatten(1).norm(dim=1).mean() / 16
+    own = {name: weights[name] for name, parameter in actor.named_parameters() if parameter.requires_grad}
+    actor_gradients = dict(zip(own, torch.autograd.grad(actor_loss, list(own.values())), strict=True))
+    assert scalars["actor_loss"].item() == pytest.approx(actor_loss.item(), rel=1e-4)
+    assert scalars["entropy"].item() == pytest.approx(-density.mean().item(), rel=1e-4)
+    compare_gradients(actor, actor_gradients)
+    assert all(f"train/{name}" in METRICS for name in scalars)
+
+    # Polyak: a quarter of the way to the critics after their step.
+    for name, value in target.state_dict().items():
+        moved = 0.75 * targets[name] + 0.25 * critic.state_dict()[name].double()
+        torch.testing.assert_close(value.double(), moved, rtol=1e-5, atol=1e-7)
+
+
+def compare_gradients(module, expected):
+    """Gradients after clipping each tensor to LIMIT."""
+    clipped = 0
+    for name, parameter in module.named_parameters():
+        if not parameter.requires_grad:
+            continue
+        norm = expected[name].norm()
+        clipped += int(norm > LIMIT)
+        wanted = expected[name] * min(1.0, LIMIT / (norm.item() + 1e-6))
+        torch.testing.assert_close(parameter.grad.double(), wanted, rtol=2e-3, atol=1e-5 * LIMIT)
+    assert clipped > 0  # the limit was felt
+
+
+def test_reward_statistics_follow_their_formula():
+    statistics = RewardStatistics(0.9)
+    mean, variance = 0.0, 1.0
+    generator = np.random.default_rng(0)
+    for _ in range(5):
+        rewards = generator.normal(5, 3, (16, 1))
+        mean, variance = 0.9 * mean + 0.1 * rewards.mean(), 0.9 * variance + 0.1 * rewards.var(ddof=1)
+        got = statistics(torch.tensor(rewards, dtype=torch.float32))
+        np.testing.assert_allclose(got, (rewards - mean) / (np.sqrt(variance) + 1e-8), rtol=1e-4, atol=1e-5)
+    assert statistics.mean.item() == pytest.approx(mean, rel=1e-5)
+
+
+def test_each_tensor_is_clipped_by_itself():
+    small, large = (torch.nn.Parameter(torch.zeros(2)) for _ in range(2))
+    small.grad, large.grad = torch.tensor([3.0, 4.0]), torch.tensor([30.0, 40.0])
+    clip_each([small, large], 10.0)
+    torch.testing.assert_close(small.grad, torch.tensor([3.0, 4.0]))
+    torch.testing.assert_close(large.grad, torch.tensor([6.0, 8.0]), rtol=1e-5, atol=0)
+
+
+def test_random_phase_and_start_of_updates_are_two_settings():
+    env = FakeEnv(num_envs=2, horizon=5)
+    model = make_model(ActorSpec((8,)), env, random_steps=20, update_start=12)
+    updates = {}
+    train = model.train
+    model.train = lambda gradient_steps, batch_size: (
+        updates.setdefault(model.num_timesteps, model.replay_buffer.size() * 2),
+        train(gradient_steps, batch_size),
+    )
+    with torch.no_grad():  # a policy that can be told from uniform noise
+        model.networks()[0].mean[-1].bias.fill_(50.0)
+    model.learn(32)
+    spread = [float((action.abs() > 0.999).float().mean()) for action in env.actions]
+    assert max(spread[:10]) < 0.1
+    assert min(spread[10:]) > 0.9
+    assert updates[14] == 14
+    assert min(updates) == 14  # more than 12 are stored
+
+
+def test_stage_two_starts_with_uniform_fine_actions():
+    env = FakeEnv(num_envs=2, resolution=16)
+    model = make_model(ActorSpec((8, 16), (-100.0,)), env, random_steps=4)
+    model.learn(4)
+    actions = torch.stack(env.actions)
+    assert actions.abs().max() <= 1
+    assert actions.std() == pytest.approx(1 / math.sqrt(3), rel=0.05)
+    neighbours = (actions[..., :-1] * actions[..., 1:]).mean()
+    assert abs(neighbours) < 0.05  # no upsampled coarse action in them
+
+
+@pytest.mark.parametrize("fault", ["reward"])
+def test_reward_that_is_not_finite_is_never_stored(fault):
+    model = make_model(ActorSpec((8,)), FakeEnv(num_envs=2, horizon=9, faults={3: fault}))
+    with pytest.raises(NonFiniteError, match="reward of environment 0 is not finite at step 6"):
+        model.learn(20)
+    assert model.replay_buffer.size() == 2
+    assert np.isfinite(model.replay_buffer.rewards).all()
+
+
+def test_loss_that_is_not_finite_changes_no_weight():
+    model = make_model(ActorSpec((8,)))
+    _, critic, _ = model.networks()
+    before = {name: value.clone() for name, value in critic.state_dict().items()}
+    batch = make_batch(8)
+    with pytest.raises(NonFiniteError, match="critic loss became nan"):
+        model.update(batch._replace(rewards=batch.rewards * float("nan")))
+    assert all(torch.equal(value, before[name]) for name, value in critic.state_dict().items())
+
+
+def test_time_limit_bootstraps_and_termination_does_not():
+    model = make_model(ActorSpec((8,)), FakeEnv(num_envs=2, horizon=3, end_above=0.05), random_steps=100)
+    model.learn(6)
+    buffer = model.replay_buffer
+    ended = buffer.dones * (1 - buffer.timeouts)
+    assert buffer.dones[:3, 0].tolist() == [0, 0, 1]
+    assert not ended[:3, 0].any()
+    assert ended[0, 1] == 1
+    # The stored next observation is the episode's last, not the next one's first.
+    assert buffer.next_observations[2, 0, 1].max() == 3
+
+
+def test_learning_improves_the_return():
+    def make_env():
+        return FakeEnv(num_envs=8, resolution=4, horizon=5, start=-0.4, push=1.0)
+
+    options = {"learning_rate": 1e-3, "gamma": 0.5, "tau": 0.05, "gradient_steps": 2, "batch_size": 32}
+    model = make_model(ActorSpec((4,)), make_env(), random_steps=80, update_start=64, alpha=0.0, **options)
+    probe = monitored(make_env())
+
+    def returns():
+        observation, total = probe.reset(), np.zeros(8)
+        for _ in range(5):
+            action, _ = model.predict(observation, deterministic=True)
+            observation, reward, _, _ = probe.step(action)
+            total += reward
+        return total.mean()
+
+    before = returns()
+    model.learn(640)
+    assert returns() > before + 0.5
+
+
+def test_policy_also_serves_the_plain_algorithm():
+    env = monitored(FakeEnv(num_envs=2))
+    model = SAC(CFPPolicy, env, ent_coef=0.01, buffer_size=100, learning_starts=4, batch_size=4, device="cpu")
+    model.learn(12)
+    action, _ = model.predict(env.reset(), deterministic=True)
+    assert action.shape == (2, 2, 8, 8)
+
+
+def test_saved_archive_of_the_base_library_keeps_everything(tmp_path):
+    model = make_model(ActorSpec((8,)), update_start=4)
+    model.learn(12)
+    model.save(tmp_path / "model.zip")
+    again = CFP.load(tmp_path / "model.zip", device="cpu")
+    assert torch.equal(again.reward_statistics.mean, model.reward_statistics.mean)
+    for name, value in model.policy.state_dict().items():
+        assert torch.equal(again.policy.state_dict()[name], value)
+
+
+def test_wrong_action_grid_is_refused():
+    with pytest.raises(ValueError, match="ladder \\(16,\\)"):
+        make_model(ActorSpec((16,)), FakeEnv(num_envs=1, resolution=8))
+    with pytest.raises(ValueError, match="use_sde"):
+        make_model(ActorSpec((8,)), use_sde=True)

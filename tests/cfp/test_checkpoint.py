@@ -1,0 +1,140 @@
+import pytest
+import torch
+from fakes import FakeEnv
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+
+from cfp.algorithm import CFP
+from cfp.checkpoint import Checkpoint, Position, model_state
+from cfp.config import Config
+from cfp.errors import CheckpointError
+from cfp.policy import CFPPolicy
+from cfp.vec_env import monitored
+
+CONFIG = Config(resolutions=(4, 8), gate_bias=(-1.0,))
+
+
+def make_model(level=1):
+    # The ring (20 rows) wraps around, and 7 does not divide anything: episodes are in progress at every checkpoint.
+    env = monitored(FakeEnv(num_envs=2, resolution=CONFIG.resolutions[level], horizon=7))
+    spec = CONFIG.actor_spec(level)
+    options = {"buffer_size": 40, "batch_size": 4, "update_start": 6, "random_steps": 10, "seed": 3, "device": "cpu"}
+    model = CFP(CFPPolicy, env, gate_penalty=0.1, policy_kwargs={"spec": spec}, **options)
+    model.set_logger(Logger(None, []))
+    return model
+
+
+class Hook(BaseCallback):
+    """Calls a function between two rollouts."""
+
+    def __init__(self, function):
+        super().__init__()
+        self.function = function
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_start(self):
+        self.function(self.model)
+
+
+def assert_same(first, second, path="state"):
+    assert type(first) is type(second), path
+    if isinstance(first, dict):
+        assert first.keys() == second.keys(), path
+        for key in first:
+            assert_same(first[key], second[key], f"{path}.{key}")
+    elif isinstance(first, list | tuple):
+        assert len(first) == len(second), path
+        for index, pair in enumerate(zip(first, second, strict=True)):
+            assert_same(*pair, f"{path}.{index}")
+    elif isinstance(first, torch.Tensor):
+        assert torch.equal(first, second), path
+    elif not path.endswith(".t"):  # wall time of an episode
+        assert first == second, path
+
+
+@pytest.mark.parametrize("stop", [8, 22, 50])
+def test_resumed_training_equals_uninterrupted_training_to_the_last_bit(tmp_path, stop):
+    checkpoint = Checkpoint(tmp_path)
+
+    def save(model):
+        if model.num_timesteps == stop:
+            checkpoint.save(model, CONFIG, Position(1, 100))
+
+    model = make_model()
+    model.learn(70, Hook(save))
+    resumed = make_model()
+    torch.rand(5)  # generators are somewhere else
+    state = Checkpoint(tmp_path).load()
+    assert (state["level"], state["offset"]) == (1, 100)
+    Checkpoint(tmp_path).restore(resumed, state)
+    assert resumed.num_timesteps == stop
+    resumed.learn(70 - stop, reset_num_timesteps=False)
+    assert_same(model_state(resumed), model_state(model))
+    batch, again = model.replay_buffer.sample(4), resumed.replay_buffer.sample(4)
+    assert all(torch.equal(*pair) for pair in zip(batch[:5], again[:5], strict=True))
+
+
+def test_checkpoint_survives_a_crash_while_the_next_is_written(tmp_path, monkeypatch):
+    checkpoint, model = Checkpoint(tmp_path), make_model()
+    model.learn(20)
+    checkpoint.save(model, CONFIG, Position(1))
+    model.learn(30, reset_num_timesteps=False)
+
+    def crash(state, file):
+        file.write(b"half a state")
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("cfp.checkpoint.torch.save", crash)
+    with pytest.raises(OSError, match="No space"):
+        checkpoint.save(model, CONFIG, Position(1))
+    monkeypatch.undo()
+    other = make_model()
+    Checkpoint(tmp_path).restore(other, Checkpoint(tmp_path).load())
+    assert other.num_timesteps == 20
+    assert other.replay_buffer.size() == 10
+
+
+def test_next_level_replaces_the_replay_of_the_last(tmp_path):
+    checkpoint, coarse, fine = Checkpoint(tmp_path), make_model(0), make_model(1)
+    coarse.learn(12)
+    checkpoint.save(coarse, CONFIG, Position(0))
+    fine.learn(8)
+    checkpoint.save(fine, CONFIG, Position(1, 12))
+    assert [path.name for path in (tmp_path / "replay").iterdir()] == ["level2-000000000-000000004.npz"]
+    state = Checkpoint(tmp_path).load()
+    other = make_model(1)
+    Checkpoint(tmp_path).restore(other, state)
+    assert other.replay_buffer.size() == 4
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut", "flipped", "pickle", "version"])
+def test_damaged_state_is_refused_with_its_name(tmp_path, damage):
+    checkpoint, model = Checkpoint(tmp_path), make_model()
+    model.learn(8)
+    checkpoint.save(model, CONFIG, Position(1))
+    path = tmp_path / "state.pt"
+    content = bytearray(path.read_bytes())
+    if damage == "missing":
+        path.unlink()
+    elif damage == "cut":
+        path.write_bytes(content[: len(content) // 2])
+    elif damage == "flipped":
+        for index in range(1000, len(content), 5000):
+            content[index] ^= 0x55
+        path.write_bytes(content)
+    elif damage == "pickle":
+        torch.save({"version": 1, "model": Position()}, path)  # a class of ours: refused, not imported
+    else:
+        torch.save({"version": 99}, path)
+    with pytest.raises(CheckpointError, match=r"state\.pt"):
+        Checkpoint(tmp_path).load()
+
+
+def test_state_of_another_network_is_refused(tmp_path):
+    checkpoint, model = Checkpoint(tmp_path), make_model(1)
+    model.learn(8)
+    checkpoint.save(model, CONFIG, Position(1))
+    with pytest.raises(CheckpointError, match="does not fit"):
+        checkpoint.restore(make_model(0), checkpoint.load())

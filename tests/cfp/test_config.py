@@ -1,0 +1,149 @@
+import json
+from dataclasses import replace
+
+import pytest
+
+from cfp.checkpoint import check_same
+from cfp.config import Config, merge, to_json
+from cfp.errors import ConfigError
+from cfp.presets import TASKS, from_json, preset
+from cfp.train import parse
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("name", ["quick", "paper"])
+def test_every_preset_is_valid_and_survives_json(task, name):
+    config = preset(task, name)
+    config.check()
+    assert from_json(json.loads(json.dumps(to_json(config)))) == config
+    levels = range(len(config.resolutions))
+    assert sum(config.stage(level).steps for level in levels) == config.steps
+    assert [config.actor_spec(level).resolutions[-1] for level in levels] == list(config.resolutions)
+
+
+def test_paper_presets_hold_the_published_numbers():
+    published = {  # alpha 1, alpha 2, gate bias, gate penalty, random steps, handover, steps
+        "shapematch": (0.01, 0.0, -2, 0.8, 500, 142_000, 400_000),
+        "run": (0.01, 0.01, -1, 0.01, 6000, 301_000, 550_000),
+        "grow": (0.01, 0.01, -1, 0.01, 6000, 407_000, 600_000),
+        "kick": (0.05, 0.05, -1, 0.0, 6000, 132_000, 550_000),
+        "dig": (0.05, 0.05, 0, 3.0, 6000, 567_000, 780_000),
+        "obstacle": (0.05, 0.05, -1, 0.04, 6000, 530_000, 700_000),
+        "catch": (0.1, 0.1, -1, 0.01, 6000, 243_000, 380_000),
+        "slot": (0.05, 0.05, -2, 0.1, 6000, 293_000, 600_000),
+    }
+    assert set(published) == set(TASKS)
+    for task, (first, second, bias, penalty, random_steps, handover, steps) in published.items():
+        config = preset(task, "paper")
+        assert config.alpha == (first, second)
+        assert (config.gate_bias, config.gate_penalty) == ((bias,), (penalty,))
+        assert config.random_steps == (random_steps, 100)
+        assert (config.handover, config.steps) == ((handover,), steps)
+        assert config.resolutions == ((32, 64) if task == "shapematch" else (8, 16))
+        assert config.network.split == (task == "dig")
+        assert config.network.gate_scale == (0.25 if task == "dig" else 1.0)
+        assert config.environment.num_envs == 1
+        assert config.report.eval_deterministic == (task == "shapematch")
+        learning = config.learning
+        assert (learning.gamma, learning.tau, learning.learning_rate, learning.batch_size) == (0.99, 0.005, 3e-4, 256)
+        assert (learning.buffer_size, learning.gradient_steps, learning.update_start) == (200_000, 1, 256)
+    assert {task: TASKS[task].seed for task in TASKS if TASKS[task].seed} == {"catch": 2, "slot": 1}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"resolutions": (16, 8)}, r"resolutions: got \(16, 8\)"),
+        ({"resolutions": (8, 20)}, "resolutions"),
+        ({"alpha": (0.1,)}, "alpha: got 1 values, allowed 2"),
+        ({"gate_bias": (0.1, 0.2)}, "gate_bias: got 2 values, allowed 1"),
+        ({"handover": (30_000,)}, "handover"),
+        ({"steps": 0}, "handover"),
+    ],
+)
+def test_impossible_options_are_named(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        replace(preset("run"), **changes).check()
+
+
+@pytest.mark.parametrize(
+    ("group", "changes", "message"),
+    [
+        ("environment", {"num_envs": 0}, "num_envs: got 0, allowed 1 or more"),
+        ("learning", {"gamma": 1.5}, "gamma: got 1.5, allowed 0 to 1"),
+        ("learning", {"learning_rate": 0.0}, "learning_rate"),
+        ("report", {"eval_episodes": 0}, "eval_episodes"),
+    ],
+)
+def test_numbers_out_of_range_are_named(group, changes, message):
+    config = preset("run")
+    with pytest.raises(ConfigError, match=message):
+        replace(config, **{group: replace(getattr(config, group), **changes)}).check()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"stepz": 3}, "stepz: no such option"),
+        ({"learning": {"gama": 3}}, "learning.gama: no such option"),
+        ({"steps": "many"}, "steps: got 'many', allowed int"),
+        ({"steps": True}, "steps"),
+        ({"learning": 3}, "learning: got 3, allowed an object"),
+        ({"alpha": [0.1, "x"]}, "alpha: got 'x', allowed float"),
+        ({"environment": {"dtype": "float16"}}, "dtype: got 'float16'"),
+        ({"environment": {"particles": [1, 2, 3]}}, "particles"),
+        ({"task": "jump"}, "task: got 'jump', allowed shapematch, run"),
+        ({"preset": "slow"}, "preset: got 'slow', allowed quick, paper"),
+    ],
+)
+def test_wrong_json_is_named(values, message):
+    with pytest.raises(ConfigError, match=message):
+        from_json(values)
+
+
+def test_json_values_take_the_types_of_their_fields():
+    config = merge(Config(), {"alpha": [1, 0], "environment": {"particles": [500, 20], "target": None}})
+    assert config.alpha == (1.0, 0.0)
+    assert all(isinstance(value, float) for value in config.alpha)
+    assert config.environment.particles == (500, 20)
+
+
+def test_command_line_beats_file_beats_preset(tmp_path):
+    file = tmp_path / "options.json"
+    file.write_text(json.dumps({"task": "run", "learning": {"gamma": 0.5, "tau": 0.25}, "report": {"video": True}}))
+    command = parse(["--config", str(file), "--gamma", "0.75", "--no-video", "--particles", "300", "--out", "x"])
+    assert command.run.task == "run"
+    assert (command.run.learning.gamma, command.run.learning.tau) == (0.75, 0.25)
+    assert command.run.report.video is False
+    assert command.run.environment.particles == 300
+    assert command.run.learning.batch_size == preset("run").learning.batch_size
+    assert parse(["--video"]).run.report.video is True
+    assert parse(["--particles", "full"]).run.environment.particles == "full"
+    assert parse(["--particles", "500", "20"]).run.environment.particles == (500, 20)
+
+
+def test_fewer_steps_shorten_every_level():
+    config = preset("run")
+    half = parse(["--task", "run", "--steps", str(config.steps // 2)]).run
+    assert half.handover == (config.handover[0] // 2,)
+    explicit = parse(["--task", "run", "--steps", "1000", "--handover", "900"]).run
+    assert explicit.handover == (900,)
+
+
+def test_ladder_of_any_length_can_be_asked_for():
+    arguments = "--resolutions 4 8 16 --handover 1000 2000 --alpha 0 0 0 --random-steps 9 9 9"
+    command = parse([*arguments.split(), "--gate-bias", "-1", "-2", "--gate-penalty", "0", "0.5"])
+    assert command.run.actor_spec(2).gate_bias == (-1.0, -2.0)
+    one = parse("--resolutions 16 --handover --alpha 0 --random-steps 9 --gate-bias --gate-penalty".split())
+    assert one.run.stage(0).steps == one.run.steps
+
+
+def test_resumed_run_may_change_only_what_does_not_alter_it():
+    config = preset("run")
+    stored = json.loads(json.dumps(to_json(config)))
+    check_same(stored, replace(config, steps=99_000, device="cpu", report=replace(config.report, eval_every=7)))
+    check_same(stored, replace(config, environment=replace(config.environment, backend="eager")))
+    with pytest.raises(ConfigError, match=r"gamma: the run was started with 0\.9.*, got 0\.5"):
+        check_same(stored, replace(config, learning=replace(config.learning, gamma=0.5)))
+    with pytest.raises(ConfigError, match="task: the run was started with 'run', got 'shapematch'"):
+        check_same(stored, replace(config, task="shapematch"))

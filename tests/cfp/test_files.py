@@ -1,0 +1,52 @@
+import json
+
+import pytest
+
+from cfp.files import ProgressTable, Table, read_table, write_atomically, write_json
+
+
+def test_interrupted_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "value.json"
+    write_json(path, {"a": 1})
+
+    def fail(file):
+        file.write(b"half")
+        raise OSError("No space left on device")
+
+    with pytest.raises(OSError, match="No space"):
+        write_atomically(path, fail)
+    assert json.loads(path.read_text()) == {"a": 1}
+    write_json(path, {"a": 2})
+    assert json.loads(path.read_text()) == {"a": 2}
+    assert [item.name for item in tmp_path.iterdir()] == ["value.json"]
+
+
+def test_table_grows_rows_and_columns(tmp_path):
+    table = Table(tmp_path / "t.csv")
+    table.add({"step": 1, "a": 0.5})
+    table.add({"step": 2, "a": None})
+    table.add({"step": 3, "a": 1, "b": "x,y"})
+    assert (tmp_path / "t.csv").read_text().splitlines() == ["step,a,b", "1,0.5,", "2,,", '3,1,"x,y"']
+
+
+def test_resumed_table_drops_rows_past_the_checkpoint(tmp_path):
+    table = Table(tmp_path / "t.csv")
+    for step in (10, 20, 30):
+        table.add({"step": step, "a": step})
+    again = Table(tmp_path / "t.csv", last_step=20)
+    again.add({"step": 25, "a": 1})
+    assert [row["step"] for row in read_table(tmp_path / "t.csv")] == ["10", "20", "25"]
+
+
+def test_line_cut_short_by_a_crash_is_left_out(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("step,a\r\n10,1\r\n20,")
+    assert read_table(path) == [{"step": "10", "a": "1"}]
+    Table(path, last_step=30).add({"step": 20, "a": 2})
+    assert [row["a"] for row in read_table(path)] == ["1", "2"]
+
+
+def test_progress_leaves_out_what_is_excluded(tmp_path):
+    writer = ProgressTable(Table(tmp_path / "p.csv"))
+    writer.write({"b": 1.0, "time/speed": 3.0}, {"b": ("",), "time/speed": ("csv",)}, step=5)
+    assert read_table(tmp_path / "p.csv") == [{"step": "5", "b": "1.0"}]

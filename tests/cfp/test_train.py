@@ -1,0 +1,191 @@
+"""The command lines, on a robot of a hundred particles that moves one substep at a time."""
+
+import json
+import signal
+
+import pytest
+
+from cfp import evaluate, train
+from cfp.callbacks import StageCallback
+from cfp.files import read_table
+
+TINY = (
+    "--task shapematch --particles 100 --substeps 1 --num-envs 2 --resolutions 4 8 --steps 150 --handover 70 "
+    "--random-steps 10 4 --batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 --eval-every 60 "
+    "--eval-episodes 2 --checkpoint-every 20 --log-every 10 --no-video --device cpu"
+).split()
+
+
+def run(folder, *more):
+    return train.main([*TINY, "--out", str(folder), *more])
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    assert run(folder) == 0
+    return folder
+
+
+def contents(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_run_trains_both_stages_and_leaves_its_files(finished):
+    for name in ("config.json", "results.json", "curve.png", "policy.safetensors", "policy.json", "stage1.json"):
+        assert (finished / name).stat().st_size > 0, name
+    assert list((finished / "tensorboard").glob("events*"))
+    progress, evaluations = read_table(finished / "progress.csv"), read_table(finished / "evaluations.csv")
+    assert [row["step"] for row in progress] == [str(step) for step in range(10, 151, 10)]
+    assert [row["stage"] for row in progress] == ["1"] * 7 + ["2"] * 8
+    assert [row["step"] for row in evaluations] == ["60", "70", "120", "150"]
+    assert progress[-1]["train/gate"] and not progress[3]["train/gate"]
+    stages = [json.loads((finished / name).read_text()) for name in ("stage1.json", "policy.json")]
+    assert [(stage["stage"], stage["resolution"], stage["steps"]) for stage in stages] == [(1, 4, 70), (2, 8, 150)]
+    results = json.loads((finished / "results.json").read_text())
+    assert [row["policy"] for row in results] == ["zero action", "random action", "stage 1", "stage 2"]
+    assert [row["action"] for row in results] == ["4x4", "4x4", "4x4", "8x8"]
+
+
+def test_one_seed_gives_one_table(finished, tmp_path):
+    assert run(tmp_path / "same") == 0
+    for name in ("progress.csv", "evaluations.csv", "results.json"):
+        assert (tmp_path / "same" / name).read_bytes() == (finished / name).read_bytes()
+    assert run(tmp_path / "other", "--seed", "1", "--steps", "40", "--handover", "30") == 0
+    assert read_table(tmp_path / "other" / "progress.csv")[2] != read_table(finished / "progress.csv")[2]
+
+
+@pytest.mark.parametrize(("stop", "number"), [(44, signal.SIGINT), (70, signal.SIGTERM), (110, signal.SIGINT)])
+def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monkeypatch, capsys, stop, number):
+    folder, on_step = tmp_path / "stopped", StageCallback._on_step
+
+    def interrupt(callback):
+        if callback.step == stop:
+            signal.raise_signal(number)
+        return on_step(callback)
+
+    monkeypatch.setattr(StageCallback, "_on_step", interrupt)
+    assert run(folder) == 128 + number
+    assert "--resume" in capsys.readouterr().out
+    monkeypatch.undo()
+    assert train.main(["--out", str(folder), "--resume"]) == 0
+    assert f"resuming {folder} at step" in capsys.readouterr().out
+    assert (folder / "results.json").read_bytes() == (finished / "results.json").read_bytes()
+    assert (folder / "evaluations.csv").read_bytes() == (finished / "evaluations.csv").read_bytes()
+    steps = [row["step"] for row in read_table(folder / "progress.csv")]
+    assert steps == [row["step"] for row in read_table(finished / "progress.csv")]
+
+
+def test_killed_run_repeats_what_no_checkpoint_holds(finished, tmp_path, monkeypatch):
+    class Killed(BaseException):
+        pass
+
+    def die(callback):
+        if callback.step == 98:
+            raise Killed
+        return True
+
+    folder = tmp_path / "killed"
+    monkeypatch.setattr(StageCallback, "_on_step", die)
+    with pytest.raises(Killed):
+        run(folder)
+    monkeypatch.undo()
+    assert read_table(folder / "progress.csv")[-1]["step"] == "90"
+    assert run(folder, "--resume") == 0
+    for name in ("progress.csv", "evaluations.csv", "results.json"):
+        assert (folder / name).read_bytes() == (finished / name).read_bytes()
+
+
+def test_folder_with_a_run_is_left_alone(finished, capsys):
+    before = contents(finished)
+    assert run(finished) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: out:") and "already holds a run" in error and "--resume" in error
+    assert contents(finished) == before
+
+
+def test_other_options_than_the_checkpoint_s_are_refused(finished, capsys):
+    before = contents(finished)
+    assert run(finished, "--resume", "--gamma", "0.5") == 2
+    assert "gamma: the run was started with" in capsys.readouterr().err
+    assert run(finished, "--resume", "--task", "run") == 2
+    assert "task: the run was started with 'shapematch', got 'run'" in capsys.readouterr().err
+    assert contents(finished) == before
+
+
+def test_resume_without_a_run_starts_afresh(tmp_path, capsys):
+    assert run(tmp_path / "new", "--resume", "--steps", "30", "--handover", "20") == 0
+    assert "starting afresh" in capsys.readouterr().out
+    assert read_table(tmp_path / "new" / "progress.csv")[-1]["step"] == "30"
+
+
+def test_finished_run_can_be_prolonged(tmp_path):
+    assert run(tmp_path / "a", "--steps", "40", "--handover", "20") == 0
+    assert train.main(["--out", str(tmp_path / "a"), "--resume", "--steps", "60"]) == 0
+    assert read_table(tmp_path / "a" / "progress.csv")[-1]["step"] == "60"
+
+
+def test_damaged_checkpoint_is_an_error_that_names_it(tmp_path, capsys):
+    assert run(tmp_path / "a", "--steps", "30", "--handover", "20") == 0
+    state = tmp_path / "a" / "checkpoint" / "state.pt"
+    state.write_bytes(state.read_bytes()[:1000])
+    assert run(tmp_path / "a", "--resume", "--steps", "30", "--handover", "20") == 2
+    assert "state.pt: the checkpoint is damaged" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--task", "jump"], "task: got 'jump', allowed shapematch, run, grow"),
+        (["--preset", "slow"], "preset: got 'slow', allowed quick, paper"),
+        (["--particles", "0"], "particles"),
+        (["--target", "no/such.png"], "target"),
+        (["--num-envs", "0"], "num_envs: got 0"),
+        (["--device", "abacus"], "device: got 'abacus'"),
+        (["--config", "no/such.json"], "config: no/such.json cannot be read"),
+        (["--backend", "slide-rule"], "backend"),
+    ],
+)
+def test_wrong_option_is_one_line_and_exit_code_two(tmp_path, capsys, arguments, message):
+    folder = tmp_path / "none"
+    assert train.main(["--out", str(folder), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1
+    assert message in error
+    assert not folder.exists()
+
+
+def test_unknown_option_is_exit_code_two(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        train.main(["--steppes", "3"])
+    assert exit_.value.code == 2
+
+
+def test_evaluation_of_a_folder(finished, capsys):
+    assert evaluate.main([str(finished), "--episodes", "2", "--json", "--device", "cpu"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert rows == json.loads((finished / "results.json").read_text())
+    assert evaluate.main([str(finished), "--episodes", "1"]) == 0
+    table = capsys.readouterr().out
+    assert "stage 2" in table and "± std" in table
+
+
+def test_evaluation_without_a_run_is_an_error(tmp_path, capsys):
+    assert evaluate.main([str(tmp_path)]) == 2
+    assert "there is no run" in capsys.readouterr().err
+
+
+def test_video_plays_or_tells_how_to_install(finished, tmp_path, monkeypatch, capsys):
+    arguments = [str(finished), "--episodes", "1", "--video", str(tmp_path / "film.mp4")]
+    monkeypatch.setattr("cfp.video.find_spec", lambda name: None)
+    assert evaluate.main(arguments) == 0
+    assert "pip install 'torchmpm[video]'" in capsys.readouterr().out
+    monkeypatch.undo()
+    imageio = pytest.importorskip("imageio.v2")
+    pytest.importorskip("imageio_ffmpeg")
+    assert evaluate.main(arguments) == 0
+    with imageio.get_reader(tmp_path / "film.mp4") as film:
+        metadata = film.get_meta_data()
+    assert metadata["codec"].startswith("h264")
+    assert tuple(metadata["size"]) == (512, 512)
+    assert metadata["duration"] == pytest.approx(4.1, abs=0.15)

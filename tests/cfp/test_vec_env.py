@@ -1,0 +1,120 @@
+import numpy as np
+import pytest
+import torch
+from fakes import FakeEnv
+
+from cfp.vec_env import TorchVecEnv, monitored
+
+
+def actions(env, value=0.0):
+    return np.full((env.num_envs, 2, 8, 8), value, np.float32)
+
+
+def test_last_observation_of_an_episode_is_kept_and_the_next_one_returned():
+    env = TorchVecEnv(FakeEnv(num_envs=2, horizon=3))
+    first = env.reset()
+    for _ in range(2):
+        before, _, done, infos = env.step(actions(env, 1.0))
+        assert not done.any()
+        assert "terminal_observation" not in infos[0]
+    after, _, done, infos = env.step(actions(env, 1.0))
+    assert done.all()
+    np.testing.assert_array_equal(after, first)
+    for index, info in enumerate(infos):
+        assert info["terminal_observation"][1].max() == 3  # the step counter in the picture
+        assert info["terminal_observation"][0, 0, 0] == round(30 + 10 * index + 50)
+        assert info["TimeLimit.truncated"]
+    assert before[0, 1].max() == 2  # earlier observations are copies, whatever the environment does with its buffer
+
+
+def test_only_the_element_that_ended_is_reset():
+    env = TorchVecEnv(FakeEnv(num_envs=2, horizon=50, end_above=0.15))
+    env.reset()
+    observation, _, done, infos = env.step(actions(env, 1.0))
+    assert done.tolist() == [False, True]  # heights 0.1 and 0.2
+    assert observation[:, 1, 0, 0].tolist() == [1, 0]
+    assert infos[1]["terminal_observation"][1, 0, 0] == 1
+    assert infos[1]["TimeLimit.truncated"] is False
+    assert "TimeLimit.truncated" not in infos[0]
+
+
+def test_time_limit_counts_as_truncation_even_if_the_element_terminates():
+    env = TorchVecEnv(FakeEnv(num_envs=1, horizon=1, end_above=-1.0))
+    env.reset()
+    _, _, done, infos = env.step(actions(env))
+    assert done[0]
+    assert infos[0]["TimeLimit.truncated"] is True
+
+
+def test_element_whose_state_is_not_finite_ends_without_bootstrap():
+    env = TorchVecEnv(FakeEnv(num_envs=2, horizon=9, faults={2: "state"}))
+    env.reset()
+    env.step(actions(env))
+    observation, _, done, infos = env.step(actions(env))
+    assert done.tolist() == [True, False]
+    assert infos[0]["TimeLimit.truncated"] is False
+    assert infos[0]["finite"] is False
+    assert observation[:, 1, 0, 0].tolist() == [0, 2]
+
+
+def test_info_holds_named_numbers_for_each_element():
+    env = TorchVecEnv(FakeEnv(num_envs=2))
+    env.reset()
+    _, reward, _, infos = env.step(actions(env, 1.0))
+    for index, info in enumerate(infos):
+        assert sum(info["reward_terms"].values()) == pytest.approx(reward[index])
+        assert isinstance(info["is_success"], bool)
+        assert info["finite"] is True
+
+
+def test_seed_is_used_at_the_next_reset_and_its_layout_kept():
+    env = TorchVecEnv(FakeEnv(num_envs=2))
+    env.seed(7)
+    first = env.reset()
+    assert first[:, 0, 0, 0].tolist() == [57, 67]
+    np.testing.assert_array_equal(env.reset(), first)
+
+
+def test_episode_sums_arrive_in_info():
+    env = monitored(FakeEnv(num_envs=2, horizon=2))
+    env.reset()
+    _, first, _, _ = env.step(actions(env))
+    _, second, _, infos = env.step(actions(env))
+    assert infos[1]["episode"]["r"] == pytest.approx(first[1] + second[1])
+    assert infos[1]["episode"]["l"] == 2
+
+
+def test_episode_in_progress_can_be_put_back():
+    env = TorchVecEnv(FakeEnv(num_envs=2, horizon=9))
+    env.reset()
+    env.step(actions(env, 0.5))
+    state = env.state_dict()
+    expected = env.step(actions(env, 0.25))
+    other = TorchVecEnv(FakeEnv(num_envs=2, horizon=9))
+    other.reset()
+    other.load_state_dict(state)
+    got = other.step(actions(env, 0.25))
+    np.testing.assert_array_equal(got[0], expected[0])
+    np.testing.assert_array_equal(got[1], expected[1])
+    with pytest.raises(ValueError, match="allowed \\(3,\\)"):
+        TorchVecEnv(FakeEnv(num_envs=3)).load_state_dict(state)
+
+
+def test_elements_share_attributes_and_pictures_come_one_by_one():
+    env = TorchVecEnv(FakeEnv(num_envs=2))
+    assert env.get_attr("horizon") == [5, 5]
+    assert env.get_attr("horizon", 1) == [5]
+    env.set_attr("horizon", 7)
+    assert env.env_method("render", 1)[0].max() == 1
+    with pytest.raises(ValueError, match="indices"):
+        env.set_attr("horizon", 7, indices=[0])
+    assert [int(image.max()) for image in env.get_images()] == [0, 1]
+    assert env.env_is_wrapped(object) == [False, False]
+
+
+def test_actions_reach_the_environment_unclipped():
+    fake = FakeEnv(num_envs=1)
+    env = TorchVecEnv(fake)
+    env.reset()
+    env.step(actions(env, 1.25))
+    assert torch.equal(fake.actions[-1], torch.full((1, 2, 8, 8), 1.25))

@@ -1,0 +1,67 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+
+import cfp
+from cfp.actor import build_actor
+from cfp.config import Config
+from cfp.errors import CheckpointError
+from cfp.networks import normalise_image
+from cfp.weights import describe, save_policy
+
+
+@pytest.fixture
+def saved(tmp_path):
+    config = Config(resolutions=(8, 16), gate_bias=(-1.0,))
+    actor = build_actor(config.actor_spec(1))
+    save_policy(tmp_path / "policy.safetensors", actor, describe(config, 1, 123))
+    return tmp_path, actor
+
+
+@pytest.mark.parametrize("name", ["", "policy.safetensors", "policy.json"])
+def test_loaded_policy_acts_as_the_saved_one(saved, name):
+    folder, actor = saved
+    policy = cfp.load(folder / name)
+    images = np.random.default_rng(0).integers(0, 256, (3, 3, 64, 64)).astype(np.uint8)
+    actions, state = policy.predict(images, deterministic=True)
+    expected = actor(normalise_image(torch.from_numpy(images)), deterministic=True).detach().numpy()
+    np.testing.assert_allclose(actions, expected, atol=1e-6)
+    assert actions.shape == (3, 2, 16, 16)
+    assert state is None
+    single, _ = policy.predict(images[1], deterministic=True)
+    np.testing.assert_allclose(single, actions[1], atol=1e-5)
+    torch.manual_seed(0)
+    noisy, _ = policy.predict(images)
+    torch.manual_seed(0)
+    np.testing.assert_array_equal(policy.predict(images)[0], noisy)
+    assert np.abs(noisy - actions).max() > 0.1
+
+
+def test_description_stands_beside_and_inside_the_weights(saved):
+    folder, _ = saved
+    beside = json.loads((folder / "policy.json").read_text())
+    assert beside == json.loads(json.dumps(cfp.load(folder).description))
+    assert (beside["task"], beside["resolution"], beside["stage"], beside["steps"]) == ("shapematch", 16, 2, 123)
+    (folder / "policy.json").unlink()
+    assert cfp.load(folder).description["steps"] == 123
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut", "garbage", "foreign", "misfit"])
+def test_file_that_is_no_policy_is_refused(saved, damage):
+    folder, actor = saved
+    path = folder / "policy.safetensors"
+    content = path.read_bytes()
+    if damage == "missing":
+        path.unlink()
+    elif damage == "cut":
+        path.write_bytes(content[:-100])
+    elif damage == "garbage":
+        path.write_bytes(b"\x80\x04K\x01.")
+    elif damage == "foreign":
+        save_policy(path, actor, {"format": "other"})
+    else:
+        save_policy(path, actor, describe(Config(resolutions=(8, 32), gate_bias=(-1.0,)), 1, 0))
+    with pytest.raises(CheckpointError, match=r"policy\.safetensors: "):
+        cfp.load(path)

@@ -1,0 +1,263 @@
+"""Velocity rules: every kind by hand, and all together against a loop over nodes and rules."""
+
+import itertools
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import normal
+from torch import Tensor
+
+from torchmpm import Grid, VelocityRule, fixed
+from torchmpm.boundary import constrain, faces
+from torchmpm.grid import PAD
+
+R = 8
+GRID = Grid(R)
+STICK = math.inf
+
+
+def apply(rules: tuple[VelocityRule, ...], velocity: Tensor, origin: Tensor | None = None) -> Tensor:
+    """Rules on the velocities of nodes that exist, (2, B, R, R)."""
+    batch = velocity.shape[1]
+    origin = torch.zeros(batch, 2, dtype=velocity.dtype) if origin is None else origin
+    padded = torch.nn.functional.pad(velocity, [PAD] * 4).flatten(2)
+    result = constrain(faces(rules, GRID, origin), padded).unflatten(-1, (GRID.width, GRID.width))
+    inner = result[..., PAD:-PAD, PAD:-PAD]
+    assert result.count_nonzero() == inner.count_nonzero(), "the padding must stay at rest"
+    return inner
+
+
+def everywhere(x: float, y: float, batch: int = 1) -> Tensor:
+    return torch.tensor([x, y], dtype=torch.float64)[:, None, None, None].expand(2, batch, R, R)
+
+
+def after(rule: VelocityRule, x: float, y: float) -> tuple[float, float]:
+    """Velocity of any node under a rule that covers all of them."""
+    result = apply((rule,), everywhere(x, y)).flatten(1)
+    assert (result == result[:, :1]).all()
+    return result[0, 0].item(), result[1, 0].item()
+
+
+@pytest.mark.parametrize(
+    ("direction", "moving", "frictionless", "away"),
+    [
+        ("+x", (2.0, 3.0), (0.0, 3.0), (-2.0, 3.0)),
+        ("-x", (-2.0, 3.0), (0.0, 3.0), (2.0, 3.0)),
+        ("+y", (2.0, 3.0), (2.0, 0.0), (2.0, -3.0)),
+        ("-y", (2.0, -3.0), (2.0, 0.0), (2.0, 3.0)),
+    ],
+)
+def test_each_direction(
+    direction: str, moving: tuple[float, float], frictionless: tuple[float, float], away: tuple[float, float]
+) -> None:
+    assert after(VelocityRule(direction), *moving) == frictionless
+    assert after(VelocityRule(direction, friction=STICK), *moving) == (0.0, 0.0)
+    for friction in (0.0, 0.5, STICK):
+        assert after(VelocityRule(direction, friction=friction), *away) == away
+
+
+@pytest.mark.parametrize(
+    ("velocity", "friction", "expected"),
+    [
+        ((3.0, -2.0), 0.5, (2.0, 0.0)),  # 3 - 0.5 * 2
+        ((-3.0, -2.0), 0.5, (-2.0, 0.0)),  # against the motion, whichever way it goes
+        ((3.0, -2.0), 1.5, (0.0, 0.0)),  # just enough to stop
+        ((3.0, -2.0), 4.0, (0.0, 0.0)),  # never turns the motion round
+        ((0.0, -2.0), 0.5, (0.0, 0.0)),
+        ((3.0, 0.0), 0.5, (3.0, 0.0)),  # no pressure, no friction
+    ],
+)
+def test_coulomb_friction(velocity: tuple[float, float], friction: float, expected: tuple[float, float]) -> None:
+    assert after(VelocityRule("-y", friction=friction), *velocity) == expected
+    turned = after(VelocityRule("+x", friction=friction), -velocity[1], velocity[0])
+    assert turned == (expected[1], expected[0])
+
+
+def test_coulomb_friction_acts_where_its_rule_is() -> None:
+    rules = (
+        VelocityRule("-y", j=(0, 1), friction=0.5),
+        VelocityRule("-y", j=(2, 2), friction=STICK),
+        VelocityRule("-y", j=(3, 3), friction=0.25),
+        VelocityRule("-y", j=(4, 4)),
+    )
+    result = apply(rules, everywhere(3.0, -2.0))[:, 0, 5]
+    assert result[0].tolist() == [2.0, 2.0, 0.0, 2.5, 3.0, 3.0, 3.0, 3.0]
+    assert result[1].tolist() == [0.0, 0.0, 0.0, 0.0, 0.0, -2.0, -2.0, -2.0]
+
+
+def test_the_first_rule_that_covers_a_node_counts() -> None:
+    slippery, sticky = VelocityRule("-y", i=(0, 4)), VelocityRule("-y", i=(3, 6), friction=STICK)
+    velocity = everywhere(1.0, -1.0)
+    assert apply((slippery, sticky), velocity)[0, 0, :, 0].tolist() == [1, 1, 1, 1, 1, 0, 0, 1]
+    assert apply((sticky, slippery), velocity)[0, 0, :, 0].tolist() == [1, 1, 1, 0, 0, 0, 0, 1]
+    rough = VelocityRule("-y", i=(3, 6), friction=0.25)
+    assert apply((rough, sticky), velocity)[0, 0, :, 0].tolist() == [1, 1, 1, 0.75, 0.75, 0.75, 0.75, 1]
+    assert apply((sticky, rough), velocity)[0, 0, :, 0].tolist() == [1, 1, 1, 0, 0, 0, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("given", "covered"),
+    [
+        ((None, None), range(R)),
+        ((2, None), range(2, R)),
+        ((None, 2), range(3)),
+        ((2, 4), range(2, 5)),
+        ((3, 3), range(3, 4)),
+        ((-5, 0), range(1)),
+        ((R, None), range(0)),
+    ],
+)
+def test_ranges_are_inclusive(given: tuple[int | None, int | None], covered: range) -> None:
+    stopped = [node in covered for node in range(R)]
+    for frame in ("world", "window"):
+        in_x = apply((VelocityRule("-y", i=given, frame=frame),), everywhere(0.0, -1.0))[1, 0]
+        in_y = apply((VelocityRule("-y", j=given, frame=frame),), everywhere(0.0, -1.0))[1, 0]
+        assert (in_x[:, 3] == 0).tolist() == stopped
+        assert (in_y[3] == 0).tolist() == stopped
+
+
+@pytest.mark.parametrize("cells", [-3.9, -3.0, -2.5, -0.9, 0.0, 0.9, 1.0, 2.5, 3.9])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_world_rules_stay_while_the_window_moves(axis: int, cells: float) -> None:
+    """By whole cells: the origin is truncated towards zero, not floored (-0.9 cells count as none)."""
+    origin = torch.zeros(1, 2, dtype=torch.float64)
+    origin[0, axis] = cells * GRID.h
+    ranges = {"ij"[axis]: (3, 4)}
+    world = apply((VelocityRule("-y", **ranges),), everywhere(0.0, -1.0), origin)[1, 0]
+    window = apply((VelocityRule("-y", **ranges, frame="window"),), everywhere(0.0, -1.0), origin)[1, 0]
+    shift = math.trunc(cells)
+    for found, offset in ((world, shift), (window, 0)):
+        line = found[:, 2] if axis == 0 else found[2]
+        assert (line == 0).tolist() == [3 <= node + offset <= 4 for node in range(R)]
+
+
+def test_reference_example_of_a_negative_origin() -> None:
+    """mpm.md 1.1: at 128 nodes a_x = -0.31 gives A = -39, in single precision too."""
+    grid = Grid(128)
+    for dtype in (torch.float32, torch.float64):
+        origin = torch.tensor([[-0.31, 0.0]], dtype=dtype)
+        (face,) = faces((VelocityRule("-x", i=(0, 0)),), grid, origin)
+        assert face.active.view(grid.width, grid.width).any(1).nonzero().item() - PAD == 39
+
+
+def test_each_simulation_has_its_origin() -> None:
+    origin = torch.tensor([[0.0, 0.0], [2.0, 0.0], [-1.0, 0.0]], dtype=torch.float64) * GRID.h
+    rules = (VelocityRule("-y", i=(3, 4), friction=0.5), VelocityRule("+x", i=(0, 0), friction=STICK))
+    velocity = normal(2, 3, R, R, seed=0)
+    together = apply(rules, velocity, origin)
+    for b in range(3):
+        alone = apply(rules, velocity[:, b : b + 1], origin[b : b + 1])
+        assert torch.equal(together[:, b : b + 1], alone)
+    assert not torch.equal(together[:, 0] == 0, together[:, 1] == 0)
+
+
+def test_fixed_holds_nodes_at_rest() -> None:
+    velocity = normal(2, 1, R, R, seed=1)
+    result = apply(fixed((2, 3), (None, 4)), velocity)
+    inside = torch.zeros(R, R, dtype=torch.bool)
+    inside[2:4, :5] = True
+    assert (result[:, :, inside] == 0).all()
+    assert torch.equal(result[:, :, ~inside], velocity[:, :, ~inside])
+    assert {rule.frame for rule in fixed(frame="window")} == {"window"}
+    assert {rule.frame for rule in fixed()} == {"world"}
+
+
+def test_no_rules() -> None:
+    velocity = normal(2, 2, R, R, seed=2)
+    assert faces((), GRID, torch.zeros(2, 2)) == ()
+    assert torch.equal(apply((), velocity), velocity)
+
+
+def sequential(rules: tuple[VelocityRule, ...], velocity: Tensor, origin: Tensor) -> Tensor:
+    """mpm.md 7 literally: for every node all rules in their order, each on what the earlier ones left."""
+    result = velocity.movedim(0, -1).tolist()
+    shift = [math.trunc(o) for o in (origin[0] / GRID.h).tolist()]
+    for i, j in itertools.product(range(R), range(R)):
+        v = result[0][i][j]
+        for rule in rules:
+            node = (i, j) if rule.frame == "window" else (i + shift[0], j + shift[1])
+            covers = [
+                (low is None or low <= n) and (high is None or n <= high)
+                for n, (low, high) in zip(node, (rule.i, rule.j), strict=True)
+            ]
+            axis, sign = "xy".index(rule.direction[1]), int(rule.direction[0] + "1")
+            removed = v[axis] * sign
+            if not all(covers) or removed <= 0:
+                continue
+            v[axis] = 0.0
+            if rule.friction == STICK:
+                v[1 - axis] = 0.0
+            else:
+                left = max(abs(v[1 - axis]) - rule.friction * removed, 0.0)
+                v[1 - axis] = math.copysign(left, v[1 - axis])
+    return torch.tensor(result, dtype=velocity.dtype).movedim(-1, 0)
+
+
+END = st.none() | st.integers(-3, R + 2)
+RANGE = st.tuples(END, END).map(
+    lambda ends: ends if None in ends or ends[0] <= ends[1] else (ends[1], ends[0]),
+)
+DIRECTION = st.sampled_from(["+x", "-x", "+y", "-y"])
+FRAME = st.sampled_from(["world", "window"])
+
+
+def rules(direction: st.SearchStrategy[str], friction: st.SearchStrategy[float]) -> st.SearchStrategy:
+    return st.lists(st.builds(VelocityRule, direction, RANGE, RANGE, friction, FRAME), max_size=7).map(tuple)
+
+
+def compare(listed: tuple[VelocityRule, ...], cells: tuple[float, float], seed: int) -> None:
+    origin = torch.tensor([cells], dtype=torch.float64) * GRID.h
+    velocity = normal(2, 1, R, R, seed=seed)
+    velocity[velocity.abs() < 0.2] = 0.0
+    found, expected = apply(listed, velocity, origin), sequential(listed, velocity, origin)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-15)
+
+
+ORIGIN = st.tuples(st.floats(-6.0, 6.0), st.floats(-6.0, 6.0))
+
+
+@settings(max_examples=40)
+@given(rules(DIRECTION, st.sampled_from([0.0, STICK])), ORIGIN, st.integers(0, 99))
+def test_against_rules_in_sequence(listed: tuple[VelocityRule, ...], origin: tuple[float, float], seed: int) -> None:
+    """Equal only without finite friction across directions.
+
+    Faces gather the rules of one direction, so two directions may act in another order than they were listed. Zeroing
+    one component and zeroing both commute; reducing a component by what was removed from the other does not, since
+    either may come first. The tasks of DittoGym have none of the latter kind.
+    """
+    compare(listed, origin, seed)
+
+
+@settings(max_examples=40)
+@given(
+    DIRECTION.flatmap(lambda d: rules(st.just(d), st.sampled_from([0.0, 0.3, 1.0, STICK]))), ORIGIN, st.integers(0, 99)
+)
+def test_against_rules_in_sequence_with_friction_in_one_direction(
+    listed: tuple[VelocityRule, ...], origin: tuple[float, float], seed: int
+) -> None:
+    compare(listed, origin, seed)
+
+
+def test_gradient_of_friction() -> None:
+    velocity = normal(2, 1, R, R, seed=3).requires_grad_()
+    listed = (VelocityRule("-y", friction=0.3), VelocityRule("+x", i=(0, 3), friction=0.6))
+    assert torch.autograd.gradcheck(lambda v: apply(listed, v), (velocity,), fast_mode=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"direction": "down"}, "direction must be one of .*'-y'.*got 'down'"),
+        ({"frame": "robot"}, "frame must be 'world' or 'window', got 'robot'"),
+        ({"friction": -0.1}, "friction must not be negative, got -0.1"),
+        ({"friction": math.nan}, "friction must not be negative, got nan"),
+        ({"i": (4, 3)}, r"i must be an inclusive range .* got \(4, 3\)"),
+        ({"j": (4, 3)}, r"j must be an inclusive range .* got \(4, 3\)"),
+    ],
+)
+def test_rules_that_make_no_sense(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        VelocityRule(**{"direction": "-y"} | options)

@@ -1,0 +1,117 @@
+"""Balances against plain sums."""
+
+import math
+
+import pytest
+import torch
+from scenes import GRID, generator, lively, normal, robot, robot_and_ball
+
+from torchmpm import Body, Elastic, ParticleState, VelocityRule, diagnostics
+
+H = GRID.h
+N = 50
+
+
+@pytest.fixture
+def state() -> ParticleState:
+    return lively(N, 2)
+
+
+SOLVER = robot_and_ball(30, 20)
+MASS = torch.tensor([2.0] * 30 + [5.0] * 20, dtype=torch.float64)
+VOLUME = torch.tensor([1.0] * 30 + [1.5] * 20, dtype=torch.float64)
+
+
+def test_mass_and_momentum(state: ParticleState) -> None:
+    assert torch.equal(diagnostics.masses(SOLVER, state), MASS.expand(2, N))
+    assert diagnostics.mass(SOLVER, state).tolist() == [160.0, 160.0]
+    expected = torch.einsum("n,bni->bi", MASS, state.v)
+    torch.testing.assert_close(diagnostics.momentum(SOLVER, state), expected)
+
+
+def test_masses_of_each_simulation(state: ParticleState) -> None:
+    mass = 1.0 + torch.rand(2, N, generator=generator(0), dtype=torch.float64)
+    solver = robot(N, bodies=(Body(N, Elastic(1.0, 1.0), mass=mass),))
+    torch.testing.assert_close(diagnostics.mass(solver, state), mass.sum(1))
+    torch.testing.assert_close(diagnostics.momentum(solver, state), (mass[..., None] * state.v).sum(1))
+
+
+def test_angular_momentum_of_a_rigid_rotation() -> None:
+    """Of a lattice about the origin: inertia times angular velocity, where a particle has m (r^2 + h^2 / 2)."""
+    state = lively(N)
+    omega = 3.0
+    spin = torch.tensor([[0.0, -omega], [omega, 0.0]], dtype=torch.float64)
+    rigid = ParticleState(state.x, state.x @ spin.T, spin.expand(1, N, 2, 2), state.F, state.Jp)
+    inertia = (MASS * (state.x.square().sum(-1) + H**2 / 2)).sum(-1)
+    torch.testing.assert_close(diagnostics.angular_momentum(SOLVER, rigid), omega * inertia)
+
+
+def test_energies(state: ParticleState) -> None:
+    kinetic = 0.5 * (MASS * state.v.square().sum(-1)).sum(-1)
+    torch.testing.assert_close(diagnostics.kinetic_energy(SOLVER, state), kinetic)
+    potential = -(MASS * (0.5 * state.x[..., 0] - 9.8 * state.x[..., 1])).sum(-1)
+    torch.testing.assert_close(diagnostics.potential_energy(SOLVER, state), potential)
+    assert diagnostics.potential_energy(SOLVER, state).min() > 0, "height counts positive"
+
+    U, _, Vh = torch.linalg.svd(state.F)
+    distance = (state.F - U @ Vh).square().sum((-1, -2))
+    dilation = (torch.linalg.det(state.F) - 1.0).square()
+    mu, lam = (torch.tensor([a] * 30 + [b] * 20, dtype=torch.float64) for a, b in ((500.0, 300.0), (50.0, 80.0)))
+    elastic = (VOLUME * (mu * distance + 0.5 * lam * dilation)).sum(-1)
+    torch.testing.assert_close(diagnostics.elastic_energy(SOLVER, state), elastic)
+
+
+def test_gravity_of_each_simulation(state: ParticleState) -> None:
+    gravity = torch.tensor([[0.0, -9.8], [2.0, 0.0]], dtype=torch.float64)
+    solver = robot_and_ball(30, 20, gravity=gravity)
+    expected = -torch.einsum("n,bni,bi->b", MASS, state.x, gravity)
+    torch.testing.assert_close(diagnostics.potential_energy(solver, state), expected)
+
+
+@pytest.mark.parametrize("name", ["x", "v", "C", "F", "Jp"])
+@pytest.mark.parametrize("number", [math.nan, math.inf])
+def test_finite(state: ParticleState, name: str, number: float) -> None:
+    assert diagnostics.finite(state).tolist() == [True, True]
+    field = getattr(state, name).clone()
+    field[1, -1] = number
+    broken = ParticleState(**{n: getattr(state, n) for n in ("x", "v", "C", "F", "Jp")} | {name: field})
+    assert diagnostics.finite(broken).tolist() == [True, False]
+
+
+def test_impulses_of_gravity_and_damping(state: ParticleState) -> None:
+    """In free space m g dt, and a share of what is there after it."""
+    solver = robot_and_ball(30, 20, rules=(), damping=0.9)
+    found = diagnostics.impulses(solver, state)
+    gravity = 160.0 * 1e-4 * torch.tensor([0.5, -9.8], dtype=torch.float64)
+    assert set(found) == {"gravity", "damping", "boundary"}
+    torch.testing.assert_close(found["gravity"], gravity.expand(2, 2), rtol=1e-9, atol=0)
+    damping = -0.1 * (diagnostics.momentum(solver, state) + gravity)
+    torch.testing.assert_close(found["damping"], damping, rtol=1e-9, atol=0)
+    assert (found["boundary"] == 0).all()
+
+
+def test_impulse_of_a_floor(state: ParticleState) -> None:
+    """A sticky floor under everything takes all that falls; a slippery one takes the vertical part."""
+    falling = ParticleState(
+        state.x, torch.tensor([0.3, -2.0], dtype=torch.float64).expand(2, N, 2), 0 * state.C, state.F, state.Jp
+    )
+    still = robot_and_ball(30, 20, gravity=(0.0, 0.0))
+    for friction, share in ((math.inf, [1.0, 1.0]), (0.0, [0.0, 1.0])):
+        solver = robot_and_ball(30, 20, gravity=(0.0, 0.0), rules=(VelocityRule("-y", friction=friction),))
+        after = diagnostics.momentum(solver, solver.step(falling))
+        found = diagnostics.impulses(solver, falling)["boundary"]
+        torch.testing.assert_close(found, after - diagnostics.momentum(still, falling), rtol=0, atol=1e-6)
+        assert (found[:, 1] > 0).all()
+        assert (found[:, 0].abs() > 1.0).tolist() == [share[0] == 1.0] * 2
+
+
+def test_impulses_take_actuation_and_origin(state: ParticleState) -> None:
+    field = 60.0 * normal(2, 2, 16, 16, seed=1)
+    origin = torch.tensor([[0.0, 0.0], [0.2, 0.1]], dtype=torch.float64)
+    found = diagnostics.impulses(SOLVER, state, field, origin)
+    change = diagnostics.momentum(SOLVER, SOLVER.step(state, field, origin=origin)) - diagnostics.momentum(
+        SOLVER, state
+    )
+    torch.testing.assert_close(sum(found.values()), change, rtol=1e-9, atol=1e-9)
+    plain = diagnostics.impulses(SOLVER, state)["boundary"]
+    assert not torch.allclose(found["boundary"], plain)

@@ -1,0 +1,160 @@
+"""Derivatives of a rollout in everything it is differentiable in, against central differences and each other."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from scenes import lively, normal, positions, robot
+from torch import Tensor
+
+from torchmpm import Body, Elastic, ParticleState, VelocityRule, VonMises
+
+B, N = 2, 40
+SUBSTEPS = 20
+NAMES = ("x", "v", "C", "F", "actuation", "mu", "lam", "yield_stress", "gravity", "mass", "volume")
+SCENES = {
+    "free": {"strain": 0.01, "rules": ()},
+    "yielding": {"strain": 0.15, "rules": ()},
+    "sticky floor": {"strain": 0.1, "rules": (VelocityRule("-y", j=(None, 7), friction=math.inf),)},
+    "rubbing floor": {"strain": 0.1, "rules": (VelocityRule("-y", j=(None, 7), friction=0.3),)},
+}
+
+
+def inputs(strain: float) -> dict[str, Tensor]:
+    """Everything that a loss may be differentiated in; material values in all shapes that are accepted."""
+    state = lively(N, B, strain=strain, seed=11)
+    scale = torch.tensor([0.9, 1.2], dtype=torch.float64)
+    return {
+        "x": state.x,
+        "v": state.v,
+        "C": state.C,
+        "F": state.F,
+        "actuation": 40.0 * normal(B, 2, 16, 16, seed=1),
+        "mu": 500.0 * scale,
+        "lam": 50.0 * (1.0 + 0.1 * normal(B, N, seed=2).abs()),
+        "yield_stress": torch.tensor(60.0, dtype=torch.float64),
+        "gravity": torch.tensor([[0.5, -9.8], [2.0, -5.0]], dtype=torch.float64),
+        "mass": 2.0 * scale.flip(0),
+        "volume": 1.0 + 0.2 * normal(B, N, seed=3).abs(),
+    }
+
+
+def loss(given: dict[str, Tensor], rules: tuple[VelocityRule, ...], segment: int | None = None) -> Tensor:
+    """A random combination of all numbers of the final state."""
+    material = VonMises(given["mu"], given["lam"], given["yield_stress"])
+    body = Body(N, material, given["mass"], given["volume"], muscle=True)
+    solver = robot(N, bodies=(body,), gravity=given["gravity"], rules=rules, damping=0.999)
+    start = ParticleState(given["x"], given["v"], given["C"], given["F"], torch.ones(B, N, dtype=torch.float64))
+    final = solver.step(start, given["actuation"], substeps=SUBSTEPS, segment=segment)
+    # Factors that bring the fields to one size, so that none drowns the others.
+    parts = ((final.x, 1.0), (final.v, 0.2), (final.C, 0.01), (final.F, 1.0))
+    return sum(size * (normal(*t.shape, seed=20 + k) * t).sum() for k, (t, size) in enumerate(parts))
+
+
+def gradients(scene: str, segment: int | None = None) -> dict[str, Tensor]:
+    options = SCENES[scene]
+    given = {name: value.clone().requires_grad_() for name, value in inputs(options["strain"]).items()}
+    found = torch.autograd.grad(loss(given, options["rules"], segment), list(given.values()))
+    return dict(zip(given, found, strict=True))
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def scene(request: pytest.FixtureRequest) -> tuple[str, dict[str, Tensor]]:
+    """A scene and its gradients by plain autograd."""
+    return request.param, gradients(request.param)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_against_central_differences(scene: tuple[str, dict[str, Tensor]], name: str) -> None:
+    """In a random direction over 20 substeps, to 1e-5."""
+    label, found = scene
+    options = SCENES[label]
+    given = inputs(options["strain"])
+    if name == "yield_stress" and label == "free":
+        assert found[name] == 0.0, "nothing may yield in this scene"
+        return
+    direction = normal(*given[name].shape, seed=30)
+    # Where a step may cross a yield surface or a cell it is shorter; elsewhere rounding asks for a longer one.
+    step = (1e-6 if name in ("x", "F") else 1e-5) * given[name].abs().max().item()
+    ahead, behind = (
+        loss(given | {name: given[name] + side * step * direction}, options["rules"]).item() for side in (1, -1)
+    )
+    slope = (found[name] * direction).sum().item()
+    assert slope == pytest.approx((ahead - behind) / (2 * step), rel=1e-5)
+
+
+@pytest.mark.parametrize("segment", [3, 10])
+def test_segments_do_not_change_gradients(scene: tuple[str, dict[str, Tensor]], segment: int) -> None:
+    label, plain = scene
+    for name, value in gradients(label, segment).items():
+        torch.testing.assert_close(value, plain[name], rtol=0, atol=1e-12 * max(plain[name].abs().max().item(), 1e-9))
+
+
+def test_default_step_is_differentiable_from_rest() -> None:
+    """F = I and v = 0 exactly, in single precision, in contact: every gradient is a number."""
+    x = positions(60).float().requires_grad_()
+    actuation = torch.zeros(1, 2, 16, 16, requires_grad=True)
+    solver = robot(60, rules=(VelocityRule("-y", j=(None, 7), friction=0.5),))
+    final = solver.step(ParticleState.at_rest(x), actuation, substeps=25)
+    for gradient in torch.autograd.grad(final.x.square().sum() + final.F.square().sum(), (x, actuation)):
+        assert gradient.isfinite().all()
+        assert gradient.abs().max() > 0
+
+
+def test_single_precision_gradients_are_near_double() -> None:
+    found = {}
+    for dtype in (torch.float32, torch.float64):
+        given = {name: value.to(dtype).requires_grad_() for name, value in inputs(0.15).items()}
+        body = Body(N, VonMises(given["mu"], given["lam"], given["yield_stress"]), given["mass"], muscle=True)
+        solver = robot(N, bodies=(body,), gravity=given["gravity"])
+        start = ParticleState(given["x"], given["v"], given["C"], given["F"], torch.ones(B, N, dtype=dtype))
+        total = solver.step(start, given["actuation"], substeps=SUBSTEPS).x.square().sum()
+        used = [name for name in NAMES if name != "volume"]
+        found[dtype] = dict(zip(used, torch.autograd.grad(total, [given[name] for name in used]), strict=True))
+    for name, double in found[torch.float64].items():
+        error = (found[torch.float32][name].double() - double).norm() / double.norm()
+        assert error <= 1e-3, f"{name}: {error:.1e}"
+
+
+def test_simulations_have_separate_gradients() -> None:
+    """A loss on one simulation leaves the others' inputs alone."""
+    state, actuation = lively(N, 3), (40.0 * normal(3, 2, 16, 16, seed=1)).requires_grad_()
+    v = state.v.clone().requires_grad_()
+    final = robot(N).step(replace(state, v=v), actuation, substeps=3)
+    for gradient in torch.autograd.grad(final.x[1].square().sum(), (v, actuation)):
+        assert gradient[1].abs().max() > 0
+        assert (gradient[[0, 2]] == 0).all()
+
+
+def test_frozen_particles_pass_their_gradient_through() -> None:
+    state = lively(10)
+    x = (state.x + torch.tensor([3.0, 0.0], dtype=torch.float64)).requires_grad_()
+    final = robot(10).step(replace(state, x=x), substeps=4)
+    (gradient,) = torch.autograd.grad(final.x.sum(), x)
+    assert torch.equal(gradient, torch.ones_like(x))
+
+
+def test_no_graph_without_gradients() -> None:
+    state = replace(lively(10), v=torch.ones(1, 10, 2, dtype=torch.float64, requires_grad=True))
+    with torch.no_grad():
+        assert not robot(10).step(state, substeps=4).x.requires_grad
+    assert robot(10).step(state, substeps=4).x.requires_grad
+
+
+def test_gradient_descent_finds_a_stiffness() -> None:
+    """What gradients are for: recover mu from the motion it caused."""
+    state, true = lively(60, strain=0.08), 420.0
+
+    def final(mu: Tensor | float) -> Tensor:
+        return robot(60, bodies=(Body(60, Elastic(mu, 50.0)),)).step(state, substeps=30).v
+
+    target, mu = final(true), torch.tensor(600.0, dtype=torch.float64)
+    for _ in range(4):  # Gauss-Newton in one unknown
+        mu.requires_grad_()
+        residual = final(mu) - target
+        (gradient,) = torch.autograd.grad(0.5 * residual.square().sum(), mu)
+        with torch.no_grad():
+            tangent = (final(mu + 1e-3) - target - residual) / 1e-3
+            mu = mu - gradient / tangent.square().sum()
+    assert mu.item() == pytest.approx(true, rel=1e-3)

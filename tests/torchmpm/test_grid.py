@@ -1,0 +1,54 @@
+"""The window of nodes."""
+
+import math
+
+import pytest
+import torch
+
+from torchmpm import Grid
+
+
+def test_default_window_is_one_metre() -> None:
+    grid = Grid()
+    assert (grid.resolution, grid.h) == (128, 1 / 128)
+    assert Grid(50).h * 50 == pytest.approx(1.0, rel=1e-15)
+
+
+def test_spacing_scales_the_window() -> None:
+    grid = Grid(10, spacing=0.5)
+    assert grid.h == 0.5
+    x = torch.tensor([[4.99, 5.01]])
+    assert grid.contains(x, torch.zeros(1, 1)).tolist() == [[True, False]]
+
+
+@pytest.mark.parametrize("resolution", [3, 0, -1])
+def test_too_few_nodes(resolution: int) -> None:
+    with pytest.raises(ValueError, match=f"resolution must be at least 4.*got {resolution}"):
+        Grid(resolution)
+
+
+def test_four_nodes_are_enough() -> None:
+    assert Grid(4).resolution == 4
+
+
+@pytest.mark.parametrize("spacing", [0.0, -1.0, math.nan])
+def test_spacing_must_be_positive(spacing: float) -> None:
+    with pytest.raises(ValueError, match="spacing must be positive"):
+        Grid(8, spacing)
+
+
+@pytest.mark.parametrize("origin", [-0.31, 0.0, 2.5])
+def test_contains_tests_the_open_interval_inside_the_margin(origin: float) -> None:
+    offsets = torch.tensor([[-0.1, 0.0, 0.9e-5, 1.1e-5, 0.5, 1 - 1.1e-5, 1 - 0.9e-5, 1.0, 1.2]], dtype=torch.float64)
+    found = Grid(64).contains(offsets + origin, torch.full((1, 1), origin, dtype=torch.float64))
+    assert found.tolist() == [[False, False, False, True, True, True, False, False, False]]
+
+
+def test_contains_uses_the_origin_of_each_simulation() -> None:
+    x = torch.tensor([[0.2, 1.2], [0.2, 1.2]])
+    assert Grid(8).contains(x, torch.tensor([[0.0], [1.0]])).tolist() == [[True, False], [False, True]]
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_what_is_no_number_is_outside(number: float) -> None:
+    assert not Grid(8).contains(torch.tensor([[number]]), torch.zeros(1, 1)).any()

@@ -1,0 +1,318 @@
+"""Constitutive laws against independent formulas, and their derivatives against finite differences."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scenes import generator, normal
+from torch import Tensor
+
+from torchmpm import Elastic, VonMises, lame
+from torchmpm.material import column, corotated_energy, corotated_stress, von_mises_return
+
+MU, LAM, YIELD = 500.0, 50.0, 62.0
+LIMIT = YIELD / (2 * MU)
+
+
+def planes(F: Tensor) -> tuple[Tensor, ...]:
+    return tuple(F.flatten(-2).unbind(-1))
+
+
+def matrix(planes: tuple[Tensor, ...]) -> Tensor:
+    return torch.stack(planes, -1).unflatten(-1, (2, 2))
+
+
+def symmetric(planes: tuple[Tensor, ...]) -> Tensor:
+    xx, xy, yy = planes
+    return torch.stack((xx, xy, xy, yy), -1).unflatten(-1, (2, 2))
+
+
+def returned(F: Tensor, limit: float | Tensor = LIMIT) -> Tensor:
+    return matrix(von_mises_return(planes(F), limit))
+
+
+def turn(angle: Tensor | float) -> Tensor:
+    angle = torch.as_tensor(angle, dtype=torch.float64)
+    c, s = angle.cos(), angle.sin()
+    return torch.stack((c, -s, s, c), -1).unflatten(-1, (2, 2))
+
+
+def stretched(first: Tensor | float, second: Tensor | float, left: Tensor | float, right: Tensor | float) -> Tensor:
+    """U diag(first, second) V^T with U and V turned by the angles left and right."""
+    sigma = torch.stack((torch.as_tensor(first, dtype=torch.float64), torch.as_tensor(second, dtype=torch.float64)), -1)
+    return turn(left) @ torch.diag_embed(sigma) @ turn(right).mT
+
+
+def deformations(count: int, low: float, high: float, seed: int, share_inverted: float = 0.3) -> Tensor:
+    """(1, N, 2, 2) with principal stretches spread evenly in their logarithm; some inverted."""
+    draw = torch.rand(5, 1, count, generator=generator(seed), dtype=torch.float64)
+    sigma = low * (high / low) ** draw[:2]
+    sign = torch.where(draw[4] < share_inverted, -1.0, 1.0)
+    return stretched(sigma[0], sign * sigma[1], 2 * math.pi * draw[2], 2 * math.pi * draw[3])
+
+
+def return_by_svd(F: np.ndarray, limit: float) -> tuple[np.ndarray, bool]:
+    """Von Mises return of one matrix after mpm.md 6.2 and 6.3, with an SVD and logarithms; and whether it yields."""
+    U, sigma, Vt = np.linalg.svd(F)
+    strain = np.log(np.maximum(sigma, 0.05))
+    deviator = strain - strain.mean()
+    norm = math.sqrt(deviator @ deviator + 1e-8)
+    excess = norm - limit
+    if excess <= 0:
+        return F, False
+    return U @ np.diag(np.exp(strain - excess / norm * deviator)) @ Vt, True
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "seed"),
+    [(0.7, 1.4, 0), (0.95, 1.08, 1), (0.01, 0.2, 2), (0.04, 3.0, 3)],
+    ids=["large strains", "around the limit", "around the floor", "everything"],
+)
+def test_return_against_svd_and_logarithms(low: float, high: float, seed: int) -> None:
+    """To 3e-7 (limits of 0.02 and more): the constant 1e-8 under the norm is treated exactly at yield only."""
+    F = deformations(1500, low, high, seed)
+    limit = 0.02 + 0.15 * torch.rand(1, 1500, generator=generator(seed + 10), dtype=torch.float64)
+    found = returned(F, limit)
+    expected = [return_by_svd(f, e) for f, e in zip(F[0].numpy(), limit[0].tolist(), strict=True)]
+    yields = torch.tensor([y for _, y in expected])
+    assert yields.sum() > 100 and (~yields).sum() > 50, "the test must reach both branches"
+    assert (torch.linalg.det(F[0])[yields] < 0).sum() > 30
+    wanted = torch.from_numpy(np.stack([m for m, _ in expected]))
+    error = (found[0] - wanted).flatten(1).norm(dim=1) / wanted.flatten(1).norm(dim=1)
+    assert error.max() <= 3e-7
+    assert torch.equal(found[0][~yields], F[0][~yields]), "what does not yield must stay as it came, bit by bit"
+    assert (found[0][yields] != F[0][yields]).flatten(1).any(1).all()
+
+
+def test_below_the_floor_nothing_happens_without_yield() -> None:
+    """The floor acts only through the yield branch: both stretches below it count as equal."""
+    F = torch.stack((stretched(0.04, 0.001, 0.3, 1.1), stretched(0.049, -0.02, 2.0, 0.4), torch.zeros(2, 2)))[None]
+    assert torch.equal(returned(F), F)
+
+
+def test_floor_in_the_yield_branch() -> None:
+    """Stretches 1 and 0.001 count as 1 and 0.05: the area after the return is 0.05."""
+    result = returned(stretched(1.0, 0.001, 0.3, 1.1)[None, None])
+    assert torch.linalg.det(result).item() == pytest.approx(0.05, rel=1e-12)
+    ratio = torch.linalg.svdvals(result)[0, 0]
+    assert math.log(ratio[0] / ratio[1]) == pytest.approx(math.sqrt(2.0) * LIMIT, rel=1e-5)
+
+
+def test_flow_is_isochoric_and_idempotent() -> None:
+    F = deformations(1000, 0.06, 3.0, seed=5)
+    once = returned(F)
+    moved = (once != F).flatten(2).any(2)
+    assert moved.sum() > 500
+    torch.testing.assert_close(torch.linalg.det(once), torch.linalg.det(F), rtol=1e-12, atol=0)
+    torch.testing.assert_close(returned(once), once, rtol=0, atol=1e-13)
+
+
+def test_return_keeps_rotations_out() -> None:
+    """R(Q F P) = Q R(F) P: the law is isotropic and objective."""
+    F, Q, P = deformations(200, 0.3, 3.0, seed=6), turn(1.1), turn(-2.3)
+    torch.testing.assert_close(returned(Q @ F @ P), Q @ returned(F) @ P, rtol=0, atol=1e-13)
+
+
+def test_tiny_yield_stress_is_finite() -> None:
+    """Limits below the constant under the norm flow back to (almost) no deviator at all."""
+    F = deformations(100, 0.3, 3.0, seed=7).requires_grad_()
+    for limit in (0.0, 1e-5, torch.zeros((), dtype=torch.float64)):
+        result = returned(F, limit)
+        sigma = torch.linalg.svdvals(result.detach())
+        torch.testing.assert_close(sigma[..., 0], sigma[..., 1], rtol=2e-4, atol=0)
+        (gradient,) = torch.autograd.grad(result.sum(), F)
+        assert gradient.isfinite().all()
+
+
+@pytest.mark.parametrize("material", [Elastic(MU, LAM), VonMises(MU, LAM, YIELD)], ids=["elastic", "von mises"])
+def test_stress_is_the_derivative_of_the_energy(material: Elastic) -> None:
+    """Kirchhoff: tau = (d energy / d F) F^T."""
+    F = deformations(500, 0.2, 3.0, seed=8, share_inverted=0.0).requires_grad_()
+    Jp = torch.ones(1, 500, dtype=torch.float64)
+    (first_piola,) = torch.autograd.grad(material.energy(planes(F), Jp).sum(), F)
+    tau = symmetric(material.stress(planes(F.detach()), Jp))
+    torch.testing.assert_close(tau, first_piola @ F.detach().mT, rtol=1e-12, atol=1e-9)
+    torch.testing.assert_close(tau, tau.mT, rtol=0, atol=0)
+
+
+def test_stress_formula() -> None:
+    """2 mu (F - R) F^T + lam J (J - 1) I with R of an SVD, det F < 0 included (mpm.md 6.4)."""
+    F = deformations(500, 0.2, 3.0, seed=9)
+    U, _, Vh = torch.linalg.svd(F)
+    J = torch.linalg.det(F)[..., None, None]
+    expected = 2 * MU * (F - U @ Vh) @ F.mT + LAM * J * (J - 1) * torch.eye(2, dtype=torch.float64)
+    torch.testing.assert_close(symmetric(corotated_stress(planes(F), MU, LAM)), expected, rtol=1e-12, atol=1e-9)
+
+
+def test_rotations_store_nothing_and_stress_turns_with_matter() -> None:
+    Q = turn(torch.linspace(0, 6, 20))[None]
+    assert corotated_energy(planes(Q), MU, LAM).abs().max() <= 1e-25
+    assert symmetric(corotated_stress(planes(Q), MU, LAM)).abs().max() <= 1e-10
+    F, turned = deformations(20, 0.5, 2.0, seed=10), turn(0.8)
+    tau, of_turned = (symmetric(corotated_stress(planes(f), MU, LAM)) for f in (F, turned @ F))
+    torch.testing.assert_close(of_turned, turned @ tau @ turned.mT, rtol=0, atol=1e-9)
+
+
+def test_uniaxial_stretch_in_closed_form() -> None:
+    F = torch.diag(torch.tensor([1.2, 1.0], dtype=torch.float64))[None, None]
+    xx, xy, yy = corotated_stress(planes(F), MU, LAM)
+    pressure = LAM * 1.2 * 0.2
+    assert xx.item() == pytest.approx(2 * MU * 0.2 * 1.2 + pressure, rel=1e-12)
+    assert (xy.item(), yy.item()) == (0.0, pytest.approx(pressure, rel=1e-12))
+    assert corotated_energy(planes(F), MU, LAM).item() == pytest.approx(MU * 0.04 + 0.5 * LAM * 0.04, rel=1e-12)
+
+
+NEAR = torch.tensor([[0.3, -0.8], [0.4, 0.6]], dtype=torch.float64)
+POINTS = {
+    "identity": torch.eye(2, dtype=torch.float64),
+    "1e-7 from identity": torch.eye(2, dtype=torch.float64) + 1e-7 * NEAR,
+    "rotation": turn(0.9),
+    "1e-7 from rotation": turn(0.9) + 1e-7 * NEAR,
+    "half turn": turn(math.pi),
+    "uniform stretch": 1.3 * torch.eye(2, dtype=torch.float64),
+    "rotated uniform stretch": 0.7 * turn(-2.0),
+    "elastic": stretched(1.05, 0.99, 0.4, 1.3),
+    "yielded": stretched(1.2, 0.9, 0.4, 1.3),
+    "yielded along the axes": stretched(1.2, 0.9, 0.0, 0.0),
+    "yielded below the floor": stretched(1.1, 0.02, 0.4, 1.3),
+    "inverted elastic": stretched(1.02, -1.0, 0.4, 1.3),
+    "inverted yielded": stretched(1.4, -0.7, 0.4, 1.3),
+    "inverted, trace zero": stretched(1.4, -0.7, 0.0, 0.0),
+}
+
+
+def all_of_it(F: Tensor, mu: Tensor, lam: Tensor, yield_stress: Tensor) -> Tensor:
+    """Return map and stress as the substep chains them; the material values as multiples of MU, LAM and YIELD."""
+    material = VonMises(MU * mu, LAM * lam, YIELD * yield_stress)
+    Jp = torch.ones_like(F[..., 0, 0])
+    mapped, _ = material.return_map(planes(F), Jp)
+    return torch.cat((matrix(mapped).flatten(2), torch.stack(material.stress(mapped, Jp), -1) / MU), -1)
+
+
+def factors(dtype: torch.dtype = torch.float64) -> tuple[Tensor, ...]:
+    return tuple(torch.ones((), dtype=dtype, requires_grad=True) for _ in range(3))
+
+
+@pytest.mark.parametrize("name", POINTS)
+def test_gradients_against_finite_differences(name: str) -> None:
+    F = POINTS[name][None, None].clone().requires_grad_()
+    assert torch.autograd.gradcheck(all_of_it, (F, *factors()), eps=1e-8, atol=1e-7, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", POINTS)
+def test_gradients_in_single_precision(name: str) -> None:
+    """To 5e-7 of the largest entry, at a point that single precision can represent."""
+    F = POINTS[name][None, None].float()
+    jacobians = []
+    for dtype in (torch.float32, torch.float64):
+        jacobian = torch.autograd.functional.jacobian(all_of_it, (F.to(dtype), *factors(dtype)))
+        jacobians.append(torch.cat([block.reshape(7, -1).double() for block in jacobian], dim=1))
+    single, double = jacobians
+    assert single.isfinite().all()
+    torch.testing.assert_close(single, double, rtol=0, atol=5e-7 * double.abs().max().item())
+
+
+def test_gradients_in_single_precision_at_large_strains() -> None:
+    """One in a hundred is worse than 1e-6, where stretches differ by a factor of two none is worse than 5e-6."""
+    F, weight = deformations(2000, 0.7, 1.4, seed=0).float(), normal(1, 2000, 7, seed=3)
+    gradients = []
+    for dtype in (torch.float32, torch.float64):
+        point = F.to(dtype).requires_grad_()
+        total = (all_of_it(point, *factors(dtype)) * weight.to(dtype)).sum()
+        gradients.append(torch.autograd.grad(total, point)[0].double().flatten(2))
+    error = (gradients[0] - gradients[1]).norm(dim=2) / gradients[1].norm(dim=2)
+    assert error.max() <= 5e-6
+    assert error.quantile(0.99) <= 1e-6
+
+
+def test_gradient_of_a_field_has_no_infinities() -> None:
+    """Also where branches that are not taken would divide by zero: F = 0, equal stretches, singular F."""
+    singular = stretched(1.0, 0.0, 0.5, 0.2)
+    F = torch.stack((torch.zeros(2, 2), torch.eye(2), turn(1.0), singular, -torch.eye(2), 1e-12 * turn(0.3)))[None]
+    for dtype in (torch.float32, torch.float64):
+        point = F.to(dtype).requires_grad_()
+        material, Jp = VonMises(MU, LAM, YIELD), point.new_ones(1, 6)
+        mapped, _ = material.return_map(planes(point), Jp)
+        total = torch.stack(material.stress(mapped, Jp)).sum() + matrix(mapped).sum()
+        assert torch.autograd.grad(total, point)[0].isfinite().all()
+
+
+def test_elastic_matter_keeps_its_deformation() -> None:
+    F, Jp = deformations(50, 0.1, 5.0, seed=11), torch.rand(1, 50, generator=generator(0), dtype=torch.float64)
+    mapped, same = Elastic(MU, LAM).return_map(planes(F), Jp)
+    assert torch.equal(matrix(mapped), F)
+    assert torch.equal(same, Jp)
+
+
+def test_von_mises_limit_is_yield_stress_over_twice_mu() -> None:
+    F = deformations(200, 0.5, 2.0, seed=12)
+    Jp = torch.ones(1, 200, dtype=torch.float64)
+    mapped, same = VonMises(MU, LAM, YIELD).return_map(planes(F), Jp)
+    assert torch.equal(matrix(mapped), returned(F, YIELD / (2 * MU)))
+    assert torch.equal(same, Jp)
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (3, 40), (1, 40)])
+def test_values_per_simulation_and_particle_equal_separate_materials(shape: tuple[int, ...]) -> None:
+    F = deformations(120, 0.6, 1.6, seed=13).view(3, 40, 2, 2)
+    scale = 0.5 + torch.rand(shape, generator=generator(1), dtype=torch.float64)
+    mu, lam, limit = MU * scale, LAM * (2.0 - scale), YIELD * scale.square()
+    material, Jp = VonMises(mu, lam, limit), torch.ones(3, 40, dtype=torch.float64)
+    mapped, _ = material.return_map(planes(F), Jp)
+    tau, energy = symmetric(material.stress(mapped, Jp)), material.energy(mapped, Jp)
+    whole = [(v[:, None] if v.ndim == 1 else v).expand(3, 40) for v in (mu, lam, limit)]
+    for b in range(3):
+        for n in (0, 7, 39):
+            alone = VonMises(*(v[b, n].item() for v in whole))
+            one, Jp_one = planes(F[b : b + 1, n : n + 1]), Jp[:1, :1]
+            f, _ = alone.return_map(one, Jp_one)
+            torch.testing.assert_close(matrix(mapped)[b, n], matrix(f)[0, 0], rtol=0, atol=1e-14)
+            torch.testing.assert_close(tau[b, n], symmetric(alone.stress(f, Jp_one))[0, 0], rtol=1e-13, atol=1e-10)
+            torch.testing.assert_close(energy[b, n], alone.energy(f, Jp_one)[0, 0], rtol=1e-13, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["mu", "lam", "yield_stress"])
+@pytest.mark.parametrize("value", [-1.0, math.nan])
+def test_negative_values_are_named(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{name} must not be negative, got {value}"):
+        VonMises(**{"mu": MU, "lam": LAM, "yield_stress": YIELD} | {name: value})
+
+
+def test_lame() -> None:
+    mu, lam = lame(5000.0, 0.2)
+    assert mu == pytest.approx(2083.3333333, rel=1e-9)
+    assert lam == pytest.approx(1388.8888889, rel=1e-9)
+    young, poisson = torch.tensor([1.0, 7.0]), torch.tensor([0.0, 0.45])
+    mu, lam = lame(young, poisson)
+    torch.testing.assert_close(mu * (3 * lam + 2 * mu) / (lam + mu), young)
+    torch.testing.assert_close(lam / (2 * (lam + mu)), poisson)
+
+
+@pytest.mark.parametrize(
+    ("shape", "result"), [((), ()), ((3,), (3, 1)), ((3, 5), (3, 5)), ((1, 5), (1, 5)), ((3, 1), (3, 1))]
+)
+def test_column_shapes(shape: tuple[int, ...], result: tuple[int, ...]) -> None:
+    value = normal(*shape, seed=0)
+    found = column(value, torch.ones(3, 5))
+    assert found.shape == result
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found.flatten(), value.float().flatten())
+
+
+def test_column_leaves_numbers_alone() -> None:
+    assert column(2.5, torch.ones(3, 5)) == 2.5
+
+
+@pytest.mark.parametrize("shape", [(5,), (2,), (1,), (2, 5), (3, 4), (3, 5, 1), (5, 3)])
+def test_column_names_what_does_not_fit(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"^stiffness must be a number or have shape \(\), \(3,\) or \(3, 5\), got"):
+        column(torch.ones(shape), torch.ones(3, 5), "stiffness")
+
+
+@pytest.mark.parametrize("name", ["mu", "lam", "yield_stress"])
+def test_materials_name_the_value_that_does_not_fit(name: str) -> None:
+    material = VonMises(**{"mu": MU, "lam": LAM, "yield_stress": YIELD} | {name: torch.ones(4)})
+    F, Jp = planes(deformations(6, 0.5, 2.0, seed=14).view(2, 3, 2, 2)), torch.ones(2, 3, dtype=torch.float64)
+    with pytest.raises(ValueError, match=f"^{name} must be a number or have shape"):
+        material.stress(material.return_map(F, Jp)[0], Jp)

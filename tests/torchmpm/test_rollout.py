@@ -1,0 +1,204 @@
+"""Loops over steps and their checkpoints, on a step simple enough to know the answer."""
+
+import gc
+import weakref
+from typing import Any
+
+import pytest
+import torch
+from scenes import lively, normal, robot
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.weak import WeakIdKeyDictionary
+
+from torchmpm import ParticleState, repeated, trajectory
+
+
+def double(x: Tensor) -> Tensor:
+    return 2.0 * x
+
+
+@pytest.mark.parametrize("segment", [None, 1, 2, 3, 5, 9])
+@pytest.mark.parametrize("times", [0, 1, 5, 6])
+def test_repeated_counts(times: int, segment: int | None) -> None:
+    x = torch.ones(2, requires_grad=True)
+    result = repeated(double, x, times, segment=segment)
+    assert result.tolist() == [2.0**times] * 2
+    if times:
+        result.sum().backward()
+        assert x.grad.tolist() == [2.0**times] * 2
+    with torch.no_grad():
+        assert repeated(double, x, times, segment=segment).tolist() == [2.0**times] * 2
+
+
+def calls(gradients: bool, **options: Any) -> tuple[int, int]:
+    """How often a step runs in six repetitions, forward and backward."""
+    count = 0
+
+    def step(x: Tensor) -> Tensor:
+        nonlocal count
+        count += 1
+        return x.sin()
+
+    x = torch.ones(1, requires_grad=True)
+    with torch.set_grad_enabled(gradients):
+        result = repeated(step, x, 6, **options)
+    forward = count
+    if gradients:
+        result.backward()
+    return forward, count - forward
+
+
+def test_segments_are_replayed_once() -> None:
+    assert calls(True) == (6, 0)
+    assert calls(True, segment=6) == (6, 0)
+    forward, backward = calls(True, segment=4)
+    assert forward == 6
+    assert 4 <= backward <= 6, "at most one more forward pass"
+    assert calls(False, segment=2) == (6, 0)
+
+
+def test_repeated_takes_tuples() -> None:
+    x = torch.ones(1, requires_grad=True)
+    a, b = repeated(lambda s: (s[1], s[0] * s[1]), (x, 2.0 * x), 5, segment=2)
+    (slope,) = torch.autograd.grad(a + b, x)
+    # Fibonacci: x, 2x, 2x^2, 4x^3, 8x^5, 32x^8, 256x^13
+    assert (a.item(), b.item(), slope.item()) == (32.0, 256.0, 32.0 * 8 + 256.0 * 13)
+
+
+def test_repeated_rejects() -> None:
+    with pytest.raises(ValueError, match="times must not be negative, got -1"):
+        repeated(double, torch.ones(1), -1)
+    for segment in (0, -3):
+        with pytest.raises(ValueError, match=f"segment must be at least 1 or None, got {segment}"):
+            repeated(double, torch.ones(1), 3, segment=segment)
+
+
+def test_solver_passes_its_mistakes_on() -> None:
+    solver, state = robot(5), lively(5)
+    with pytest.raises(ValueError, match="times must not be negative"):
+        solver.step(state, substeps=-1)
+    with pytest.raises(ValueError, match="segment must be at least 1"):
+        solver.step(state, segment=0)
+
+
+@pytest.mark.parametrize("checkpointed", [True, False])
+def test_trajectory_collects_what_it_observes(checkpointed: bool) -> None:
+    inputs = [torch.tensor(float(k), requires_grad=True) for k in (1, 2, 3)]
+    x = torch.tensor(1.0, requires_grad=True)
+    final, seen = trajectory(
+        lambda s, a: s * a + 1.0, x, iter(inputs), observe=lambda s: 10.0 * s, checkpointed=checkpointed
+    )
+    assert [s.item() for s in seen] == [20.0, 50.0, 160.0]
+    assert final.item() == 16.0
+    gradient = torch.autograd.grad(final + seen[1] / 10.0, [x, *inputs])
+    # final = ((x a + 1) b + 1) c + 1, seen[1] / 10 = (x a + 1) b + 1
+    assert [g.item() for g in gradient] == [6.0 + 2.0, 6.0 + 2.0, 6.0 + 2.0, 5.0]
+
+
+def test_trajectory_of_nothing() -> None:
+    x = torch.ones(1)
+    assert trajectory(lambda s, a: s, x, [], observe=lambda s: s) == (x, [])
+
+
+def test_trajectory_replays_each_step_once() -> None:
+    count = 0
+
+    def step(x: Tensor, a: float) -> Tensor:
+        nonlocal count
+        count += 1
+        return (a * x).sin()
+
+    x = torch.ones(1, requires_grad=True)
+    for checkpointed, replays in ((True, 4), (False, 0)):
+        count = 0
+        final, _ = trajectory(step, x, [1.0, 2.0, 3.0, 4.0], observe=lambda s: None, checkpointed=checkpointed)
+        assert count == 4
+        final.backward()
+        assert count - 4 == replays
+    count = 0
+    with torch.no_grad():
+        trajectory(step, x, [1.0, 2.0], observe=lambda s: None)
+    assert count == 2
+
+
+def rollout_gradients(checkpointed: bool, segment: int | None) -> list[Tensor]:
+    """Gradients of a loss on four observed steps of a robot."""
+    solver, state = robot(30), lively(30)
+    x, v = state.x.clone().requires_grad_(), state.v.clone().requires_grad_()
+    fields = [(60.0 * normal(1, 2, 16, 16, seed=k)).requires_grad_() for k in range(4)]
+    start = ParticleState(x, v, state.C, state.F, state.Jp)
+    final, seen = trajectory(
+        lambda s, a: solver.step(s, a, substeps=5, segment=segment),
+        start,
+        fields,
+        observe=lambda s: s.x.square().sum() + s.F.square().sum(),
+        checkpointed=checkpointed,
+    )
+    return list(torch.autograd.grad(sum(seen) + final.v.square().sum(), [x, v, *fields]))
+
+
+@pytest.mark.parametrize(("checkpointed", "segment"), [(True, None), (True, 2), (False, 2)])
+def test_checkpoints_do_not_change_gradients(checkpointed: bool, segment: int | None) -> None:
+    plain = rollout_gradients(False, None)
+    assert all(g.abs().max() > 0 for g in plain)
+    for with_checkpoints, without in zip(rollout_gradients(checkpointed, segment), plain, strict=True):
+        torch.testing.assert_close(with_checkpoints, without, rtol=0, atol=1e-12 * without.abs().max().item())
+
+
+class PeakMemory(TorchDispatchMode):
+    """Largest number of bytes alive at once among the storages that operators return."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen = WeakIdKeyDictionary()
+        self.now = self.peak = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        for tensor in result if isinstance(result, (tuple, list)) else (result,):
+            if not isinstance(tensor, Tensor):
+                continue
+            storage = tensor.untyped_storage()
+            if storage not in self.seen:
+                size = storage.nbytes()
+                self.seen[storage] = size
+                self.now += size
+                self.peak = max(self.peak, self.now)
+                weakref.finalize(storage, self.release, size)
+        return result
+
+    def release(self, size: int) -> None:
+        self.now -= size
+
+
+def peak_memory(substeps: int, segment: int | None, checkpointed: bool | None = None) -> int:
+    """Peak bytes of a forward and backward pass; with ``checkpointed`` as a trajectory of steps."""
+    solver, state = robot(100), lively(100)
+    v = state.v.clone().requires_grad_()
+    start = ParticleState(state.x, v, state.C, state.F, state.Jp)
+    gc.collect()
+    with PeakMemory() as memory:
+        if checkpointed is None:
+            final = solver.step(start, substeps=substeps, segment=segment)
+        else:
+            final, _ = trajectory(
+                lambda s, _: solver.step(s, substeps=4, segment=segment),
+                start,
+                range(substeps // 4),
+                observe=lambda s: None,
+                checkpointed=checkpointed,
+            )
+        final.x.square().sum().backward()
+    assert v.grad.abs().max() > 0
+    return memory.peak
+
+
+def test_checkpoints_bound_the_memory() -> None:
+    """Twenty substeps in segments of four need well under half of the whole graph, in both kinds of loop."""
+    whole = peak_memory(20, None)
+    assert whole > 1.8 * peak_memory(10, None), "without segments memory must grow with the number of substeps"
+    segmented = peak_memory(20, 4)
+    assert segmented < 0.4 * whole
+    assert peak_memory(40, 4) < 1.4 * segmented
+    assert peak_memory(20, None, checkpointed=True) < 0.4 * whole

@@ -1,0 +1,178 @@
+"""ParticleState: shapes, views on its planes, selection and branching."""
+
+import subprocess
+import sys
+import textwrap
+
+import pytest
+import torch
+from scenes import assert_identical, lively
+
+from torchmpm import ParticleState
+
+FIELDS = ("x", "v", "C", "F", "Jp")
+
+
+def fields(state: ParticleState) -> dict[str, torch.Tensor]:
+    return {name: getattr(state, name).clone() for name in FIELDS}
+
+
+def test_at_rest_is_undeformed_and_without_velocity() -> None:
+    x = torch.rand(3, 5, 2)
+    state = ParticleState.at_rest(x)
+    assert torch.equal(state.x, x)
+    assert torch.equal(state.v, torch.zeros(3, 5, 2))
+    assert torch.equal(state.C, torch.zeros(3, 5, 2, 2))
+    assert torch.equal(state.F, torch.eye(2).expand(3, 5, 2, 2))
+    assert torch.equal(state.Jp, torch.ones(3, 5))
+    assert (state.batch_size, state.num_particles, state.dtype) == (3, 5, torch.float32)
+    assert state.device == x.device
+
+
+def test_at_rest_makes_a_batch_of_one() -> None:
+    assert ParticleState.at_rest(torch.rand(5, 2, dtype=torch.float64)).x.shape == (1, 5, 2)
+
+
+@pytest.mark.parametrize("shape", [(5, 3), (5,), (2, 5, 1), (1, 2, 5, 2)])
+def test_positions_of_the_wrong_shape_are_named(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"x must have shape \(B, N, 2\), got"):
+        ParticleState(**fields(lively(5)) | {"x": torch.zeros(shape)})
+
+
+@pytest.mark.parametrize("name", FIELDS[1:])
+def test_a_field_of_the_wrong_shape_is_named(name: str) -> None:
+    wrong = fields(lively(5, 2))
+    wrong[name] = wrong[name][:, :4]
+    with pytest.raises(ValueError, match=rf"^{name} must have shape \(2, 5.*got \(2, 4"):
+        ParticleState(**wrong)
+
+
+@pytest.mark.parametrize("name", FIELDS[1:])
+def test_a_field_of_another_dtype_or_device_is_named(name: str) -> None:
+    right = fields(lively(5))
+    with pytest.raises(ValueError, match=rf"^{name} is torch.float32 on cpu, but x is torch.float64 on cpu"):
+        ParticleState(**right | {name: right[name].float()})
+    with pytest.raises(ValueError, match=rf"^{name} is torch.float64 on meta, but x is torch.float64 on cpu"):
+        ParticleState(**right | {name: right[name].to("meta")})
+
+
+def test_planes_are_the_components_and_invert() -> None:
+    state = lively(7, 2)
+    planes = state.planes()
+    expected = [state.x[..., 0], state.x[..., 1], state.v[..., 0], state.v[..., 1]]
+    expected += [matrix[..., row, col] for matrix in (state.C, state.F) for row in (0, 1) for col in (0, 1)]
+    expected.append(state.Jp)
+    assert len(planes) == len(expected) == 13
+    assert all(torch.equal(plane, component) for plane, component in zip(planes, expected, strict=True))
+    again = ParticleState.from_planes(planes)
+    assert_identical(again, state)
+    assert all(plane.is_contiguous() for plane in again.planes())
+
+
+def test_integer_index_keeps_the_batch_dimension() -> None:
+    state = lively(4, 3)
+    for index in (0, 1, 2, -1, -3):
+        picked = state[index]
+        assert picked.batch_size == 1
+        assert torch.equal(picked.x[0], state.x[index])
+        assert torch.equal(picked.F[0], state.F[index])
+
+
+@pytest.mark.parametrize("index", [3, -4])
+def test_integer_index_out_of_range(index: int) -> None:
+    with pytest.raises(IndexError):
+        lively(4, 3)[index]
+
+
+def test_iteration_yields_each_simulation_once() -> None:
+    state = lively(4, 3)
+    assert [torch.equal(one.x[0], x) for one, x in zip(state, state.x, strict=True)] == [True] * 3
+
+
+@pytest.mark.parametrize("index", [slice(1, None), [2, 0], torch.tensor([True, False, True])])
+def test_other_indices_select_along_the_batch(index: object) -> None:
+    state = lively(4, 3)
+    picked = state[index]
+    for name in FIELDS:
+        assert torch.equal(getattr(picked, name), getattr(state, name)[index])
+
+
+def test_where_takes_whole_simulations() -> None:
+    mine, other = lively(4, 3, seed=1), lively(4, 3, seed=2)
+    mixed = mine.where(torch.tensor([True, False, True]), other)
+    assert_identical(mixed[[0, 2]], mine[[0, 2]])
+    assert_identical(mixed[1], other[1])
+
+
+def test_clone_is_independent_and_detach_leaves_the_graph() -> None:
+    state = lively(4)
+    copy = state.clone()
+    copy.x.zero_()
+    assert state.x.abs().min() > 0
+    x = state.x.clone().requires_grad_()
+    linked = ParticleState(**fields(state) | {"x": x})
+    assert linked.clone().x.requires_grad
+    assert not linked.detach().x.requires_grad
+    assert linked.detach().x.data_ptr() == x.data_ptr()
+
+
+def test_to_converts_every_field() -> None:
+    single = lively(4).to(torch.float32)
+    assert {getattr(single, name).dtype for name in FIELDS} == {torch.float32}
+    assert single.to("meta").Jp.device.type == "meta"
+
+
+ANNOTATED = """
+import beartype, jaxtyping, pytest, torch
+with jaxtyping.install_import_hook("torchmpm", "beartype.beartype"):
+    import torchmpm
+    from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VelocityRule, VonMises, fixed, trajectory
+WRONG = (jaxtyping.TypeCheckError, beartype.roar.BeartypeCallHintViolation)
+
+# The annotations admit what the package is for ...
+x = 0.4 + 0.2 * torch.rand(2, 6, 2)
+state = ParticleState.at_rest(x)
+ParticleState.at_rest(x[0])
+bodies = (
+    Body(4, VonMises(torch.tensor([500.0, 400.0]), 50.0, 20.0), muscle=True),
+    Body(2, Elastic(300.0, torch.full((2, 2), 50.0)), mass=torch.tensor([1.0, 2.0])),
+)
+rules = (VelocityRule("-y", j=(None, 3), friction=0.5), *fixed((0, 1), frame="window"))
+solver = Solver(Grid(16), bodies, gravity=(0.0, -9.8), damping=0.999, rules=rules)
+field, origin = torch.ones(2, 2, 16, 16), torch.zeros(2, 2)
+after = solver.step(state, field, substeps=4, origin=origin, segment=2)
+assert not torch.equal(after.x, state.x)
+Solver(Grid(16), bodies, gravity=torch.zeros(2, 2)).step(state)
+state.where(torch.tensor([True, False]), after)[0].to(torch.float64).detach().clone()
+trajectory(lambda s, a: solver.step(s, a), state, [field], observe=lambda s: s.x)
+for name in ("mass", "momentum", "angular_momentum", "impulses"):
+    getattr(torchmpm.diagnostics, name)(solver, state)
+for name in ("kinetic_energy", "elastic_energy", "potential_energy"):
+    getattr(torchmpm.diagnostics, name)(solver, state)
+assert torchmpm.diagnostics.finite(after).all()
+
+# ... and what they forbid is found.
+with pytest.raises(WRONG):
+    ParticleState(*(t.to(torch.int64) for t in (state.x, state.v, state.C, state.F, state.Jp)))
+with pytest.raises(WRONG):
+    ParticleState.at_rest(torch.zeros(2))
+with pytest.raises(WRONG):
+    state.where(torch.tensor([1.0, 0.0]), after)
+with pytest.raises(WRONG):
+    solver.step(state, torch.ones(2, 2, 16, 15))
+with pytest.raises(WRONG):
+    solver.step(state, torch.ones(3, 2, 16, 16), origin=origin)
+with pytest.raises(WRONG):
+    solver.step(state, origin=torch.zeros(2, 3))
+with pytest.raises(WRONG):
+    solver.step(state.x)
+print("all checked")
+"""
+
+
+def test_annotations_hold_when_they_are_checked() -> None:
+    """Run in a process of its own, because jaxtyping's hook only reaches modules that are not imported yet."""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", textwrap.dedent(ANNOTATED)], capture_output=True, text=True, timeout=120
+    )
+    assert done.stdout.strip() == "all checked", done.stderr
