@@ -40,6 +40,7 @@ class StageCallback(BaseCallback):
         signals: Whether the user wants to stop.
         evaluate: Called with the step; returns the result, which it has written down.
         save: Writes policy and checkpoint.
+        evaluate_first: Evaluate before the first step.
     """
 
     def __init__(
@@ -51,11 +52,12 @@ class StageCallback(BaseCallback):
         signals: StopSignals,
         evaluate: Callable[[int], Result],
         save: Callable[[int], None],
+        evaluate_first: bool = False,
     ) -> None:
         super().__init__()
         self.level, self.offset, self.total = level, offset, total
         self.report, self.signals = report, signals
-        self.evaluate, self.save = evaluate, save
+        self.evaluate, self.save, self.evaluate_first = evaluate, save, evaluate_first
         self.last_result: Result | None = None
         self._last = self._logged = self._saved = self._evaluated = 0
         self._clock = time.perf_counter()
@@ -75,6 +77,8 @@ class StageCallback(BaseCallback):
             unit="step",
             mininterval=0.1 if sys.stderr.isatty() else 15.0,  # a log file needs fewer lines than a terminal
         )
+        if self.evaluate_first:
+            self._evaluate()
 
     def _on_step(self) -> bool:
         self.bar.update(self.training_env.num_envs)

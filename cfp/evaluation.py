@@ -130,18 +130,18 @@ def compare(config: Config, policies: Mapping[str, ActorPolicy], episodes: int) 
         episodes: Episodes of each.
     """
     coarsest = config.resolutions[0]
+    seed = config.seed + EVALUATION_SEED  # layouts that neither trained a policy nor chose the best one
     env = make_env(config, coarsest, episodes)
     untrained = {"zero action": ZeroPolicy(coarsest), "random action": RandomPolicy(coarsest, config.seed)}
     results = [
-        evaluate(name, policy, env, episodes, deterministic=True, seed=config.seed)
-        for name, policy in untrained.items()
+        evaluate(name, policy, env, episodes, deterministic=True, seed=seed) for name, policy in untrained.items()
     ]
     for name, trained in policies.items():
         resolution = trained.spec.resolutions[-1]
         if env.action_space.shape != (2, resolution, resolution):
             env = make_env(config, resolution, episodes)
         deterministic = trained.deterministic_by_default
-        results.append(evaluate(name, trained, env, episodes, deterministic=deterministic, seed=config.seed))
+        results.append(evaluate(name, trained, env, episodes, deterministic=deterministic, seed=seed))
     return results
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from cfp.config import Config, EnvironmentConfig, LearningConfig, NetworkConfig, Preset, ReportConfig, merge
 from cfp.errors import ConfigError
+from torchmpm.backends import compiler_found
 
 
 @dataclass(frozen=True)
@@ -81,11 +82,16 @@ def preset(task: str, name: str = "quick") -> Config:
         alpha=numbers.alpha,
         gate_bias=(numbers.gate_bias,),
         gate_penalty=(numbers.gate_penalty,),
-        environment=EnvironmentConfig(num_envs=1, particles="full", parity="reference"),
+        environment=EnvironmentConfig(num_envs=1, particles="full", parity="reference", backend=_backend()),
         network=NetworkConfig("aligned", numbers.split, 0.25 if numbers.split else 1.0),
         report=ReportConfig(eval_deterministic=task == "shapematch"),
     )
     return paper if name == "paper" else _quick(paper)
+
+
+def _backend() -> str:
+    """Compiled physics where it can be had: training takes many steps of the same shapes."""
+    return "compile" if compiler_found() else "eager"
 
 
 def _quick(paper: Config) -> Config:
@@ -94,13 +100,15 @@ def _quick(paper: Config) -> Config:
         paper,
         preset="quick",
         seed=0,
-        steps=20_000,
-        handover=(12_000,),
-        random_steps=(1_000, 100),
-        environment=EnvironmentConfig(),
+        steps=6_400,
+        handover=(3_840,),
+        random_steps=(480, 100),
+        environment=EnvironmentConfig(backend=_backend()),
         network=replace(paper.network, interpolation="half_pixel"),
-        learning=LearningConfig(batch_size=64, learning_rate=1e-3, gamma=0.95, buffer_size=20_000, gradient_steps=4),
-        report=replace(paper.report, eval_every=4_000, checkpoint_every=4_000, log_every=480),
+        learning=LearningConfig(
+            batch_size=64, learning_rate=1e-3, gamma=0.9, tau=0.01, buffer_size=20_000, gradient_steps=4
+        ),
+        report=replace(paper.report, eval_every=480, checkpoint_every=480, log_every=160),
     )
     return quick
 

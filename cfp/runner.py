@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,9 @@ def stage_files(folder: Path, levels: int) -> dict[str, Path]:
 class Runner:
     """Trains all levels of a run in its folder.
 
+    ``policy.safetensors`` is the policy with the best evaluation of its level so far (without evaluations: the newest);
+    it is what the next level freezes and what the final table judges, on layouts of its own.
+
     Args:
         config: The run's options.
         folder: Its folder.
@@ -103,9 +107,8 @@ class Runner:
             model = self._train_level(level)
             last = level + 1 == len(self.config.resolutions)
             if not last:
-                actor, _, _ = model.networks()
-                description = describe(self.config, level, self.position.offset + model.num_timesteps)
-                save_policy(self.folder / f"stage{level + 1}.safetensors", actor, description)
+                best = load(self.folder / "policy.safetensors")
+                save_policy(self.folder / f"stage{level + 1}.safetensors", best.actor, best.description)
                 self.position = Position(level + 1, self.position.offset + model.num_timesteps)
         self.logger.close()
 
@@ -155,21 +158,33 @@ class Runner:
         episodes = config.report.eval_episodes
         env = make_env(config, config.resolutions[level], episodes)
         actor, _, _ = model.networks()
+        rows = read_table(self.folder / "evaluations.csv")
+        best = max((float(row["mean"]) for row in rows if int(row["stage"]) == level + 1), default=-math.inf)
+
+        def keep(step: int) -> None:
+            save_policy(self.folder / "policy.safetensors", actor, describe(config, level, step))
 
         def measure(step: int) -> Result:
+            nonlocal best
             deterministic = config.report.eval_deterministic
             result = evaluate("", model, env, episodes, deterministic=deterministic, seed=config.seed)
             row: dict[str, Any] = {"step": step, "stage": level + 1, "episodes": episodes}
             row |= {"mean": result.mean, "std": result.std}
             row |= {"lowest": min(result.returns), "highest": max(result.returns), "success": result.success}
+            if result.mean > best:  # before the row: a crash between the two repeats the evaluation
+                best = result.mean
+                keep(step)
             self.evaluations.add(row)
             return result
 
         def save(step: int) -> None:
-            save_policy(self.folder / "policy.safetensors", actor, describe(config, level, step))
+            if best == -math.inf:  # not evaluated yet, or never
+                keep(step)
             self.checkpoint.save(model, config, position)
 
-        return StageCallback(level, position.offset, config.steps, config.report, self.signals, measure, save)
+        # A level begins with the coarser one's policy under a nearly closed gate: it must do better than that.
+        first = level > 0 and config.report.eval_every > 0 and best == -math.inf
+        return StageCallback(level, position.offset, config.steps, config.report, self.signals, measure, save, first)
 
     def finish(self) -> list[Result]:
         """After training: the final table, ``results.json``, the curve and the video. Returns the table's rows."""

@@ -16,6 +16,7 @@ from cfp.errors import CFPError, ConfigError, NonFiniteError
 from cfp.presets import preset
 from cfp.process import Stopped, StopSignals, keep_memory
 from cfp.runner import Runner, holds_run, read_config
+from torchmpm.backends import compiler_found
 
 
 @dataclass(frozen=True)
@@ -124,6 +125,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"{folder} holds no run yet: starting afresh")
         print(f"{command.run.task}, preset {command.run.preset}, seed {command.run.seed} -> {folder}")
         keep_memory()
+        if command.run.environment.backend == "compile":
+            print("compiling the physics; the first time on a machine this takes half a minute ...")
+        elif not compiler_found():
+            print("no C++ compiler found: the physics runs operator by operator, about three times slower")
         train(command.run, folder, command.resume)
     except Stopped as stopped:
         print(f"{stopped}; go on with: python -m cfp.train --resume --out {folder}")

@@ -259,7 +259,7 @@ def test_learning_improves_the_return():
     def make_env():
         return FakeEnv(num_envs=8, resolution=4, horizon=5, start=-0.4, push=1.0)
 
-    options = {"learning_rate": 1e-3, "gamma": 0.5, "tau": 0.05, "gradient_steps": 2, "batch_size": 32}
+    options = {"learning_rate": 1e-3, "gamma": 0.5, "tau": 0.05, "gradient_steps": 2, "batch_size": 16}
     model = make_model(ActorSpec((4,)), make_env(), random_steps=80, update_start=64, alpha=0.0, **options)
     probe = monitored(make_env())
 
@@ -272,8 +272,9 @@ def test_learning_improves_the_return():
         return total.mean()
 
     before = returns()
-    model.learn(640)
-    assert returns() > before + 0.5
+    model.learn(400)
+    assert before < 2.5
+    assert returns() > 3.0  # 3.09 is the best that can be had
 
 
 def test_policy_also_serves_the_plain_algorithm():

@@ -108,14 +108,16 @@ def reference_substep(
 @pytest.mark.parametrize("strain", [0.01, 0.2], ids=["elastic", "yielding"])
 @pytest.mark.parametrize("moved", [0.0, -0.31], ids=["window at home", "window moved"])
 def test_against_a_loop_over_particles_and_nodes(strain: float, moved: float) -> None:
-    """Two bodies, muscles, rules in both frames, damping, and particles beyond every edge of the window."""
+    """Three bodies, muscles, rules in both frames, damping, and particles beyond every edge of the window."""
     origin = torch.tensor([[moved, 0.02]], dtype=torch.float64)
     rules = (
         VelocityRule("-y", j=(None, 6), friction=math.inf),
         VelocityRule("+x", i=(9, 9)),
         *fixed((10, 11), (4, 6), frame="window"),
     )
-    solver = robot_and_ball(18, 8, rules=rules, damping=0.999)
+    tail = Body(6, VonMises(700.0, 30.0, 40.0), mass=1.0, muscle=True)
+    bodies = (*robot_and_ball(12, 8).bodies, tail)
+    solver = robot(26, bodies=bodies, rules=rules, damping=0.999)
     state = lively(26, strain=strain)
     x = origin + state.x
     places = [(-0.1, 0.5), (0.02, 0.5), (0.99, 0.5), (1.2, 0.5), (0.5, -0.11), (0.5, -0.02), (0.5, 0.97), (0.5, 1.3)]
