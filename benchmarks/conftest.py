@@ -10,6 +10,12 @@ def pytest_configure(config: pytest.Config) -> None:
     config.stash[ROWS] = []
 
 
+@pytest.fixture(autouse=True)
+def fresh_compiler() -> None:
+    """A process compiles only so many combinations before it runs eagerly: let no benchmark use up another's share."""
+    torch.compiler.reset()
+
+
 @pytest.fixture
 def per_substep(request: pytest.FixtureRequest, benchmark):
     """Time ``run``, which advances ``particles`` particles by ``substeps`` substeps; note the cost of one."""

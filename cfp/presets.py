@@ -100,15 +100,16 @@ def _quick(paper: Config) -> Config:
         paper,
         preset="quick",
         seed=0,
-        steps=6_400,
-        handover=(3_840,),
+        steps=4_800,
+        handover=(3_200,),
         random_steps=(480, 100),
+        alpha=(0.5 * paper.alpha[0], paper.alpha[1]),
         environment=EnvironmentConfig(backend=_backend()),
         network=replace(paper.network, interpolation="half_pixel"),
         learning=LearningConfig(
             batch_size=64, learning_rate=1e-3, gamma=0.9, tau=0.01, buffer_size=20_000, gradient_steps=4
         ),
-        report=replace(paper.report, eval_every=480, checkpoint_every=480, log_every=160),
+        report=replace(paper.report, eval_every=480, eval_deterministic=False, checkpoint_every=480, log_every=160),
     )
     return quick
 
