@@ -20,10 +20,14 @@ THRESHOLD = 125
 OFF_CENTRE = 3.0
 
 # Corners (column, row) of filled polygons, several for a shape that is a union.
+# fmt: off
 _OUTLINES: dict[str, list[list[tuple[int, int]]]] = {
     "star": [
-        [(30, 15), (32, 15), (36, 26), (44, 25), (45, 27), (38, 34), (43, 48), (40, 47)]
-        + [(31, 41), (23, 48), (22, 47), (26, 34), (19, 28), (18, 25), (26, 25)]
+        [
+            (30, 15), (32, 15), (36, 26), (44, 25), (45, 27),
+            (38, 34), (43, 48), (40, 47), (31, 41), (23, 48),
+            (22, 47), (26, 34), (19, 28), (18, 25), (26, 25),
+        ],
     ],
     "I": [
         [(15, 17), (46, 17), (46, 19), (15, 19)],
@@ -37,6 +41,7 @@ _OUTLINES: dict[str, list[list[tuple[int, int]]]] = {
     ],
     "T": [[(15, 21), (48, 21), (48, 27), (15, 27)], [(28, 28), (35, 28), (35, 51), (28, 51)]],
 }
+# fmt: on
 
 
 def load_target(target: TargetLike) -> np.ndarray:
