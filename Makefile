@@ -3,6 +3,9 @@
 PYTHON ?= python3
 PIP_FLAGS ?=
 
+# Threads that wait for each other by spinning stall for seconds as soon as another program wants a core.
+export OMP_WAIT_POLICY ?= PASSIVE
+
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt $(PIP_FLAGS)
 STAMP := .venv/.stamp-install
