@@ -250,7 +250,7 @@ class Solver:
         columns = []
         for body, part in self.parts():
             value = column(getattr(body, name), like[:, part], name)
-            columns.append(value * torch.ones_like(like[: 1 if not isinstance(value, Tensor) else None, part]))
+            columns.append(value * torch.ones_like(like[:1, part]))
         batch = max(len(c) for c in columns)
         return torch.cat([c.expand(batch, -1) for c in columns], dim=1)
 
