@@ -10,6 +10,7 @@ import typing
 from dataclasses import dataclass, replace
 from typing import Any
 
+import dittogym
 from cfp.config import Config, EnvironmentConfig, LearningConfig, NetworkConfig, Preset, ReportConfig, merge
 from cfp.errors import ConfigError
 from torchmpm.backends import compiler_found
@@ -67,7 +68,7 @@ def preset(task: str, name: str = "quick") -> Config:
         ConfigError: No such task or preset.
     """
     if task not in TASKS:
-        raise ConfigError(f"task: got {task!r}, allowed {', '.join(TASKS)}")
+        raise ConfigError(f"task: got {task!r}, allowed {', '.join(dittogym.TASKS)}")
     if name not in typing.get_args(Preset):
         raise ConfigError(f"preset: got {name!r}, allowed {', '.join(typing.get_args(Preset))}")
     numbers = TASKS[task]

@@ -109,6 +109,10 @@ def train(config: Config, folder: Path, resume: bool = False) -> None:
     """
     with StopSignals() as signals:
         runner = Runner(config, folder, resume, signals)
+        if config.environment.backend == "compile":
+            print("compiling the physics; the first time on a machine this takes half a minute ...")
+        elif not compiler_found():
+            print("no C++ compiler found: the physics runs operator by operator, about three times slower")
         runner.train()
     runner.finish()
 
@@ -125,10 +129,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"{folder} holds no run yet: starting afresh")
         print(f"{command.run.task}, preset {command.run.preset}, seed {command.run.seed} -> {folder}")
         keep_memory()
-        if command.run.environment.backend == "compile":
-            print("compiling the physics; the first time on a machine this takes half a minute ...")
-        elif not compiler_found():
-            print("no C++ compiler found: the physics runs operator by operator, about three times slower")
         train(command.run, folder, command.resume)
     except Stopped as stopped:
         print(f"{stopped}; go on with: python -m cfp.train --resume --out {folder}")

@@ -85,9 +85,8 @@ class Measurement(NamedTuple):
 
     def map(self, function: Callable[..., Tensor], *others: Measurement) -> Measurement:
         """Apply ``function`` to every field that is there, together with the same field of ``others``."""
-        return Measurement(
-            *(None if mine is None else function(mine, *theirs) for mine, *theirs in zip(self, *others, strict=True))  # type: ignore[arg-type]
-        )
+        there = {name: mine for name, mine in self._asdict().items() if mine is not None}
+        return Measurement(**{n: function(mine, *(getattr(o, n) for o in others)) for n, mine in there.items()})
 
 
 class Moment(NamedTuple):

@@ -139,7 +139,7 @@ def test_damaged_checkpoint_is_an_error_that_names_it(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--task", "jump"], "task: got 'jump', allowed shapematch, run, grow"),
+        (["--task", "jump"], "task: got 'jump', allowed shapematch, run"),
         (["--preset", "slow"], "preset: got 'slow', allowed quick, paper"),
         (["--particles", "0"], "particles"),
         (["--target", "no/such.png"], "target"),
