@@ -7,7 +7,7 @@ description of grid, bodies and boundary) advances it, and no function keeps a t
 from torchmpm import diagnostics, sampling
 from torchmpm.boundary import VelocityRule, fixed
 from torchmpm.grid import Grid
-from torchmpm.material import Elastic, Material, VonMises, lame
+from torchmpm.material import Elastic, Material, Soil, VonMises, lame
 from torchmpm.rollout import repeated, trajectory
 from torchmpm.solver import Body, Solver
 from torchmpm.state import ParticleState
@@ -20,6 +20,7 @@ __all__ = [
     "Grid",
     "Material",
     "ParticleState",
+    "Soil",
     "Solver",
     "VelocityRule",
     "VonMises",

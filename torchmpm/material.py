@@ -1,4 +1,4 @@
-"""Constitutive laws: elastic and von Mises elasto-plastic matter."""
+"""Constitutive laws: elastic, von Mises elasto-plastic, and soil."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Material(Protocol):
         """Project the trial deformation gradient (planes (B, N)) onto the elastic range."""
 
     def stress(self, F: Mat2, Jp: Tensor) -> Sym2:
-        """Kirchhoff stress of the projected deformation gradient, planes (B, N), Pa."""
+        """Kirchhoff stress of the projected F, planes (B, N), Pa; ``Jp`` is the one from before the projection."""
 
     def energy(self, F: Mat2, Jp: Tensor) -> Tensor:
         """Stored energy per unit volume, (B, N), J/m^2 (two-dimensional)."""
@@ -58,21 +58,24 @@ def column(value: Value, like: Tensor, name: str = "value") -> Value:
     raise ValueError(f"{name} must be a number or have shape (), ({batch},) or ({batch}, {count}), got {value.shape}")
 
 
-def corotated_stress(F: Mat2, mu: Value, lam: Value) -> Sym2:
-    """Kirchhoff stress of the fixed corotated solid, 2 mu (F - R) F^T + lam J (J - 1) I (Stomakhin et al., 2012)."""
+def corotated_stress(F: Mat2, mu: Value, lam: Value, J: Tensor | None = None) -> Sym2:
+    """Kirchhoff stress of the fixed corotated solid, 2 mu (F - R) F^T + lam J (J - 1) I (Stomakhin et al., 2012).
+
+    J is det F unless it is given.
+    """
     a, b, c, d = F
     r = polar(F)
     e, f, g, h = a - r[0], b - r[1], c - r[2], d - r[3]
-    J = det(F)
+    J = det(F) if J is None else J
     pressure = lam * (J * (J - 1.0))
     mu2 = 2.0 * mu
     return mu2 * (e * a + f * b) + pressure, mu2 * (e * c + f * d), mu2 * (g * c + h * d) + pressure
 
 
-def corotated_energy(F: Mat2, mu: Value, lam: Value) -> Tensor:
-    """Energy mu |F - R|^2 + lam/2 (J - 1)^2 whose derivative is :func:`corotated_stress`."""
+def corotated_energy(F: Mat2, mu: Value, lam: Value, J: Tensor | None = None) -> Tensor:
+    """Energy mu |F - R|^2 + lam/2 (J - 1)^2 whose derivative is :func:`corotated_stress`; J is det F unless given."""
     distance = sum((f - r).square() for f, r in zip(F, polar(F), strict=True))
-    return mu * distance + 0.5 * lam * (det(F) - 1.0).square()
+    return mu * distance + 0.5 * lam * ((det(F) if J is None else J) - 1.0).square()
 
 
 def _sqrt(value: Value) -> Value:
@@ -126,10 +129,58 @@ def von_mises_return(F: Mat2, limit: Value) -> Mat2:
     )
 
 
-def _check_not_negative(material: Elastic | VonMises) -> None:
+def clamp_stretches(F: Mat2, low: Value, high: Value, shear_cutoff: float = 0.0) -> tuple[Mat2, Tensor]:
+    """Bring both principal stretches of F into [low, high].
+
+    No SVD: sum and difference of the stretches rescale the rotation and the reflection part of F (see
+    :mod:`torchmpm.linalg`), the larger of which holds the orthogonal factor R of F = R S.
+
+    Args:
+        F: Trial deformation gradient, planes (B, N).
+        low: Smallest stretch, broadcastable to (B, N).
+        high: Largest stretch.
+        shear_cutoff: An off-diagonal entry of S below this is dropped first, as in the reference implementation.
+
+    Returns:
+        The new F, and by how much its area |det F| was reduced, |det F| before over after, (B, N).
+    """
+    p, q, r, s = split(F)
+    rotation, reflection = p.square() + q.square(), r.square() + s.square()
+    proper = rotation >= reflection
+    m1, m2 = torch.where(proper, p, r), torch.where(proper, q, s)  # the larger part: R and the sum of stretches
+    n1, n2 = torch.where(proper, r, p), torch.where(proper, s, q)  # the smaller part: their difference
+    square = torch.where(proper, rotation, reflection)
+    empty = square == 0
+    total = torch.where(empty, 1.0, square).sqrt()
+    cos, sin = torch.where(empty, 1.0, m1 / total), m2 / total
+    total = torch.where(empty, 0.0, total)
+    if shear_cutoff:
+        along = n1 * cos + n2 * sin
+        drop = (n2 * cos - n1 * sin).abs() < 2.0 * shear_cutoff
+        n1, n2 = torch.where(drop, along * cos, n1), torch.where(drop, along * sin, n2)
+    square = n1.square() + n2.square()
+    round_ = square == 0  # equal stretches: any axes are principal, and no square root is taken of zero
+    difference = torch.where(round_, 0.0, torch.where(round_, 1.0, square).sqrt())
+    stretches = 0.5 * (total + difference), 0.5 * (total - difference)
+    major, minor = (_clamp(stretch, low, high) for stretch in stretches)
+    # Where stretches are equal the ratio multiplies zeros; its value is what a small difference would be scaled by.
+    kept = ((stretches[0] >= low) & (stretches[0] <= high)).to(total.dtype)
+    ratio = torch.where(round_, kept, (major - minor) / torch.where(round_, 1.0, difference))
+    m1, m2, n1, n2 = (major + minor) * cos, (major + minor) * sin, ratio * n1, ratio * n2
+    p, q, r, s = (torch.where(proper, a, b) for a, b in ((m1, n1), (m2, n2), (n1, m1), (n2, m2)))
+    squeezed = stretches[0] * stretches[1] / (major * minor)
+    return (0.5 * (p + r), 0.5 * (s - q), 0.5 * (q + s), 0.5 * (p - r)), squeezed
+
+
+def _clamp(stretch: Tensor, low: Value, high: Value) -> Tensor:
+    """Clamp whose derivative at the bounds is that of the inside."""
+    return torch.where(stretch < low, low, torch.where(stretch > high, high, stretch))
+
+
+def _check_not_negative(material: Elastic) -> None:
     for field in fields(material):
         value = getattr(material, field.name)
-        if not isinstance(value, Tensor) and not value >= 0:
+        if isinstance(value, (int, float)) and not value >= 0:
             raise ValueError(f"{field.name} must not be negative, got {value}")
 
 
@@ -183,3 +234,60 @@ class VonMises(Elastic):
         """Isochoric return to the yield surface; see :func:`von_mises_return`."""
         limit = column(self.yield_stress, Jp, "yield_stress") / (2.0 * column(self.mu, Jp, "mu"))
         return von_mises_return(F, limit), Jp
+
+
+@dataclass(frozen=True, eq=False)
+class Soil(Elastic):
+    """Loose ground: stretches leave a narrow range plastically, and compaction hardens.
+
+    Snow plasticity (Stomakhin et al., "A material point method for snow simulation", 2013) with the values of
+    DittoGym's DIG. The plastic volume ratio Jp collects the area that stretches lost to their bounds; the elastic
+    constants are multiplied by ``exp(hardening (1 - Jp))`` within ``hardening_range``, with the Jp of the substep before.
+
+    Attributes:
+        mu: Second Lame parameter at Jp = 1, Pa.
+        lam: First Lame parameter at Jp = 1, Pa.
+        compression: A principal stretch is kept above 1 - compression.
+        stretch: And below 1 + stretch.
+        hardening: Exponent.
+        hardening_range: Bounds of the factor on the elastic constants.
+        shear_cutoff: Shear stretch below this is forgotten in every substep, so the ground creeps. 1e-5 is the
+            threshold of the reference implementation's singular value decomposition, and part of DIG; 0 turns it off.
+
+    Raises:
+        ValueError: A value is negative, ``compression`` is not below 1, or ``hardening_range`` is not a range.
+    """
+
+    compression: Value = 0.025
+    stretch: Value = 0.0045
+    hardening: Value = 10.0
+    hardening_range: tuple[float, float] = (0.1, 5.0)
+    shear_cutoff: float = 1e-5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.compression, Tensor) and not self.compression < 1:
+            raise ValueError(f"compression must be below 1, got {self.compression}")
+        low, high = self.hardening_range
+        if not 0 <= low <= high:
+            raise ValueError(f"hardening_range must be (low, high) with 0 <= low <= high, got {self.hardening_range}")
+
+    def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
+        """Bring the principal stretches into their range; see :func:`clamp_stretches`."""
+        low, high = 1.0 - column(self.compression, Jp, "compression"), 1.0 + column(self.stretch, Jp, "stretch")
+        F, squeezed = clamp_stretches(F, low, high, self.shear_cutoff)
+        return F, Jp * squeezed
+
+    def stress(self, F: Mat2, Jp: Tensor) -> Sym2:
+        """Kirchhoff stress, planes (B, N), Pa; an inverted element is at rest in its mirrored shape."""
+        mu, lam = self._hardened(Jp)
+        return corotated_stress(F, mu, lam, det(F).abs())
+
+    def energy(self, F: Mat2, Jp: Tensor) -> Tensor:
+        """Stored energy per unit volume, (B, N)."""
+        mu, lam = self._hardened(Jp)
+        return corotated_energy(F, mu, lam, det(F).abs())
+
+    def _hardened(self, Jp: Tensor) -> tuple[Value, Value]:
+        factor = torch.exp(column(self.hardening, Jp, "hardening") * (1.0 - Jp)).clamp(*self.hardening_range)
+        return factor * column(self.mu, Jp, "mu"), factor * column(self.lam, Jp, "lam")

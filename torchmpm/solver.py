@@ -226,13 +226,14 @@ class Solver:
         parts: list[tuple[Tensor, ...]] = []
         for body, part in self.parts():
             a, b, c, d = trial
-            F, Jp_body = body.material.return_map((a[:, part], b[:, part], c[:, part], d[:, part]), Jp[:, part])
-            xx, xy, yy = body.material.stress(F, Jp_body)
+            before = Jp[:, part]
+            F, after = body.material.return_map((a[:, part], b[:, part], c[:, part], d[:, part]), before)
+            xx, xy, yy = body.material.stress(F, before)
             if body.muscle and scene.actuation is not None:
                 pull = muscle.muscle_stress(F, muscle.sample(nodes.part(part), scene.actuation))
                 xx, xy, yy = xx + pull[0], xy + pull[1], yy + pull[2]
-            factor = -self.dt * (4.0 / self.grid.h**2) * column(body.volume, Jp_body, "volume")
-            parts.append((*F, Jp_body, factor * xx, factor * xy, factor * yy))
+            factor = -self.dt * (4.0 / self.grid.h**2) * column(body.volume, before, "volume")
+            parts.append((*F, after, factor * xx, factor * xy, factor * yy))
         planes = zip(*parts, strict=True)
         f0, f1, f2, f3, Jp, xx, xy, yy = (p[0] if len(p) == 1 else torch.cat(p, dim=1) for p in planes)
         return (f0, f1, f2, f3), Jp, (xx, xy, yy)

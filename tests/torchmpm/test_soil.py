@@ -1,0 +1,130 @@
+"""Soil against an independent singular value decomposition, and its derivatives against finite differences."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from test_material import deformations, matrix, planes, stretched, symmetric, turn
+from torch import Tensor
+
+from torchmpm import Soil, lame
+from torchmpm.material import clamp_stretches, corotated_stress
+
+MU, LAM = lame(5000.0, 0.2)
+LOW, HIGH = 0.975, 1.0045
+
+
+def soil(**values) -> Soil:
+    return Soil(MU, LAM, **values)
+
+
+def by_svd(F: np.ndarray, cutoff: float) -> tuple[np.ndarray, float]:
+    """Clamped F, and area before over after, from R, S and one Jacobi rotation (mpm.md 6.2 and 6.6)."""
+    U, sigma, Vt = np.linalg.svd(F)
+    R, S = U @ Vt, Vt.T @ np.diag(sigma) @ Vt
+    if abs(S[0, 1]) < cutoff:
+        sigma, V = np.diag(S).copy(), np.eye(2)
+    else:
+        sigma, V = np.linalg.eigh(S)
+    new = np.clip(sigma, LOW, HIGH)
+    return R @ V @ np.diag(new) @ V.T, float(np.prod(sigma / new))
+
+
+@pytest.mark.parametrize("cutoff", [0.0, 1e-5, 0.02])
+def test_clamp_against_svd(cutoff: float) -> None:
+    """All around the range, some inverted; the large cutoff catches about half of them."""
+    F = torch.cat((deformations(300, 0.96, 1.03, seed=1), deformations(100, 0.2, 3.0, seed=2)), 1)
+    clamped, squeezed = clamp_stretches(planes(F), LOW, HIGH, cutoff)
+    expected = [by_svd(f, cutoff) for f in F[0].numpy()]
+    np.testing.assert_allclose(matrix(clamped)[0].numpy(), np.stack([e[0] for e in expected]), rtol=0, atol=2e-14)
+    np.testing.assert_allclose(squeezed[0].numpy(), [e[1] for e in expected], rtol=1e-13)
+
+
+def test_inside_the_range_nothing_changes() -> None:
+    F = deformations(100, LOW + 1e-9, HIGH - 1e-9, seed=3)
+    mapped, Jp = soil(shear_cutoff=0.0).return_map(planes(F), torch.full((1, 100), 0.9, dtype=torch.float64))
+    torch.testing.assert_close(matrix(mapped), F, rtol=0, atol=1e-15)
+    torch.testing.assert_close(Jp, torch.full_like(Jp, 0.9), rtol=1e-14, atol=0)
+
+
+def test_shear_cutoff_forgets_small_shear_only() -> None:
+    small, large = (torch.tensor([[[[1.0, s], [s, 1.0]]]], dtype=torch.float64) for s in (0.9e-5, 1.1e-5))
+    Jp = torch.ones(1, 1, dtype=torch.float64)
+    for F, kept in ((small, 0.0), (large, 1.1e-5)):
+        assert matrix(soil().return_map(planes(F), Jp)[0])[0, 0, 0, 1].item() == pytest.approx(kept, abs=1e-15)
+    assert matrix(soil(shear_cutoff=0.0).return_map(planes(small), Jp)[0])[0, 0, 0, 1].item() == pytest.approx(0.9e-5)
+
+
+def test_area_that_stretches_lose_goes_into_jp() -> None:
+    F = deformations(200, 0.9, 1.1, seed=4)
+    mapped, Jp = soil().return_map(planes(F), torch.ones(1, 200, dtype=torch.float64))
+    before, after = (torch.linalg.det(f).abs() for f in (F, matrix(mapped)))
+    torch.testing.assert_close(Jp * after, before, rtol=1e-8, atol=0)  # the cutoff changes areas by 1e-10
+
+
+@pytest.mark.parametrize(("Jp", "factor"), [(1.0, 1.0), (0.9, math.e), (0.5, 5.0), (1.1, 1 / math.e), (2.0, 0.1)])
+def test_hardening(Jp: float, factor: float) -> None:
+    F = deformations(10, LOW, HIGH, seed=5, share_inverted=0.0)
+    tau = symmetric(soil().stress(planes(F), torch.full((1, 10), Jp, dtype=torch.float64)))
+    expected = symmetric(corotated_stress(planes(F), factor * MU, factor * LAM))
+    torch.testing.assert_close(tau, expected, rtol=1e-12, atol=1e-10)
+
+
+def test_inverted_soil_is_at_rest_in_its_mirrored_shape() -> None:
+    F = (turn(0.3) @ torch.diag(torch.tensor([1.0, -1.0], dtype=torch.float64)))[None, None]
+    one = torch.ones(1, 1, dtype=torch.float64)
+    assert symmetric(soil().stress(planes(F), one)).abs().max() < 1e-10
+    assert soil().energy(planes(F), one).abs().max() < 1e-20
+
+
+POINTS = {
+    "identity": torch.eye(2, dtype=torch.float64),
+    "rotated": turn(0.7),
+    "inside": stretched(1.003, 0.98, 0.4, 1.3),
+    "one stretched": stretched(1.02, 0.99, 0.4, 1.3),
+    "both squeezed": stretched(0.95, 0.9, 0.4, 1.3),
+    "both squeezed alike": 0.9 * turn(0.2),
+    "beyond both ends": stretched(1.1, 0.9, 0.4, 1.3),
+    "inverted": stretched(1.1, -0.98, 0.4, 1.3),
+}
+
+
+def all_of_it(F: Tensor, Jp: Tensor, mu: Tensor) -> Tensor:
+    """Return map and stress as the substep chains them, without the cutoff: it is not continuous."""
+    material = Soil(MU * mu, LAM, shear_cutoff=0.0)
+    mapped, after = material.return_map(planes(F), Jp)
+    return torch.cat((matrix(mapped).flatten(2), torch.stack((*material.stress(mapped, Jp), after), -1) / MU), -1)
+
+
+@pytest.mark.parametrize("name", POINTS)
+def test_gradients_against_finite_differences(name: str) -> None:
+    F = POINTS[name][None, None].clone().requires_grad_()
+    Jp, mu = torch.full((1, 1), 0.95, dtype=torch.float64, requires_grad=True), torch.ones((), dtype=torch.float64)
+    assert torch.autograd.gradcheck(all_of_it, (F, Jp, mu.requires_grad_()), eps=1e-8, atol=1e-7, rtol=1e-6)
+
+
+@pytest.mark.parametrize("cutoff", [0.0, 1e-5])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradient_of_a_field_has_no_infinities(dtype: torch.dtype, cutoff: float) -> None:
+    singular = stretched(1.0, 0.0, 0.5, 0.2)
+    F = torch.stack((torch.zeros(2, 2), torch.eye(2), turn(1.0), singular, -torch.eye(2), 1e-12 * turn(0.3)))[None]
+    F = F.to(dtype).requires_grad_()
+    Jp = F.new_ones(1, 6)
+    mapped, after = soil(shear_cutoff=cutoff).return_map(planes(F), Jp)
+    total = torch.stack(soil().stress(mapped, Jp)).sum() + matrix(mapped).sum() + after.sum()
+    assert torch.autograd.grad(total, F)[0].isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"compression": -0.1}, "compression must not be negative, got -0.1"),
+        ({"compression": 1.5}, "compression must be below 1, got 1.5"),
+        ({"shear_cutoff": -1.0}, "shear_cutoff must not be negative, got -1.0"),
+        ({"hardening_range": (5.0, 0.1)}, r"hardening_range must be \(low, high\)"),
+    ],
+)
+def test_bad_values_are_named(values: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        soil(**values)
