@@ -242,7 +242,8 @@ class Soil(Elastic):
 
     Snow plasticity (Stomakhin et al., "A material point method for snow simulation", 2013) with the values of
     DittoGym's DIG. The plastic volume ratio Jp collects the area that stretches lost to their bounds; the elastic
-    constants are multiplied by ``exp(hardening (1 - Jp))`` within ``hardening_range``; Jp is that of the substep before.
+    constants are multiplied by ``exp(hardening (1 - Jp))`` within ``hardening_range``, Jp being that of the substep
+    before.
 
     Attributes:
         mu: Second Lame parameter at Jp = 1, Pa.
