@@ -21,7 +21,7 @@ def to_grid_layout(action: Tensor, layout: Layout) -> Tensor:
     return action.flip(-2).transpose(-1, -2) if layout == "image" else action
 
 
-def patch_field(action: Tensor, patch: int, max_actuation: float) -> Tensor:
+def patch_field(action: Tensor, patch: int, max_actuation: float | Tensor) -> Tensor:
     """Upsample an action in grid layout to the patch and scale it to muscle stress.
 
     Bicubic interpolation (a = -0.75) with half-pixel centres; the result is clipped to the muscles' limit, because the
@@ -30,13 +30,14 @@ def patch_field(action: Tensor, patch: int, max_actuation: float) -> Tensor:
     Args:
         action: (B, 2, R, R), 1 is the full actuation.
         patch: Width P of the patch in nodes.
-        max_actuation: Muscle stress limit, Pa.
+        max_actuation: Muscle stress limit, Pa; a number or (B,).
 
     Returns:
         (B, 2, P, P), Pa.
     """
     upsampled = interpolate(action, size=(patch, patch), mode="bicubic", align_corners=False)
-    return (max_actuation * upsampled).clamp(-max_actuation, max_actuation)
+    scale = max_actuation.view(-1, 1, 1, 1) if isinstance(max_actuation, Tensor) else max_actuation
+    return scale * upsampled.clamp(-1.0, 1.0)
 
 
 def place(field: Tensor, centre: Tensor, nodes: int) -> Tensor:

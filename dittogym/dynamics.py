@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dittogym import observation as obs
 from dittogym.action import patch_field, place
+from dittogym.physics import Physics
 from dittogym.reward import action_cost, measure, split_penalty
 from dittogym.spec import FAILURE_REWARD, Measurement, Moment, Outcome, TaskSpec
 from dittogym.window import in_window, window_origin
@@ -26,6 +27,7 @@ class EnvState:
         centre: (B, 2) the robot's centre on which the next action is placed, m.
         start: Averages right after the reset.
         memory: What the task remembers.
+        physics: Constants that differ from the task's, see :func:`dittogym.physics.physics_values`.
         steps: (B,) int64 control steps taken.
     """
 
@@ -34,33 +36,39 @@ class EnvState:
     centre: Tensor
     start: Measurement
     memory: Mapping[str, Tensor]
+    physics: Physics
     steps: Tensor
+
+    def map(self, function: Callable[..., Tensor], *others: EnvState) -> EnvState:
+        """Apply ``function`` to every tensor, together with the same tensor of ``others``."""
+
+        def entries(name: str) -> dict[str, Tensor]:
+            maps = [getattr(state, name) for state in (self, *others)]
+            return {key: function(*(m[key] for m in maps)) for key in maps[0]}
+
+        def field(name: str) -> Tensor:
+            return function(*(getattr(state, name) for state in (self, *others)))
+
+        return EnvState(
+            particles=self.particles.map(function, *(other.particles for other in others)),
+            origin=field("origin"),
+            centre=field("centre"),
+            start=self.start.map(function, *(other.start for other in others)),
+            memory=entries("memory"),
+            physics=entries("physics"),
+            steps=field("steps"),
+        )
 
     def where(self, mask: Tensor, other: EnvState) -> EnvState:
         """Whole batch elements from this state where ``mask`` (B,) holds, from ``other`` elsewhere."""
-
-        def choose(mine: Tensor, theirs: Tensor) -> Tensor:
-            return torch.where(mask.view(-1, *[1] * (mine.ndim - 1)), mine, theirs)
-
-        return EnvState(
-            particles=self.particles.where(mask, other.particles),
-            origin=choose(self.origin, other.origin),
-            centre=choose(self.centre, other.centre),
-            start=self.start.map(choose, other.start),
-            memory={name: choose(value, other.memory[name]) for name, value in self.memory.items()},
-            steps=choose(self.steps, other.steps),
+        return self.map(
+            lambda mine, theirs: torch.where(mask.view(-1, *[1] * (mine.ndim - 1)), mine, theirs),
+            other,
         )
 
     def detach(self) -> EnvState:
         """The same numbers, cut off from the autograd graph."""
-        return replace(
-            self,
-            particles=self.particles.detach(),
-            origin=self.origin.detach(),
-            centre=self.centre.detach(),
-            start=self.start.map(Tensor.detach),
-            memory={name: value.detach() for name, value in self.memory.items()},
-        )
+        return self.map(Tensor.detach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,18 +79,33 @@ class Model:
         spec: The task.
         solver: Its physics.
         substeps: Substeps of a control step.
-        share: Full-size particles that one particle stands for; ``None`` for the reference's pixel raster.
+        shares: By body, the full-size particles that one particle stands for.
+        pixels: Whether observations use the reference's pixel raster.
     """
 
     spec: TaskSpec
     solver: Solver
     substeps: int
-    share: float | None
+    shares: tuple[float, ...]
+    pixels: bool
 
     @property
     def robot(self) -> int:
         """Number of robot particles."""
         return self.solver.bodies[0].count
+
+    def solver_for(self, physics: Physics) -> Solver:
+        """The solver with the constants of :func:`dittogym.physics.physics_values` in place of the task's own."""
+        if not physics:
+            return self.solver
+        counts = tuple(body.count for body in self.solver.bodies)
+        bodies = _bodies(self.spec, counts, self.shares, physics)
+        return replace(self.solver, bodies=bodies, gravity=physics.get("gravity", self.spec.gravity))
+
+    def per_particle(self, values: tuple[float, ...] | tuple[bool, ...], like: Tensor) -> Tensor:
+        """Values of the bodies as (N,) over all particles, on the device of ``like``."""
+        counts = torch.tensor([body.count for body in self.solver.bodies])
+        return torch.tensor(values).repeat_interleave(counts).to(like.device)
 
 
 def make_model(
@@ -90,8 +113,8 @@ def make_model(
 ) -> Model:
     """Build the physics of a task.
 
-    Mass and volume of particles are scaled by full-size over actual count of the robot, so that density and stiffness
-    of the bodies mean the same at every tier.
+    Mass and volume of a body's particles are scaled by full-size over actual count, so that density and stiffness mean
+    the same at every tier.
 
     Args:
         spec: The task.
@@ -101,30 +124,35 @@ def make_model(
         unscaled: As in the reference: unit volumes, and the pixel raster, whatever the counts.
     """
     full = counts == tuple(body.count for body in spec.bodies)
-    share = 1.0 if unscaled else spec.robot.count / counts[0]
-    robot = VonMises(spec.mu, spec.lam, spec.yield_stress)
-    bodies = [
-        Body(n, robot if i == 0 else Elastic(spec.mu, spec.lam), share * body.mass, share, muscle=i == 0)
-        for i, (body, n) in enumerate(zip(spec.bodies, counts, strict=True))
-    ]
+    shares = tuple(1.0 if unscaled else body.count / n for body, n in zip(spec.bodies, counts, strict=True))
     solver = Solver(
         Grid(),
-        tuple(bodies),
+        _bodies(spec, counts, shares, {}),
         gravity=spec.gravity,
         damping=spec.damping,
         rules=tuple(rule for obstacle in spec.obstacles for rule in obstacle.rules),
         backend=backend,
     )
-    return Model(spec, solver, substeps, share=None if full or unscaled else share)
+    return Model(spec, solver, substeps, shares, pixels=full or unscaled)
 
 
-def initial(model: Model, positions: Tensor) -> EnvState:
+def _bodies(spec: TaskSpec, counts: tuple[int, ...], shares: tuple[float, ...], physics: Physics) -> tuple[Body, ...]:
+    mu, lam, yield_stress = (physics.get(name, getattr(spec, name)) for name in ("mu", "lam", "yield_stress"))
+    robot, elastic = VonMises(mu, lam, yield_stress), Elastic(mu, lam)
+    heavier = physics.get("mass", 1.0)
+    return tuple(
+        Body(n, robot if i == 0 else body.material or elastic, share * body.mass * heavier, share, muscle=i == 0)
+        for i, (body, n, share) in enumerate(zip(spec.bodies, counts, shares, strict=True))
+    )
+
+
+def initial(model: Model, positions: Tensor, physics: Physics | None = None) -> EnvState:
     """State right after a reset with particles at rest at ``positions`` (B, N, 2), m."""
     particles = ParticleState.at_rest(positions)
     start = measure(particles, model.robot)
     origin = window_origin(model.spec, start.com)
     steps = torch.zeros(len(positions), dtype=torch.int64, device=positions.device)
-    state = EnvState(particles, origin, start.com, start, {}, steps)
+    state = EnvState(particles, origin, start.com, start, {}, physics or {}, steps)
     memory = model.spec.remember(_moment(model, state, start, observe(model, state)))
     return replace(state, memory=memory)
 
@@ -140,10 +168,10 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
     Returns:
         The next state, and the actuation on the patch (B, 2, P, P) in Pa.
     """
-    spec, grid = model.spec, model.solver.grid
-    field = patch_field(action, spec.patch, spec.max_actuation)
-    on_nodes = place(field, in_window(spec.reach, state.centre, state.origin), grid.resolution)
-    particles = model.solver.step(state.particles, on_nodes, substeps=model.substeps, origin=state.origin)
+    spec, solver = model.spec, model.solver_for(state.physics)
+    field = patch_field(action, spec.patch, state.physics.get("max_actuation", spec.max_actuation))
+    on_nodes = place(field, in_window(spec.reach, state.centre, state.origin), solver.grid.resolution)
+    particles = solver.step(state.particles, on_nodes, substeps=model.substeps, origin=state.origin)
     com = particles.x[:, : model.robot].mean(1)
     origin = state.origin if spec.window.follow is None else window_origin(spec, com)
     return replace(state, particles=particles, origin=origin, centre=com, steps=state.steps + 1), field
@@ -155,21 +183,30 @@ def observe(model: Model, state: EnvState) -> Tensor:
     particles, origin = state.particles.detach(), state.origin.detach()
     finite = torch.isfinite(particles.x).all(-1) & torch.isfinite(particles.v).all(-1)
     seen = finite & model.solver.grid.contains(particles.x[..., 0], origin[:, 0:1])
-    position = particles.x - origin[:, None]
-    velocity = (2.0 * torch.where(seen[..., None], particles.v, 0.0)).clamp(-obs.CLIP, obs.CLIP)
-    row, column = obs.crop_corner(in_window(spec.view, state.centre.detach(), origin))
+    silent = ~model.per_particle(tuple(body.moves_visibly for body in spec.bodies), origin)
+    speaks = (seen & ~silent)[..., None]
     boxes = [box for obstacle in spec.obstacles for box in obstacle.drawn]
-    mask = obs.background(boxes, origin, row, column)
-    if model.share is None:
-        return obs.quantise(obs.pixel_means(position, velocity, seen, row, column, mask))
-    return obs.quantise(obs.splat_means(position, velocity, seen, row, column, mask, model.share))
+    boxes += [] if spec.goal is None else [obs.goal_box(spec.goal)]
+    row, column = obs.crop_corner(in_window(spec.view, state.centre.detach(), origin))
+    sight = obs.Sight(
+        position=particles.x - origin[:, None],
+        velocity=(2.0 * torch.where(speaks, particles.v, 0.0)).clamp(-obs.CLIP, obs.CLIP),
+        seen=seen,
+        silent=silent,
+        row=row,
+        column=column,
+        mask=obs.background(boxes, origin, row, column),
+    )
+    if model.pixels:
+        return obs.quantise(obs.pixel_means(sight))
+    return obs.quantise(obs.splat_means(sight, model.per_particle(model.shares, origin)))
 
 
 def judge(model: Model, state: EnvState, field: Tensor, observation: Tensor) -> tuple[EnvState, Outcome]:
     """Reward terms, termination and success after a transition.
 
-    Elements whose state is not finite end with the single term ``failure`` = :data:`dittogym.spec.FAILURE_REWARD`;
-    their neighbours are not touched.
+    Elements whose state is not finite, or whose robot has left the window, end with the single term ``failure`` =
+    :data:`dittogym.spec.FAILURE_REWARD`; their neighbours are not touched.
 
     Returns:
         The state with the task's memory brought up to date, and the outcome with ``terminated`` always given and
@@ -179,7 +216,7 @@ def judge(model: Model, state: EnvState, field: Tensor, observation: Tensor) -> 
     weights = spec.weights
     now = measure(state.particles, model.robot)
     own = spec.judge(_moment(model, state, now, observation), weights)
-    finite = diagnostics.finite(state.particles)
+    finite = intact(model, state)
     terms = dict(own.terms)
     terminated = torch.zeros_like(finite) if own.terminated is None else own.terminated
     if spec.split_limit is not None:
@@ -197,6 +234,14 @@ def judge(model: Model, state: EnvState, field: Tensor, observation: Tensor) -> 
     success = own.success & finite if own.success is not None else None
     state = state if own.memory is None else replace(state, memory=own.memory)
     return state, Outcome(terms, terminated | ~finite, success, info)
+
+
+def intact(model: Model, state: EnvState) -> Tensor:
+    """Which simulations can go on, (B,) bool: all numbers are finite and some of the robot is in the window."""
+    x = state.particles.x[:, : model.robot].detach()
+    height = x[..., 1] - state.origin[:, 1:2]
+    present = model.solver.grid.contains(x[..., 0], state.origin[:, 0:1]) & (height > 0) & (height < 1)
+    return diagnostics.finite(state.particles) & present.any(1)
 
 
 def _moment(model: Model, state: EnvState, now: Measurement, observation: Tensor) -> Moment:

@@ -16,12 +16,21 @@ FLOOR_NODE = 19
 
 @dataclass(frozen=True)
 class Box:
-    """Open axis-aligned box in the world, m; an infinite bound leaves a side open."""
+    """Axis-aligned box in the world, m; an infinite bound leaves a side open.
+
+    Its bounds belong to it if it is ``closed``.
+    """
 
     left: float = -math.inf
     right: float = math.inf
     bottom: float = -math.inf
     top: float = math.inf
+    closed: bool = False
+
+
+def nodes(left: float = -math.inf, right: float = math.inf, bottom: float = -math.inf, top: float = math.inf) -> Box:
+    """A box whose bounds are counted in nodes from the world's origin."""
+    return Box(left / NODES, right / NODES, bottom / NODES, top / NODES)
 
 
 @dataclass(frozen=True)
@@ -53,6 +62,13 @@ def ceiling(node: int) -> Obstacle:
     return Obstacle("ceiling", (VelocityRule("+y", j=(node, None)),), shown=(Box(bottom=node / NODES),))
 
 
+def side_walls(top: int | None) -> Obstacle:
+    """Invisible walls at both ends of a fixed window that reaches from -0.5 m to 0.5 m, up to this node."""
+    rules = (VelocityRule("+x", (32, 34), (None, top)), VelocityRule("-x", (-34, -32), (None, top)))
+    height = math.inf if top is None else top
+    return Obstacle("side walls", rules, shown=(nodes(32, 34, top=height), nodes(-34, -32, top=height)))
+
+
 def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True) -> Obstacle:
     """A box of nodes that matter cannot enter: one-sided faces left, right, below and above.
 
@@ -73,10 +89,5 @@ def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True) -> O
         rules.append(VelocityRule("+y", i, (low, low + 1)))
     if high is not None:
         rules.append(VelocityRule("-y", i, (high - 1, high)))
-    box = Box(
-        left / NODES,
-        right / NODES,
-        -math.inf if low is None else low / NODES,
-        math.inf if high is None else high / NODES,
-    )
+    box = nodes(left, right, -math.inf if low is None else low, math.inf if high is None else high)
     return Obstacle(name, tuple(rules), (box,) if visible else (), (box,))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from dittogym.spec import Body, TaskSpec
-from torchmpm import sampling
+from dittogym.window import window_origin
+from torchmpm import Grid, sampling
 from torchmpm.sampling import Points
 
 #: ``"full"``, ``"lite"``, the number of robot particles, or the numbers for robot and object.
@@ -22,7 +25,8 @@ MAX_SEED = 2**32 - 1
 def particle_counts(spec: TaskSpec, particles: Particles) -> tuple[int, ...]:
     """Particles of each body.
 
-    ``"lite"`` and a single number keep the full-size ratio between the bodies.
+    A single number keeps the full-size ratio between the bodies; so does ``"lite"``, unless a body of the task names
+    its own number there.
 
     Raises:
         ValueError: Not one of the allowed forms, or a count below 1.
@@ -31,8 +35,10 @@ def particle_counts(spec: TaskSpec, particles: Particles) -> tuple[int, ...]:
     if particles == "full":
         return full
     if particles == "lite":
-        particles = LITE
-    if isinstance(particles, (int, np.integer)) and not isinstance(particles, bool):
+        robot, *objects = spec.bodies
+        count = min(LITE, robot.count)
+        counts = (count, *(b.lite or max(1, round(count * b.count / robot.count)) for b in objects))
+    elif isinstance(particles, (int, np.integer)) and not isinstance(particles, bool):
         counts = (int(particles), *(max(1, round(particles * n / full[0])) for n in full[1:]))
     elif isinstance(particles, (tuple, list)) and len(particles) == len(full):
         counts = tuple(int(n) for n in particles)
@@ -85,3 +91,75 @@ class LayoutSampler:
             return draws
         magnitude, sign = draws[:, :2], np.where(draws[:, 2:] > 0.5, 1.0, -1.0)
         return 0.5 * (1.0 + sign * magnitude)
+
+
+class Layouts:
+    """Starting positions of a batch: drawn at a seeded reset, kept until the next, or given by the user.
+
+    Args:
+        spec: The task.
+        counts: Particles of each body.
+        num_envs: B.
+        spread: Evenly spread instead of random numbers, see :class:`LayoutSampler`.
+        resample: Draw anew at every reset.
+    """
+
+    def __init__(self, spec: TaskSpec, counts: tuple[int, ...], num_envs: int, *, spread: bool, resample: bool) -> None:
+        self._spec, self._counts, self._num_envs = spec, counts, num_envs
+        self._spread, self._resample = spread, resample
+        self._samplers: dict[int, LayoutSampler] = {}
+        self._positions: Tensor | None = None
+
+    def draw(self, seed: int | None, mask: np.ndarray, given: Any, like: Tensor) -> Tensor:
+        """Starting positions (B, N, 2) in m of all elements; those outside ``mask`` (B,) keep theirs.
+
+        Args:
+            seed: Of the first element, the others follow; ``None`` goes on with what there is.
+            mask: Which elements are reset.
+            given: (N, 2) or (B, N, 2) positions, or ``None``.
+            like: Gives dtype and device.
+
+        Raises:
+            ValueError: Positions of the wrong shape or outside the window, or a seed out of range.
+        """
+        samplers = dict(self._samplers)
+        redraw = seed is not None or not samplers
+        if redraw:
+            for i in np.flatnonzero(mask).tolist():
+                element_seed = None if seed is None else seed + i
+                samplers[i] = LayoutSampler(self._spec, self._counts, element_seed, spread=self._spread)
+        if given is not None:
+            positions = self._given(given, like)
+        elif self._positions is None or redraw or self._resample:
+            stacked = np.zeros((self._num_envs, sum(self._counts), 2))
+            for i in np.flatnonzero(mask).tolist():
+                stacked[i] = samplers[i].draw()
+            positions = torch.as_tensor(stacked).to(like)
+        else:
+            return self._positions
+        if self._positions is not None:
+            positions = torch.where(
+                torch.as_tensor(mask, device=like.device)[:, None, None], positions, self._positions
+            )
+        self._samplers, self._positions = samplers, positions
+        return positions
+
+    def _given(self, given: Any, like: Tensor) -> Tensor:
+        positions = torch.as_tensor(given).to(like)
+        shape = (sum(self._counts), 2)
+        if tuple(positions.shape) not in (shape, (self._num_envs, *shape)):
+            raise ValueError(
+                f"positions must have shape {shape} or {(self._num_envs, *shape)}, got {tuple(positions.shape)}"
+            )
+        positions = positions.expand(self._num_envs, *shape)
+        origin = window_origin(self._spec, positions[:, : self._counts[0]].mean(1))
+        height = positions[..., 1] - origin[:, 1:2]
+        inside = Grid().contains(positions[..., 0], origin[:, 0:1]) & (height > 0) & (height < 1)
+        if not bool(inside.all()):
+            element, particle = (~inside).nonzero()[0].tolist()
+            where = positions[element, particle].tolist()
+            raise ValueError(
+                f"positions must lie inside the window ({origin[element, 0]:.3f} < x < {origin[element, 0] + 1:.3f}, "
+                f"0 < y < 1), got {where} for particle {particle} of element {element}"
+            )
+        return positions

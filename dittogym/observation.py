@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -32,35 +33,60 @@ def crop_corner(centre: Tensor) -> tuple[Tensor, Tensor]:
     return RASTER - below - 2 * half, column
 
 
-def background(boxes: Sequence[Box], origin: Tensor, row: Tensor, column: Tensor) -> Tensor:
-    """Fine pixels of the crop that obstacles and targets set, (B, 512, 512) bool.
+class Sight(NamedTuple):
+    """What an observation is made from.
 
-    A pixel belongs to a box if its left edge and its upper edge lie in the open box.
-    """
-    pixels = torch.arange(SIZE * BLOCK, device=origin.device)
-    x = (column + pixels) / RASTER + origin[:, 0:1]
-    y = (RASTER - row - pixels) / RASTER + origin[:, 1:2]
-    mask = torch.zeros(len(origin), SIZE * BLOCK, SIZE * BLOCK, dtype=torch.bool, device=origin.device)
-    for box in boxes:
-        across, along = (x > box.left) & (x < box.right), (y > box.bottom) & (y < box.top)
-        mask = mask | (along[:, :, None] & across[:, None, :])
-    return mask
-
-
-def pixel_means(position: Tensor, velocity: Tensor, seen: Tensor, row: Tensor, column: Tensor, mask: Tensor) -> Tensor:
-    """The reference's raster: a fine pixel is set by any particle in it and has the velocity of the last one.
-
-    Args:
+    Attributes:
         position: (B, N, 2) window coordinates, m.
-        velocity: (B, N, 2) doubled, clipped velocities.
+        velocity: (B, N, 2) doubled, clipped velocities; zero for silent particles.
         seen: (B, N) bool, particles that are drawn.
+        silent: (N,) bool, particles that only the occupancy channel shows.
         row: First fine row of the crop, (B, 1).
         column: First fine column of the crop, (B, 1).
-        mask: (B, 512, 512) background.
+        mask: (B, 512, 512) bool, fine pixels of the crop that obstacles and goals set.
+    """
+
+    position: Tensor
+    velocity: Tensor
+    seen: Tensor
+    silent: Tensor
+    row: Tensor
+    column: Tensor
+    mask: Tensor
+
+
+def goal_box(goal: tuple[float, float]) -> Box:
+    """What the observation shows of a goal: pixels less than ten fine pixels away in both directions."""
+    reach = 10 / RASTER
+    return Box(goal[0] - reach, goal[0] + reach, goal[1] - reach, goal[1] + reach)
+
+
+def background(boxes: Sequence[Box], origin: Tensor, row: Tensor, column: Tensor) -> Tensor:
+    """Fine pixels of the crop that obstacles and goals set, (B, 512, 512) bool.
+
+    A pixel belongs to a box if its left edge and its upper edge lie in it.
+    """
+    pixels = torch.arange(SIZE * BLOCK, device=origin.device)
+    if not boxes:
+        return torch.zeros(len(origin), SIZE * BLOCK, SIZE * BLOCK, dtype=torch.bool, device=origin.device)
+    x = (column + pixels) / RASTER + origin[:, 0:1]
+    y = (RASTER - row - pixels) / RASTER + origin[:, 1:2]
+    across = torch.stack([_between(x, box.left, box.right, box.closed) for box in boxes], dim=1)
+    along = torch.stack([_between(y, box.bottom, box.top, box.closed) for box in boxes], dim=2)
+    return along.float() @ across.float() > 0
+
+
+def _between(value: Tensor, low: float, high: float, closed: bool) -> Tensor:
+    return (value >= low) & (value <= high) if closed else (value > low) & (value < high)
+
+
+def pixel_means(sight: Sight) -> Tensor:
+    """The reference's raster: a fine pixel is set by any particle in it and has the velocity of the last one.
 
     Returns:
         (B, 3, 64, 64) means over image pixels of occupancy and both velocities.
     """
+    position, velocity, seen, silent, row, column, mask = sight
     batch, count = seen.shape
     width = SIZE * BLOCK
     r = torch.trunc((1.0 - position[..., 1]) * float(RASTER)).to(torch.int64) - row
@@ -68,7 +94,9 @@ def pixel_means(position: Tensor, velocity: Tensor, seen: Tensor, row: Tensor, c
     seen = seen & (position[..., 1] > 0) & (r >= 0) & (r < width) & (c >= 0) & (c < width)
     r, c = torch.where(seen, r, 0), torch.where(seen, c, 0)
     fine = r * width + c
-    order = torch.where(seen, torch.arange(count, device=r.device), -1)
+    # Silent particles leave the velocity of a pixel to any other particle in it.
+    rank = torch.arange(count, device=r.device) + torch.where(silent, 0, count)
+    order = torch.where(seen, rank, -1)
     last = torch.full((batch, width * width), -1, dtype=torch.int64, device=r.device)
     last = last.scatter_reduce(1, fine, order, "amax")
     wins = seen & (last.gather(1, fine) == order)
@@ -77,31 +105,24 @@ def pixel_means(position: Tensor, velocity: Tensor, seen: Tensor, row: Tensor, c
     coarse = (r // BLOCK) * SIZE + c // BLOCK
     sums = torch.zeros(3, batch, SIZE * SIZE, dtype=velocity.dtype, device=r.device)
     sums = sums.scatter_add(2, coarse.expand(3, -1, -1), values).view(3, batch, SIZE, SIZE)
-    blocks = mask.view(batch, SIZE, BLOCK, SIZE, BLOCK).sum((2, 4))
-    sums[0] += blocks
+    sums[0] += mask.view(batch, SIZE, BLOCK, SIZE, BLOCK).sum((2, 4))
     return sums.transpose(0, 1) / BLOCK**2
 
 
-def splat_means(
-    position: Tensor, velocity: Tensor, seen: Tensor, row: Tensor, column: Tensor, mask: Tensor, share: float
-) -> Tensor:
-    """What the reference's raster of a full-size robot would show on average, from fewer particles.
+def splat_means(sight: Sight, shares: Tensor) -> Tensor:
+    """What the reference's raster of full-size bodies would show on average, from fewer particles.
 
     Particles are spread over image pixels by quadratic B-splines, which gives the number n of full-size particles to
     expect in a pixel; the share of its fine pixels that they hit is ``1 - exp(-n / SATURATION)``.
 
     Args:
-        position: (B, N, 2) window coordinates, m.
-        velocity: (B, N, 2) doubled, clipped velocities.
-        seen: (B, N) bool, particles that are drawn.
-        row: First fine row of the crop, (B, 1).
-        column: First fine column of the crop, (B, 1).
-        mask: (B, 512, 512) background.
-        share: Full-size particles that one particle stands for.
+        sight: What is there.
+        shares: (N,) full-size particles that each particle stands for.
 
     Returns:
         (B, 3, 64, 64) means over image pixels of occupancy and both velocities.
     """
+    position, velocity, seen, silent, row, column, mask = sight
     batch = len(seen)
     u = position[..., 0] * (RASTER / BLOCK) - column / BLOCK - 0.5
     w = (1.0 - position[..., 1]) * (RASTER / BLOCK) - row / BLOCK - 0.5
@@ -114,15 +135,17 @@ def splat_means(
     c = base_u.to(torch.int64)[:, None, None] + offset[:, None]
     inside = (r >= 0) & (r < SIZE) & (c >= 0) & (c < SIZE) & seen[:, None, None]
     ids = (r.clamp(0, SIZE - 1) * SIZE + c.clamp(0, SIZE - 1)).flatten(1)
-    weight = torch.where(inside, weight, 0.0) * share
-    values = torch.stack((weight, *(weight * v[:, None, None] for v in velocity.unbind(-1)))).flatten(2)
-    sums = torch.zeros(3, batch, SIZE * SIZE, dtype=velocity.dtype, device=u.device)
-    sums = sums.scatter_add(2, ids.expand(3, -1, -1), values).view(3, batch, SIZE, SIZE)
-    expected = sums[0]
-    hit = 1.0 - torch.exp(-expected / SATURATION)
+    weight = torch.where(inside, weight, 0.0) * shares
+    moving = weight * ~silent
+    values = torch.stack((weight, moving, *(moving * v[:, None, None] for v in velocity.unbind(-1)))).flatten(2)
+    sums = torch.zeros(4, batch, SIZE * SIZE, dtype=velocity.dtype, device=u.device)
+    sums = sums.scatter_add(2, ids.expand(4, -1, -1), values).view(4, batch, SIZE, SIZE)
+    expected, heard = sums[0], sums[1]
     free = 1.0 - mask.view(batch, SIZE, BLOCK, SIZE, BLOCK).to(velocity.dtype).mean((2, 4))
-    per_particle = torch.where(expected > 0, hit / torch.where(expected > 0, expected, 1.0), 0.0)
-    return torch.stack((1.0 - free * (1.0 - hit), sums[1] * per_particle, sums[2] * per_particle), dim=1)
+    hit = 1.0 - torch.exp(-heard / SATURATION)
+    per_particle = torch.where(heard > 0, hit / torch.where(heard > 0, heard, 1.0), 0.0)
+    occupancy = 1.0 - free * torch.exp(-expected / SATURATION)
+    return torch.stack((occupancy, sums[2] * per_particle, sums[3] * per_particle), dim=1)
 
 
 def quantise(means: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from torch import Tensor
 from dittogym.action import place
 from dittogym.geometry import Box
 from dittogym.window import in_window
+from torchmpm import Soil
 
 if TYPE_CHECKING:
     from dittogym.dynamics import EnvState, Model
@@ -19,7 +20,7 @@ GROUND = (248, 246, 240)
 SOLID = (112, 119, 130)
 GRID = (226, 224, 217)
 TARGET = (247, 198, 98)
-BODIES = ((38, 121, 140), (222, 122, 60), (150, 118, 86))
+ROBOT, OBJECT, GROUND_BODY = (38, 121, 140), (222, 122, 60), (150, 118, 86)
 CONTRACT, RELAX, EXPAND = np.array((206, 60, 52)), np.array((190, 190, 190)), np.array((52, 92, 200))
 #: Distance of the marks on the ground that show how far the window has moved, m.
 MARK = 0.1
@@ -55,6 +56,8 @@ def frame(model: Model, state: EnvState, index: int, field: Tensor | None, size:
     origin = state.origin[index].detach().cpu().double().numpy()
     canvas = Canvas(size * OVERSAMPLING, origin)
     canvas.marks()
+    if spec.goal is not None:
+        canvas.goal(spec.goal)
     if spec.target is not None:
         canvas.target(spec.target, state.centre[index].detach().cpu().double().numpy())
     for obstacle in spec.obstacles:
@@ -62,10 +65,13 @@ def frame(model: Model, state: EnvState, index: int, field: Tensor | None, size:
             canvas.box(box, filled=bool(obstacle.drawn) or obstacle.name == "floor")
     x = particles.x[0].cpu().double().numpy()
     counts = [body.count for body in model.solver.bodies]
-    colours = np.repeat(np.array(BODIES[: len(counts)]), counts, axis=0)
+    kinds = [ROBOT, *(GROUND_BODY if isinstance(body.material, Soil) else OBJECT for body in spec.objects)]
+    colours = np.repeat(np.array(kinds), counts, axis=0)
     if field is not None:
         colours[: model.robot] = _muscle_colours(model, state, index, field)
-    canvas.dots(x, colours, radius=_radius(model, size * OVERSAMPLING))
+    parts = [part for _, part in model.solver.parts()]
+    for part, share in reversed(list(zip(parts, model.shares, strict=True))):  # the robot last, on top
+        canvas.dots(x[part], colours[part], radius=_radius(share, size * OVERSAMPLING))
     return cv2.resize(canvas.image, (size, size), interpolation=cv2.INTER_AREA)
 
 
@@ -94,6 +100,11 @@ class Canvas:
         corners = (round(left), round(self.pixels - high)), (round(right), round(self.pixels - low))
         cv2.rectangle(self.image, *corners, SOLID, cv2.FILLED if filled else 3)
 
+    def goal(self, goal: tuple[float, float]) -> None:
+        """A disc at a point of the world."""
+        middle = (np.array(goal) - self.origin) * self.pixels
+        cv2.circle(self.image, (round(middle[0]), round(self.pixels - middle[1])), self.pixels // 60, TARGET, -1)
+
     def target(self, target: np.ndarray, centre: np.ndarray) -> None:
         """The picture to match, half a window wide, around the robot's centre."""
         width = self.pixels // 2
@@ -118,10 +129,9 @@ class Canvas:
                 self.image[r[ok], c[ok]] = colours[ok]
 
 
-def _radius(model: Model, pixels: int) -> int:
-    """Dots just large enough to close the robot's body at its initial density."""
-    full = model.spec.robot.count
-    return max(1, round(FULL_SIZE_RADIUS * np.sqrt(full / model.robot) * pixels))
+def _radius(share: float, pixels: int) -> int:
+    """Dots just large enough to close a body at its initial density."""
+    return max(1, round(FULL_SIZE_RADIUS * np.sqrt(share) * pixels))
 
 
 def _muscle_colours(model: Model, state: EnvState, index: int, field: Tensor) -> np.ndarray:
@@ -132,5 +142,6 @@ def _muscle_colours(model: Model, state: EnvState, index: int, field: Tensor) ->
     relative = (state.particles.x[index, : model.robot] - state.origin[index]).detach().cpu().double().numpy()
     finite = np.isfinite(relative).all(1, keepdims=True)
     at = np.clip(np.where(finite, relative, 0.0) * len(nodes), 0, len(nodes) - 1).astype(int)
-    pull = np.clip(nodes[at[:, 0], at[:, 1]] / (2 * spec.max_actuation), -1, 1)[:, None]
+    strength = float(state.physics["max_actuation"][index]) if "max_actuation" in state.physics else spec.max_actuation
+    pull = np.clip(nodes[at[:, 0], at[:, 1]] / (2 * strength), -1, 1)[:, None]
     return RELAX + np.abs(pull) * (np.where(pull > 0, CONTRACT, EXPAND) - RELAX)

@@ -4,51 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from torch import Tensor
 
 from dittogym.geometry import Obstacle
-from torchmpm import ParticleState, sampling
-from torchmpm.sampling import Points
+from dittogym.shapes import Shape
+from torchmpm import Material, ParticleState
 
 #: Rewards per step of an element whose state is no longer finite; its episode ends.
 FAILURE_REWARD = -16.0
-
-
-class Shape(Protocol):
-    """Where the particles of a body start.
-
-    ``draws`` is the number of uniform random numbers a particle takes in the reference implementation: 4 where each
-    coordinate is a magnitude and a sign, 2 where it is one number, 0 for a lattice.
-    """
-
-    @property
-    def draws(self) -> int:
-        """Uniform numbers per particle in the reference."""
-
-    def positions(self, numbers: Points) -> Points:
-        """World positions (N, 2) in m from N points of the unit square (N, 2)."""
-
-
-@dataclass(frozen=True)
-class Disc:
-    """Disc with the chord density of the reference, given like there by its bounding square.
-
-    Attributes:
-        corner: Lower left corner of the bounding square in the world, m.
-        diameter: m.
-    """
-
-    corner: tuple[float, float]
-    diameter: float
-    draws: int = 4
-
-    def positions(self, numbers: Points) -> Points:
-        """World positions (N, 2) in m."""
-        radius = 0.5 * self.diameter
-        return sampling.chord_disc(numbers, (self.corner[0] + radius, self.corner[1] + radius), radius)
 
 
 @dataclass(frozen=True)
@@ -59,11 +25,18 @@ class Body:
         shape: Where they start.
         count: Particles at full size.
         mass: Mass of a particle at full size, kg.
+        material: Of an object; ``None``: elastic, with the robot's Lame parameters. The robot always is von Mises
+            matter with the constants of its task.
+        lite: Particles in the lite tier; ``None``: in proportion to the robot's.
+        moves_visibly: Whether the velocity channels of the observation show it; the occupancy channel always does.
     """
 
     shape: Shape
     count: int
     mass: float = 2.0
+    material: Material | None = None
+    lite: int | None = None
+    moves_visibly: bool = True
 
 
 class Measurement(NamedTuple):
@@ -169,7 +142,7 @@ class TaskSpec:
         max_actuation: Muscle stress at action 1, Pa.
         judge: The task's own reward terms, termination and success.
         weights: Weights of the terms that all tasks share, and of the task's own.
-        objects: Bodies beside the robot, at most one; elastic, with the robot's Lame parameters.
+        objects: Bodies beside the robot, at most one.
         gravity: (x, y), m/s^2.
         damping: Factor on node velocities in every substep.
         window: Fixed or moving window.
@@ -177,9 +150,11 @@ class TaskSpec:
         reach: Centre of the patch of nodes on which actions act.
         patch: Its width in nodes.
         obstacles: Static geometry, in order of precedence.
+        goal: Point in the world that the observation marks by a square of 19 fine pixels, m; ``None`` for none.
         coarse, fine: Action resolutions.
         split_limit: Spread at which the episode ends, m; ``None`` for never.
         remember: What to keep from the start of an episode, tensors with a leading B.
+        stale: Entries of the memory that a reset leaves as they are under ``parity="reference"``.
         target: (64, 64) bool picture to match, centred on the robot, row 0 at the top; for pictures of the task.
     """
 
@@ -200,10 +175,12 @@ class TaskSpec:
     reach: Centre = (None, None)
     patch: int = 64
     obstacles: tuple[Obstacle, ...] = ()
+    goal: tuple[float, float] | None = None
     coarse: int = 8
     fine: int = 16
     split_limit: float | None = None
     remember: Callable[[Moment], Mapping[str, Tensor]] = field(default=lambda moment: {})
+    stale: tuple[str, ...] = ()
     target: np.ndarray | None = field(default=None, compare=False)
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -12,17 +12,30 @@ from torch import Tensor
 from dittogym import dynamics
 from dittogym.action import Layout, to_grid_layout
 from dittogym.dynamics import EnvState
-from dittogym.layout import LayoutSampler, Particles, particle_counts
+from dittogym.layout import Layouts, Particles, particle_counts
+from dittogym.physics import Physics, merged, physics_values
 from dittogym.render import frame
 from dittogym.reward import measure
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
-from dittogym.window import window_origin
-from torchmpm import ParticleState, diagnostics
+from torchmpm import ParticleState
 
 Parity = Literal["clean", "reference"]
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
-_RESET_OPTIONS = ("positions", "reset_mask")
+_RESET_OPTIONS = ("physics", "positions", "reset_mask")
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """A moment of an environment, see :meth:`TorchEnv.save`.
+
+    Attributes:
+        state: Everything that moves, leading B.
+        observation: (B, 3, 64, 64) uint8.
+    """
+
+    state: EnvState
+    observation: Tensor
 
 
 class TorchEnv:
@@ -48,7 +61,10 @@ class TorchEnv:
         parity: ``"clean"``, or ``"reference"`` to bring back the reference's stale observation and action centre
             after a reset, its random layout, unit particle volume and pixel raster at every particle count.
         resample: Draw new particles at every reset, not only at a seeded one.
-        task_options: Options of the task, such as ``target`` of SHAPE MATCH.
+        deterministic: Accept only what repeats a trajectory bit by bit for one seed and number of threads: the CPU, and
+            not the backend ``"compile"``.
+        task_options: ``body``, ``obstacles``, and options of the task such as ``target`` of SHAPE MATCH; see
+            :func:`dittogym.make_spec`.
 
     Attributes:
         spec: The task.
@@ -77,6 +93,7 @@ class TorchEnv:
         action_layout: Layout | None = None,
         parity: Parity = "clean",
         resample: bool = False,
+        deterministic: bool = False,
         **task_options: Any,
     ) -> None:
         self.spec = make_spec(task, **task_options)
@@ -93,19 +110,21 @@ class TorchEnv:
         self.num_envs, self.dtype, self.device = num_envs, _DTYPES[dtype], torch.device(device)
         if self.device.type == "cuda" and not torch.cuda.is_available():
             raise ValueError(f"device must be available, got {device!r}, but torch finds no CUDA device")
+        if deterministic and (self.device.type != "cpu" or backend == "compile"):
+            raise ValueError(
+                "deterministic=True needs device 'cpu' and a backend other than 'compile', "
+                f"got {device!r} and {backend!r}"
+            )
         self.action_resolution = self._resolution(resolution)
         self.action_shape = (2, self.action_resolution, self.action_resolution)
         self._stale = parity == "reference"
         self._layout: Layout = action_layout or ("grid" if self._stale else "image")
-        self._resample = resample
-        self._counts = particle_counts(self.spec, particles)
-        full = self._counts == particle_counts(self.spec, "full")
-        self._spread = not (full or self._stale)
-        self.model = dynamics.make_model(
-            self.spec, self._counts, substeps=substeps, backend=backend, unscaled=self._stale
-        )
-        self._samplers: dict[int, LayoutSampler] = {}
-        self._positions: Tensor | None = None
+        counts = particle_counts(self.spec, particles)
+        full = counts == particle_counts(self.spec, "full")
+        self.model = dynamics.make_model(self.spec, counts, substeps=substeps, backend=backend, unscaled=self._stale)
+        self._layouts = Layouts(self.spec, counts, num_envs, spread=not (full or self._stale), resample=resample)
+        self._like = torch.empty(num_envs, dtype=self.dtype, device=self.device)
+        self._physics: Physics = {}
         self._env_state: EnvState | None = None
         self._observation: Tensor | None = None
         self._field: Tensor | None = None
@@ -120,14 +139,12 @@ class TorchEnv:
     @property
     def num_particles(self) -> int:
         """N, particles of all bodies."""
-        return sum(self._counts)
+        return self.model.solver.num_particles
 
     @property
     def env_state(self) -> EnvState:
-        """Everything that moves, for :mod:`dittogym.dynamics`; assign to it to branch or restore."""
-        if self._env_state is None:
-            raise RuntimeError("call reset() first: the environment has no state yet")
-        return self._env_state
+        """Everything that moves, for :mod:`dittogym.dynamics`; see also :meth:`save`."""
+        return self._moment()[0]
 
     @env_state.setter
     def env_state(self, value: EnvState) -> None:
@@ -138,9 +155,56 @@ class TorchEnv:
         """The particles of all simulations."""
         return self.env_state.particles
 
+    def _moment(self) -> tuple[EnvState, Tensor]:
+        if self._env_state is None or self._observation is None:
+            raise RuntimeError("call reset() first: the environment has no state yet")
+        return self._env_state, self._observation
+
     def detach(self) -> None:
         """Cut the autograd graph: gradients do not reach back beyond this moment."""
-        self.env_state = self.env_state.detach()
+        self._env_state = self.env_state.detach()
+
+    def save(self) -> Snapshot:
+        """A copy of the present moment, to which :meth:`load` returns; keeps the autograd graph."""
+        state, observation = self._moment()
+        return Snapshot(state.map(Tensor.clone), observation.clone())
+
+    def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
+        """Go on from a saved moment, to the last bit as if nothing had happened since.
+
+        The layout and the physics of the next reset, and a ``TimeLimit`` wrapper's count, are not part of it.
+
+        Args:
+            snapshot: Of this environment or one like it; one of a single simulation goes into every element.
+            mask: (B,) bool, load only these elements.
+
+        Returns:
+            The observation (B, 3, 64, 64) uint8.
+
+        Raises:
+            ValueError: The snapshot is of another task, number of particles, type or batch size.
+        """
+        chosen = self._mask(mask)
+        theirs, mine = snapshot.state, self._env_state
+        size = len(theirs.steps)
+        kind = (theirs.particles.num_particles, theirs.particles.dtype, theirs.particles.device.type)
+        own = (self.num_particles, self.dtype, self.device.type)
+        if kind != own or size not in (1, self.num_envs):
+            raise ValueError(
+                f"snapshot must hold 1 or {self.num_envs} simulations of {own}, got {size} of {kind} "
+                "(particles, dtype, device)"
+            )
+        if mine is not None and set(theirs.memory) != set(mine.memory):
+            raise ValueError(f"snapshot must be of task {self.spec.name!r}, but that does not remember {theirs.memory}")
+        index = torch.arange(self.num_envs, device=self.device) % size
+        state, observation = theirs.map(lambda t: t[index]), snapshot.observation[index]
+        if not bool(chosen.all()):
+            mine, seen = self._moment()
+            physics = merged(self.spec, mine.physics, state.physics, chosen, self._like)
+            state = replace(state, physics=physics).where(chosen, replace(mine, physics=physics))
+            observation = torch.where(chosen[:, None, None, None], observation, seen)
+        self._env_state, self._observation, self._field = state, observation, None
+        return observation
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Start new episodes.
@@ -149,6 +213,8 @@ class TorchEnv:
             seed: Seeds element i with ``seed + i`` and draws its particles anew. Without it the last layout is used
                 again, unless ``resample`` was asked for.
             options: ``"positions"``: (N, 2) or (B, N, 2) world positions in m, robot first, used until the next seed;
+                ``"physics"``: constants of the matter, one value for all or one per element, see
+                :func:`dittogym.physics.physics_values`; used until given again, ``{}`` goes back to the task's own;
                 ``"reset_mask"``: (B,) bool, reset only these elements.
 
         Returns:
@@ -162,21 +228,26 @@ class TorchEnv:
             if name not in _RESET_OPTIONS:
                 raise ValueError(f"options may hold {', '.join(_RESET_OPTIONS)}, got {name!r}")
         mask = self._mask(options.get("reset_mask"))
-        positions = self._draw(seed, mask, options.get("positions"))
-        fresh = dynamics.initial(self.model, positions)
-        old = self._env_state
-        everyone = bool(mask.all())
+        old, everyone = self._env_state, bool(mask.all())
         if old is None and not everyone:
             raise ValueError("reset_mask must reset all elements the first time")
+        physics = self._physics
+        if options.get("physics") is not None:
+            given = physics_values(options["physics"], self.num_envs, self._like)
+            physics = merged(self.spec, physics, given, mask, self._like)
+        positions = self._layouts.draw(seed, mask.cpu().numpy(), options.get("positions"), self._like)
+        fresh = dynamics.initial(self.model, positions, physics)
         if old is not None and self._stale:
-            fresh = replace(fresh, centre=old.centre.detach())
-        self._positions = positions
-        self._env_state = fresh if everyone or old is None else fresh.where(mask, old)
-        self._field = None
+            memory = {**fresh.memory, **{name: old.memory[name].detach() for name in self.spec.stale}}
+            fresh = replace(fresh, centre=old.centre.detach(), memory=memory)
+        if old is not None and not everyone:
+            kept = merged(self.spec, physics, old.physics, ~mask, self._like)
+            fresh = replace(fresh, physics=kept).where(mask, replace(old, physics=kept))
+        self._physics, self._env_state, self._field = physics, fresh, None
         if self._observation is None or not self._stale:
-            self._observation = dynamics.observe(self.model, self._env_state)
+            self._observation = dynamics.observe(self.model, fresh)
         now = measure(self.state, self.model.robot)
-        info = {"com": now.com, "split": now.split, "finite": diagnostics.finite(self.state)}
+        info = {"com": now.com, "split": now.split, "finite": dynamics.intact(self.model, fresh)}
         return self._observation, {name: value.detach() for name, value in info.items()}
 
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
@@ -226,49 +297,6 @@ class TorchEnv:
                 f"reset_mask must be bool of shape ({self.num_envs},), got {mask.dtype} of shape {tuple(mask.shape)}"
             )
         return mask
-
-    def _draw(self, seed: int | None, mask: Tensor, given: Any) -> Tensor:
-        """Starting positions (B, N, 2) of all elements; those outside ``mask`` keep theirs."""
-        chosen = mask.tolist()
-        redraw = seed is not None or not self._samplers
-        if redraw:
-            for i in np.flatnonzero(chosen).tolist():
-                element_seed = None if seed is None else seed + i
-                self._samplers[i] = LayoutSampler(self.spec, self._counts, element_seed, spread=self._spread)
-        if given is not None:
-            positions = self._given(given)
-        elif self._positions is None or redraw or self._resample:
-            drawn = [self._samplers[i].draw() if chosen[i] else None for i in range(self.num_envs)]
-            empty = np.zeros((self.num_particles, 2))
-            stacked = np.stack([empty if d is None else d for d in drawn])
-            positions = torch.as_tensor(stacked, dtype=self.dtype, device=self.device)
-        else:
-            return self._positions
-        if self._positions is None:
-            return positions
-        return torch.where(mask[:, None, None], positions, self._positions)
-
-    def _given(self, given: Any) -> Tensor:
-        positions = torch.as_tensor(given, dtype=self.dtype, device=self.device)
-        shape = (self.num_particles, 2)
-        if tuple(positions.shape) not in (shape, (self.num_envs, *shape)):
-            raise ValueError(
-                f"positions must have shape {shape} or {(self.num_envs, *shape)}, got {tuple(positions.shape)}"
-            )
-        positions = positions.expand(self.num_envs, *shape)
-        com = positions[:, : self.model.robot].mean(1)
-        origin = window_origin(self.spec, com)
-        relative = positions - origin[:, None]
-        inside = self.model.solver.grid.contains(positions[..., 0], origin[:, 0:1])
-        inside = inside & (relative[..., 1] > 0) & (relative[..., 1] < 1)
-        if not bool(inside.all()):
-            element, particle = (~inside).nonzero()[0].tolist()
-            where = positions[element, particle].tolist()
-            raise ValueError(
-                f"positions must lie inside the window ({origin[element, 0]:.3f} < x < {origin[element, 0] + 1:.3f}, "
-                f"0 < y < 1), got {where} for particle {particle} of element {element}"
-            )
-        return positions
 
     def _checked(self, action: Tensor) -> Tensor:
         if not isinstance(action, Tensor) or not action.is_floating_point():

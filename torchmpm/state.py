@@ -94,15 +94,15 @@ class ParticleState:
 
     def to(self, *args: Any, **kwargs: Any) -> ParticleState:
         """Copy to another dtype or device; takes the arguments of :meth:`torch.Tensor.to`."""
-        return self._map(lambda t: t.to(*args, **kwargs))
+        return self.map(lambda t: t.to(*args, **kwargs))
 
     def detach(self) -> ParticleState:
         """The same numbers, cut off from the autograd graph."""
-        return self._map(Tensor.detach)
+        return self.map(Tensor.detach)
 
     def clone(self) -> ParticleState:
         """An independent copy, for branching a simulation."""
-        return self._map(Tensor.clone)
+        return self.map(Tensor.clone)
 
     def __getitem__(self, index: Any) -> ParticleState:
         """Select batch elements; an integer keeps a batch dimension of one.
@@ -114,15 +114,13 @@ class ParticleState:
             if not -self.batch_size <= index < self.batch_size:
                 raise IndexError(f"index {index} is out of range for a batch of {self.batch_size}")
             index = slice(index, index + 1 or None)
-        return self._map(lambda t: t[index])
+        return self.map(lambda t: t[index])
 
     def where(self, mask: Bool[Tensor, " B"], other: ParticleState) -> ParticleState:
         """Take whole batch elements: this state where ``mask`` (B,) holds, ``other`` elsewhere."""
-        return ParticleState(
-            *(
-                torch.where(mask.view(-1, *[1] * (mine.ndim - 1)), mine, theirs)
-                for mine, theirs in zip(self._tensors(), other._tensors(), strict=True)
-            )
+        return self.map(
+            lambda mine, theirs: torch.where(mask.view(-1, *[1] * (mine.ndim - 1)), mine, theirs),
+            other,
         )
 
     def planes(self) -> tuple[Tensor, ...]:
@@ -142,8 +140,6 @@ class ParticleState:
         vector, matrix = (lambda p: p.movedim(0, -1)), (lambda p: p.movedim(0, -1).unflatten(-1, (2, 2)))
         return cls(vector(stacked[0:2]), vector(stacked[2:4]), matrix(stacked[4:8]), matrix(stacked[8:12]), stacked[12])
 
-    def _tensors(self) -> list[Tensor]:
-        return [getattr(self, f.name) for f in fields(self)]
-
-    def _map(self, function: Callable[[Tensor], Tensor]) -> ParticleState:
-        return ParticleState(*map(function, self._tensors()))
+    def map(self, function: Callable[..., Tensor], *others: ParticleState) -> ParticleState:
+        """Apply ``function`` to every field, together with the same field of ``others``."""
+        return ParticleState(*(function(*(getattr(s, f.name) for s in (self, *others))) for f in fields(self)))

@@ -6,11 +6,19 @@ import inspect
 from collections.abc import Callable
 
 from dittogym.spec import TaskSpec
+from dittogym.tasks.catch import catch
+from dittogym.tasks.dig import dig
+from dittogym.tasks.grow import grow
+from dittogym.tasks.kick import kick
+from dittogym.tasks.obstacle import obstacle
 from dittogym.tasks.run import run
 from dittogym.tasks.shapematch import shapematch
+from dittogym.tasks.slot import slot
 
 #: Functions by task name; their keyword arguments are the task's own options.
-TASKS: dict[str, Callable[..., TaskSpec]] = {"shapematch": shapematch, "run": run}
+TASKS: dict[str, Callable[..., TaskSpec]] = {
+    make.__name__: make for make in (shapematch, run, grow, kick, dig, obstacle, catch, slot)
+}
 
 
 def make_spec(task: str | TaskSpec, **options: object) -> TaskSpec:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dittogym.geometry import NODES, Box, Obstacle, ceiling, floor
+from dataclasses import dataclass
+
+from dittogym.geometry import Obstacle, ceiling, floor, nodes
 from dittogym.reward import signed_quadratic
-from dittogym.spec import Body, Disc, Moment, Outcome, TaskSpec, Weights, Window
+from dittogym.shapes import Disc
+from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
 from torchmpm import VelocityRule
 
 #: Displacement from which the location term no longer grows, m; reaching it counts as success (our definition).
@@ -20,21 +23,31 @@ HANGING_BLOCK = Obstacle(
         VelocityRule("-x", (46, 47), (61, None)),
         VelocityRule("+y", (33, 46), (59, 60)),
     ),
-    shown=(Box(32 / NODES, 47 / NODES, 59 / NODES),),
+    shown=(nodes(32, 47, 59),),
 )
 
 
-def judge(moment: Moment, weights: Weights) -> Outcome:
-    """Displacement from the start and present speed, both saturating."""
-    travelled = moment.now.com[:, 0] - moment.start.com[:, 0]
-    location = signed_quadratic(travelled, 5.0).clamp(-20.0, 20.0)
-    velocity = signed_quadratic(moment.now.velocity[:, 0], 5.0).clamp(-20.0, 20.0)
-    return Outcome(
-        terms={"location": weights.location * location, "velocity": weights.velocity * velocity},
-        terminated=moment.now.com[:, 0] < REAR_LIMIT,
-        success=travelled >= GOAL,
-        info={"displacement": travelled},
-    )
+@dataclass(frozen=True)
+class Forward:
+    """Displacement from the start and present speed to the right, both saturating; shared with OBSTACLE.
+
+    Attributes:
+        goal: Displacement that counts as success, m.
+    """
+
+    goal: float
+
+    def __call__(self, moment: Moment, weights: Weights) -> Outcome:
+        """Judge a step."""
+        travelled = moment.now.com[:, 0] - moment.start.com[:, 0]
+        location = signed_quadratic(travelled, 5.0).clamp(-20.0, 20.0)
+        velocity = signed_quadratic(moment.now.velocity[:, 0], 5.0).clamp(-20.0, 20.0)
+        return Outcome(
+            terms={"location": weights.location * location, "velocity": weights.velocity * velocity},
+            terminated=moment.now.com[:, 0] < REAR_LIMIT,
+            success=travelled >= self.goal,
+            info={"displacement": travelled},
+        )
 
 
 def run() -> TaskSpec:
@@ -53,6 +66,6 @@ def run() -> TaskSpec:
         reach=(None, 0.28),
         obstacles=(HANGING_BLOCK, floor(), ceiling(119)),
         split_limit=0.10,
-        judge=judge,
+        judge=Forward(GOAL),
         weights=Weights(location=1.0, velocity=4.0, split=1.0, action=2e-4, alive=3.0),
     )

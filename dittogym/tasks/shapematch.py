@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from dittogym.geometry import ceiling, floor
-from dittogym.spec import Body, Disc, Moment, Outcome, TaskSpec, Weights
+from dittogym.shapes import Disc
+from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights
 from dittogym.targets import TargetLike, load_target
 
 #: A pixel belongs to the robot if its occupancy code reaches this (21 of 64 fine pixels hit).

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import dittogym
+from dittogym import dynamics
 from dittogym.action import patch_field, place
 from dittogym.window import in_window
 from torchmpm import muscle
@@ -40,6 +41,9 @@ SMALL = {
     "sub100_F": 1e-4,
     "sub100_Jp": 1e-12,
 }
+#: Tasks whose rewards look at a selection of particles: a fixed number of them in the reference, a share in ours, so
+#: that rewards agree at full size only.
+SHARES = ("grow", "catch", "slot")
 EPISODE = {
     "com": 1e-4,
     "anchor": 1e-4,
@@ -75,7 +79,9 @@ def make(data: dict[str, np.ndarray], **options: Any) -> dittogym.TorchEnv:
         parity="reference",
         **options,
     )
-    env.reset(seed=0, options={"positions": data["x0"]})
+    env.reset(seed=0)
+    # Not through the option "positions": one file parks particles that it does not need outside the window.
+    env.env_state = dynamics.initial(env.model, torch.as_tensor(data["x0"])[None].to(env.dtype))
     return env
 
 
@@ -114,10 +120,12 @@ def _first_grid(data: dict[str, np.ndarray], env: dittogym.TorchEnv, recorded: t
         return values.view(solver.grid.width, solver.grid.width)[PAD:-PAD, PAD:-PAD]
 
     velocity = torch.stack([on_nodes(v[0]) for v in grid_velocity(scene, grid.momentum)], -1)
+    heavy = data["sub1_grid_m"][..., None] > 1e-9
     return {
         "sub1_grid_actuation": worst(ours, recorded.numpy()),
         "sub1_particle_actuation": worst(along, data["sub1_particle_actuation"]),
-        "sub1_grid_v": worst(velocity, data["sub1_grid_v"]),
+        # On nodes with next to no mass, velocity is a quotient of two rounding errors.
+        "sub1_grid_v": worst(velocity * heavy, data["sub1_grid_v"] * heavy),
         "sub1_grid_m": worst(on_nodes(grid.momentum[0, 0]), data["sub1_grid_m"]),
     }
 
@@ -142,7 +150,10 @@ def episode_errors(data: dict[str, np.ndarray]) -> dict[str, float]:
         rows["obs"].append(observation[0])
     ours = {name: torch.stack(values).numpy() for name, values in rows.items()}
     errors = {name: worst(ours[name], data[name]) for name in EPISODE}
-    errors["reward"] /= max(float(np.ptp(data["reward"])), 10.0)
+    if env.spec.name in SHARES and robot != env.spec.robot.count:
+        del errors["reward"]
+    else:
+        errors["reward"] /= max(float(np.ptp(data["reward"])), 10.0)
     errors["kinetic"] /= float(data["kinetic"].max()) or 1.0
     errors["action_norm"] /= float(data["action_norm"].max()) or 1.0
     errors["obs"] = float((np.abs(ours["obs"].astype(int) - data["obs"].astype(int)) > 8).mean())

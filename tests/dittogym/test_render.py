@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dittogym import TorchEnv
-from dittogym.render import BODIES, CONTRACT, SOLID
+from dittogym.render import CONTRACT, ROBOT, SOLID
 
 
 def near(image: np.ndarray, colour) -> np.ndarray:
@@ -18,7 +18,7 @@ def test_body_and_floor_are_where_they_should_be(particles: str) -> None:
     env.reset(seed=0)
     image = env.render()
     assert image.shape == (512, 512, 3) and image.dtype == np.uint8
-    rows, columns = near(image, BODIES[0])
+    rows, columns = near(image, ROBOT)
     area = np.pi * (0.09 * 512) ** 2
     assert 0.85 * area < len(rows) < 1.15 * area
     assert columns.mean() == pytest.approx(0.4 * 512, abs=3)
@@ -47,4 +47,4 @@ def test_particles_that_are_not_finite_are_left_out() -> None:
     env.reset(seed=0)
     env.state.x[0, :50] = torch.nan
     env.render(muscles=True)
-    assert len(near(env.render(), BODIES[0])[0]) > 0
+    assert len(near(env.render(), ROBOT)[0]) > 0

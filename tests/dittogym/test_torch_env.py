@@ -150,7 +150,7 @@ def test_bad_actions(action: object, message: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"task": "fly"}, ValueError, "task must be one of run, shapematch, got 'fly'"),
+        ({"task": "fly"}, ValueError, "task must be one of catch, .* got 'fly'"),
         ({"target": "star"}, TypeError, "task 'run' has no option 'target'"),
         ({"particles": 0}, ValueError, "particles must be at least 1"),
         ({"particles": -3}, ValueError, "particles must be at least 1"),
@@ -179,7 +179,7 @@ def test_bad_resets() -> None:
         env.reset(options={"reset_mask": [True, False]})
     with pytest.raises(ValueError, match="reset_mask must be bool"):
         env.reset(options={"reset_mask": [1, 0]})
-    with pytest.raises(ValueError, match="options may hold positions, reset_mask, got 'position'"):
+    with pytest.raises(ValueError, match="options may hold physics, positions, reset_mask, got 'position'"):
         env.reset(options={"position": 0})
     with pytest.raises(ValueError, match="seed must be between"):
         env.reset(seed=-1)

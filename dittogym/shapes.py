@@ -1,0 +1,141 @@
+"""Where the particles of a body start: discs, boxes, lattices, polygons and pictures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from torchmpm import sampling
+from torchmpm.sampling import Points
+
+
+class Shape(Protocol):
+    """Where the particles of a body start.
+
+    ``draws`` is the number of uniform random numbers a particle takes in the reference implementation: 4 where each
+    coordinate is a magnitude and a sign, 2 where it is one number, 0 for a lattice.
+    """
+
+    @property
+    def draws(self) -> int:
+        """Uniform numbers per particle in the reference."""
+
+    @property
+    def corner(self) -> tuple[float, float]:
+        """Lower left corner of the bounding box in the world, m."""
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height of the bounding box, m."""
+
+    @property
+    def area(self) -> float:
+        """m^2."""
+
+    def positions(self, numbers: Points) -> Points:
+        """World positions (N, 2) in m from N points of the unit square (N, 2)."""
+
+
+@dataclass(frozen=True)
+class Disc:
+    """Disc with the chord density of the reference, given like there by its bounding square.
+
+    Attributes:
+        corner: Lower left corner of the bounding square in the world, m.
+        diameter: m.
+    """
+
+    corner: tuple[float, float]
+    diameter: float
+    draws: int = 4
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height of the bounding box, m."""
+        return self.diameter, self.diameter
+
+    @property
+    def area(self) -> float:
+        """m^2."""
+        return 0.25 * math.pi * self.diameter**2
+
+    def positions(self, numbers: Points) -> Points:
+        """World positions (N, 2) in m."""
+        radius = 0.5 * self.diameter
+        return sampling.chord_disc(numbers, (self.corner[0] + radius, self.corner[1] + radius), radius)
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """Box of uniform density.
+
+    Attributes:
+        corner: Lower left corner in the world, m.
+        size: Width and height, m.
+    """
+
+    corner: tuple[float, float]
+    size: tuple[float, float]
+    draws: int = 4
+
+    @property
+    def area(self) -> float:
+        """m^2."""
+        return self.size[0] * self.size[1]
+
+    def positions(self, numbers: Points) -> Points:
+        """World positions (N, 2) in m."""
+        return sampling.box(numbers, self.corner, self.size)
+
+
+@dataclass(frozen=True)
+class Lattice(Rectangle):
+    """Box with evenly spaced particles in rows from the bottom up, without any randomness."""
+
+    draws: int = 0
+
+    def positions(self, numbers: Points) -> Points:
+        """World positions (N, 2) in m; a square number of particles makes a square lattice.
+
+        Other numbers are spread over rows that differ by at most one particle.
+        """
+        count = len(numbers)
+        rows = max(1, round(math.sqrt(count * self.size[1] / self.size[0])))
+        rank = np.arange(count)
+        row = rank * rows // count
+        first = -(-row * count // rows)  # of the row: the smallest rank that falls into it
+        across = (rank - first + 0.5) / np.bincount(row, minlength=rows)[row]
+        return sampling.box(np.stack((across, (row + 0.5) / rows), axis=1), self.corner, self.size)
+
+
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """The set pixels of a mask, with uniform density.
+
+    Attributes:
+        mask: (rows, columns) bool, row 0 at the top, without empty rows or columns at the edges.
+        corner: Lower left corner in the world, m.
+        pixel: Side of a pixel, m.
+    """
+
+    mask: np.ndarray
+    corner: tuple[float, float]
+    pixel: float
+    draws: int = 2
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height of the bounding box, m."""
+        return self.mask.shape[1] * self.pixel, self.mask.shape[0] * self.pixel
+
+    @property
+    def area(self) -> float:
+        """m^2."""
+        return float(self.mask.sum()) * self.pixel**2
+
+    def positions(self, numbers: Points) -> Points:
+        """World positions (N, 2) in m."""
+        return sampling.image(numbers, self.mask, self.corner, self.size)

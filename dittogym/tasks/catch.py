@@ -1,0 +1,99 @@
+"""CATCH: reach into a narrow shaft, take hold of a cube, and put it on a shelf."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from torch import Tensor
+
+from dittogym.geometry import Obstacle, ceiling, floor, nodes, side_walls
+from dittogym.reward import nearest, pick
+from dittogym.shapes import Disc, Rectangle
+from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
+from torchmpm import VelocityRule
+
+GOAL = (0.15, 0.25)
+#: Distance (|x| + |y|) of the cube's centre from the goal that counts as success (our definition), m.
+CAUGHT = 0.05
+#: Share of the robot's particles that are its hand: 1,201 of 20,000.
+HAND = 1201 / 20000
+#: Costs per metre of cube to goal and hand to cube, and the distance from which they no longer grow, m.
+OBJECT_COST, HAND_COST, CAP = 5.0, 3.0, 0.5
+
+# Drawn blocks do not touch: a seam of one pixel is left between them, as in the reference.
+RIGHT_BLOCK = Obstacle(
+    "right block",
+    (
+        VelocityRule("+x", (1, 2), (37, 45)),
+        VelocityRule("+x", (26, 27), (27, 37)),
+        VelocityRule("+x", (16, 17), (20, 27)),
+        VelocityRule("-y", (2, 31), (45, 45), friction=math.inf),
+        VelocityRule("-y", (17, 25), (27, 27)),
+        VelocityRule("+y", (2, 25), (37, 37)),
+    ),
+    drawn=(nodes(1, 32, 37, 45), nodes(26, 32, 27, 37), nodes(16, 32, 20, 27)),
+    shown=(nodes(1, 34, 37, 45), nodes(26, 34, 27, 37), nodes(16, 34, 20, 27)),
+)
+LEFT_BLOCK = Obstacle(
+    "left block",
+    (
+        VelocityRule("-x", (-12, -11), (37, 45)),
+        VelocityRule("-x", (-17, -16), (27, 37)),
+        VelocityRule("-x", (-27, -26), (20, 27)),
+        VelocityRule("-y", (-31, -12), (45, 45), friction=math.inf),
+        VelocityRule("+y", (-15, -12), (37, 37)),
+        VelocityRule("+y", (-25, -17), (27, 27)),
+    ),
+    drawn=(nodes(-32, -11, 37, 45), nodes(-32, -16, 27, 37), nodes(-32, -26, 20, 27)),
+    shown=(nodes(-34, -11, 37, 45), nodes(-34, -16, 27, 37), nodes(-34, -26, 20, 27)),
+)
+
+
+def remember(moment: Moment) -> Mapping[str, Tensor]:
+    """The cube's centre: the hand is chosen by where the cube was a step ago."""
+    assert moment.now.object_com is not None
+    return {"object_com": moment.now.object_com}
+
+
+def judge(moment: Moment, weights: Weights) -> Outcome:
+    """Distances of the cube from the goal, and of the hand from the cube."""
+    cube = moment.now.object_com
+    assert cube is not None
+    x = moment.particles.x[:, : moment.robot]
+    hand = pick(x, nearest(x.detach(), moment.memory["object_com"].detach(), HAND)).mean(1)
+    to_goal, to_cube = (offset.abs().sum(-1) for offset in (cube - cube.new_tensor(GOAL), hand - cube))
+    return Outcome(
+        terms={
+            "object_distance": -weights.location * OBJECT_COST * to_goal.clamp_max(CAP),
+            "hand_distance": -weights.location * HAND_COST * to_cube.clamp_max(CAP),
+        },
+        success=to_goal < CAUGHT,
+        info={"object_distance": to_goal, "hand_distance": to_cube},
+        memory=remember(moment),
+    )
+
+
+def catch() -> TaskSpec:
+    """The task CATCH."""
+    return TaskSpec(
+        name="catch",
+        horizon=1200,
+        robot=Body(Disc((0.05, 0.36), 0.18), count=20000),
+        objects=(Body(Rectangle((-0.06, 0.16), (0.05, 0.05)), count=2000, mass=1.0),),
+        mu=350.0,
+        yield_stress=100.0,
+        max_actuation=55.0,
+        gravity=(0.0, -20.0),
+        damping=0.999,
+        window=Window(left=-0.5),
+        view=(0.5, 0.4),
+        reach=(0.5, 0.4),
+        obstacles=(side_walls(79), RIGHT_BLOCK, LEFT_BLOCK, floor(), ceiling(126)),
+        goal=GOAL,
+        split_limit=0.13,
+        remember=remember,
+        stale=("object_com",),
+        judge=judge,
+        weights=Weights(location=10.0, split=1.0, action=2e-4, alive=21.0),
+    )

@@ -1,0 +1,49 @@
+"""DIG: get through loose soil to a point in it."""
+
+from __future__ import annotations
+
+from dittogym.geometry import ceiling, floor, side_walls
+from dittogym.reward import signed_quadratic
+from dittogym.shapes import Disc, Rectangle
+from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
+from torchmpm import Soil, lame
+
+GOAL = (0.2, 0.17)
+#: Mean distance of the robot's particles (|x| + |y|) from the goal that counts as success (our definition), m.
+REACHED = 0.1
+SOIL = Soil(*lame(5000.0, 0.2))
+
+
+def judge(moment: Moment, weights: Weights) -> Outcome:
+    """Mean distance of all particles from the goal, under a square root; speed to the right and downwards."""
+    x = moment.particles.x[:, : moment.robot]
+    distance = (x - x.new_tensor(GOAL)).abs().sum(-1).mean(1)
+    rightwards, upwards = moment.now.velocity.unbind(1)
+    along, down = (signed_quadratic(v, 5.0).clamp(-20.0, 20.0) for v in (rightwards, -upwards))
+    return Outcome(
+        terms={"distance": -weights.location * distance.sqrt(), "velocity": weights.velocity * (along + down)},
+        success=distance < REACHED,
+        info={"distance": distance},
+    )
+
+
+def dig() -> TaskSpec:
+    """The task DIG."""
+    return TaskSpec(
+        name="dig",
+        horizon=1000,
+        robot=Body(Disc((-0.2, 0.5), 0.14), count=12000),
+        objects=(Body(Rectangle((-0.25, 0.16), (0.5, 0.33), draws=2), count=8000, material=SOIL, moves_visibly=False),),
+        mu=400.0,
+        yield_stress=65.0,
+        max_actuation=50.0,
+        gravity=(0.0, -19.0),
+        window=Window(left=-0.5),
+        view=(0.5, 0.4),
+        patch=32,
+        obstacles=(side_walls(None), floor(friction=0.0), ceiling(126)),
+        goal=GOAL,
+        split_limit=0.12,
+        judge=judge,
+        weights=Weights(location=20.0, velocity=5.0, split=1.0, action=2e-4, alive=15.0),
+    )

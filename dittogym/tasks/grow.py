@@ -1,0 +1,91 @@
+"""GROW: reach a point above, past two beams."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from dittogym.geometry import Obstacle, ceiling, floor, nodes, side_walls
+from dittogym.reward import drop_widest, pick, share_of
+from dittogym.shapes import Lattice
+from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
+from torchmpm import VelocityRule
+
+GOAL = (0.0, 0.5)
+#: The episode ends, in success, with the tip this near to the goal, m.
+REACHED = 0.04
+#: It ends, in failure, with the tip this far away, m.
+LOST = 0.28
+BONUS = 200.0
+#: Share of the robot's particles that are its tip: 2,000 of 19,600.
+TIP = 2000 / 19600
+
+RIGHT_BEAM = Obstacle(
+    "right beam",
+    (
+        VelocityRule("+x", (15, 16), (38, 41)),
+        VelocityRule("-x", (30, 31), (38, 41)),
+        VelocityRule("-y", (15, 32), (41, 41)),
+        VelocityRule("+y", (15, 32), (38, 38)),
+    ),
+    drawn=(nodes(15, 31, 38, 41),),
+    shown=(nodes(15, 32, 38, 41),),
+)
+LEFT_BEAM = Obstacle(
+    "left beam",
+    (
+        VelocityRule("+x", (-30, -29), (54, 57)),
+        VelocityRule("-x", (1, 2), (54, 57)),
+        VelocityRule("-y", (-30, 2), (56, 57)),
+        VelocityRule("+y", (-30, 2), (54, 54)),
+    ),
+    drawn=(nodes(-30, 2, 54, 57),),
+    shown=(nodes(-30, 2, 54, 57),),
+)
+
+
+def remember(moment: Moment) -> Mapping[str, Tensor]:
+    """The tip: the highest particles at the start; of equally high ones those nearest to x = 0."""
+    x = moment.particles.x[:, : moment.robot].detach()
+    inwards = x[..., 0].abs().argsort(dim=1, stable=True)
+    height = x[..., 1].gather(1, inwards)
+    highest = height.argsort(dim=1, descending=True, stable=True)[:, : share_of(TIP, x)]
+    return {"tip": drop_widest(inwards.gather(1, highest), x)}
+
+
+def judge(moment: Moment, weights: Weights) -> Outcome:
+    """Mean distance of the tip from the goal, under a square root."""
+    tip = pick(moment.particles.x, moment.memory["tip"])
+    distance = (tip - tip.new_tensor(GOAL)).norm(dim=-1).mean(1)
+    reached = distance < REACHED
+    return Outcome(
+        terms={"distance": -weights.location * distance.sqrt(), "success": torch.where(reached, BONUS, 0.0)},
+        terminated=reached | (distance > LOST),
+        success=reached,
+        info={"distance": distance},
+    )
+
+
+def grow() -> TaskSpec:
+    """The task GROW."""
+    return TaskSpec(
+        name="grow",
+        horizon=600,
+        robot=Body(Lattice((-0.06, 0.16), (0.16, 0.16)), count=19600),
+        mu=400.0,
+        yield_stress=50.0,
+        max_actuation=30.0,
+        gravity=(0.0, -9.0),
+        damping=0.999,
+        window=Window(left=-0.5),
+        view=(0.5, 0.4),
+        reach=(0.5, 0.4),
+        obstacles=(side_walls(39), floor(), ceiling(126), RIGHT_BEAM, LEFT_BEAM),
+        goal=GOAL,
+        split_limit=0.16,
+        remember=remember,
+        judge=judge,
+        weights=Weights(location=40.0, split=1.0, action=2e-4, alive=23.0),
+    )

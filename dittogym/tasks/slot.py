@@ -1,0 +1,134 @@
+"""SLOT: get through a low passage and knock a cap off its shelf on the far side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from dittogym.geometry import NODES, Box, Obstacle, ceiling, floor, nodes
+from dittogym.reward import nearest, pick, signed_quadratic
+from dittogym.shapes import Disc, Rectangle
+from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
+from torchmpm import VelocityRule, fixed
+
+#: Below this height the cap has fallen, and the episode ends, m.
+FALLEN = 0.24
+#: Right of this it fell on the far side, which is success, m.
+FAR_SIDE = 0.67
+#: Where the cap rests at the start, m.
+CAP_START = 0.585
+#: The episode ends when the robot's centre gets behind this, m.
+REAR_LIMIT = -0.05
+#: Share of the robot's particles that reach for the cap: 2,000 of 20,000.
+FRONT = 2000 / 20000
+#: (mu, yield stress, muscle limit), Pa: of the registered environment, and of the published training run.
+VARIANTS = {"registered": (500.0, 85.0, 40.0), "published": (650.0, 90.0, 45.0)}
+
+BLOCK = Obstacle(
+    "hanging block",
+    (
+        VelocityRule("+x", (32, 34), (36, None)),
+        VelocityRule("-x", (44, 45), (36, None)),
+        VelocityRule("+y", (32, 45), (35, 36)),
+    ),
+    drawn=(nodes(32, 45, 36),),
+    shown=(nodes(32, 45, 36),),
+)
+SHELF = Obstacle(
+    "shelf",
+    (
+        VelocityRule("+x", (45, 46), (40, 40)),
+        VelocityRule("-x", (69, 70), (40, 40)),
+        VelocityRule("-y", (45, 70), (40, 40), friction=math.inf),
+        VelocityRule("+y", (45, 70), (40, 40)),
+    ),
+    drawn=(Box(45 / NODES, 70 / NODES, 38 / NODES, 40 / NODES, closed=True),),
+    shown=(nodes(45, 70, 38, 40),),
+)
+POST = Obstacle(
+    "post",
+    (
+        VelocityRule("+x", (81, 82), (None, 39)),
+        VelocityRule("-x", (84, 85), (None, 39)),
+        VelocityRule("-y", (82, 85), (40, 40), friction=math.inf),
+    ),
+    drawn=(Box(81 / NODES, 85 / NODES, top=40 / NODES, closed=True),),
+    shown=(nodes(81, 85, top=40),),
+)
+# Moves with the robot: a wall behind it and one ahead.
+FRAME = Obstacle(
+    "frame",
+    tuple(
+        rule for end in ((0, 0), (127, 127)) for rule in (*fixed(i=end, frame="window"), *fixed(j=end, frame="window"))
+    ),
+)
+
+
+def front_distance(moment: Moment) -> Tensor:
+    """Mean distance of the robot's front from the cap's centre, (B,), m."""
+    x, cap = moment.particles.x[:, : moment.robot], moment.now.object_com
+    assert cap is not None
+    front = pick(x, nearest(x.detach(), cap.detach(), FRONT))
+    return (front - cap[:, None]).norm(dim=-1).mean(1)
+
+
+def remember(moment: Moment) -> Mapping[str, Tensor]:
+    """The distance at the start, against which progress is measured."""
+    return {"front_distance": front_distance(moment)}
+
+
+def judge(moment: Moment, weights: Weights) -> Outcome:
+    """Approach to the cap, displacement of the cap, where it falls, and speed in both directions."""
+    cap, distance = moment.now.object_com, front_distance(moment)
+    assert cap is not None
+    z = 2.0 * (moment.memory["front_distance"] - distance)
+    approach = (16.0 * z * z.abs() + 10.0 * z).clamp(-20.0, 50.0)
+    fallen, far = cap[:, 1] < FALLEN, cap[:, 0] >= FAR_SIDE
+    velocity = signed_quadratic(moment.now.velocity, 10.0).clamp(-20.0, 20.0).sum(1)
+    return Outcome(
+        terms={
+            "approach": weights.location * approach,
+            "object_location": weights.location * 200.0 * (cap[:, 0] - CAP_START),
+            "fall": weights.location * torch.where(fallen, torch.where(far, 100.0, -100.0), 0.0),
+            "velocity": weights.velocity * velocity,
+        },
+        terminated=fallen | (moment.now.com[:, 0] < REAR_LIMIT),
+        success=fallen & far,
+        info={"distance": distance},
+    )
+
+
+def slot(variant: Literal["registered", "published"] = "registered") -> TaskSpec:
+    """The task SLOT.
+
+    Args:
+        variant: ``"registered"``, or ``"published"`` for the matter of the published training run.
+
+    Raises:
+        ValueError: No such variant.
+    """
+    if variant not in VARIANTS:
+        raise ValueError(f"variant must be one of {', '.join(VARIANTS)}, got {variant!r}")
+    mu, yield_stress, max_actuation = VARIANTS[variant]
+    return TaskSpec(
+        name="slot",
+        horizon=1500,
+        robot=Body(Disc((0.0, 0.16), 0.16), count=20000),
+        objects=(Body(Rectangle((0.52, 0.322), (0.13, 0.03)), count=2000),),
+        mu=mu,
+        yield_stress=yield_stress,
+        max_actuation=max_actuation,
+        gravity=(0.0, -20.0),
+        window=Window(follow=0.25),
+        view=(None, 0.28),
+        reach=(None, 0.28),
+        obstacles=(BLOCK, SHELF, POST, floor(), ceiling(119), FRAME),
+        split_limit=0.12,
+        remember=remember,
+        judge=judge,
+        weights=Weights(location=2.0, velocity=6.0, split=1.0, action=2e-4, alive=3.0),
+    )
