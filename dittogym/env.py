@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from dittogym.spec import TaskSpec
-from dittogym.torch_env import TorchEnv
+from dittogym.torch_env import Snapshot, TorchEnv
 from torchmpm import ParticleState
 
 RENDER_MODES = ("rgb_array", "human")
@@ -112,6 +112,14 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         self._show()
         picked = element(as_numpy(info), 0)
         return observation[0].cpu().numpy(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), picked
+
+    def save(self) -> Snapshot:
+        """The present moment, to return to with :meth:`load`; see :meth:`dittogym.TorchEnv.save`."""
+        return self.torch_env.save()
+
+    def load(self, snapshot: Snapshot) -> np.ndarray:
+        """Go on from a saved moment; returns its observation. See :meth:`dittogym.TorchEnv.load`."""
+        return self.torch_env.load(snapshot)[0].cpu().numpy()
 
     def render(self) -> np.ndarray | None:
         """The picture (512, 512, 3) uint8 in mode ``"rgb_array"``, else nothing."""

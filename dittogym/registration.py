@@ -2,19 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import gymnasium
 
-from dittogym.tasks import TASKS, make_spec
+from dittogym.spec import TaskSpec
+from dittogym.tasks import TASKS
 
 
-def register() -> None:
-    """Register every task in both resolutions; done on ``import dittogym``."""
-    for task in TASKS:
-        for resolution in ("coarse", "fine"):
-            gymnasium.register(
-                id=f"dittogym/{task}-{resolution}-v0",
-                entry_point="dittogym.env:Env",
-                vector_entry_point="dittogym.vector:BatchEnv",
-                max_episode_steps=make_spec(task).horizon,
-                kwargs={"task": task, "resolution": resolution},
-            )
+def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "dittogym", version: int = 0) -> None:
+    """Make a task known by name: to :class:`dittogym.TorchEnv`, and to Gymnasium in both resolutions.
+
+    Args:
+        task: Its name; the ids are ``{namespace}/{task}-coarse-v{version}`` and ``{namespace}/{task}-fine-v{version}``.
+        make: Returns the specification; its keyword arguments, which need defaults, become options of the environment.
+        namespace: Of the ids.
+        version: To be raised with every change of behaviour.
+
+    Raises:
+        ValueError: Another task has this name.
+        TypeError: ``make`` does not return a :class:`dittogym.TaskSpec`.
+    """
+    spec = make()
+    if not isinstance(spec, TaskSpec):
+        raise TypeError(f"make must return a TaskSpec, got {type(spec).__name__}")
+    if TASKS.setdefault(task, make) is not make:
+        raise ValueError(f"task must be a new name, got {task!r}, which is taken")
+    for resolution in ("coarse", "fine"):
+        gymnasium.register(
+            id=f"{namespace}/{task}-{resolution}-v{version}",
+            entry_point="dittogym.env:Env",
+            vector_entry_point="dittogym.vector:BatchEnv",
+            max_episode_steps=spec.horizon,
+            kwargs={"task": task, "resolution": resolution},
+        )
+
+
+def register_all() -> None:
+    """Register the eight tasks; done on ``import dittogym``."""
+    for task, make in list(TASKS.items()):
+        register(task, make)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from torchmpm import sampling
 from torchmpm.sampling import Points
 
 
+@runtime_checkable
 class Shape(Protocol):
     """Where the particles of a body start.
 

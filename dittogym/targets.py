@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from typing import TypeAlias
 
 import cv2
 import numpy as np
 
+from dittogym.pictures import PictureLike, read_grey
+
 #: The name of a drawn target, the path of an image file, or an array.
-TargetLike: TypeAlias = "str | os.PathLike[str] | np.ndarray"
+TargetLike: TypeAlias = PictureLike
 
 #: Pixels per axis of a target.
 SIZE = 64
@@ -56,14 +57,12 @@ def load_target(target: TargetLike) -> np.ndarray:
         ValueError: Neither a name nor a readable image, an array of another kind, or a picture without any pixel set or
             unset.
     """
-    if isinstance(target, np.ndarray):
-        grey = _grey(target)
-    elif str(target) in _OUTLINES:
-        grey = np.zeros((SIZE, SIZE), np.uint8)
-        for outline in _OUTLINES[str(target)]:
+    if isinstance(target, str) and target in _OUTLINES:
+        grey: np.ndarray = np.zeros((SIZE, SIZE), np.uint8)
+        for outline in _OUTLINES[target]:
             cv2.fillPoly(grey, [np.array(outline)], 255)
     else:
-        grey = _read(target)
+        grey = read_grey(target, "target", others=", ".join(repr(name) for name in _OUTLINES))
     if grey.shape != (SIZE, SIZE):
         grey = cv2.resize(grey, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
     mask = grey >= THRESHOLD
@@ -77,33 +76,3 @@ def load_target(target: TargetLike) -> np.ndarray:
             stacklevel=2,
         )
     return mask
-
-
-def _read(path: str | os.PathLike[str]) -> np.ndarray:
-    names = ", ".join(repr(name) for name in _OUTLINES)
-    if not os.path.isfile(path):
-        raise ValueError(f"target must be {names}, an array or the path of an image; no such file: {os.fspath(path)!r}")
-    image = cv2.imread(os.fspath(path), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise ValueError(f"target {os.fspath(path)!r} cannot be read as an image")
-    return _grey(image)
-
-
-def _grey(image: np.ndarray) -> np.ndarray:
-    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (3, 4)) or 0 in image.shape:
-        raise ValueError(f"target array must have shape (H, W), (H, W, 3) or (H, W, 4), got {image.shape}")
-    if image.dtype == bool:
-        image = image * np.uint8(255)
-    elif np.issubdtype(image.dtype, np.floating):
-        if not np.isfinite(image).all() or image.min() < 0 or image.max() > 1:
-            raise ValueError("target array of floating point numbers must lie in [0, 1]")
-        image = np.round(image * 255).astype(np.uint8)
-    elif image.dtype == np.uint16:
-        image = (image // 257).astype(np.uint8)
-    elif image.dtype != np.uint8:
-        raise ValueError(f"target array must be bool, uint8, uint16 or floating point, got {image.dtype}")
-    if image.ndim == 2:
-        return image
-    grey = cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_BGR2GRAY)
-    # What is transparent is ground.
-    return (grey * (image[..., 3] / 255.0)).astype(np.uint8) if image.shape[2] == 4 else grey

@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 
 from dittogym.env import RENDER_FPS, RENDER_MODES, as_numpy, as_tensor, spaces
 from dittogym.spec import TaskSpec
-from dittogym.torch_env import TorchEnv
+from dittogym.torch_env import Snapshot, TorchEnv
 from torchmpm import ParticleState
 
 
@@ -115,6 +115,19 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _restart(self, mask: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
         observation, info = self.torch_env.reset(options={"reset_mask": torch.as_tensor(mask)})
         return observation.cpu().numpy(), as_numpy(info)
+
+    def save(self) -> Snapshot:
+        """The present moment of all simulations; see :meth:`dittogym.TorchEnv.save`."""
+        return self.torch_env.save()
+
+    def load(self, snapshot: Snapshot, mask: np.ndarray | None = None) -> np.ndarray:
+        """Go on from a saved moment, in all elements or those of ``mask``; returns the observations of all.
+
+        An element that had ended and was to be reset goes on instead. See :meth:`dittogym.TorchEnv.load`.
+        """
+        observation = self.torch_env.load(snapshot, mask)
+        self._ended &= False if mask is None else ~np.asarray(mask)
+        return observation.cpu().numpy()
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """One picture per simulation in mode ``"rgb_array"``, else nothing."""

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
+from dittogym.geometry import Obstacle
+from dittogym.robots import BodyLike, with_body
 from dittogym.spec import TaskSpec
 from dittogym.tasks.catch import catch
 from dittogym.tasks.dig import dig
@@ -21,25 +24,38 @@ TASKS: dict[str, Callable[..., TaskSpec]] = {
 }
 
 
-def make_spec(task: str | TaskSpec, **options: object) -> TaskSpec:
+def make_spec(
+    task: str | TaskSpec,
+    *,
+    body: BodyLike | None = None,
+    obstacles: Sequence[Obstacle] | None = None,
+    **options: object,
+) -> TaskSpec:
     """The specification of a task.
 
     Args:
-        task: A name from :data:`TASKS`, or a specification, which is returned as it is.
+        task: A name from :data:`TASKS`, or a specification.
+        body: A robot of one's own, see :func:`dittogym.robots.with_body`.
+        obstacles: Static geometry in place of the task's own, see :mod:`dittogym.geometry`.
         options: Options of that task, such as ``target`` of SHAPE MATCH.
 
     Raises:
-        ValueError: No such task.
+        ValueError: No such task, or a body that does not fit into it.
         TypeError: The task has no such option.
     """
     if isinstance(task, TaskSpec):
         if options:
-            raise TypeError(f"a TaskSpec takes no options, got {sorted(options)}")
-        return task
-    if task not in TASKS:
-        raise ValueError(f"task must be one of {', '.join(sorted(TASKS))}, got {task!r}")
-    known = list(inspect.signature(TASKS[task]).parameters)
-    for name in options:
-        if name not in known:
-            raise TypeError(f"task {task!r} has no option {name!r}; its options are: {', '.join(known) or 'none'}")
-    return TASKS[task](**options)
+            raise TypeError(f"a TaskSpec takes no options but body and obstacles, got {sorted(options)}")
+        spec = task
+    else:
+        if task not in TASKS:
+            raise ValueError(f"task must be one of {', '.join(sorted(TASKS))}, got {task!r}")
+        known = list(inspect.signature(TASKS[task]).parameters)
+        for name in options:
+            if name not in known:
+                names = ", ".join(("body", "obstacles", *known))
+                raise TypeError(f"task {task!r} has no option {name!r}; its options are: {names}")
+        spec = TASKS[task](**options)
+    if obstacles is not None:
+        spec = replace(spec, obstacles=tuple(obstacles))
+    return spec if body is None else with_body(spec, body)

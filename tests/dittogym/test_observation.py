@@ -28,7 +28,9 @@ def test_pixels_equal_the_loop() -> None:
     mask = rng.random((2, 512, 512)) < 0.01
     p, v = torch.as_tensor(position), torch.as_tensor(velocity)
     seen = (p[..., 0] > 0) & (p[..., 0] < 1)
-    ours = obs.pixel_means(p, v, seen, row, column, torch.as_tensor(mask))
+    ours = obs.pixel_means(
+        obs.Sight(p, v, seen, torch.zeros(4000, dtype=torch.bool), row, column, torch.as_tensor(mask))
+    )
     for i in range(2):
         kept = seen[i].numpy()
         loop = loop_raster(position[i][kept], velocity[i][kept], int(row[i]), int(column[i]), mask[i])
@@ -48,12 +50,30 @@ def test_splat_is_the_mean_of_random_rasters() -> None:
         position = 0.4 + 0.2 * torch.rand(1, count, 2, generator=generator, dtype=torch.float64)
         velocity = torch.tensor([1.5, -0.5], dtype=torch.float64).expand(1, count, 2)
         seen = torch.ones(1, count, dtype=torch.bool)
-        if share is None:
-            image = obs.pixel_means(position, velocity, seen, *corner, mask)
-        else:
-            image = obs.splat_means(position, velocity, seen, *corner, mask, share)
+        sight = obs.Sight(position, velocity, seen, ~seen[0], *corner, mask)
+        image = obs.pixel_means(sight) if share is None else obs.splat_means(sight, torch.full((count,), share))
         means[count] = image[0, :, 25:38, 25:38].mean((1, 2))
     assert means[4000].tolist() == pytest.approx(means[40000].tolist(), rel=0.08)
+
+
+@pytest.mark.parametrize("raster", [obs.pixel_means, lambda sight: obs.splat_means(sight, torch.ones(2))])
+def test_silent_particles_are_seen_but_do_not_move(raster) -> None:
+    """Two particles in one place: the velocity of the pixel is that of the one which speaks."""
+    velocity = torch.tensor([[[3.0, -2.0], [0.0, 0.0]]])
+    corner = (torch.tensor([[256]]), torch.tensor([[256]]))
+    means = {}
+    for silent in ([False, True], [True, True], [False, False]):
+        here = torch.full((1, 2, 2), 0.5)
+        mask = torch.zeros(1, 512, 512, dtype=torch.bool)
+        sight = obs.Sight(here, velocity, torch.ones(1, 2, dtype=torch.bool), torch.tensor(silent), *corner, mask)
+        if all(silent):
+            sight = sight._replace(velocity=torch.zeros(1, 2, 2))
+        means[tuple(silent)] = raster(sight)[0].sum((1, 2))
+    speaks, mute, both = means.values()
+    assert speaks[0] == mute[0] == both[0]
+    assert mute[1:].tolist() == [0.0, 0.0]
+    assert speaks[1] == pytest.approx(3.0 / 64, rel=0.05) and speaks[2] == pytest.approx(-2.0 / 64, rel=0.05)
+    assert abs(both[1]) < abs(speaks[1]) * 1.01
 
 
 def test_coding() -> None:

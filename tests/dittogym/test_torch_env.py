@@ -150,7 +150,7 @@ def test_bad_actions(action: object, message: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"task": "fly"}, ValueError, "task must be one of catch, .* got 'fly'"),
+        ({"task": "fly"}, ValueError, r"task must be one of catch, .* got 'fly'"),
         ({"target": "star"}, TypeError, "task 'run' has no option 'target'"),
         ({"particles": 0}, ValueError, "particles must be at least 1"),
         ({"particles": -3}, ValueError, "particles must be at least 1"),

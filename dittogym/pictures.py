@@ -1,0 +1,60 @@
+"""Pictures from files and arrays as grey values."""
+
+from __future__ import annotations
+
+import os
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+
+#: The path of an image file, or an array.
+PictureLike: TypeAlias = "str | os.PathLike[str] | np.ndarray"
+
+
+def read_grey(picture: PictureLike, name: str, others: str = "") -> np.ndarray:
+    """A picture as grey values (H, W) uint8, row 0 at the top; what is transparent is black.
+
+    Args:
+        picture: The path of an image that OpenCV reads, or an array (H, W), (H, W, 3) or (H, W, 4): bool, uint8,
+            uint16, or floating point 0..1; colours in the order blue, green, red.
+        name: What error messages call it.
+        others: What else would have been allowed, for the message about a path that does not exist.
+
+    Raises:
+        ValueError: No such file, not an image, or an array of another kind.
+    """
+    if isinstance(picture, np.ndarray):
+        return _grey(picture, name)
+    if not isinstance(picture, (str, os.PathLike)):
+        raise ValueError(f"{name} must be {_join(others)}an array or a path, got {type(picture).__name__}")
+    path = os.fspath(picture)
+    if not os.path.isfile(path):
+        raise ValueError(f"{name} must be {_join(others)}an array or the path of an image; no such file: {path!r}")
+    image = cv2.imread(path, cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise ValueError(f"{name} {path!r} cannot be read as an image")
+    return _grey(image, name)
+
+
+def _join(others: str) -> str:
+    return others + ", " if others else ""
+
+
+def _grey(image: np.ndarray, name: str) -> np.ndarray:
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (3, 4)) or 0 in image.shape:
+        raise ValueError(f"{name} array must have shape (H, W), (H, W, 3) or (H, W, 4), got {image.shape}")
+    if image.dtype == bool:
+        image = image * np.uint8(255)
+    elif np.issubdtype(image.dtype, np.floating):
+        if not np.isfinite(image).all() or image.min() < 0 or image.max() > 1:
+            raise ValueError(f"{name} array of floating point numbers must lie in [0, 1]")
+        image = np.round(image * 255).astype(np.uint8)
+    elif image.dtype == np.uint16:
+        image = (image // 257).astype(np.uint8)
+    elif image.dtype != np.uint8:
+        raise ValueError(f"{name} array must be bool, uint8, uint16 or floating point, got {image.dtype}")
+    if image.ndim == 2:
+        return image
+    grey = cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_BGR2GRAY)
+    return (grey * (image[..., 3] / 255.0)).astype(np.uint8) if image.shape[2] == 4 else grey

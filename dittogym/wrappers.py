@@ -1,0 +1,71 @@
+"""Other resolutions of actions and observations, for single and vector environments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import gymnasium
+import numpy as np
+from gymnasium.vector import VectorEnv
+from gymnasium.vector.utils import batch_space
+
+AnyEnv = gymnasium.Env[Any, Any] | VectorEnv[Any, Any, Any]
+
+
+def action_resolution(env: AnyEnv, size: int) -> Any:
+    """Actions of (2, size, size), enlarged to the resolution of ``env`` by bicubic interpolation.
+
+    To let the physics itself enlarge them, in one step, give ``resolution=size`` to :func:`gymnasium.make` instead.
+
+    Raises:
+        ValueError: ``size`` is not between 1 and the resolution of ``env``.
+    """
+    box = _box(env, "action_space")
+    _check(size, box.shape[-1])
+
+    def enlarge(action: np.ndarray) -> np.ndarray:
+        return _resized(np.asarray(action, np.float32), box.shape[-1], cv2.INTER_CUBIC).clip(-1.0, 1.0)
+
+    small = gymnasium.spaces.Box(-1.0, 1.0, (2, size, size), np.float32)
+    if isinstance(env, VectorEnv):
+        batch = batch_space(small, env.num_envs)
+        return gymnasium.wrappers.vector.TransformAction(env, enlarge, batch, small)
+    return gymnasium.wrappers.TransformAction(env, enlarge, small)
+
+
+def observation_resolution(env: AnyEnv, size: int) -> Any:
+    """Observations of (3, size, size), reduced by averaging over areas.
+
+    Raises:
+        ValueError: ``size`` is not between 1 and the resolution of ``env``.
+    """
+    box = _box(env, "observation_space")
+    _check(size, box.shape[-1])
+
+    def reduce(observation: np.ndarray) -> np.ndarray:
+        return _resized(observation, size, cv2.INTER_AREA)
+
+    small = gymnasium.spaces.Box(0, 255, (3, size, size), np.uint8)
+    if isinstance(env, VectorEnv):
+        batch = batch_space(small, env.num_envs)
+        return gymnasium.wrappers.vector.TransformObservation(env, reduce, batch, small)
+    return gymnasium.wrappers.TransformObservation(env, reduce, small)
+
+
+def _box(env: AnyEnv, name: str) -> gymnasium.spaces.Box:
+    space = getattr(env, "single_" + name if isinstance(env, VectorEnv) else name)
+    assert isinstance(space, gymnasium.spaces.Box)
+    return space
+
+
+def _check(size: int, largest: int) -> None:
+    if not 1 <= size <= largest:
+        raise ValueError(f"size must be between 1 and {largest}, got {size}")
+
+
+def _resized(images: np.ndarray, size: int, interpolation: int) -> np.ndarray:
+    """Resize the last two axes of (..., H, W)."""
+    planes = images.reshape(-1, *images.shape[-2:])
+    resized = np.stack([cv2.resize(plane, (size, size), interpolation=interpolation) for plane in planes])
+    return resized.reshape(*images.shape[:-2], size, size)
