@@ -6,11 +6,11 @@ one's own.
 
 from dittogym.env import Env
 from dittogym.registration import register, register_all
-from dittogym.spec import TaskSpec
+from dittogym.spec import Outcome, TaskSpec, Weights
 from dittogym.tasks import TASKS, make_spec
 from dittogym.torch_env import TorchEnv
 from dittogym.vector import BatchEnv
 
 register_all()
 
-__all__ = ["TASKS", "BatchEnv", "Env", "TaskSpec", "TorchEnv", "make_spec", "register"]
+__all__ = ["TASKS", "BatchEnv", "Env", "Outcome", "TaskSpec", "TorchEnv", "Weights", "make_spec", "register"]

@@ -1,4 +1,4 @@
-"""The examples of the README run as they stand there, and keep to the shapes that the annotations promise."""
+"""The examples of the README and of the docs run as they stand, and keep to the shapes that the annotations promise."""
 
 import re
 import subprocess
@@ -14,9 +14,9 @@ with install_import_hook("torchmpm", "beartype.beartype"):
 """
 
 
-def examples() -> str:
-    """The Python blocks of the README that need no trained policy, one after the other."""
-    text, _, _ = (ROOT / "README.md").read_text().partition("<!-- trained -->")
+def examples(page: str) -> str:
+    """The Python blocks of a page that need no trained policy, one after the other."""
+    text, _, _ = (ROOT / page).read_text().partition("<!-- trained -->")
     return "\n".join(re.findall(r"^```python\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE))
 
 
@@ -31,7 +31,17 @@ def test_examples_run_with_checked_annotations() -> None:
         "assert env.observation_space.shape == (3, 64, 64)",
         "assert reward.shape == (16,) and action.grad.flatten(1).norm(dim=1).min() > 0",
     ]
-    done = run("\n".join([CHECKED, examples(), *checks]))
+    done = run("\n".join([CHECKED, examples("README.md"), *checks]))
+    assert done.returncode == 0, done.stderr
+
+
+def test_examples_of_ones_own() -> None:
+    checks = [
+        "assert env.action_space.shape == (2, 4, 4) and env.observation_space.shape == (3, 16, 16)",
+        "assert batch.num_envs == 4 and 0 <= action < 8",
+        'assert dittogym.make_spec("hop").horizon == 200',
+    ]
+    done = run("\n".join([CHECKED, examples("docs/own.md"), *checks]))
     assert done.returncode == 0, done.stderr
 
 

@@ -33,7 +33,15 @@ def dig() -> TaskSpec:
         name="dig",
         horizon=1000,
         robot=Body(Disc((-0.2, 0.5), 0.14), count=12000),
-        objects=(Body(Rectangle((-0.25, 0.16), (0.5, 0.33), draws=2), count=8000, material=SOIL, moves_visibly=False),),
+        objects=(
+            Body(
+                Rectangle((-0.25, 0.16), (0.5, 0.33), draws=2),
+                count=8000,
+                lite=3400,
+                material=SOIL,
+                moves_visibly=False,
+            ),
+        ),
         mu=400.0,
         yield_stress=65.0,
         max_actuation=50.0,

@@ -1,0 +1,197 @@
+"""Batches: equal to single environments, repeatable, and no element harms another; for every task."""
+
+import random
+
+import numpy as np
+import pytest
+import torch
+from tiny import FIXED, SMALL, TASKS, actions, assert_same_bits, everything, leaves, stir, tiny
+
+from dittogym import BatchEnv, TorchEnv
+from dittogym.spec import FAILURE_REWARD
+
+
+def assert_element_is(batch: TorchEnv, result: tuple, i: int, single: TorchEnv, one: tuple) -> None:
+    """Element i of a batch and its result of a step against a batch of one: numbers to 1e-9, observation and ends."""
+    for ours, theirs in zip(everything(batch), everything(single), strict=True):
+        size = max(1.0, float(theirs[0].abs().max()))
+        assert float((ours[i] - theirs[0]).abs().max()) <= 1e-9 * size
+    for (path, ours), (_, theirs) in zip(leaves(result), leaves(one), strict=True):
+        bound = 1e-9 * max(1.0, np.abs(theirs[0]).max()) if ours.dtype == np.float64 else 0
+        assert np.abs(ours[i].astype(np.float64) - theirs[0]).max() <= bound, path
+
+
+@pytest.mark.parametrize("task", TASKS)
+@torch.no_grad()
+def test_a_batch_is_its_single_environments(task: str) -> None:
+    """Random actions and velocities, an element reset alone, and two reset with new seeds."""
+    batch, singles = tiny(task, 3), [tiny(task) for _ in range(3)]
+    seen, info = batch.reset(seed=7)
+    for i, env in enumerate(singles):
+        assert_element_is(batch, (seen, info), i, env, env.reset(seed=7 + i))
+        stir(env, i)
+    stir(batch)
+    for t, action in enumerate(actions(batch, 6)):
+        if t == 2:
+            batch.reset(options={"reset_mask": [False, True, False]})
+            singles[1].reset()
+        if t == 4:
+            batch.reset(seed=40, options={"reset_mask": [True, False, True]})
+            singles[0].reset(seed=40)
+            singles[2].reset(seed=42)
+        result = batch.step(action)
+        for i, env in enumerate(singles):
+            assert_element_is(batch, result, i, env, env.step(action[i : i + 1]))
+    assert batch.env_state.steps.tolist() == [2, 4, 2]
+
+
+@torch.no_grad()
+def test_a_batch_with_physics_of_each_element_is_its_single_environments() -> None:
+    physics = {
+        "mu": [300.0, 600.0, 900.0],
+        "lam": [20.0, 50.0, 80.0],
+        "yield_stress": [5.0, 50.0, 90.0],
+        "max_actuation": [20.0, 0.0, 50.0],
+        "gravity": [[0.0, -12.0], [3.0, -9.0], [0.0, 0.0]],
+        "mass": [0.5, 1.0, 2.0],
+    }
+    batch, singles = tiny("kick", 3, substeps=20), [tiny("kick", substeps=20) for _ in range(3)]
+    batch.reset(seed=3, options={"physics": physics})
+    stir(batch)
+    for i, env in enumerate(singles):
+        env.reset(seed=3 + i, options={"physics": {name: values[i] for name, values in physics.items()}})
+        stir(env, i)
+    for t, action in enumerate(actions(batch, 4)):
+        if t == 2:
+            batch.reset(options={"reset_mask": [False, False, True]})
+            singles[2].reset()
+        result = batch.step(action)
+        for i, env in enumerate(singles):
+            assert_element_is(batch, result, i, env, env.step(action[i : i + 1]))
+
+
+def episode(task: str) -> list:
+    """All that two simulations show and are over a few steps, one of them reset on the way."""
+    env = TorchEnv(task, 2, particles=300, substeps=10, deterministic=True)
+    rows: list = [env.reset(seed=11)]
+    stir(env)
+    for t, action in enumerate(actions(env, 4)):
+        if t == 2:
+            rows.append(env.reset(options={"reset_mask": [True, False]}))
+        rows += [env.step(action), everything(env)]
+    return rows
+
+
+@pytest.mark.parametrize("task", TASKS)
+@torch.no_grad()
+def test_an_episode_repeats_bit_by_bit(task: str) -> None:
+    assert_same_bits(episode(task), episode(task))
+
+
+def test_what_cannot_be_deterministic_is_refused() -> None:
+    message = "deterministic=True needs device 'cpu' and a backend other than 'compile', got 'cpu' and 'compile'"
+    with pytest.raises(ValueError, match=message):
+        tiny("run", deterministic=True, backend="compile")
+    for backend in ("auto", "eager"):
+        assert tiny("run", deterministic=True, backend=backend).num_particles == 120
+
+
+@pytest.mark.cuda
+def test_deterministic_refuses_a_cuda_device() -> None:
+    with pytest.raises(ValueError, match="deterministic=True needs device 'cpu'"):
+        tiny("run", deterministic=True, device="cuda")
+
+
+def spoil(env: TorchEnv, how: str) -> None:
+    """Make element 1 unable to go on."""
+    state = env.state
+    if how in ("nan", "inf"):
+        state.v[1, 7] = float(how)
+    elif how == "shape":
+        state.F[1, -1, 0, 0] = torch.nan
+    elif how == "shot":
+        state.v[1] = 1e300
+    else:
+        robot = slice(0, env.model.robot)
+        axis, distance = {"up": (1, 1.5), "down": (1, -1.5), "left": (0, -1.5), "right": (0, 1.5)}[how]
+        state.x[1, robot, axis] += distance
+
+
+WAYS = [(task, how) for task in TASKS for how in ("nan", "inf", "shape", "shot", "up", "down")]
+WAYS += [(task, how) for task in FIXED for how in ("left", "right")]
+
+
+@pytest.mark.parametrize(("task", "how"), WAYS)
+@torch.no_grad()
+def test_an_element_fails_alone(task: str, how: str) -> None:
+    """It ends, and its neighbours do as in a batch where nothing happened, also after it was reset."""
+    env, twin = tiny(task, 3, substeps=2), tiny(task, 3, substeps=2)
+    drive = actions(env, 4)
+    for e in (env, twin):
+        e.reset(seed=0)
+        stir(e)
+        e.step(drive[0])
+    spoil(env, how)
+    for t in range(1, 4):
+        if t == 3:
+            env.reset(options={"reset_mask": [False, True, False]})
+        ours, theirs = env.step(drive[t]), twin.step(drive[t])
+        for i in (0, 2):
+            assert_same_bits([a[i] for _, a in leaves(ours)], [b[i] for _, b in leaves(theirs)])
+            assert_same_bits([a[i] for a in everything(env)], [b[i] for b in everything(twin)])
+        _, reward, terminated, _, info = ours
+        if t < 3:
+            assert info["finite"].tolist() == [True, False, True]
+            assert bool(terminated[1]) and float(reward[1]) == FAILURE_REWARD
+            terms = {name: float(term[1]) for name, term in info["reward_terms"].items()}
+            assert terms.pop("failure") == FAILURE_REWARD and not any(terms.values())
+            assert "is_success" not in info or not info["is_success"][1]
+    assert info["finite"].all() and float(info["reward_terms"]["failure"][1]) == 0.0
+
+
+def test_gradients_of_the_neighbours_do_not_notice() -> None:
+    gradients = []
+    for how in (None, "nan"):
+        env = tiny("kick", 3)
+        env.reset(seed=0)
+        if how is not None:
+            spoil(env, how)
+        drive = actions(env, 2).requires_grad_()
+        sum(env.step(action)[1].sum() for action in drive).backward()
+        gradients.append(drive.grad[:, [0, 2]])
+    assert gradients[0].abs().amax((2, 3, 4)).min() > 0
+    assert_same_bits(*gradients)
+
+
+def test_a_failed_element_of_a_vector_environment_starts_anew() -> None:
+    env = BatchEnv("grow", 3, **SMALL)
+    env.reset(seed=0)
+    env.state.v[1] = torch.nan
+    _, rewards, terminated, _, info = env.step(np.zeros(env.action_space.shape, np.float32))
+    assert terminated.tolist() == [False, True, False] and rewards[1] == FAILURE_REWARD
+    assert info["final_info"]["finite"].tolist() == [True, False, True] and info["finite"].all()
+    _, _, terminated, _, info = env.step(np.zeros(env.action_space.shape, np.float32))
+    assert info["finite"].all() and not terminated.any()
+
+
+@pytest.mark.parametrize("task", TASKS)
+@torch.no_grad()
+def test_global_generators_are_left_alone(task: str) -> None:
+    """By construction, resets with and without a seed, steps, pictures, saved moments and robots of one's own."""
+
+    def states() -> tuple:
+        kind, keys, *rest = np.random.get_state()
+        return random.getstate(), kind, keys.tolist(), rest, torch.get_rng_state().tolist()
+
+    before = states()
+    triangle = np.array([(0, 0), (4, 0), (2, 3)])
+    for options in ({"particles": "lite", "substeps": 1}, {"body": triangle}, {"resample": True}):
+        env = tiny(task, 2, **options)
+        env.reset(seed=0)
+        moment = env.save()
+        env.step(actions(env, 1)[0])
+        env.reset()
+        env.load(moment)
+        env.render(muscles=True, size=64)
+    tiny(task).reset()  # entropy of the system
+    assert states() == before

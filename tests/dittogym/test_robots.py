@@ -1,0 +1,316 @@
+"""Robots and obstacles of one's own, and what particles bodies are made of."""
+
+from pathlib import Path
+
+import cv2
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from tiny import SMALL, TASKS, tiny
+
+import dittogym
+from dittogym import layout
+from dittogym.geometry import ceiling, floor, solid
+from dittogym.render import SOLID
+from dittogym.shapes import Disc, Figure, Lattice, Rectangle
+from dittogym.spec import Body
+from torchmpm import sampling
+
+#: An L: a column of two by six cells on the left, a foot of four by two to its right.
+ELL = np.zeros((6, 6), bool)
+ELL[:, :2] = True
+ELL[4:, 2:] = True
+ELL_OUTLINE = [(0, 0), (6, 0), (6, 2), (2, 2), (2, 6), (0, 6)]
+SQUARE = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+
+
+def large(mask: np.ndarray = ELL, margin: int = 7) -> np.ndarray:
+    """The mask with ten pixels a cell and an uneven dark margin."""
+    return np.pad(np.kron(mask, np.ones((10, 10), bool)), ((margin, 0), (3, margin)))
+
+
+def pictures(folder: Path) -> dict[str, object]:
+    """The same robot in every form in which it can be given as a picture."""
+    mask = large()
+    grey = np.where(mask, 200, 30).astype(np.uint8)
+    colour = np.dstack([grey] * 3)
+    clear = np.dstack([np.full_like(colour, 255), 255 * mask.astype(np.uint8)])
+    forms = {"grey": grey, "bool": mask, "float": grey / 255.0, "uint16": grey * np.uint16(257)}
+    forms |= {"colour": colour, "transparent": clear}
+    for name in ("grey", "colour", "transparent", "uint16"):
+        path = folder / f"{name}.png"
+        assert cv2.imwrite(str(path), forms[name])
+        forms |= {f"path of {name}": path, f"text path of {name}": str(path)}
+    return forms
+
+
+def points(shape, count: int = 4096) -> np.ndarray:
+    return shape.positions(sampling.sobol(count, seed=1))
+
+
+def test_pictures_of_all_kinds_are_the_same_robot(tmp_path: Path) -> None:
+    own = dittogym.make_spec("run").robot
+    for name, picture in pictures(tmp_path).items():
+        robot = dittogym.make_spec("run", body=picture).robot
+        assert isinstance(robot.shape, Figure) and np.array_equal(robot.shape.mask, large(margin=0)[:, 3:]), name
+        assert (robot.count, robot.mass) == (own.count, own.mass)
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("body", [large(), ELL_OUTLINE, np.array(ELL_OUTLINE) * 0.01 - 5.0, np.array(SQUARE)])
+def test_area_and_place_are_those_of_the_tasks_own_robot(task: str, body) -> None:
+    own, robot = dittogym.make_spec(task).robot, dittogym.make_spec(task, body=body).robot
+    assert robot.count == own.count and robot.shape.area == pytest.approx(own.shape.area)
+    assert robot.shape.corner[1] == own.shape.corner[1]
+    assert robot.shape.corner[0] + robot.shape.size[0] / 2 == pytest.approx(own.shape.corner[0] + own.shape.size[0] / 2)
+    assert robot.shape.size[0] == pytest.approx(robot.shape.size[1], rel=0.01)
+    x = points(robot.shape)
+    low, high = np.array(robot.shape.corner), np.array(robot.shape.corner) + robot.shape.size
+    assert (x >= low).all() and (x <= high).all()
+    assert x.min(0) == pytest.approx(low, abs=0.005) and x.max(0) == pytest.approx(high, abs=0.005)
+
+
+@pytest.mark.parametrize("body", [large(), ELL_OUTLINE])
+@pytest.mark.parametrize("particles", [2000, "full"])
+def test_particles_fill_the_mask_evenly(body, particles) -> None:
+    """Sobol and random draws: every cell of the L holds its share, what is outside holds none; the foot is below."""
+    env = tiny("run", body=body, particles=particles)
+    env.reset(seed=0)
+    shape, x = env.spec.robot.shape, env.state.x[0].numpy()
+    column, above = ((x - shape.corner) / shape.size * 6).clip(0, 6 - 1e-9).astype(int).T
+    cells = np.zeros((6, 6), int)
+    np.add.at(cells, (5 - above, column), 1)
+    share = env.num_particles / ELL.sum()
+    assert cells[~ELL].sum() <= 0.02 * env.num_particles  # an outline is drawn with its edge
+    assert cells[ELL] == pytest.approx(np.full(ELL.sum(), share), rel=0.07 if particles == 2000 else 0.15)
+
+
+def test_an_outline_and_its_picture_are_nearly_the_same() -> None:
+    shapes = [dittogym.make_spec("run", body=body).robot.shape for body in (ELL_OUTLINE, large())]
+    first, second = (points(shape) for shape in shapes)
+    assert first.mean(0) == pytest.approx(second.mean(0), abs=1e-3)
+    assert first.std(0) == pytest.approx(second.std(0), abs=1e-3)
+    tip = points(dittogym.make_spec("run", body=[(0, 0), (2, 0), (1, 2)]).robot.shape)
+    low, high = tip[:, 1].min(), tip[:, 1].max()
+    assert tip[:, 1].mean() == pytest.approx(low + (high - low) / 3, abs=2e-3)  # y is upwards
+
+
+def test_particle_positions_of_a_picture_pixel_by_pixel() -> None:
+    """Speckle, with a random share of the pixels set: every particle lies in one of them."""
+    mask = np.random.default_rng(0).random((40, 30)) < 0.5
+    mask[[0, 0, -1, -1], [0, -1, 0, -1]] = [True, False, False, True]
+    env = tiny("shapematch", body=mask, particles="full")
+    env.reset(seed=3)
+    shape = env.spec.robot.shape
+    column, above = ((env.state.x[0].numpy() - shape.corner) / shape.pixel).astype(int).T
+    assert mask[39 - above, column].all()
+    counts = np.zeros(mask.shape, int)
+    np.add.at(counts, (39 - above, column), 1)
+    expected = env.num_particles / mask.sum()
+    assert ((counts[mask] - expected) ** 2 / expected).sum() < 1.2 * mask.sum()  # chi-square of independent draws
+
+
+def test_a_shape_lies_where_it_says_and_is_as_dense() -> None:
+    spec, own = dittogym.make_spec("run", body=Rectangle((0.05, 0.3), (0.1, 0.12))), dittogym.make_spec("run").robot
+    assert spec.robot.shape.corner == (0.05, 0.3)
+    assert spec.robot.count / spec.robot.shape.area == pytest.approx(own.count / own.shape.area, rel=1e-4)
+    assert spec.robot.mass == own.mass
+    env = dittogym.TorchEnv(spec, particles="lite")
+    env.reset(seed=0)
+    assert env.state.x[0].mean(0).tolist() == pytest.approx([0.1, 0.36], abs=1e-3)
+    assert env.env_state.origin[0].tolist() == pytest.approx([0.1 - 0.4, 0.0], abs=1e-3)
+
+
+def test_a_body_is_taken_as_it_is() -> None:
+    body = Body(Disc((0.1, 0.2), 0.1), count=77, mass=3.5)
+    env = tiny("kick", body=body, particles="full")
+    assert env.spec.robot is body and env.model.robot == 77
+    assert env.model.solver.bodies[0].mass == 3.5
+
+
+def test_a_task_with_a_body_behind_gymnasium() -> None:
+    for make in (gymnasium.make, gymnasium.make_vec):
+        env = make("dittogym/kick-coarse-v0", body=ELL_OUTLINE, **SMALL)
+        env.reset(seed=0)
+        assert isinstance(env.unwrapped.torch_env.spec.robot.shape, Figure)
+
+
+@pytest.mark.parametrize("task", TASKS)
+@torch.no_grad()
+def test_a_square_robot_in_every_task(task: str) -> None:
+    env = tiny(task, 2, body=SQUARE, particles=300)
+    observation, info = env.reset(seed=0)
+    side = np.sqrt(env.spec.robot.shape.area)
+    assert info["split"].tolist() == pytest.approx([side / np.sqrt(6)] * 2, rel=0.03)
+    assert info["finite"].all() and (observation[:, 0] > 60).any()
+    for _ in range(2):
+        _, reward, terminated, _, info = env.step(torch.ones(2, *env.action_shape, dtype=env.dtype))
+    assert info["finite"].all() and not terminated.any() and torch.isfinite(reward).all()
+
+
+@pytest.mark.parametrize(
+    ("task", "body", "message"),
+    [
+        ("run", np.zeros((8, 8), bool), "body must have pixels brighter than 127, got none"),
+        ("run", np.full((8, 8), 127, np.uint8), "brighter than 127, got none"),
+        ("run", [(0, 0), (1, 0)], "at least 3 finite corners"),
+        ("run", np.zeros((0, 2)), "at least 3 finite corners"),
+        ("run", [(0, 0), (1, 0), (0, np.nan)], "at least 3 finite corners"),
+        ("run", [(0, 0), (1, 1), (2, 2), (5, 5)], "corners that enclose an area"),
+        ("run", [(3, 3)] * 4, "corners that enclose an area"),
+        ("run", Rectangle((-0.45, 0.2), (0.1, 0.9)), "inside the window"),
+        ("run", Rectangle((0.0, -0.01), (0.1, 0.1)), "inside the window"),
+        ("grow", Rectangle((0.45, 0.2), (0.1, 0.1)), r"inside the window \(-0.500 < x < 0.500"),
+        ("shapematch", [(0, 0), (50, 0), (50, 1), (0, 1)], "inside the window"),
+        ("kick", Rectangle((0.25, 0.16), (0.1, 0.1)), r"place of the object free, \[0.3, 0.16\] to \[0.35"),
+        ("catch", Disc((-0.1, 0.14), 0.1), "place of the object free"),
+        ("dig", Rectangle((-0.2, 0.45), (0.1, 0.1)), "place of the object free"),
+        ("kick", Body(Disc((0.28, 0.16), 0.1), count=10), "place of the object free"),
+        ("run", [(0, 0), (6, 0), (6, 1), (0, 1)], "more compact: its spread is 0.11. m, and run ends at 0.1 m"),
+        ("run", Rectangle((0.0, 0.16), (0.36, 0.05)), "more compact"),
+        ("run", "no/such/file.png", "body must be an outline .* no such file: 'no/such/file.png'"),
+        ("run", Path("no_file.png"), "no such file: 'no_file.png'"),
+        ("run", 42, "body"),
+        ("run", {"corners": SQUARE}, "body"),
+        ("run", np.zeros((5, 5), np.int64), "body array must be bool, uint8, uint16 or floating point, got int64"),
+        ("run", np.zeros((5, 5, 2), np.uint8), "body array must have shape"),
+        ("run", np.full((5, 5), 2.0), r"body array of floating point numbers must lie in \[0, 1\]"),
+    ],
+)
+def test_bad_bodies(task: str, body: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        tiny(task, body=body)
+
+
+def test_a_file_that_is_not_a_picture(tmp_path: Path) -> None:
+    path = tmp_path / "notes.png"
+    path.write_text("hello")
+    with pytest.raises(ValueError, match=r"body .*notes.png' cannot be read as an image"):
+        dittogym.make_spec("run", body=path)
+
+
+def test_what_fits_is_not_refused() -> None:
+    """Just beside the cube; long where the task does not end by it."""
+    tiny("kick", body=Rectangle((0.19, 0.16), (0.11, 0.1)))
+    tiny("shapematch", body=[(0, 0), (6, 0), (6, 1), (0, 1)])
+
+
+def test_a_dark_robot_on_bright_ground_is_pointed_out() -> None:
+    with pytest.warns(UserWarning, match="bright pixels are the robot"):
+        dittogym.make_spec("shapematch", body=~np.pad(ELL, 3))
+
+
+def wall(i: tuple[int, int] = (40, 46), *, visible: bool = True):
+    return solid("wall", i, (None, 60), visible=visible)
+
+
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_a_custom_obstacle_is_felt_seen_and_drawn(make) -> None:
+    """A wall ahead of a robot that is thrown to the right: it stops there, and flies on where there is none."""
+    reached, seen, drawn = {}, {}, {}
+    worlds = {"wall": (wall(), ceiling(119)), "glass": (wall(visible=False),), "none": ()}
+    for name, obstacles in worlds.items():
+        options = {"particles": 200, "substeps": 50, "render_mode": "rgb_array", "obstacles": list(obstacles)}
+        env = make("dittogym/run-coarse-v0", **options)
+        observation, _ = env.reset(seed=0, options={"physics": {"gravity": (0.0, 0.0)}})
+        seen[name] = observation.reshape(-1, 3, 64, 64)[0, 0]
+        drawn[name] = np.asarray(env.render()).reshape(-1, 512, 512, 3)[0]
+        env.unwrapped.state.v[..., 0] = 4.0
+        for _ in range(12):
+            env.step(np.zeros(env.action_space.shape, np.float32))
+        reached[name] = float(env.unwrapped.state.x[..., 0].max()) * 128
+    assert reached["wall"] < 43 and reached["glass"] == pytest.approx(reached["wall"]) and reached["none"] > 50
+    # The window begins at node 11.5 - 51.2, the crop a quarter of the window further; a pixel is one node wide.
+    left = 40 - (0.09 - 0.4) * 128 - 32
+    column, row = round(left + 3), 64 - (60 // 2) + 10
+    assert seen["wall"][row, column] == 255 and seen["glass"][row, column] == 0 == seen["none"][row, column]
+    assert np.array_equal(seen["glass"], seen["none"])
+    x, y = round((43 / 128 - 0.09 + 0.4) * 512), round((1 - 50 / 128) * 512)
+    assert np.abs(drawn["wall"][y, x].astype(int) - SOLID).max() < 12
+    assert np.abs(drawn["none"][y, x].astype(int) - SOLID).max() > 60
+    edge = drawn["glass"][y, x - 14 : x + 15].astype(int)
+    assert np.abs(edge - SOLID).max(-1).min() < 40 and np.abs(edge[14] - SOLID).max() > 60  # an outline only
+
+
+def test_obstacles_of_the_task_are_gone_when_others_are_given() -> None:
+    assert tiny("obstacle", obstacles=()).model.solver.rules == ()
+    stairs, ground = (tiny("obstacle", obstacles=o) for o in (None, (floor(),)))
+    assert not torch.equal(stairs.reset(seed=0)[0], ground.reset(seed=0)[0])
+    with pytest.raises(ValueError, match="at least 4 nodes"):
+        wall((40, 42))
+
+
+@pytest.mark.parametrize("size", [(0.16, 0.16), (0.32, 0.16), (0.1, 0.3)])
+@pytest.mark.parametrize("count", [1, 2, 17, 300, 19600])
+def test_a_lattice_of_any_number_of_particles(count: int, size: tuple[float, float]) -> None:
+    """All inside, none twice, rows in order, centred, and about equally far from each other in both directions."""
+    shape = Lattice((-0.06, 0.16), size)
+    x = shape.positions(np.empty((count, 2)))
+    relative = (x - shape.corner) / size
+    assert x.shape == (count, 2) and (relative > 0).all() and (relative < 1).all()
+    assert len(np.unique(x.round(12), axis=0)) == count
+    assert (np.diff(x[:, 1]) >= 0).all()
+    assert relative[:, 0].mean() == pytest.approx(0.5, abs=1e-9)
+    if count >= 300:
+        heights, in_row = np.unique(x[:, 1].round(12), return_counts=True)
+        assert np.ptp(in_row) <= 1
+        assert relative.mean(0) == pytest.approx([0.5, 0.5], abs=0.01)
+        spacing = size[0] / in_row.mean(), np.diff(heights).mean()
+        assert spacing[0] == pytest.approx(spacing[1], rel=0.1)
+    assert np.array_equal(x, shape.positions(np.random.default_rng(0).random((count, 2))))
+
+
+def test_a_square_number_makes_a_square_lattice() -> None:
+    for count in (1, 4, 300**2 // 100, 14400, 19600):
+        side = round(count**0.5)
+        x = Lattice((0.0, 0.16), (0.16, 0.16)).positions(np.empty((count, 2)))
+        across, up = np.meshgrid((np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side)
+        assert x == pytest.approx(np.stack((across.ravel() * 0.16, 0.16 + up.ravel() * 0.16), axis=1))
+
+
+@pytest.mark.parametrize("count", [1, 2, 17])
+def test_a_lattice_task_with_hardly_any_particles(count: int) -> None:
+    env = tiny("grow", particles=count)
+    env.reset(seed=0)
+    assert env.step(torch.zeros(1, *env.action_shape, dtype=env.dtype))[-1]["finite"].all()
+
+
+#: Particles of robot and object in the lite tier; of DIG's soil there are more than in proportion.
+LITE = {
+    "shapematch": (2000,),
+    "run": (2000,),
+    "grow": (2000,),
+    "kick": (2000, 164),
+    "dig": (2000, None),
+    "obstacle": (2000,),
+    "catch": (2000, 200),
+    "slot": (2000, 200),
+}
+
+
+def test_lite_counts() -> None:
+    assert LITE.keys() == set(TASKS)
+    for task, counts in LITE.items():
+        spec = dittogym.make_spec(task)
+        ours = layout.particle_counts(spec, "lite")
+        assert len(ours) == len(spec.bodies)
+        for n, wanted, body in zip(ours, counts, spec.bodies, strict=True):
+            assert n == wanted or (wanted is None and 1333 <= n <= body.count)
+        assert tiny(task, particles="lite").num_particles == sum(ours)
+
+
+def test_lite_counts_of_other_bodies() -> None:
+    few = Body(Disc((0.0, 0.16), 0.1), count=500)
+    assert layout.particle_counts(dittogym.make_spec("run", body=few), "lite") == (500,)
+    assert layout.particle_counts(dittogym.make_spec("kick", body=few), "lite") == (500, 2000)
+    assert layout.particle_counts(dittogym.make_spec("kick", body=SQUARE), "lite") == (2000, 164)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_mass_and_volume_are_the_same_with_any_number_of_particles(task: str) -> None:
+    totals = []
+    for particles in ("full", "lite", 150):
+        bodies = tiny(task, particles=particles).model.solver.bodies
+        totals.append([(body.count * body.mass, body.count * body.volume) for body in bodies])
+    assert totals[1] == pytest.approx(np.array(totals[0])) and totals[2] == pytest.approx(np.array(totals[0]))

@@ -1,0 +1,287 @@
+"""Saved moments: what goes on from one is, to the last bit, what would have gone on without."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from tiny import SMALL, TASKS, actions, assert_same_bits, everything, stir, tiny
+
+from dittogym import TorchEnv
+from dittogym.torch_env import Snapshot
+
+STEPS = 3
+
+
+def contents(snapshot: Snapshot) -> list[torch.Tensor]:
+    """Copies of all tensors of a snapshot."""
+    found: list[torch.Tensor] = []
+    snapshot.state.map(lambda tensor: found.append(tensor.detach().clone()) or tensor)
+    return [*found, snapshot.observation.clone()]
+
+
+def go_on(env: TorchEnv, drive: torch.Tensor) -> list[Any]:
+    """Results of all steps, and all that moves after each."""
+    return [(env.step(action), everything(env)) for action in drive]
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@torch.no_grad()
+def test_a_loaded_moment_goes_on_as_it_would_have(task: str, dtype: str) -> None:
+    """In the same environment, after more steps and a reset; in a new one; and in one that is elsewhere."""
+    env, elsewhere = (tiny(task, 2, dtype=dtype, substeps=10) for _ in range(2))
+    env.reset(seed=4)
+    stir(env)
+    drive = actions(env, 2 + STEPS)
+    for action in drive[:2]:
+        seen = env.step(action)[0]
+    moment = env.save()
+    future = go_on(env, drive[2:])
+    env.reset(seed=9)
+    elsewhere.reset(seed=30)
+    elsewhere.step(drive[0])
+    for other in (env, tiny(task, 2, dtype=dtype, substeps=10), elsewhere):
+        assert torch.equal(other.load(moment), seen)
+        assert_same_bits(go_on(other, drive[2:]), future)
+
+
+@pytest.mark.parametrize("task", ["grow", "catch", "slot", "run"])
+def test_through_gymnasium_make(task: str) -> None:
+    """The future from a moment, behind all wrappers."""
+    env = gymnasium.make(f"dittogym/{task}-coarse-v0", **SMALL)
+    env.reset(seed=2)
+    env.action_space.seed(0)
+    drive = [env.action_space.sample() for _ in range(2 + STEPS)]
+    seen = [env.step(action) for action in drive[:2]][-1][0]
+    moment = env.unwrapped.save()
+    future = [env.step(action) for action in drive[2:]]
+    env.reset(seed=8)
+    loaded = env.unwrapped.load(moment)
+    assert isinstance(loaded, np.ndarray) and np.array_equal(loaded, seen)
+    assert_same_bits([env.step(action) for action in drive[2:]], future)
+
+
+@pytest.mark.parametrize("task", ["grow", "catch", "slot", "run"])
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep", "Disabled"])
+def test_through_make_vec(task: str, mode: str) -> None:
+    name = f"dittogym/{task}-coarse-v0"
+    env = gymnasium.make_vec(name, num_envs=2, vectorization_mode="vector_entry_point", autoreset_mode=mode, **SMALL)
+    env.reset(seed=2)
+    env.action_space.seed(0)
+    drive = [env.action_space.sample() for _ in range(2 + STEPS)]
+    seen = [env.step(action) for action in drive[:2]][-1][0]
+    moment = env.unwrapped.save()
+    future = [env.step(action) for action in drive[2:]]
+    env.reset(seed=8)
+    assert np.array_equal(env.unwrapped.load(moment), seen)
+    assert_same_bits([env.step(action) for action in drive[2:]], future)
+
+
+def test_an_ended_element_goes_on_from_a_loaded_moment() -> None:
+    """Its reset, due in the next call, is off; the step count of the moment is back."""
+    env = gymnasium.make_vec(
+        "dittogym/run-coarse-v0",
+        num_envs=2,
+        vectorization_mode="vector_entry_point",
+        max_episode_steps=3,
+        autoreset_mode="NextStep",
+        **SMALL,
+    )
+    env.reset(seed=0)
+    action = np.ones(env.action_space.shape, np.float32)
+    env.step(action)
+    env.step(action)
+    moment = env.unwrapped.save()
+    wanted = env.step(action)
+    assert wanted[3].all()
+    env.unwrapped.load(moment, np.array([True, False]))
+    observations, rewards, _, truncated, info = env.step(action)
+    assert np.array_equal(observations[0], wanted[0][0]) and rewards[0] == wanted[1][0]
+    assert truncated.tolist() == [True, False] and info["_com"].tolist() == [True, False]
+    assert env.unwrapped.torch_env.env_state.steps.tolist() == [3, 0]
+
+
+@pytest.mark.parametrize("task", ["grow", "catch", "slot", "run"])
+@torch.no_grad()
+def test_one_moment_into_every_element(task: str) -> None:
+    """Branches: what every element does is what the single simulation would have done with its actions."""
+    single, batch = tiny(task), tiny(task, 3)
+    single.reset(seed=5)
+    stir(single)
+    single.step(actions(single, 1)[0])
+    moment = single.save()
+    batch.reset(seed=0)
+    assert torch.equal(batch.load(moment), moment.observation.expand(3, -1, -1, -1))
+    assert_same_bits(everything(batch), [t.expand(3, *t.shape[1:]) for t in contents(moment)[:-1]])
+    drive = actions(batch, STEPS, seed=1)
+    future = go_on(batch, drive)
+    for i in range(3):
+        single.load(moment)
+        for (result, numbers), action in zip(future, drive[:, i : i + 1], strict=True):
+            one = single.step(action)
+            assert torch.equal(result[0][i], one[0][0])
+            assert float(result[1][i]) == pytest.approx(float(one[1][0]), abs=1e-9)
+            for ours, theirs in zip(numbers, everything(single), strict=True):
+                assert float((ours[i] - theirs[0]).abs().max()) <= 1e-9 * max(1.0, float(theirs.abs().max()))
+    assert not torch.equal(batch.state.x[0], batch.state.x[1])
+
+
+@pytest.mark.parametrize("task", ["grow", "slot", "run"])
+@torch.no_grad()
+def test_only_masked_elements_are_loaded(task: str) -> None:
+    env, twin = tiny(task, 3), tiny(task, 3)
+    drive = actions(env, 4)
+    for e in (env, twin):
+        e.reset(seed=1)
+        stir(e)
+    moment = env.save()
+    for action in drive[:2]:
+        env.step(action)
+        twin.step(action)
+    seen = env.load(moment, mask=[False, True, False])
+    now, then = everything(env), contents(moment)
+    assert env.env_state.steps.tolist() == [2, 0, 2]
+    assert torch.equal(seen[1], moment.observation[1]) and torch.equal(seen[0], twin.save().observation[0])
+    assert_same_bits([t[1] for t in now], [t[1] for t in then[:-1]])
+    for action in drive[2:]:
+        ours, theirs = env.step(action), twin.step(action)
+        for i in (0, 2):
+            assert torch.equal(ours[0][i], theirs[0][i]) and ours[1][i] == theirs[1][i]
+            assert_same_bits([t[i] for t in everything(env)], [t[i] for t in everything(twin)])
+    env.load(moment, mask=[True, False, True])
+    env.load(moment, mask=[False, True, False])
+    assert_same_bits(everything(env), then[:-1])
+
+
+@torch.no_grad()
+def test_a_snapshot_is_not_changed_by_what_follows() -> None:
+    env = tiny("catch", 2)
+    env.reset(seed=0, options={"physics": {"mu": 300.0}})
+    env.step(actions(env, 1)[0])
+    moment = env.save()
+    wanted = contents(moment)
+    env.state.v[:] = 3.0  # right after saving, and again after loading: nothing is shared either way
+    env.step(actions(env, 1)[0])
+    env.reset(seed=1, options={"physics": {}})
+    observation = env.load(moment)
+    observation.zero_()
+    env.state.x[:] += 0.1
+    env.env_state.memory["object_com"].zero_()
+    env.step(actions(env, 1)[0])
+    env.load(moment, mask=[True, False])
+    env.state.x[:] += 0.1
+    assert_same_bits(contents(moment), wanted)
+
+
+@torch.no_grad()
+def test_the_step_count_is_part_of_a_moment() -> None:
+    env = tiny("shapematch", substeps=1, particles=20)
+    env.reset(seed=0)
+    still = torch.zeros(1, *env.action_shape, dtype=env.dtype)
+    for _ in range(28):
+        env.step(still)
+    moment = env.save()
+    env.reset()
+    env.load(moment)
+    assert [bool(env.step(still)[3]) for _ in range(2)] == [False, True]
+
+
+@torch.no_grad()
+def test_physics_travels_with_a_moment() -> None:
+    """Into an environment with the task's own constants, whole or in part; the next reset knows nothing of it."""
+    physics = {"mu": torch.tensor([200.0, 900.0]), "gravity": [[0.0, 5.0], [0.0, -30.0]], "mass": 2.0}
+    env, plain = tiny("run", 2), tiny("run", 2)
+    env.reset(seed=0, options={"physics": physics})
+    moment = env.save()
+    drive = actions(env, STEPS)
+    future = go_on(env, drive)
+    plain.reset(seed=0)
+    own = go_on(plain, drive)
+    assert not torch.equal(plain.state.x, env.state.x)
+    plain.load(moment)
+    assert_same_bits(go_on(plain, drive), future)
+    plain.reset()
+    assert_same_bits([plain.step(action) for action in drive], [result for result, _ in own])
+    env.reset(options={"physics": {}})
+    env.load(moment, mask=[False, True])
+    assert env.env_state.physics["mu"].tolist() == [650.0, 900.0]
+    assert env.env_state.physics["gravity"].tolist() == [[0.0, -9.0], [0.0, -30.0]]
+    assert env.env_state.physics["mass"].tolist() == [1.0, 2.0]
+    assert torch.allclose(go_on(env, drive)[-1][1][0][1], future[-1][1][0][1], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"task": "grow"}, "snapshot must be of task 'run'"),
+        ({"particles": 119}, "snapshot must hold 1 or 2 simulations"),
+        ({"dtype": "float32"}, "torch.float32"),
+        ({"num_envs": 3}, "snapshot must hold 1 or 2 simulations .* got 3 of"),
+    ],
+)
+@torch.no_grad()
+def test_a_snapshot_that_does_not_fit_is_refused(options: dict, message: str) -> None:
+    env, other = tiny("run", 2), tiny(**{"task": "run", "num_envs": 2, **options})
+    env.reset(seed=0)
+    other.reset(seed=0)
+    before, seen = env.state, env.save().observation
+    for mask in (None, [True, False]):
+        with pytest.raises(ValueError, match=message):
+            env.load(other.save(), mask)
+    assert env.state is before and torch.equal(env.save().observation, seen)
+    assert env.step(actions(env, 1)[0])[-1]["finite"].all()
+
+
+def test_bad_use() -> None:
+    env = tiny("run", 2)
+    with pytest.raises(RuntimeError, match=r"call reset\(\) first"):
+        env.save()
+    single = tiny("run")
+    single.reset(seed=0)
+    with pytest.raises(RuntimeError, match=r"call reset\(\) first"):
+        env.load(single.save(), mask=[True, False])  # the other element has no state
+    env.reset(seed=0)
+    for mask in ([1, 0], [True], True):
+        with pytest.raises(ValueError, match=r"mask must be bool of shape \(2,\)"):
+            env.load(env.save(), mask)
+
+
+@pytest.mark.parametrize("task", ["slot", "grow"])
+def test_gradients_flow_through_a_saved_moment(task: str) -> None:
+    """Of a reward after a detour to actions before the saved moment; not to those of the detour."""
+    straight, env = tiny(task), tiny(task)
+    drives = [actions(env, 3).requires_grad_() for _ in range(2)]
+    straight.reset(seed=0)
+    straight.step(drives[0][0])
+    straight.step(drives[0][2])[1].sum().backward()
+    env.reset(seed=0)
+    env.step(drives[1][0])
+    moment = env.save()
+    env.step(drives[1][1])
+    env.load(moment)
+    env.step(drives[1][2])[1].sum().backward()
+    ours, wanted = drives[1].grad, drives[0].grad
+    assert min(wanted[0].abs().max(), wanted[2].abs().max()) > 1e-6
+    assert torch.allclose(ours, wanted, rtol=1e-10, atol=1e-12) and ours[1].abs().max() == 0
+
+
+def test_gradients_of_branches_add_up_in_their_stem() -> None:
+    """One moment in every element of a batch: the stem's gradient is that of the sum over branches."""
+    single, batch = tiny("slot"), tiny("slot", 2)
+    stem = actions(single, 1)[0].requires_grad_()
+    twigs = actions(batch, 1, seed=1)[0]
+
+    def total(first: torch.Tensor) -> torch.Tensor:
+        single.reset(seed=0)
+        single.step(first)
+        batch.load(single.save())
+        return batch.step(twigs)[1].sum()
+
+    (gradient,) = torch.autograd.grad(total(stem), stem)
+    direction = actions(single, 1, seed=2)[0]
+    with torch.no_grad():
+        difference = (total(stem + 1e-4 * direction) - total(stem - 1e-4 * direction)) / 2e-4
+    assert abs(float(difference)) > 1e-6
+    assert float((gradient * direction).sum()) == pytest.approx(float(difference), rel=1e-5)

@@ -1,0 +1,62 @@
+"""Environments so small that a test takes a moment, and ways to drive and compare them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+
+import dittogym
+
+TASKS = tuple(dittogym.TASKS)
+#: Tasks whose window stays where it is.
+FIXED = tuple(task for task in TASKS if dittogym.make_spec(task).window.follow is None)
+SMALL = {"particles": 120, "substeps": 4}
+
+
+def tiny(task: str | dittogym.TaskSpec, num_envs: int = 1, **options: Any) -> dittogym.TorchEnv:
+    """A batch in float64 with few particles."""
+    return dittogym.TorchEnv(task, num_envs, **{**SMALL, "dtype": "float64", **options})
+
+
+def actions(env: dittogym.TorchEnv, steps: int, seed: int = 0) -> torch.Tensor:
+    """Random actions (steps, B, 2, R, R)."""
+    generator = torch.Generator().manual_seed(seed)
+    uniform = torch.rand(steps, env.num_envs, *env.action_shape, generator=generator, dtype=torch.float64)
+    return (2 * uniform - 1).to(env.dtype)
+
+
+def stir(env: dittogym.TorchEnv, seed: int = 0) -> None:
+    """Give element i the random velocities of ``seed + i``, about 1 m/s, so that things happen within few substeps."""
+    for i in range(env.num_envs):
+        generator = torch.Generator().manual_seed(seed + i)
+        env.state.v[i] += torch.randn(env.state.v[i].shape, generator=generator, dtype=torch.float64).to(env.dtype)
+
+
+def leaves(value: Any, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
+    """Everything in nested dictionaries and sequences, with its path, as arrays."""
+    if isinstance(value, dict):
+        for key in value:
+            yield from leaves(value[key], f"{path}/{key}")
+    elif isinstance(value, (tuple, list)):
+        for i, entry in enumerate(value):
+            yield from leaves(entry, f"{path}/{i}")
+    else:
+        yield path, value.detach().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+
+
+def assert_same_bits(ours: Any, theirs: Any) -> None:
+    """Two nests of tensors, arrays and numbers are equal to the last bit, in the same places."""
+    first, second = list(leaves(ours)), list(leaves(theirs))
+    assert [path for path, _ in first] == [path for path, _ in second]
+    for (path, a), (_, b) in zip(first, second, strict=True):
+        assert a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes(), path
+
+
+def everything(env: dittogym.TorchEnv) -> list[torch.Tensor]:
+    """Every number that an environment's future depends on."""
+    found: list[torch.Tensor] = []
+    env.env_state.map(lambda tensor: found.append(tensor) or tensor)
+    return found
