@@ -16,7 +16,7 @@ RANKED = {"run": 100, "kick": 100, "shapematch": 30}
 
 
 def sine(env: dittogym.TorchEnv, t: int) -> torch.Tensor:
-    """The wave of the recorded episodes of the reference implementation: along x in one muscle, along y in the other."""
+    """The wave of the reference implementation's recorded episodes: along x in one muscle, along y in the other."""
     r, s = np.indices(env.action_shape[1:]) / env.action_resolution
     along, across = np.sin(2 * math.pi * (r + 0.15 * t)), np.cos(2 * math.pi * (s - 0.1 * t))
     return torch.as_tensor(np.stack((along, across)), dtype=env.dtype)[None]

@@ -201,7 +201,7 @@ def test_a_dark_robot_on_bright_ground_is_pointed_out() -> None:
         dittogym.make_spec("shapematch", body=~np.pad(ELL, 3))
 
 
-def wall(i: tuple[int, int] = (40, 46), *, visible: bool = True):
+def wall(i: tuple[int, int] = (32, 38), *, visible: bool = True):
     return solid("wall", i, (None, 60), visible=visible)
 
 
@@ -217,16 +217,16 @@ def test_a_custom_obstacle_is_felt_seen_and_drawn(make) -> None:
         seen[name] = observation.reshape(-1, 3, 64, 64)[0, 0]
         drawn[name] = np.asarray(env.render()).reshape(-1, 512, 512, 3)[0]
         env.unwrapped.state.v[..., 0] = 4.0
-        for _ in range(12):
+        for _ in range(8):
             env.step(np.zeros(env.action_space.shape, np.float32))
         reached[name] = float(env.unwrapped.state.x[..., 0].max()) * 128
-    assert reached["wall"] < 43 and reached["glass"] == pytest.approx(reached["wall"]) and reached["none"] > 50
+    assert reached["wall"] < 34 and reached["glass"] == pytest.approx(reached["wall"]) and reached["none"] > 39
     # The window begins at node 11.5 - 51.2, the crop a quarter of the window further; a pixel is one node wide.
-    left = 40 - (0.09 - 0.4) * 128 - 32
+    left = 32 - (0.09 - 0.4) * 128 - 32
     column, row = round(left + 3), 64 - (60 // 2) + 10
     assert seen["wall"][row, column] == 255 and seen["glass"][row, column] == 0 == seen["none"][row, column]
     assert np.array_equal(seen["glass"], seen["none"])
-    x, y = round((43 / 128 - 0.09 + 0.4) * 512), round((1 - 50 / 128) * 512)
+    x, y = round((35 / 128 - 0.09 + 0.4) * 512), round((1 - 50 / 128) * 512)
     assert np.abs(drawn["wall"][y, x].astype(int) - SOLID).max() < 12
     assert np.abs(drawn["none"][y, x].astype(int) - SOLID).max() > 60
     edge = drawn["glass"][y, x - 14 : x + 15].astype(int)
