@@ -221,9 +221,8 @@ def test_a_custom_obstacle_is_felt_seen_and_drawn(make) -> None:
             env.step(np.zeros(env.action_space.shape, np.float32))
         reached[name] = float(env.unwrapped.state.x[..., 0].max()) * 128
     assert reached["wall"] < 34 and reached["glass"] == pytest.approx(reached["wall"]) and reached["none"] > 39
-    # The window begins at node 11.5 - 51.2, the crop a quarter of the window further; a pixel is one node wide.
-    left = 32 - (0.09 - 0.4) * 128 - 32
-    column, row = round(left + 3), 64 - (60 // 2) + 10
+    # The crop is 64 nodes wide, around node (11.52, 35.84); a pixel is a node wide.
+    column, row = round(35 - 11.52 + 32), round(35.84 + 32 - 50)
     assert seen["wall"][row, column] == 255 and seen["glass"][row, column] == 0 == seen["none"][row, column]
     assert np.array_equal(seen["glass"], seen["none"])
     x, y = round((35 / 128 - 0.09 + 0.4) * 512), round((1 - 50 / 128) * 512)
