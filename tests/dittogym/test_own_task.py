@@ -1,0 +1,193 @@
+"""A task of one's own, registered without touching the library."""
+
+import dataclasses
+from collections.abc import Iterator
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+from tiny import SMALL, actions, tiny
+
+import dittogym
+from dittogym.geometry import ceiling, floor
+from dittogym.shapes import Disc, Rectangle
+from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights
+
+
+@pytest.fixture(autouse=True)
+def unregister() -> Iterator[None]:
+    """Forget what a test registers."""
+    tasks, ids = dict(dittogym.TASKS), set(gymnasium.registry)
+    yield
+    for name in set(gymnasium.registry) - ids:
+        del gymnasium.registry[name]
+    dittogym.TASKS.clear()
+    dittogym.TASKS.update(tasks)
+
+
+# A task in about ten lines: get high above the start.
+def height(moment: Moment, weights: Weights) -> Outcome:
+    risen = moment.now.com[:, 1] - moment.start.com[:, 1]
+    return Outcome({"height": weights.location * risen}, terminated=risen > 0.3, success=risen > 0.2)
+
+
+def hop(pull: float = -5.0, horizon: int = 40, coarse: int = 4) -> TaskSpec:
+    robot = Body(Disc((0.4, 0.16), 0.18), count=5000)
+    matter = {"mu": 500.0, "yield_stress": 80.0, "max_actuation": 60.0, "gravity": (0.0, pull)}
+    world = {"obstacles": (floor(), ceiling(119)), "coarse": coarse, "fine": 8}
+    weights = Weights(location=7.0, action=1e-4, alive=1.0)
+    return TaskSpec("hop", horizon, robot, judge=height, weights=weights, **matter, **world)
+
+
+def test_through_gymnasium_make_in_both_resolutions() -> None:
+    dittogym.register("hop", hop)
+    for resolution, size in (("coarse", 4), ("fine", 8)):
+        name = f"dittogym/hop-{resolution}-v0"
+        assert gymnasium.spec(name).max_episode_steps == 40
+        env = gymnasium.make(name, **SMALL)
+        assert env.action_space.shape == (2, size, size)
+        env.reset(seed=0)
+        assert env.unwrapped.torch_env.spec.name == "hop"
+        check_env(gymnasium.make(name, render_mode="rgb_array", **SMALL).unwrapped)
+        check_env_sb3(gymnasium.make(name, **SMALL))
+
+
+def test_its_own_reward_term_ending_and_success() -> None:
+    dittogym.register("hop", hop)
+    env = gymnasium.make("dittogym/hop-coarse-v0", **SMALL)
+    _, start = env.reset(seed=0)
+    still = np.zeros(env.action_space.shape, np.float32)
+    _, reward, terminated, _, info = env.step(still)
+    assert set(info["reward_terms"]) == {"height", "action", "alive", "failure"}
+    risen = info["com"][1] - start["com"][1]
+    assert info["reward_terms"]["height"] == pytest.approx(7.0 * risen, abs=1e-6)
+    assert reward == pytest.approx(sum(info["reward_terms"].values()), abs=1e-5)
+    assert terminated is False and info["is_success"] is False
+    for lift, wanted in ((0.25, (False, True)), (0.1, (True, True))):
+        env.unwrapped.state.x[..., 1] += lift
+        _, _, terminated, _, info = env.step(still)
+        assert (terminated, info["is_success"]) == wanted
+
+
+def test_through_make_vec_and_torch() -> None:
+    dittogym.register("hop", hop)
+    env = gymnasium.make_vec("dittogym/hop-coarse-v0", num_envs=3, vectorization_mode="vector_entry_point", **SMALL)
+    single = gymnasium.make("dittogym/hop-coarse-v0", **SMALL)
+    env.reset(seed=0)
+    single.reset(seed=2)
+    env.action_space.seed(0)
+    action = env.action_space.sample()
+    assert action.shape == (3, 2, 4, 4)
+    observation, reward, _, _, info = env.step(action)
+    seen, one, *_ = single.step(action[2])
+    assert np.array_equal(observation[2], seen) and reward[2] == pytest.approx(one, abs=1e-5)
+    assert info["reward_terms"]["height"].shape == (3,)
+    env.unwrapped.state.x[1, :, 1] += 0.35
+    _, _, terminated, _, info = env.step(action)
+    assert terminated.tolist() == [False, True, False] and info["final_info"]["is_success"][1]
+    assert tiny("hop").spec.name == "hop" and dittogym.Env("hop", **SMALL).action_space.shape == (2, 4, 4)
+
+
+def test_options_of_the_function_arrive() -> None:
+    dittogym.register("hop", hop)
+    env = gymnasium.make("dittogym/hop-coarse-v0", pull=-1.5, coarse=6, body=Disc((0.4, 0.16), 0.1), **SMALL)
+    assert env.unwrapped.torch_env.spec.gravity == (0.0, -1.5)
+    assert env.action_space.shape == (2, 6, 6)
+    assert env.unwrapped.torch_env.spec.robot.shape.size == (0.1, 0.1)
+    assert tiny("hop", pull=-2.0).spec.gravity == (0.0, -2.0)
+    message = "task 'hop' has no option 'push'; its options are: body, obstacles, pull, horizon, coarse"
+    with pytest.raises(TypeError, match=message):
+        gymnasium.make("dittogym/hop-coarse-v0", push=1.0)
+    with pytest.raises(ValueError, match=r"task must be one of catch, .*, hop, .* got 'hope'"):
+        tiny("hope")
+
+
+def test_the_horizon_of_an_option_counts_for_the_batch() -> None:
+    dittogym.register("hop", hop)
+    env = tiny("hop", horizon=2, substeps=1)
+    env.reset(seed=0)
+    assert [bool(env.step(action)[3]) for action in actions(env, 3)] == [False, True, True]
+
+
+def test_namespace_and_version() -> None:
+    dittogym.register("hop", hop, namespace="mine", version=3)
+    assert {"mine/hop-coarse-v3", "mine/hop-fine-v3"} <= set(gymnasium.registry)
+    assert "dittogym/hop-coarse-v0" not in gymnasium.registry
+    assert gymnasium.make("mine/hop-fine-v3", **SMALL).action_space.shape == (2, 8, 8)
+
+
+def test_a_second_version_of_the_same_function() -> None:
+    dittogym.register("hop", hop)
+    dittogym.register("hop", hop, version=1)
+    assert {"dittogym/hop-coarse-v0", "dittogym/hop-coarse-v1"} <= set(gymnasium.registry)
+
+
+def test_a_taken_name_is_refused() -> None:
+    dittogym.register("hop", hop)
+    before = dict(dittogym.TASKS), set(gymnasium.registry)
+    for name in ("run", "hop"):
+        with pytest.raises(ValueError, match=f"task must be a new name, got '{name}', which is taken"):
+            dittogym.register(name, lambda: hop())
+    assert (dict(dittogym.TASKS), set(gymnasium.registry)) == before
+    assert tiny("run").spec.name == "run"
+
+
+@pytest.mark.parametrize(("result", "kind"), [(None, "NoneType"), ({"name": "hop"}, "dict"), (TaskSpec, "type")])
+def test_a_function_that_returns_something_else_is_refused(result: object, kind: str) -> None:
+    with pytest.raises(TypeError, match=f"make must return a TaskSpec, got {kind}"):
+        dittogym.register("hop", lambda: result)
+    assert "hop" not in dittogym.TASKS and "dittogym/hop-coarse-v0" not in gymnasium.registry
+
+
+def test_options_need_defaults() -> None:
+    def needy(pull: float) -> TaskSpec:
+        return hop(pull)
+
+    with pytest.raises(TypeError, match="pull"):
+        dittogym.register("needy", needy)
+    assert "needy" not in dittogym.TASKS
+
+
+def test_a_specification_needs_no_registration() -> None:
+    env = dittogym.Env(hop(), particles=50, substeps=1)
+    check_env(env, skip_render_check=True)
+    assert dittogym.BatchEnv(hop(), 2, particles=50, substeps=1).single_action_space.shape == (2, 4, 4)
+
+
+def remember_peak(moment: Moment) -> dict[str, torch.Tensor]:
+    return {"peak": moment.now.com[:, 1]}
+
+
+def judge_peak(moment: Moment, weights: Weights) -> Outcome:
+    peak = torch.maximum(moment.memory["peak"], moment.now.com[:, 1])
+    assert moment.now.object_com is not None
+    return Outcome(
+        {"peak": weights.location * (peak - moment.start.com[:, 1])},
+        info={"peak": peak, "stone": moment.now.object_com},
+        memory={"peak": peak},
+    )
+
+
+def test_memory_and_objects_of_a_task_of_ones_own() -> None:
+    """The highest point so far is remembered by each element until its own reset."""
+    stone = Body(Rectangle((0.7, 0.16), (0.06, 0.06)), count=500, mass=4.0)
+    spec = dataclasses.replace(hop(), objects=(stone,), remember=remember_peak, judge=judge_peak, gravity=(0.0, 0.0))
+    env = tiny(spec, 2, particles=(100, 30))
+    env.reset(seed=0)
+    start = env.state.x[:, :100, 1].mean(1)
+    still = torch.zeros(2, *env.action_shape, dtype=env.dtype)
+    env.state.x[:, :100, 1] += torch.tensor([[0.1], [0.2]])
+    env.step(still)
+    env.state.x[:, :100, 1] -= torch.tensor([[0.1], [0.2]])
+    info = env.step(still)[-1]
+    assert info["peak"].tolist() == pytest.approx((start + torch.tensor([0.1, 0.2])).tolist(), abs=1e-3)
+    assert info["reward_terms"]["peak"].tolist() == pytest.approx([0.7, 1.4], abs=1e-2)
+    assert info["stone"].tolist() == info["object_com"].tolist()
+    assert info["stone"][0].tolist() == pytest.approx([0.73, 0.19], abs=0.01)
+    env.reset(options={"reset_mask": [True, False]})
+    info = env.step(still)[-1]
+    assert info["reward_terms"]["peak"].tolist() == pytest.approx([0.0, 1.4], abs=1e-2)
+    assert "is_success" not in info

@@ -1,0 +1,293 @@
+"""Wrappers: ours for other resolutions, and Gymnasium's own around our environments."""
+
+import sys
+import types
+import warnings
+from pathlib import Path
+
+import cv2
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import wrappers
+from tiny import SMALL
+from torch.nn.functional import interpolate
+
+from dittogym.wrappers import action_resolution, observation_resolution
+
+NAME = "dittogym/run-coarse-v0"
+
+
+def single(**options) -> gymnasium.Env:
+    return gymnasium.make(NAME, **{**SMALL, **options})
+
+
+def batch(num_envs: int = 2, autoreset_mode: str = "NextStep", **options) -> gymnasium.vector.VectorEnv:
+    options = {**SMALL, "autoreset_mode": autoreset_mode, **options}
+    return gymnasium.make_vec(NAME, num_envs=num_envs, vectorization_mode="vector_entry_point", **options)
+
+
+def bicubic(action: np.ndarray, size: int) -> np.ndarray:
+    """What is expected of the enlargement: PyTorch's bicubic interpolation, saturated like the muscles."""
+    planes = torch.as_tensor(action).reshape(-1, 1, *action.shape[-2:])
+    large = interpolate(planes, size=(size, size), mode="bicubic", align_corners=False).clamp(-1.0, 1.0)
+    return large.reshape(*action.shape[:-2], size, size).numpy()
+
+
+@pytest.mark.parametrize("size", [1, 3, 4, 8])
+def test_spaces_of_actions(size: int) -> None:
+    env, vector = action_resolution(single(), size), action_resolution(batch(3), size)
+    assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (2, size, size), np.float32)
+    assert vector.single_action_space == env.action_space
+    assert vector.action_space.shape == (3, 2, size, size) and vector.num_envs == 3
+    assert env.observation_space.shape == (3, 64, 64)
+    env.reset(seed=0)
+    vector.reset(seed=0)
+    assert env.observation_space.contains(env.step(env.action_space.sample())[0])
+    assert vector.observation_space.contains(vector.step(vector.action_space.sample())[0])
+
+
+@pytest.mark.parametrize("size", [1, 16, 48, 64])
+def test_spaces_of_observations(size: int) -> None:
+    env, vector = observation_resolution(single(), size), observation_resolution(batch(3), size)
+    assert env.observation_space == gymnasium.spaces.Box(0, 255, (3, size, size), np.uint8)
+    assert vector.single_observation_space == env.observation_space
+    assert vector.observation_space.shape == (3, 3, size, size)
+    for e in (env, vector):
+        first, _ = e.reset(seed=0)
+        assert e.observation_space.contains(first)
+        assert e.observation_space.contains(e.step(e.action_space.sample())[0])
+
+
+@pytest.mark.parametrize("size", [1, 3, 4, 8])
+def test_actions_are_enlarged_by_bicubic_interpolation(size: int) -> None:
+    """A wrapped environment does what the bare one does with the enlarged action; the same for a batch."""
+    wrapped, bare = action_resolution(single(), size), single()
+    vector, bare_vector = action_resolution(batch(), size), batch()
+    for e in (wrapped, bare, vector, bare_vector):
+        e.reset(seed=0)
+    vector.action_space.seed(0)
+    for _ in range(2):
+        actions = vector.action_space.sample()
+        large = bicubic(actions, 8)
+        assert wrapped.action(actions[0]) == pytest.approx(large[0], abs=1e-5)
+        assert vector.actions(actions) == pytest.approx(large, abs=1e-5)
+        ours, theirs = wrapped.step(actions[0]), bare.step(large[0])
+        assert np.abs(ours[0].astype(int) - theirs[0]).max() <= 1 and ours[1] == pytest.approx(theirs[1], abs=1e-4)
+        ours, theirs = vector.step(actions), bare_vector.step(large)
+        assert np.abs(ours[0].astype(int) - theirs[0]).max() <= 1 and ours[1] == pytest.approx(theirs[1], abs=1e-4)
+
+
+def test_actions_of_the_own_size_stay_as_they_are() -> None:
+    for env in (action_resolution(single(), 8), action_resolution(batch(), 8)):
+        env.action_space.seed(3)
+        action = env.action_space.sample()
+        assert np.array_equal(env.func(action), action)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 8])
+@pytest.mark.parametrize("level", [-1.0, 0.0, 0.3, 1.0])
+def test_constant_actions_stay_constant(size: int, level: float) -> None:
+    env = action_resolution(single(), size)
+    large = env.action(np.full((2, size, size), level, np.float32))
+    assert large.shape == (2, 8, 8) and large == pytest.approx(np.full((2, 8, 8), level), abs=1e-6)
+    assert np.abs(large).max() <= 1.0
+
+
+def test_enlarged_actions_do_not_leave_the_space() -> None:
+    """Bicubic interpolation overshoots at edges."""
+    env = action_resolution(single(), 4)
+    edge = np.where(np.indices((2, 4, 4))[2] < 2, -1.0, 1.0).astype(np.float32)
+    assert np.abs(cv2.resize(edge[0], (8, 8), interpolation=cv2.INTER_CUBIC)).max() > 1.0
+    assert single().action_space.contains(env.action(edge))
+
+
+@pytest.mark.parametrize("size", [1, 8, 16, 32])
+def test_observations_are_area_means(size: int) -> None:
+    """Of blocks, rounded; the three channels and the elements of a batch for themselves."""
+    for make in (single, batch):
+        wrapped, bare = observation_resolution(make(), size), make()
+        width = 64 // size
+        action = np.ones(bare.action_space.shape, np.float32)
+        for ours, whole in ((wrapped.reset(seed=5), bare.reset(seed=5)), (wrapped.step(action), bare.step(action))):
+            blocks = whole[0].reshape(*whole[0].shape[:-2], size, width, size, width).astype(float)
+            assert np.abs(ours[0] - blocks.mean((-3, -1))).max() <= 0.5
+        assert ours[0].std() > 0
+
+
+def test_observations_of_the_own_size_stay_as_they_are() -> None:
+    for make in (single, batch):
+        assert np.array_equal(observation_resolution(make(), 64).reset(seed=1)[0], make().reset(seed=1)[0])
+
+
+@pytest.mark.parametrize("size", [3, 24, 50])
+def test_observations_of_sizes_that_do_not_divide(size: int) -> None:
+    """The mean of every channel is kept, up to the rounding of pixels."""
+    small, whole = observation_resolution(single(), size).reset(seed=1)[0], single().reset(seed=1)[0]
+    assert small.mean((1, 2)) == pytest.approx(whole.mean((1, 2)), abs=0.5)
+
+
+def test_both_together() -> None:
+    for make in (single, batch):
+        env = observation_resolution(action_resolution(make(), 4), 16)
+        twin = action_resolution(observation_resolution(make(), 16), 4)
+        env.reset(seed=0)
+        twin.reset(seed=0)
+        env.action_space.seed(0)
+        action = env.action_space.sample()
+        ours, theirs = env.step(action), twin.step(action)
+        assert ours[0].shape[-3:] == (3, 16, 16) and np.array_equal(ours[0], theirs[0])
+        assert env.unwrapped.state.x.shape[1] == SMALL["particles"]
+
+
+@pytest.mark.parametrize("make", [single, batch])
+@pytest.mark.parametrize("size", [0, -1, 9])
+def test_bad_action_sizes(make, size: int) -> None:
+    with pytest.raises(ValueError, match=f"size must be between 1 and 8, got {size}"):
+        action_resolution(make(), size)
+
+
+@pytest.mark.parametrize("make", [single, batch])
+@pytest.mark.parametrize("size", [0, -1, 65])
+def test_bad_observation_sizes(make, size: int) -> None:
+    with pytest.raises(ValueError, match=f"size must be between 1 and 64, got {size}"):
+        observation_resolution(make(), size)
+
+
+def test_the_limit_is_that_of_what_is_wrapped() -> None:
+    assert action_resolution(single(resolution=32), 32).action_space.shape == (2, 32, 32)
+    with pytest.raises(ValueError, match="size must be between 1 and 16, got 17"):
+        observation_resolution(observation_resolution(single(), 16), 17)
+
+
+def test_actions_that_are_not_finite_are_noticed_behind_the_wrapper() -> None:
+    env = action_resolution(single(disable_env_checker=True), 4)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="action must be finite"):
+        env.step(np.full((2, 4, 4), np.nan, np.float32))
+
+
+# Gymnasium's wrappers.
+
+
+@pytest.fixture
+def recorded(monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[list[np.ndarray], float]]:
+    """Stands in for moviepy, which Gymnasium encodes videos with and we do without: files, their frames and rate."""
+    files: dict[str, tuple[list[np.ndarray], float]] = {}
+
+    class ImageSequenceClip:
+        def __init__(self, frames: list[np.ndarray], fps: float) -> None:
+            self.frames, self.fps = list(frames), fps
+
+        def write_videofile(self, path: str, logger: object = None) -> None:
+            Path(path).write_bytes(b"video")
+            files[Path(path).name] = self.frames, self.fps
+
+    names = ["moviepy", "moviepy.video", "moviepy.video.io", "moviepy.video.io.ImageSequenceClip"]
+    modules = [types.ModuleType(name) for name in names]
+    modules[-1].ImageSequenceClip = ImageSequenceClip
+    for name, module in zip(names, modules, strict=True):
+        monkeypatch.setitem(sys.modules, name, module)
+    return files
+
+
+def test_record_video(recorded: dict, tmp_path: Path) -> None:
+    env = single(render_mode="rgb_array", render_muscles=True, max_episode_steps=3)
+    env = wrappers.RecordVideo(env, str(tmp_path / "videos"), episode_trigger=lambda episode: True)
+    for _ in range(2):
+        env.reset(seed=0)
+        truncated = False
+        while not truncated:
+            truncated = env.step(np.ones(env.action_space.shape, np.float32))[3]
+    env.close()
+    assert sorted(path.name for path in (tmp_path / "videos").iterdir()) == sorted(recorded)
+    assert sorted(recorded) == ["rl-video-episode-0.mp4", "rl-video-episode-1.mp4"]
+    for frames, fps in recorded.values():
+        assert fps == 30 and len(frames) == 4
+        assert all(frame.shape == (512, 512, 3) and frame.dtype == np.uint8 for frame in frames)
+        assert not np.array_equal(frames[0], frames[1])  # muscles are coloured from the first step on
+
+
+def test_record_video_of_a_batch(recorded: dict, tmp_path: Path) -> None:
+    env = batch(render_mode="rgb_array", max_episode_steps=3)
+    env = wrappers.vector.RecordVideo(env, str(tmp_path / "videos"), step_trigger=lambda step: step == 0)
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(np.zeros(env.action_space.shape, np.float32))
+    env.close()
+    ((frames, fps),) = recorded.values()
+    assert fps == 30 and len(frames) == 3 and frames[0].ndim == 3 and frames[0].std() > 0
+
+
+def test_record_video_needs_pictures(recorded: dict, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="incompatible with RecordVideo"):
+        wrappers.RecordVideo(single(), str(tmp_path / "videos"))
+
+
+def test_record_episode_statistics() -> None:
+    env = wrappers.RecordEpisodeStatistics(single(max_episode_steps=4))
+    env.reset(seed=0)
+    rewards, info = [], {}
+    while "episode" not in info:
+        _, reward, _, _, info = env.step(np.zeros((2, 8, 8), np.float32))
+        rewards.append(reward)
+    assert info["episode"]["l"] == len(rewards) == 4
+    assert info["episode"]["r"] == pytest.approx(sum(rewards), abs=1e-4)
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
+def test_record_episode_statistics_of_a_batch(mode: str) -> None:
+    env = wrappers.vector.RecordEpisodeStatistics(batch(max_episode_steps=3, autoreset_mode=mode))
+    env.reset(seed=0)
+    rewards = []
+    for _ in range(3):
+        _, reward, _, truncated, info = env.step(np.ones(env.action_space.shape, np.float32))
+        rewards.append(reward)
+    assert truncated.all() and info["_episode"].all()
+    assert info["episode"]["l"].tolist() == [3, 3]
+    assert info["episode"]["r"] == pytest.approx(np.sum(rewards, axis=0), abs=1e-4)
+
+
+def test_time_limit() -> None:
+    for env in (wrappers.TimeLimit(single(), 2), single(max_episode_steps=2)):
+        env.reset(seed=0)
+        ends = [env.step(np.zeros((2, 8, 8), np.float32))[2:4] for _ in range(2)]
+        assert ends == [(False, False), (False, True)]
+
+
+def test_stacked_frames_and_rescaled_actions() -> None:
+    env = wrappers.FrameStackObservation(wrappers.RescaleAction(single(), np.float32(0), np.float32(1)), 3)
+    observation, _ = env.reset(seed=0)
+    assert observation.shape == (3, 3, 64, 64)
+    observation = env.step(np.full((2, 8, 8), 0.5, np.float32))[0]
+    bare = single()
+    bare.reset(seed=0)
+    assert np.array_equal(observation[-1], bare.step(np.zeros((2, 8, 8), np.float32))[0])
+
+
+def test_gymnasiums_own_vector_environments() -> None:
+    env = gymnasium.make_vec(NAME, num_envs=2, vectorization_mode="sync", **SMALL)
+    ours = batch()
+    assert np.array_equal(env.reset(seed=4)[0], ours.reset(seed=4)[0])
+    action = np.ones(env.action_space.shape, np.float32)
+    theirs, results = env.step(action), ours.step(action)
+    assert np.array_equal(theirs[0], results[0]) and theirs[1] == pytest.approx(results[1], abs=1e-5)
+    assert theirs[4]["com"] == pytest.approx(results[4]["com"], abs=1e-6)
+    assert set(results[4]) == set(theirs[4])
+
+
+def test_the_window_on_the_screen_shows_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # pygame's own imports
+        pygame = pytest.importorskip("pygame")
+    env = single(render_mode="human")
+    env.reset(seed=0)
+    for _ in range(2):
+        shown = pygame.surfarray.array3d(pygame.display.get_surface()).transpose(1, 0, 2)
+        assert np.array_equal(shown, env.unwrapped.torch_env.render())
+        env.step(np.ones((2, 8, 8), np.float32))
+    assert pygame.display.get_caption()[0] == "dittogym: run"
+    env.close()
+    assert not pygame.display.get_init()
