@@ -1,0 +1,383 @@
+"""Constants of the matter given at a reset: what each does, how long it holds, and its gradient."""
+
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from tiny import SMALL, actions, assert_same_bits, everything, stir, tiny
+
+import dittogym
+from dittogym import TorchEnv
+from dittogym.physics import NAMES
+from dittogym.render import CONTRACT
+from torchmpm import ParticleState
+
+DT = 1e-4
+OWN = {name: getattr(dittogym.make_spec("kick"), name) for name in NAMES if name != "mass"} | {"mass": 1.0}
+
+
+def given(env: TorchEnv, **physics: object) -> TorchEnv:
+    """The environment after a reset with these constants."""
+    env.reset(seed=0, options={"physics": physics})
+    return env
+
+
+def alike(env: TorchEnv, **physics: object) -> TorchEnv:
+    """The same, with the particles of all elements where those of the first are."""
+    env.reset(seed=0)
+    env.reset(options={"physics": physics, "positions": env.state.x[0].clone()})
+    return env
+
+
+def set_particles(env: TorchEnv, **fields: torch.Tensor) -> None:
+    """Put other values in place of fields of the particles."""
+    own = env.state
+    values = {name: fields.get(name, getattr(own, name)) for name in ("x", "v", "C", "F", "Jp")}
+    env.env_state = replace(env.env_state, particles=ParticleState(**values))
+
+
+def drive(env: TorchEnv, level: float = 1.0) -> torch.Tensor:
+    """Contraction along x, expansion along y, everywhere."""
+    action = torch.full((env.num_envs, *env.action_shape), level, dtype=env.dtype)
+    action[:, 1] *= -1
+    return action
+
+
+def strain(env: TorchEnv, count: int | None = None) -> torch.Tensor:
+    """Mean distance of the robot's elastic F from the identity, (B,)."""
+    return (env.state.F[:, :count] - torch.eye(2, dtype=env.dtype)).flatten(2).norm(dim=2).mean(1)
+
+
+# In which forms values may come.
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("form", [float, np.float64, np.array, torch.tensor])
+def test_one_number_for_all(form, dtype: str) -> None:
+    env = given(tiny("kick", 3, dtype=dtype), **{name: form(OWN[name]) for name in OWN if name != "gravity"})
+    for name, values in env.env_state.physics.items():
+        assert values.shape == (3,) and values.dtype == env.dtype
+        assert values.tolist() == pytest.approx([OWN[name]] * 3)
+
+
+def test_one_number_for_each_element() -> None:
+    own = {"mu": [100, 200, 300], "mass": np.array([0.5, 1.0, 2.0], np.float32), "lam": torch.tensor([0.0, 1.0, 2.0])}
+    physics = given(tiny("kick", 3), **own).env_state.physics
+    assert set(physics) == set(own)
+    assert {name: values.tolist() for name, values in physics.items()} == {
+        "mu": [100.0, 200.0, 300.0],
+        "mass": [0.5, 1.0, 2.0],
+        "lam": [0.0, 1.0, 2.0],
+    }
+
+
+def test_gravity_for_all_and_for_each() -> None:
+    for value in ((1.0, -2.0), np.array([1.0, -2.0]), torch.tensor([1.0, -2.0])):
+        assert given(tiny("kick", 3), gravity=value).env_state.physics["gravity"].tolist() == [[1.0, -2.0]] * 3
+    each = [[0.0, -1.0], [2.0, 0.0], [0.0, 0.0]]
+    assert given(tiny("kick", 3), gravity=each).env_state.physics["gravity"].tolist() == each
+
+
+@torch.no_grad()
+def test_the_tasks_own_values_change_nothing() -> None:
+    for task in dittogym.TASKS:
+        spec = dittogym.make_spec(task)
+        env, plain = tiny(task, 2, substeps=10), tiny(task, 2, substeps=10)
+        given(env, **{name: getattr(spec, name) for name in NAMES if name != "mass"}, mass=1.0)
+        plain.reset(seed=0)
+        stir(env)
+        stir(plain)
+        for action in actions(env, 2):
+            ours, theirs = env.step(action), plain.step(action)
+        assert torch.equal(ours[0], theirs[0]) and torch.allclose(ours[1], theirs[1], rtol=1e-10, atol=1e-10)
+        for a, b in zip(env.state.planes(), plain.state.planes(), strict=True):
+            assert torch.allclose(a, b, rtol=1e-9, atol=1e-9), task
+
+
+def test_through_gymnasium() -> None:
+    env = gymnasium.make("dittogym/run-coarse-v0", **SMALL)
+    env.reset(seed=0, options={"physics": {"gravity": (0.0, 0.0), "mu": 100}})
+    assert env.unwrapped.torch_env.env_state.physics["mu"].tolist() == [100.0]
+    vector = gymnasium.make_vec(
+        "dittogym/run-coarse-v0",
+        num_envs=2,
+        vectorization_mode="vector_entry_point",
+        max_episode_steps=2,
+        **SMALL,
+    )
+    vector.reset(seed=0, options={"physics": {"mu": np.array([100.0, 200.0])}})
+    for _ in range(3):  # through an autoreset
+        vector.step(np.zeros(vector.action_space.shape, np.float32))
+    assert vector.unwrapped.torch_env.env_state.steps.tolist() == [1, 1]
+    assert vector.unwrapped.torch_env.env_state.physics["mu"].tolist() == [100.0, 200.0]
+
+
+# What each of them does.
+
+
+@torch.no_grad()
+def test_gravity_makes_fall() -> None:
+    """SHAPE MATCH's robot hangs in the air: free fall, to the last digits, in the direction of gravity."""
+    pulls = torch.tensor([[0.0, 0.0], [0.0, -2.0], [0.0, -20.0], [5.0, 0.0]], dtype=torch.float64)
+    env = given(tiny("shapematch", 4, substeps=10), gravity=pulls)
+    start = env.env_state.start.com
+    still = torch.zeros(4, *env.action_shape, dtype=env.dtype)
+    for _ in range(3):
+        info = env.step(still)[-1]
+    fallen = info["com"] - start
+    assert torch.allclose(fallen, pulls * DT**2 * 30 * 31 / 2, rtol=1e-6, atol=1e-12)
+    assert torch.allclose(env.state.v, (30 * DT * pulls)[:, None].expand_as(env.state.v), rtol=1e-6, atol=1e-10)
+
+
+@torch.no_grad()
+def test_max_actuation_scales_the_field() -> None:
+    """The cost of actions is proportional to it, and so is the motion of the first substep."""
+    env = alike(tiny("run", 4, substeps=1), max_actuation=[0.0, 10.0, 20.0, 45.0], gravity=(0.0, 0.0))
+    action = actions(env, 1)[0, :1].expand(4, -1, -1, -1)
+    _, _, _, _, info = env.step(action)
+    cost = info["reward_terms"]["action"]
+    assert cost[0] == 0 and (cost[1:] / cost[1]).tolist() == pytest.approx([1.0, 2.0, 4.5])
+    v = env.state.v
+    assert v[0].abs().max() == 0 and v[1].abs().max() > 0
+    assert torch.allclose(v[2], 2.0 * v[1]) and torch.allclose(v[3], 4.5 * v[1])
+
+
+@torch.no_grad()
+def test_mass_makes_inert() -> None:
+    """The same forces accelerate all particles in inverse proportion, those of objects too; gravity does not care."""
+    env = alike(tiny("kick", 3, substeps=1), mass=[0.5, 1.0, 2.0], gravity=(0.0, 0.0))
+    robot = env.model.robot
+    F = env.state.F.clone()
+    F[:, robot:, 0, 0] = 1.05  # a cube that is stretched
+    set_particles(env, F=F)
+    env.step(drive(env))
+    v = env.state.v
+    for part in (slice(0, robot), slice(robot, None)):
+        assert v[:, part].abs().max() > 0
+        for i, factor in ((0, 2.0), (2, 0.5)):
+            assert torch.allclose(v[i, part], factor * v[1, part], rtol=1e-6, atol=1e-9)
+    env = alike(tiny("shapematch", 2, substeps=5), mass=[0.5, 2.0], gravity=(0.0, -10.0))
+    env.step(torch.zeros(2, *env.action_shape, dtype=env.dtype))
+    assert torch.allclose(env.state.v[0], env.state.v[1], rtol=1e-6, atol=1e-9)
+
+
+@torch.no_grad()
+def test_mu_resists_the_muscles() -> None:
+    """The same muscles deform what is stiffer less."""
+    env = alike(tiny("shapematch", 3, substeps=40), mu=[100.0, 500.0, 2500.0], yield_stress=1e6)
+    for _ in range(3):
+        env.step(drive(env, 0.5))
+    soft, own, hard = strain(env).tolist()
+    assert soft > 1.1 * own > 1.21 * hard
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("name", "shape"), [("mu", (1.05, 1 / 1.05)), ("lam", (1.03, 1.03))])
+def test_stiffness_of_robot_and_object(name: str, shape: tuple[float, float]) -> None:
+    """Matter sheared without change of area is driven by mu alone, matter blown up by lam too: forces differ by that."""
+    env = tiny("kick", 3, substeps=1)
+    alike(env, **{"mu": 600.0, name: [200.0, 400.0, 600.0]}, gravity=(0.0, 0.0), max_actuation=0.0, yield_stress=1e6)
+    F = torch.diag(torch.tensor(shape, dtype=env.dtype)).expand_as(env.state.F).clone()
+    set_particles(env, F=F)
+    env.step(torch.zeros(3, *env.action_shape, dtype=env.dtype))
+    for part in (slice(0, env.model.robot), slice(env.model.robot, None)):
+        v = env.state.v[:, part]
+        assert (v[1] - v[0]).abs().max() > 1e-6
+        assert torch.allclose(v[2] - v[1], v[1] - v[0], rtol=1e-6, atol=1e-9)  # linear in the constant
+        ratio = v[2].norm() / v[0].norm()
+        assert float(ratio) == pytest.approx(3.0, rel=0.01) if name == "mu" else 1.05 < float(ratio) < 3.0
+
+
+@torch.no_grad()
+def test_soil_keeps_its_own_stiffness() -> None:
+    env = given(tiny("dig", 2, substeps=1), mu=[100.0, 2000.0], gravity=(0.0, 0.0))
+    solver = env.model.solver_for(env.env_state.physics)
+    assert solver.bodies[1].material is env.spec.objects[0].material
+    assert solver.bodies[0].material.mu.tolist() == [100.0, 2000.0]
+
+
+@torch.no_grad()
+def test_yield_stress_limits_the_strain() -> None:
+    """The difference of logarithmic principal strains does not exceed sqrt(2) times yield stress over 2 mu."""
+    limits = torch.tensor([5.0, 20.0, 1e5], dtype=torch.float64)
+    env = alike(tiny("shapematch", 3, substeps=40), yield_stress=limits)
+    for _ in range(2):
+        env.step(drive(env))
+    # F is kept from before the last move, so a little more may have come on top.
+    stretches = torch.linalg.svdvals(env.state.F).log()
+    gap = (stretches[..., 0] - stretches[..., 1]).amax(1)
+    bound = 2**0.5 * limits / (2 * 500.0)
+    assert gap[:2].tolist() == pytest.approx(bound[:2].tolist(), rel=1e-2)
+    assert float(gap[2]) > 1.2 * float(bound[1])
+
+
+@torch.no_grad()
+def test_max_actuation_is_what_the_picture_is_coloured_by() -> None:
+    env = alike(tiny("shapematch", 2), max_actuation=[10.0, 80.0])
+    env.step(torch.ones(2, *env.action_shape, dtype=env.dtype))
+    red = [(np.abs(env.render(i, muscles=True) - CONTRACT).max(-1) < 12).sum() for i in (0, 1)]
+    assert red[0] > 1000 and red[0] == pytest.approx(red[1], rel=0.05)
+
+
+# How long they hold.
+
+
+def test_values_stay_until_given_again() -> None:
+    env = given(tiny("run", 2), mu=300.0)
+    env.reset()
+    env.reset(seed=3)
+    assert env.env_state.physics["mu"].tolist() == [300.0, 300.0]
+    env.reset(options={"physics": {"gravity": (0.0, -1.0)}})
+    physics = env.env_state.physics
+    assert physics["gravity"].tolist() == [[0.0, -1.0]] * 2
+    assert physics["mu"].tolist() == [650.0, 650.0]  # what is not given is the task's own
+
+
+@torch.no_grad()
+def test_an_empty_mapping_goes_back_to_the_task() -> None:
+    env, plain = given(tiny("run", 2, substeps=20), mu=50.0, mass=3.0, gravity=(9.0, 0.0)), tiny("run", 2, substeps=20)
+    env.reset(options={"physics": {}})
+    plain.reset(seed=0)
+    for action in actions(env, 2):
+        ours, theirs = env.step(action), plain.step(action)
+    assert torch.equal(ours[0], theirs[0])
+    assert torch.allclose(ours[1], theirs[1], rtol=1e-10)
+    assert torch.allclose(env.state.x, plain.state.x, rtol=0, atol=1e-12)
+    env.reset()
+    assert env.env_state.physics["mu"].tolist() == [650.0, 650.0]
+
+
+@torch.no_grad()
+def test_only_masked_elements_change() -> None:
+    env, twin = (given(tiny("run", 3), mu=[100.0, 200.0, 300.0]) for _ in range(2))
+    drives = actions(env, 4)
+    for e in (env, twin):
+        e.step(drives[0])
+    mask = [False, True, False]
+    env.reset(options={"physics": {"mu": 900.0, "mass": 2.0}, "reset_mask": mask})
+    physics = env.env_state.physics
+    assert physics["mu"].tolist() == [100.0, 900.0, 300.0] and physics["mass"].tolist() == [1.0, 2.0, 1.0]
+    for action in drives[1:]:
+        env.step(action)
+        twin.step(action)
+    for i in (0, 2):
+        assert_same_bits([p[i] for p in env.state.planes()], [p[i] for p in twin.state.planes()])
+    env.reset(options={"reset_mask": mask})
+    assert env.env_state.physics["mu"].tolist() == [100.0, 900.0, 300.0]
+    env.reset(options={"reset_mask": [True, True, False]})
+    assert env.env_state.physics["mu"].tolist() == [100.0, 900.0, 300.0]
+    env.reset(options={"physics": {}, "reset_mask": [True, True, False]})
+    assert env.env_state.physics["mu"].tolist() == [650.0, 650.0, 300.0]
+    assert env.env_state.physics["mass"].tolist() == [1.0, 1.0, 1.0]
+    env.reset(options={"physics": {"mu": [1.0, 2.0, 3.0]}, "reset_mask": [False, False, True]})
+    assert env.env_state.physics["mu"].tolist() == [650.0, 650.0, 3.0]
+
+
+def test_other_tensors_of_the_user_are_not_touched() -> None:
+    mu = torch.tensor([100.0, 200.0], dtype=torch.float64)
+    env = given(tiny("run", 2), mu=mu)
+    env.reset(options={"physics": {}, "reset_mask": [True, False]})
+    env.step(actions(env, 1)[0])
+    assert mu.tolist() == [100.0, 200.0]
+
+
+# Gradients.
+
+#: Soft and weak enough that the robot flows within a few milliseconds.
+BASE = {"mu": 500.0, "lam": 60.0, "yield_stress": 12.0, "max_actuation": 48.0, "gravity": (0.5, -11.0), "mass": 1.1}
+
+
+def rollout(env: TorchEnv, physics: dict, drives: torch.Tensor) -> torch.Tensor:
+    """Rewards of each element, added up over a few steps."""
+    env.reset(seed=0, options={"physics": physics})
+    # A throw to the right and downwards, against the floor.
+    set_particles(env, v=env.state.v + torch.tensor([1.0, -1.5], dtype=env.dtype))
+    return torch.stack([env.step(action)[1] for action in drives]).sum(0)
+
+
+def test_gradients_of_a_reward_in_every_constant() -> None:
+    """One value per element, against central differences of each; SLOT, whose reward looks at the shape of the robot."""
+    env = tiny("slot", 2, substeps=10)
+    drives = actions(env, 3)
+    scale = torch.tensor([0.9, 1.1], dtype=env.dtype)
+    values = {name: torch.tensor(value, dtype=env.dtype) for name, value in BASE.items()}
+    values = {name: scale.view(2, *[1] * v.ndim) * v for name, v in values.items()}
+    leaves = {name: v.clone().requires_grad_() for name, v in values.items()}
+    gradients = torch.autograd.grad(rollout(env, leaves, drives).sum(), list(leaves.values()))
+    assert (strain(env, env.model.robot) > 1e-3).all()
+    for name, gradient in zip(leaves, gradients, strict=True):
+        for column in range(2 if name == "gravity" else 1):
+            step = torch.zeros_like(values[name])
+            step.view(2, -1)[:, column] = 1e-5 * values[name].abs().max()
+            with torch.no_grad():
+                ends = [rollout(env, {**values, name: values[name] + sign * step}, drives) for sign in (1, -1)]
+            difference = (ends[0] - ends[1]) / (2e-5 * values[name].abs().max())
+            ours = gradient.view(2, -1)[:, column]
+            assert difference.abs().min() > 1e-6, name
+            assert ours.tolist() == pytest.approx(difference.tolist(), rel=1e-4), name
+
+
+def test_gradient_of_one_value_for_all_is_the_sum() -> None:
+    drives = actions(tiny("kick", 2), 2)
+    one = torch.tensor(500.0, dtype=torch.float64, requires_grad=True)
+    each = torch.full((2,), 500.0, dtype=torch.float64, requires_grad=True)
+    for mu in (one, each):
+        rollout(tiny("kick", 2, substeps=10), {"mu": mu}, drives).sum().backward()
+    assert each.grad.abs().min() > 0
+    assert float(one.grad) == pytest.approx(float(each.grad.sum()), rel=1e-12)
+
+
+def test_gradients_stay_with_the_masked_elements() -> None:
+    """A value given to one element only has a gradient there, and the others keep theirs."""
+    env = tiny("kick", 2, substeps=10)
+    first, second = (torch.full((2,), 500.0, dtype=env.dtype, requires_grad=True) for _ in range(2))
+    env.reset(seed=0, options={"physics": {"mu": first}})
+    env.reset(options={"physics": {"mu": second}, "reset_mask": [False, True]})
+    for action in actions(env, 2):
+        reward = env.step(action)[1]
+    reward.sum().backward()
+    assert first.grad[0] != 0 and first.grad[1] == 0 and second.grad[0] == 0 and second.grad[1] != 0
+
+
+# What is refused.
+
+
+@pytest.mark.parametrize(
+    ("physics", "message"),
+    [
+        (3.0, "physics must be a mapping from mu, lam, yield_stress, max_actuation, gravity, mass to values, got float"),
+        ([("mu", 1.0)], "physics must be a mapping .* got list"),
+        ({"nu": 0.3}, "physics may hold mu, lam, yield_stress, max_actuation, gravity, mass, got 'nu'"),
+        ({"mu": [1.0, 2.0, 3.0]}, r"physics\['mu'\] must have shape \(\) or \(2,\), got \(3,\)"),
+        ({"mu": [[1.0], [2.0]]}, r"physics\['mu'\] must have shape .* got \(2, 1\)"),
+        ({"mass": torch.ones(2, 120)}, r"physics\['mass'\] must have shape .* got \(2, 120\)"),
+        ({"gravity": -9.0}, r"physics\['gravity'\] must have shape \(2,\) or \(2, 2\), got \(\)"),
+        ({"gravity": [1.0, 2.0, 3.0]}, r"physics\['gravity'\] must have shape \(2,\) or \(2, 2\), got \(3,\)"),
+        ({"mu": 0.0}, r"physics\['mu'\] must be finite, positive, got 0.0"),
+        ({"mu": [1.0, -2.0]}, r"physics\['mu'\] must be finite, positive, got -2.0"),
+        ({"mass": 0.0}, r"physics\['mass'\] must be finite, positive, got 0.0"),
+        ({"lam": -1.0}, r"physics\['lam'\] must be finite, not negative, got -1.0"),
+        ({"yield_stress": -1.0}, r"physics\['yield_stress'\] must be finite, not negative"),
+        ({"max_actuation": -1.0}, r"physics\['max_actuation'\] must be finite, not negative"),
+        ({"mu": float("nan")}, r"physics\['mu'\] must be finite, positive, got nan"),
+        ({"lam": float("inf")}, r"physics\['lam'\] must be finite, not negative, got inf"),
+        ({"gravity": (0.0, float("nan"))}, r"physics\['gravity'\] must be finite, got nan"),
+    ],
+)
+def test_bad_physics(physics: object, message: str) -> None:
+    """Nothing has changed afterwards: neither the state nor the constants of this and the next episode."""
+    env = given(tiny("run", 2), mu=300.0)
+    before, numbers = env.state, [t.clone() for t in everything(env)]
+    with pytest.raises(ValueError, match=message):
+        env.reset(seed=5, options={"physics": physics})
+    assert env.state is before
+    env.reset()
+    assert_same_bits(everything(env), numbers)
+
+
+def test_zero_is_allowed_where_it_makes_sense() -> None:
+    env = given(tiny("run"), lam=0.0, yield_stress=0.0, max_actuation=0.0, gravity=(0.0, 0.0))
+    stir(env)
+    assert env.step(actions(env, 1)[0])[-1]["finite"].all()
