@@ -20,6 +20,9 @@ Sym2: TypeAlias = tuple[Tensor, Tensor, Tensor]
 STRETCH_FLOOR = 0.05
 #: Constant under the square root of the norm of the deviatoric strain.
 NORM_EPSILON = 1e-8
+#: Jp of soil stays below this. A grain that is pulled apart for ever has lost all stiffness long before, at Jp = 1.23;
+#: its Jp would go on growing until it is no number any more, and spoil gradients.
+LARGEST_JP = 1e30
 
 
 @runtime_checkable
@@ -277,7 +280,7 @@ class Soil(Elastic):
         """Bring the principal stretches into their range; see :func:`clamp_stretches`."""
         low, high = 1.0 - column(self.compression, Jp, "compression"), 1.0 + column(self.stretch, Jp, "stretch")
         F, squeezed = clamp_stretches(F, low, high, self.shear_cutoff)
-        return F, Jp * squeezed
+        return F, (Jp * squeezed).clamp_max(LARGEST_JP)
 
     def stress(self, F: Mat2, Jp: Tensor) -> Sym2:
         """Kirchhoff stress, planes (B, N), Pa; an inverted element is at rest in its mirrored shape."""

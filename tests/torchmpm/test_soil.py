@@ -63,6 +63,16 @@ def test_area_that_stretches_lose_goes_into_jp() -> None:
     torch.testing.assert_close(Jp * after, before, rtol=1e-8, atol=0)  # the cutoff changes areas by 1e-10
 
 
+def test_a_grain_pulled_apart_for_ever_stays_finite() -> None:
+    F = (2.0 * torch.eye(2))[None, None].requires_grad_()
+    Jp = torch.ones(1, 1)
+    for _ in range(200):
+        Jp = soil().return_map(planes(F), Jp)[1]
+    assert Jp.item() == pytest.approx(1e30)
+    total = torch.stack(soil().stress(soil().return_map(planes(F), Jp)[0], Jp)).sum() + 0.0 * Jp.sum()
+    assert torch.autograd.grad(total, F)[0].isfinite().all()
+
+
 @pytest.mark.parametrize(("Jp", "factor"), [(1.0, 1.0), (0.9, math.e), (0.5, 5.0), (1.1, 1 / math.e), (2.0, 0.1)])
 def test_hardening(Jp: float, factor: float) -> None:
     F = deformations(10, LOW, HIGH, seed=5, share_inverted=0.0)
