@@ -1,9 +1,9 @@
 """Short rollouts of all tasks against numbers kept beside this file: the dynamics do not change unnoticed.
 
 The ids end in a version, and published figures rest on what happens under it. A change of the dynamics, the rewards or
-the observations that moves these numbers therefore means a new version id (``-v1``), not only a new file. After a change
-that is meant to be seen here, such as a new task, write the file anew with ``python tests/dittogym/test_golden.py`` and
-look at the difference.
+the observations that moves these numbers therefore means a new version id (``-v1``), not only a new file. After a
+change that is meant to be seen here, such as a new task, write the file anew with
+``python tests/dittogym/test_golden.py`` and look at the difference.
 """
 
 from __future__ import annotations

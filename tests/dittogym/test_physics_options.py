@@ -176,7 +176,7 @@ def test_mu_resists_the_muscles() -> None:
 @torch.no_grad()
 @pytest.mark.parametrize(("name", "shape"), [("mu", (1.05, 1 / 1.05)), ("lam", (1.03, 1.03))])
 def test_stiffness_of_robot_and_object(name: str, shape: tuple[float, float]) -> None:
-    """Matter sheared without change of area is driven by mu alone, matter blown up by lam too: forces differ by that."""
+    """Matter sheared without change of area is driven by mu alone, matter blown up by lam too."""
     env = tiny("kick", 3, substeps=1)
     alike(env, **{"mu": 600.0, name: [200.0, 400.0, 600.0]}, gravity=(0.0, 0.0), max_actuation=0.0, yield_stress=1e6)
     F = torch.diag(torch.tensor(shape, dtype=env.dtype)).expand_as(env.state.F).clone()
@@ -298,7 +298,7 @@ def rollout(env: TorchEnv, physics: dict, drives: torch.Tensor) -> torch.Tensor:
 
 
 def test_gradients_of_a_reward_in_every_constant() -> None:
-    """One value per element, against central differences of each; SLOT, whose reward looks at the shape of the robot."""
+    """One value per element, against central differences of each; the reward of SLOT looks at the robot's shape."""
     env = tiny("slot", 2, substeps=10)
     drives = actions(env, 3)
     scale = torch.tensor([0.9, 1.1], dtype=env.dtype)
@@ -347,7 +347,10 @@ def test_gradients_stay_with_the_masked_elements() -> None:
 @pytest.mark.parametrize(
     ("physics", "message"),
     [
-        (3.0, "physics must be a mapping from mu, lam, yield_stress, max_actuation, gravity, mass to values, got float"),
+        (
+            3.0,
+            "physics must be a mapping from mu, lam, yield_stress, max_actuation, gravity, mass to values, got float",
+        ),
         ([("mu", 1.0)], "physics must be a mapping .* got list"),
         ({"nu": 0.3}, "physics may hold mu, lam, yield_stress, max_actuation, gravity, mass, got 'nu'"),
         ({"mu": [1.0, 2.0, 3.0]}, r"physics\['mu'\] must have shape \(\) or \(2,\), got \(3,\)"),
