@@ -16,6 +16,9 @@ from dittogym.spec import FAILURE_REWARD, Measurement, Moment, Outcome, TaskSpec
 from dittogym.window import in_window, window_origin
 from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VonMises, diagnostics
 
+#: Terms that the engine adds to those of a task.
+RESERVED = {"split", "action", "alive", "failure"}
+
 
 @dataclass(frozen=True, eq=False)
 class EnvState:
@@ -208,6 +211,9 @@ def judge(model: Model, state: EnvState, field: Tensor, observation: Tensor) -> 
     Elements whose state is not finite, or whose robot has left the window, end with the single term ``failure`` =
     :data:`dittogym.spec.FAILURE_REWARD`; their neighbours are not touched.
 
+    Raises:
+        ValueError: The task returns a term under a name of :data:`RESERVED`.
+
     Returns:
         The state with the task's memory brought up to date, and the outcome with ``terminated`` always given and
         ``info`` holding ``com``, ``split``, ``finite`` and the task's own quantities.
@@ -218,6 +224,8 @@ def judge(model: Model, state: EnvState, field: Tensor, observation: Tensor) -> 
     own = spec.judge(_moment(model, state, now, observation), weights)
     finite = intact(model, state)
     terms = dict(own.terms)
+    if taken := RESERVED & terms.keys():
+        raise ValueError(f"judge of task {spec.name!r} must not return the engine's own terms, got {sorted(taken)}")
     terminated = torch.zeros_like(finite) if own.terminated is None else own.terminated
     if spec.split_limit is not None:
         penalty, torn = split_penalty(now.split, spec.split_limit)

@@ -39,6 +39,12 @@ def as_tensor(action: Any, env: TorchEnv) -> torch.Tensor:
     return torch.as_tensor(array, dtype=env.dtype, device=env.device)
 
 
+def as_image(observation: torch.Tensor) -> np.ndarray:
+    """A copy, which the user may write to."""
+    image: np.ndarray = observation.cpu().numpy().copy()
+    return image
+
+
 def as_numpy(info: dict[str, Any]) -> dict[str, Any]:
     """Tensors of an ``info`` as arrays with a leading B, nested dictionaries included."""
     return {k: as_numpy(v) if isinstance(v, dict) else v.detach().cpu().numpy() for k, v in info.items()}
@@ -57,6 +63,9 @@ def element(info: dict[str, Any], index: int) -> dict[str, Any]:
 
 class Env(gymnasium.Env[np.ndarray, np.ndarray]):
     """One simulation behind the Gymnasium interface.
+
+    Made by :func:`gymnasium.make` it leaves the time limit to Gymnasium's wrapper; made directly it truncates by
+    itself, at the task's horizon.
 
     Args:
         task: Task name or specification.
@@ -98,7 +107,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         with torch.no_grad():
             observation, info = self.torch_env.reset(seed=seed, options=options)
         self._show()
-        return observation[0].cpu().numpy(), element(as_numpy(info), 0)
+        return as_image(observation)[0], element(as_numpy(info), 0)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance by one control step; see :meth:`dittogym.TorchEnv.step`.
@@ -109,9 +118,11 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         with torch.no_grad():
             batch = as_tensor(np.asarray(action)[None], self.torch_env)
             observation, reward, terminated, truncated, info = self.torch_env.step(batch)
+            if self.spec is not None:
+                truncated = torch.zeros_like(truncated)  # made by Gymnasium, whose TimeLimit wrapper does it
         self._show()
         picked = element(as_numpy(info), 0)
-        return observation[0].cpu().numpy(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), picked
+        return as_image(observation)[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), picked
 
     def save(self) -> Snapshot:
         """The present moment, to return to with :meth:`load`; see :meth:`dittogym.TorchEnv.save`."""
@@ -119,7 +130,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def load(self, snapshot: Snapshot) -> np.ndarray:
         """Go on from a saved moment; returns its observation. See :meth:`dittogym.TorchEnv.load`."""
-        return self.torch_env.load(snapshot)[0].cpu().numpy()
+        return as_image(self.torch_env.load(snapshot))[0]
 
     def render(self) -> np.ndarray | None:
         """The picture (512, 512, 3) uint8 in mode ``"rgb_array"``, else nothing."""

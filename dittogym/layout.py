@@ -124,6 +124,8 @@ class Layouts:
         """
         samplers = dict(self._samplers)
         redraw = seed is not None or not samplers
+        if self._positions is None:
+            mask = np.ones_like(mask)  # every element has a layout from the first draw on
         if redraw:
             for i in np.flatnonzero(mask).tolist():
                 element_seed = None if seed is None else seed + i

@@ -43,7 +43,13 @@ def physics_values(given: Any, batch: int, like: Tensor) -> dict[str, Tensor]:
     for name, value in given.items():
         if name not in NAMES:
             raise ValueError(f"physics may hold {', '.join(NAMES)}, got {name!r}")
-        tensor = torch.as_tensor(value).to(like)
+        try:
+            tensor = torch.as_tensor(value)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ValueError(f"physics[{name!r}] must be numbers, got {value!r}") from error
+        if tensor.is_complex():
+            raise ValueError(f"physics[{name!r}] must be real, got {tensor.dtype}")
+        tensor = tensor.to(like)
         own = (2,) if name == "gravity" else ()
         if tuple(tensor.shape) not in (own, (batch, *own)):
             raise ValueError(f"physics[{name!r}] must have shape {own} or {(batch, *own)}, got {tuple(tensor.shape)}")
@@ -58,6 +64,8 @@ def physics_values(given: Any, batch: int, like: Tensor) -> dict[str, Tensor]:
 
 def merged(spec: TaskSpec, old: Physics, new: Physics, mask: Tensor, like: Tensor) -> dict[str, Tensor]:
     """``new`` where ``mask`` (B,) holds, ``old`` elsewhere; the task's own value where one of them has none."""
+    if bool(mask.all()):
+        return dict(new)
     own = defaults(spec, like)
     names = [name for name in NAMES if name in old or name in new]
     return {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 import gymnasium
@@ -20,14 +21,16 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
         version: To be raised with every change of behaviour.
 
     Raises:
-        ValueError: Another task has this name.
+        ValueError: Another task has this name, or it is not one word.
         TypeError: ``make`` does not return a :class:`dittogym.TaskSpec`.
     """
     spec = make()
     if not isinstance(spec, TaskSpec):
         raise TypeError(f"make must return a TaskSpec, got {type(spec).__name__}")
-    if TASKS.setdefault(task, make) is not make:
+    if TASKS.get(task, make) is not make:
         raise ValueError(f"task must be a new name, got {task!r}, which is taken")
+    if re.fullmatch(r"\w+", task) is None:
+        raise ValueError(f"task must be a name of letters, digits and underscores, got {task!r}")
     for resolution in ("coarse", "fine"):
         gymnasium.register(
             id=f"{namespace}/{task}-{resolution}-v{version}",
@@ -36,6 +39,7 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
             max_episode_steps=spec.horizon,
             kwargs={"task": task, "resolution": resolution},
         )
+    TASKS[task] = make
 
 
 def register_all() -> None:

@@ -69,7 +69,13 @@ def _figure(body: str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, fl
 
 def _mask(body: str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, float]]) -> np.ndarray:
     if not isinstance(body, (str, os.PathLike)):
-        body = np.asarray(body)
+        kinds = "a path, an array, an outline (K, 2), a Shape or a Body"
+        try:
+            body = np.asarray(body)
+        except ValueError as error:  # rows of different lengths
+            raise ValueError(f"body must be {kinds}, got {body!r}") from error
+        if body.ndim < 2:
+            raise ValueError(f"body must be {kinds}, got {body.tolist()!r}")
         if body.ndim == 2 and body.shape[1] == 2 and body.dtype.kind in "fiu":
             return _filled(body.astype(np.float64))
     grey = read_grey(body, "body", others="an outline (K, 2)")
@@ -88,10 +94,11 @@ def _filled(corners: np.ndarray) -> np.ndarray:
     size = np.ptp(corners, axis=0).max()
     pixels = (corners - corners.min(0)) * (OUTLINE_PIXELS / size if size > 0 else 1.0)
     height, width = np.ceil(pixels.max(0)).astype(int)[::-1] + 1
-    image = np.zeros((height, width), np.uint8)
-    cv2.fillPoly(image, [np.round(pixels).astype(np.int32)], 1)
-    # The outline itself is drawn too; without it nothing may be left of corners on one line.
-    if cv2.contourArea(pixels.astype(np.float32)) < 1.0:
+    image, outline = np.zeros((height, width), np.uint8), np.zeros((height, width), np.uint8)
+    path = [np.round(pixels).astype(np.int32)]
+    cv2.fillPoly(image, path, 1)
+    cv2.polylines(outline, path, isClosed=True, color=1)
+    if not (image > outline).any():
         raise ValueError(f"body must have corners that enclose an area, got {corners.tolist()}")
     return np.flipud(image).astype(bool)
 
@@ -109,7 +116,9 @@ def _check_place(spec: TaskSpec) -> None:
     for other in spec.objects:
         low, high = np.array(other.shape.corner), np.array(other.shape.corner) + other.shape.size
         if ((points > low) & (points < high)).all(1).any():
-            raise ValueError(f"body must leave the place of the object free, {low.tolist()} to {high.tolist()}")
+            raise ValueError(
+                f"body must leave the place of the object free, {low.round(4).tolist()} to {high.round(4).tolist()}"
+            )
     split = float(np.sqrt(points.var(0).sum()))
     if spec.split_limit is not None and split >= spec.split_limit:
         raise ValueError(

@@ -86,7 +86,8 @@ class Outcome(NamedTuple):
     """A task's own judgement of a step.
 
     Attributes:
-        terms: Named reward terms, (B,) each, already weighted.
+        terms: Named reward terms, (B,) each, already weighted; not ``split``, ``action``, ``alive`` or ``failure``,
+            which the engine adds.
         terminated: (B,) bool, the task's own reasons to end; ``None`` for none.
         success: (B,) bool; ``None`` where success is not defined.
         info: Further quantities for ``info``, leading B.

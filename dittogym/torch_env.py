@@ -30,10 +30,14 @@ class Snapshot:
     """A moment of an environment, see :meth:`TorchEnv.save`.
 
     Attributes:
+        task: Name of the task.
+        counts: Particles of each body.
         state: Everything that moves, leading B.
         observation: (B, 3, 64, 64) uint8.
     """
 
+    task: str
+    counts: tuple[int, ...]
     state: EnvState
     observation: Tensor
 
@@ -119,7 +123,7 @@ class TorchEnv:
         self.action_shape = (2, self.action_resolution, self.action_resolution)
         self._stale = parity == "reference"
         self._layout: Layout = action_layout or ("grid" if self._stale else "image")
-        counts = particle_counts(self.spec, particles)
+        self._counts = counts = particle_counts(self.spec, particles)
         full = counts == particle_counts(self.spec, "full")
         self.model = dynamics.make_model(self.spec, counts, substeps=substeps, backend=backend, unscaled=self._stale)
         self._layouts = Layouts(self.spec, counts, num_envs, spread=not (full or self._stale), resample=resample)
@@ -167,7 +171,7 @@ class TorchEnv:
     def save(self) -> Snapshot:
         """A copy of the present moment, to which :meth:`load` returns; keeps the autograd graph."""
         state, observation = self._moment()
-        return Snapshot(state.map(Tensor.clone), observation.clone())
+        return Snapshot(self.spec.name, self._counts, state.map(Tensor.clone), observation.clone())
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Go on from a saved moment, to the last bit as if nothing had happened since.
@@ -182,20 +186,21 @@ class TorchEnv:
             The observation (B, 3, 64, 64) uint8.
 
         Raises:
-            ValueError: The snapshot is of another task, number of particles, type or batch size.
+            TypeError: Not a snapshot.
+            ValueError: The snapshot is of another task, other numbers of particles, another type, device or batch size.
         """
-        chosen = self._mask(mask)
-        theirs, mine = snapshot.state, self._env_state
+        if not isinstance(snapshot, Snapshot):
+            raise TypeError(f"snapshot must be what save() returned, got {type(snapshot).__name__}")
+        chosen = self._mask(mask, "mask")
+        theirs = snapshot.state
         size = len(theirs.steps)
-        kind = (theirs.particles.num_particles, theirs.particles.dtype, theirs.particles.device.type)
-        own = (self.num_particles, self.dtype, self.device.type)
+        kind = (snapshot.task, snapshot.counts, theirs.particles.dtype, theirs.particles.device.type)
+        own = (self.spec.name, self._counts, self.dtype, self.device.type)
         if kind != own or size not in (1, self.num_envs):
             raise ValueError(
                 f"snapshot must hold 1 or {self.num_envs} simulations of {own}, got {size} of {kind} "
-                "(particles, dtype, device)"
+                "(task, particles, dtype, device)"
             )
-        if mine is not None and set(theirs.memory) != set(mine.memory):
-            raise ValueError(f"snapshot must be of task {self.spec.name!r}, but that does not remember {theirs.memory}")
         index = torch.arange(self.num_envs, device=self.device) % size
         state, observation = theirs.map(lambda t: t[index]), snapshot.observation[index]
         if not bool(chosen.all()):
@@ -227,7 +232,7 @@ class TorchEnv:
         for name in options:
             if name not in _RESET_OPTIONS:
                 raise ValueError(f"options may hold {', '.join(_RESET_OPTIONS)}, got {name!r}")
-        mask = self._mask(options.get("reset_mask"))
+        mask = self._mask(options.get("reset_mask"), "reset_mask")
         old, everyone = self._env_state, bool(mask.all())
         if old is None and not everyone:
             raise ValueError("reset_mask must reset all elements the first time")
@@ -243,7 +248,9 @@ class TorchEnv:
         if old is not None and not everyone:
             kept = merged(self.spec, physics, old.physics, ~mask, self._like)
             fresh = replace(fresh, physics=kept).where(mask, replace(old, physics=kept))
-        self._physics, self._env_state, self._field = physics, fresh, None
+        # Gradients in these constants reach back to this reset only, not to those before it.
+        self._physics = {name: value.detach() for name, value in physics.items()}
+        self._env_state, self._field = fresh, None
         if self._observation is None or not self._stale:
             self._observation = dynamics.observe(self.model, fresh)
         now = measure(self.state, self.model.robot)
@@ -288,13 +295,13 @@ class TorchEnv:
         field = self._field if muscles else None
         return frame(self.model, self.env_state, index, field, size)
 
-    def _mask(self, given: Any) -> Tensor:
+    def _mask(self, given: Any, name: str) -> Tensor:
         if given is None:
             return torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         mask = torch.as_tensor(given, device=self.device)
         if mask.dtype != torch.bool or mask.shape != (self.num_envs,):
             raise ValueError(
-                f"reset_mask must be bool of shape ({self.num_envs},), got {mask.dtype} of shape {tuple(mask.shape)}"
+                f"{name} must be bool of shape ({self.num_envs},), got {mask.dtype} of shape {tuple(mask.shape)}"
             )
         return mask
 

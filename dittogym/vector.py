@@ -9,7 +9,7 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from dittogym.env import RENDER_FPS, RENDER_MODES, as_numpy, as_tensor, spaces
+from dittogym.env import RENDER_FPS, RENDER_MODES, as_image, as_numpy, as_tensor, spaces
 from dittogym.spec import TaskSpec
 from dittogym.torch_env import Snapshot, TorchEnv
 from torchmpm import ParticleState
@@ -88,7 +88,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         info = as_numpy(raw)
         rewards, ends = reward.double().cpu().numpy(), terminated.cpu().numpy()
         limits = (self.torch_env.env_state.steps >= self._horizon).cpu().numpy()
-        observations = observation.cpu().numpy()
+        observations = as_image(observation)
         if self.autoreset_mode is AutoresetMode.DISABLED:
             self._ended = fresh | ends | limits
             return observations, rewards, ends, limits, _with_masks(info, np.ones(self.num_envs, dtype=bool))
@@ -114,7 +114,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _restart(self, mask: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
         observation, info = self.torch_env.reset(options={"reset_mask": torch.as_tensor(mask)})
-        return observation.cpu().numpy(), as_numpy(info)
+        return as_image(observation), as_numpy(info)
 
     def save(self) -> Snapshot:
         """The present moment of all simulations; see :meth:`dittogym.TorchEnv.save`."""
@@ -127,7 +127,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         observation = self.torch_env.load(snapshot, mask)
         self._ended &= False if mask is None else ~np.asarray(mask)
-        return observation.cpu().numpy()
+        return as_image(observation)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """One picture per simulation in mode ``"rgb_array"``, else nothing."""

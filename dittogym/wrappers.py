@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import cv2
 import gymnasium
 import numpy as np
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 AnyEnv = gymnasium.Env[Any, Any] | VectorEnv[Any, Any, Any]
@@ -25,6 +26,9 @@ def action_resolution(env: AnyEnv, size: int) -> Any:
     _check(size, box.shape[-1])
 
     def enlarge(action: np.ndarray) -> np.ndarray:
+        expected = (size, size)
+        if np.shape(action)[-2:] != expected:
+            raise ValueError(f"action must end in the shape {expected}, got {np.shape(action)}")
         return _resized(np.asarray(action, np.float32), box.shape[-1], cv2.INTER_CUBIC).clip(-1.0, 1.0)
 
     small = gymnasium.spaces.Box(-1.0, 1.0, (2, size, size), np.float32)
@@ -48,9 +52,34 @@ def observation_resolution(env: AnyEnv, size: int) -> Any:
 
     small = gymnasium.spaces.Box(0, 255, (3, size, size), np.uint8)
     if isinstance(env, VectorEnv):
-        batch = batch_space(small, env.num_envs)
-        return gymnasium.wrappers.vector.TransformObservation(env, reduce, batch, small)
+        return _VectorObservation(env, reduce, small)
     return gymnasium.wrappers.TransformObservation(env, reduce, small)
+
+
+class _VectorObservation(VectorWrapper[Any, Any, Any]):
+    """Like Gymnasium's ``TransformObservation``, which refuses environments that reset in the same step."""
+
+    def __init__(
+        self, env: VectorEnv[Any, Any, Any], function: Callable[[np.ndarray], np.ndarray], space: gymnasium.spaces.Box
+    ) -> None:
+        super().__init__(env)
+        self._function = function
+        self.single_observation_space = space
+        self.observation_space = batch_space(space, env.num_envs)
+
+    def reset(self, **arguments: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        observation, info = self.env.reset(**arguments)
+        return self._function(observation), info
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, Any, Any, Any, dict[str, Any]]:
+        observation, *rest, info = self.env.step(actions)
+        if "final_obs" in info:
+            final = np.empty_like(info["final_obs"])
+            for i in np.flatnonzero(info["_final_obs"]):
+                final[i] = self._function(info["final_obs"][i])
+            info = {**info, "final_obs": final}
+        reward, terminated, truncated = rest
+        return self._function(observation), reward, terminated, truncated, info
 
 
 def _box(env: AnyEnv, name: str) -> gymnasium.spaces.Box:
@@ -60,8 +89,8 @@ def _box(env: AnyEnv, name: str) -> gymnasium.spaces.Box:
 
 
 def _check(size: int, largest: int) -> None:
-    if not 1 <= size <= largest:
-        raise ValueError(f"size must be between 1 and {largest}, got {size}")
+    if not isinstance(size, int) or not 1 <= size <= largest:
+        raise ValueError(f"size must be a whole number between 1 and {largest}, got {size}")
 
 
 def _resized(images: np.ndarray, size: int, interpolation: int) -> np.ndarray:

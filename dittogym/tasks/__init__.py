@@ -41,7 +41,7 @@ def make_spec(
 
     Raises:
         ValueError: No such task, or a body that does not fit into it.
-        TypeError: The task has no such option.
+        TypeError: The task has no such option, or the obstacles are something else.
     """
     if isinstance(task, TaskSpec):
         if options:
@@ -57,5 +57,7 @@ def make_spec(
                 raise TypeError(f"task {task!r} has no option {name!r}; its options are: {names}")
         spec = TASKS[task](**options)
     if obstacles is not None:
+        if not isinstance(obstacles, Sequence) or not all(isinstance(item, Obstacle) for item in obstacles):
+            raise TypeError(f"obstacles must be a sequence of Obstacle, got {obstacles!r}")
         spec = replace(spec, obstacles=tuple(obstacles))
     return spec if body is None else with_body(spec, body)

@@ -191,3 +191,27 @@ def test_memory_and_objects_of_a_task_of_ones_own() -> None:
     info = env.step(still)[-1]
     assert info["reward_terms"]["peak"].tolist() == pytest.approx([0.0, 1.4], abs=1e-2)
     assert "is_success" not in info
+
+
+def test_a_name_that_gymnasium_would_refuse_leaves_nothing_behind() -> None:
+    with pytest.raises(ValueError, match=r"task must be a name of letters, digits and underscores, got 'my task!'"):
+        dittogym.register("my task!", hop)
+    assert "my task!" not in dittogym.TASKS
+
+
+def test_terms_of_the_engine_are_refused() -> None:
+    spec = dataclasses.replace(hop(), judge=lambda moment, weights: Outcome({"alive": moment.now.split}))
+    env = tiny(spec)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"must not return the engine's own terms, got \['alive'\]"):
+        env.step(actions(env, 1)[0])
+
+
+def test_a_longer_limit_than_the_horizon() -> None:
+    env = gymnasium.make("dittogym/shapematch-coarse-v0", max_episode_steps=32, particles=20, substeps=1)
+    env.reset(seed=0)
+    limits = [env.step(np.zeros(env.action_space.shape, np.float32))[3] for _ in range(32)]
+    assert limits == [False] * 31 + [True]
+    own = dittogym.Env("shapematch", particles=20, substeps=1)
+    own.reset(seed=0)
+    assert [own.step(np.zeros(own.action_space.shape, np.float32))[3] for _ in range(30)] == [False] * 29 + [True]

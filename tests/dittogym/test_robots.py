@@ -310,3 +310,20 @@ def test_mass_and_volume_are_the_same_with_any_number_of_particles(task: str) ->
         bodies = tiny(task, particles=particles).model.solver.bodies
         totals.append([(body.count * body.mass, body.count * body.volume) for body in bodies])
     assert totals[1] == pytest.approx(np.array(totals[0])) and totals[2] == pytest.approx(np.array(totals[0]))
+
+
+@pytest.mark.parametrize("body", [42, {"a": 1}, [(0, 0), (1, 0, 3)]])
+def test_bodies_of_the_wrong_kind(body: object) -> None:
+    with pytest.raises(ValueError, match=r"body must be a path, an array, an outline \(K, 2\), a Shape or a Body, got"):
+        dittogym.make_spec("run", body=body)
+
+
+def test_an_outline_may_cross_itself() -> None:
+    spec = dittogym.make_spec("run", body=[(0, 0), (4, 4), (4, 0), (0, 4)])
+    assert spec.robot.shape.area == pytest.approx(dittogym.make_spec("run").robot.shape.area)
+
+
+@pytest.mark.parametrize("obstacles", [3, [3], "wall"])
+def test_obstacles_of_the_wrong_kind(obstacles: object) -> None:
+    with pytest.raises(TypeError, match="obstacles must be a sequence of Obstacle, got"):
+        dittogym.make_spec("run", obstacles=obstacles)

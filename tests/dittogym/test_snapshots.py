@@ -215,7 +215,7 @@ def test_physics_travels_with_a_moment() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"task": "grow"}, "snapshot must be of task 'run'"),
+        ({"task": "grow"}, "got 2 of \\('grow', "),
         ({"particles": 119}, "snapshot must hold 1 or 2 simulations"),
         ({"dtype": "float32"}, "torch.float32"),
         ({"num_envs": 3}, "snapshot must hold 1 or 2 simulations .* got 3 of"),
@@ -285,3 +285,40 @@ def test_gradients_of_branches_add_up_in_their_stem() -> None:
         difference = (total(stem + 1e-4 * direction) - total(stem - 1e-4 * direction)) / 2e-4
     assert abs(float(difference)) > 1e-6
     assert float((gradient * direction).sum()) == pytest.approx(float(difference), rel=1e-5)
+
+
+@pytest.mark.parametrize("resample", [False, True])
+@torch.no_grad()
+def test_elements_that_were_only_ever_loaded_can_be_reset(resample: bool) -> None:
+    source, batch = tiny("run"), tiny("run", 2, resample=resample)
+    source.reset(seed=0)
+    batch.load(source.save())
+    batch.reset(options={"reset_mask": [True, False]})
+    batch.reset()
+    assert batch.state.x[1, :, 1].min() > 0.1
+
+
+@torch.no_grad()
+def test_bodies_of_other_sizes_do_not_fit() -> None:
+    source, env = tiny("kick", particles=(100, 20)), tiny("kick", particles=(90, 30))
+    source.reset(seed=0)
+    with pytest.raises(ValueError, match=r"\('kick', \(90, 30\), .* got 1 of \('kick', \(100, 20\)"):
+        env.load(source.save())
+
+
+@torch.no_grad()
+def test_something_else_than_a_snapshot() -> None:
+    env = tiny("run")
+    env.reset(seed=0)
+    with pytest.raises(TypeError, match=r"snapshot must be what save\(\) returned, got ParticleState"):
+        env.load(env.state)
+    with pytest.raises(ValueError, match=r"^mask must be bool"):
+        env.load(env.save(), mask=[1])
+
+
+def test_returned_pictures_are_the_users() -> None:
+    env = gymnasium.make("dittogym/run-coarse-v0", **SMALL).unwrapped
+    observation, _ = env.reset(seed=0)
+    first = observation.copy()
+    observation[:] = 0
+    assert np.array_equal(env.load(env.save()), first)

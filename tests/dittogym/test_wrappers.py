@@ -144,20 +144,20 @@ def test_both_together() -> None:
 @pytest.mark.parametrize("make", [single, batch])
 @pytest.mark.parametrize("size", [0, -1, 9])
 def test_bad_action_sizes(make, size: int) -> None:
-    with pytest.raises(ValueError, match=f"size must be between 1 and 8, got {size}"):
+    with pytest.raises(ValueError, match=f"size must be a whole number between 1 and 8, got {size}"):
         action_resolution(make(), size)
 
 
 @pytest.mark.parametrize("make", [single, batch])
 @pytest.mark.parametrize("size", [0, -1, 65])
 def test_bad_observation_sizes(make, size: int) -> None:
-    with pytest.raises(ValueError, match=f"size must be between 1 and 64, got {size}"):
+    with pytest.raises(ValueError, match=f"size must be a whole number between 1 and 64, got {size}"):
         observation_resolution(make(), size)
 
 
 def test_the_limit_is_that_of_what_is_wrapped() -> None:
     assert action_resolution(single(resolution=32), 32).action_space.shape == (2, 32, 32)
-    with pytest.raises(ValueError, match="size must be between 1 and 16, got 17"):
+    with pytest.raises(ValueError, match="size must be a whole number between 1 and 16, got 17"):
         observation_resolution(observation_resolution(single(), 16), 17)
 
 
@@ -291,3 +291,41 @@ def test_the_window_on_the_screen_shows_the_picture(monkeypatch: pytest.MonkeyPa
     assert pygame.display.get_caption()[0] == "dittogym: run"
     env.close()
     assert not pygame.display.get_init()
+
+
+def test_a_real_video(tmp_path: Path) -> None:
+    """What the extra "video" installs is enough for Gymnasium to write a film."""
+    pytest.importorskip("moviepy")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # moviepy's
+        env = wrappers.RecordVideo(single(render_mode="rgb_array", max_episode_steps=3), str(tmp_path))
+        env.reset(seed=0)
+        for _ in range(3):
+            env.step(np.zeros(env.action_space.shape, np.float32))
+        env.close()
+    film = cv2.VideoCapture(str(tmp_path / "rl-video-episode-0.mp4"))
+    assert int(film.get(cv2.CAP_PROP_FRAME_COUNT)) == 4
+    assert film.read()[1].shape == (512, 512, 3)
+
+
+def test_observations_of_environments_that_reset_in_the_same_step() -> None:
+    plain, small = (
+        batch(autoreset_mode="SameStep", max_episode_steps=2),
+        batch(autoreset_mode="SameStep", max_episode_steps=2),
+    )
+    small = observation_resolution(small, 16)
+    plain.reset(seed=0)
+    assert small.reset(seed=0)[0].shape == (2, 3, 16, 16)
+    action = np.zeros(plain.action_space.shape, np.float32)
+    for _ in range(2):
+        whole, reduced = plain.step(action), small.step(action)
+    assert reduced[3].all() and small.observation_space.contains(reduced[0])
+    for large, little in zip(whole[4]["final_obs"], reduced[4]["final_obs"], strict=True):
+        assert np.array_equal(cv2.resize(large[0], (16, 16), interpolation=cv2.INTER_AREA), little[0])
+
+
+def test_actions_of_another_size_are_refused() -> None:
+    env = action_resolution(single(), 4)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"action must end in the shape \(4, 4\), got \(2, 5, 5\)"):
+        env.step(np.zeros((2, 5, 5), np.float32))
