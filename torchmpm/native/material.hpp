@@ -45,7 +45,7 @@ INLINE Direction von_mises_return(const Values& m, Bounds bounds, Mat2& F) {
     const Real minor = at_least(Real(0.5) * (total - difference), bounds.stretch_floor);
     const bool yields = beyond & (major > minor * m.ratio);
     const Real mean = Real(0.5) * std::sqrt(major * minor);
-    const Real grow_total = mean * m.plus, grow_difference = mean * m.minus / difference;
+    const Real grow_total = mean * m.plus, grow_difference = mean * (m.minus / difference);
     const Mat2 returned = join(
         {grow_total * R.cos, grow_total * R.sin, grow_difference * v.n1, grow_difference * v.n2, v.proper});
     F = select(yields, returned, F);

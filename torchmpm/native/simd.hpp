@@ -6,6 +6,9 @@
 #include <type_traits>
 
 #define INLINE inline __attribute__((always_inline))
+// Work on a whole block: a call costs nothing there, and profiles can tell one from the other.
+#define PASS inline __attribute__((noinline))
+#define PASS_MEMBER __attribute__((noinline))
 
 using Real = TORCHMPM_REAL;
 
@@ -49,6 +52,20 @@ INLINE void transpose(Real4 (&v)[4]) {
     const Real4 c = SHUFFLE(v[2], v[3], 0, 4, 1, 5), d = SHUFFLE(v[2], v[3], 2, 6, 3, 7);
     v[0] = SHUFFLE(a, c, 0, 1, 4, 5), v[1] = SHUFFLE(a, c, 2, 3, 6, 7);
     v[2] = SHUFFLE(b, d, 0, 1, 4, 5), v[3] = SHUFFLE(b, d, 2, 3, 6, 7);
+}
+
+// Both halves on their own.
+INLINE void transpose(Real8 (&v)[4]) {
+    const Real8 a = SHUFFLE(v[0], v[1], 0, 8, 1, 9, 4, 12, 5, 13), b = SHUFFLE(v[0], v[1], 2, 10, 3, 11, 6, 14, 7, 15);
+    const Real8 c = SHUFFLE(v[2], v[3], 0, 8, 1, 9, 4, 12, 5, 13), d = SHUFFLE(v[2], v[3], 2, 10, 3, 11, 6, 14, 7, 15);
+    v[0] = SHUFFLE(a, c, 0, 1, 8, 9, 4, 5, 12, 13), v[1] = SHUFFLE(a, c, 2, 3, 10, 11, 6, 7, 14, 15);
+    v[2] = SHUFFLE(b, d, 0, 1, 8, 9, 4, 5, 12, 13), v[3] = SHUFFLE(b, d, 2, 3, 10, 11, 6, 7, 14, 15);
+}
+
+INLINE Real4 half(const Real8& v, int which) {
+    Real4 result;
+    __builtin_memcpy(&result, reinterpret_cast<const char*>(&v) + which * sizeof(Real4), sizeof(Real4));
+    return result;
 }
 
 INLINE void transpose(Real8 (&v)[8]) {

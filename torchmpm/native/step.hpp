@@ -3,7 +3,7 @@
 #pragma once
 #include "workspace.hpp"
 
-// What a block's particles give to the nodes: mass, momentum, and the affine momentum -dt V 4/h^2 tau + m C.
+// What a block's particles give to the nodes, zero for those that take no part: mass, momentum, and the affine momentum -dt V 4/h^2 tau + m C.
 struct alignas(64) Impulse {
     Real mass[LANES], vx[LANES], vy[LANES], affine[4][LANES];
 };
@@ -14,52 +14,45 @@ struct alignas(64) Pull {
 
     void none() { std::fill_n(x, LANES, Real(0)), std::fill_n(y, LANES, Real(0)); }
 
-    void sample(const Nodes<2>& nodes, const Stencil& at) {
-#pragma omp simd
-        for (int k = 0; k < LANES; ++k) {
-            Real sx = 0, sy = 0;
-            three([&](int p) {
-                Real rx = 0, ry = 0;
-                three([&](int q) {
-                    rx += at.wy[q][k] * nodes.v[3 * p + q][0][k];
-                    ry += at.wy[q][k] * nodes.v[3 * p + q][1][k];
-                });
-                sx += at.wx[p][k] * rx, sy += at.wx[p][k] * ry;
+    PASS_MEMBER void sample(const Scene& scene, const Stencil& at, const Real* field) {
+        for (int k = 0; k < LANES; k += 8) {
+            Real8 sum[2] = {};
+            read_eight(at.node + k, scene.width, field, [&](int p, const Real8(&row)[8]) {
+                for (int c = 0; c < 2; ++c)
+                    sum[c] += eight(at.wx[p] + k) * (eight(at.wy[0] + k) * row[c] + eight(at.wy[1] + k) * row[2 + c] +
+                                                     eight(at.wy[2] + k) * row[4 + c]);
             });
-            x[k] = sx, y[k] = sy;
+            put(sum[0], x + k), put(sum[1], y + k);
         }
     }
 };
 
 // New velocity and affine matrix from the velocities of the nodes, and the way they carry the particles.
-INLINE void advance(const Scene& scene, const Nodes<2>& nodes, const Stencil& at, Block& block) {
+PASS void advance(const Scene& scene, const Real* velocity, const Stencil& at, Block& block) {
     const Real dt = scene.dt, scale = 4 * scene.inverse_h;
-#pragma omp simd
-    for (int k = 0; k < LANES; ++k) {
-        Real v[2] = {0, 0}, slope_x[2] = {0, 0}, slope_y[2] = {0, 0};
-        three([&](int p) {
-            Real across[2] = {0, 0}, tilt[2] = {0, 0};
-            three([&](int q) {
-                const Real w = at.wy[q][k], wd = w * (q - at.fy[k]);
-                for (int c = 0; c < 2; ++c) {
-                    across[c] += w * nodes.v[3 * p + q][c][k];
-                    tilt[c] += wd * nodes.v[3 * p + q][c][k];
-                }
-            });
-            const Real w = at.wx[p][k], wd = w * (p - at.fx[k]);
+    for (int k = 0; k < LANES; k += 8) {
+        const Real8 fx = eight(at.fx + k), fy = eight(at.fy + k);
+        const Real8 w0 = eight(at.wy[0] + k), w1 = eight(at.wy[1] + k), w2 = eight(at.wy[2] + k);
+        const Real8 d0 = w0 * -fy, d1 = w1 * (1 - fy), d2 = w2 * (2 - fy);
+        Real8 v[2] = {}, slope_x[2] = {}, slope_y[2] = {};
+        read_eight(at.node + k, scene.width, velocity, [&](int p, const Real8(&row)[8]) {
+            const Real8 w = eight(at.wx[p] + k), d = w * (Real(p) - fx);
             for (int c = 0; c < 2; ++c) {
-                v[c] += w * across[c], slope_x[c] += wd * across[c], slope_y[c] += w * tilt[c];
+                const Real8 across = w0 * row[c] + w1 * row[2 + c] + w2 * row[4 + c];
+                const Real8 tilt = d0 * row[c] + d1 * row[2 + c] + d2 * row[4 + c];
+                v[c] += w * across, slope_x[c] += d * across, slope_y[c] += w * tilt;
             }
         });
-        const bool on = at.on[k] != 0;
-        block.v[X][k] = on ? block.v[X][k] + dt * v[0] : block.v[X][k];
-        block.v[Y][k] = on ? block.v[Y][k] + dt * v[1] : block.v[Y][k];
-        block.v[VX][k] = on ? v[0] : block.v[VX][k];
-        block.v[VY][k] = on ? v[1] : block.v[VY][k];
-        block.v[C0][k] = on ? scale * slope_x[0] : block.v[C0][k];
-        block.v[C1][k] = on ? scale * slope_y[0] : block.v[C1][k];
-        block.v[C2][k] = on ? scale * slope_x[1] : block.v[C2][k];
-        block.v[C3][k] = on ? scale * slope_y[1] : block.v[C3][k];
+        const auto on = eight(at.on + k) != 0;
+        const auto update = [&](int plane, Real8 value) {
+            put(on ? value : eight(block.v[plane] + k), block.v[plane] + k);
+        };
+        for (int c = 0; c < 2; ++c) {
+            update(X + c, eight(block.v[X + c] + k) + dt * v[c]);
+            update(VX + c, v[c]);
+            update(C0 + 2 * c, scale * slope_x[c]);
+            update(C1 + 2 * c, scale * slope_y[c]);
+        }
     }
 }
 
@@ -81,10 +74,13 @@ INLINE void deform_one(Real dt, Values m, Bounds bounds, bool on, Real pull_x, R
     Real Jp = before;
     const Direction R = return_map<kind>(m, bounds, F, Jp);
     const Sym2 tau = stress<kind>(m, hard, F, R, pull_x, pull_y);
-    out.mass[k] = m.mass;
-    out.vx[k] = m.mass * block.v[VX][k], out.vy[k] = m.mass * block.v[VY][k];
-    out.affine[0][k] = m.factor * tau.xx + m.mass * C.a, out.affine[1][k] = m.factor * tau.xy + m.mass * C.b;
-    out.affine[2][k] = m.factor * tau.xy + m.mass * C.c, out.affine[3][k] = m.factor * tau.yy + m.mass * C.d;
+    out.mass[k] = on ? m.mass : 0;
+    out.vx[k] = on ? m.mass * block.v[VX][k] : 0;
+    out.vy[k] = on ? m.mass * block.v[VY][k] : 0;
+    out.affine[0][k] = on ? m.factor * tau.xx + m.mass * C.a : 0;
+    out.affine[1][k] = on ? m.factor * tau.xy + m.mass * C.b : 0;
+    out.affine[2][k] = on ? m.factor * tau.xy + m.mass * C.c : 0;
+    out.affine[3][k] = on ? m.factor * tau.yy + m.mass * C.d : 0;
     block.v[F0][k] = on ? F.a : old.a, block.v[F1][k] = on ? F.b : old.b;
     block.v[F2][k] = on ? F.c : old.c, block.v[F3][k] = on ? F.d : old.d;
     if (kind == Kind::soil) block.v[JP][k] = on ? Jp : before;
@@ -112,20 +108,19 @@ INLINE void deform(const Scene& scene, const Body& body, const Real* table, cons
     table_of[int(body.kind)][body.varying](scene, table, body.bounds, at, pull, block, out);
 }
 
-// Mass and momentum for each of the nine nodes.
-INLINE void spread(const Scene& scene, const Impulse& in, const Stencil& at, Nodes<3>& out) {
+// Add mass and momentum to the nodes.
+PASS void scatter(const Scene& scene, const Impulse& in, const Stencil& at, Real* grid) {
     const Real h = scene.h;
-#pragma omp simd
-    for (int k = 0; k < LANES; ++k) {
-        three([&](int p) {
-            const Real dx = (p - at.fx[k]) * h;
-            const Real x = in.vx[k] + in.affine[0][k] * dx, y = in.vy[k] + in.affine[2][k] * dx;
-            three([&](int q) {
-                const Real dy = (q - at.fy[k]) * h, w = at.wx[p][k] * at.wy[q][k];
-                out.v[3 * p + q][0][k] = w * (x + in.affine[1][k] * dy);
-                out.v[3 * p + q][1][k] = w * (y + in.affine[3][k] * dy);
-                out.v[3 * p + q][2][k] = w * in.mass[k];
-            });
+    for (int k = 0; k < LANES; k += 8) {
+        const Real8 fx = eight(at.fx + k), fy = eight(at.fy + k), mass = eight(in.mass + k);
+        const Real8 vx = eight(in.vx + k), vy = eight(in.vy + k);
+        const Real8 xx = h * eight(in.affine[0] + k), xy = h * eight(in.affine[1] + k);
+        const Real8 yx = h * eight(in.affine[2] + k), yy = h * eight(in.affine[3] + k);
+        add_eight(at.node + k, scene.width, grid, [&](int p, int q, Real8(&out)[4]) {
+            const Real8 dx = Real(p) - fx, dy = Real(q) - fy, w = eight(at.wx[p] + k) * eight(at.wy[q] + k);
+            out[0] = w * (vx + xx * dx + xy * dy);
+            out[1] = w * (vy + yx * dx + yy * dy);
+            out[2] = w * mass;
         });
     }
 }
@@ -172,8 +167,6 @@ private:
     const Tape tape;
     int64_t element = 0;
     Stencil at;
-    Nodes<2> read;
-    Nodes<3> written;
     Pull pull;
     Impulse impulse;
 
@@ -200,8 +193,7 @@ private:
             Block& block = work.state[index];
             if (arriving) {
                 at.locate(scene, origin, block);
-                gather(work.velocity, at, scene.width, read);
-                advance(scene, read, at, block);
+                advance(scene, work.velocity, at, block);
             }
             if (tape.states) tape.states[substep * scene.blocks + index] = block;
             if (!leaving) return;
@@ -215,17 +207,15 @@ private:
         const Body& body = scene.body(index);
         const bool pulls = body.muscle && scene.muscles;
         if (pulls) {
-            gather(work.field, at, scene.width, read);
-            pull.sample(read, at);
+            pull.sample(scene, at, work.field);
         } else if (scene.muscles) {
             pull.none();
         }
         Real uniform[VALUES];
         deform(scene, body, work.values_of(scene, index, element, uniform), at, pull, block, impulse);
-        spread(scene, impulse, at, written);
         sums.reserve(at.box, scene.width);
         sums.box.include(at.box);
-        scatter(written, at, scene.width, sums.nodes);
+        scatter(scene, impulse, at, sums.nodes);
     }
 
     void nodes(int64_t substep) {

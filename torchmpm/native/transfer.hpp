@@ -21,12 +21,12 @@ struct Box {
 
 struct alignas(64) Stencil {
     Real wx[3][LANES], wy[3][LANES];  // weights
-    Real fx[LANES], fy[LANES];        // distance from the first node in cells
-    Real on[LANES];                   // 1 for particles that take part
+    Real fx[LANES], fy[LANES];        // distance from the first node in cells; all zero for others
+    Real on[LANES];                   // 1 for particles that take part, 0 for others
     int32_t node[LANES];              // first node
     Box box;                          // all nodes of particles that take part
 
-    void locate(const Scene& scene, const Real* origin, const Block& block) {
+    PASS_MEMBER void locate(const Scene& scene, const Real* origin, const Block& block) {
         const Real ox = origin[0], oy = origin[1], inverse_h = scene.inverse_h;
         const Real margin = scene.margin, extent = scene.extent;
         const Real low = -PAD, high = Real(scene.resolution);
@@ -38,11 +38,14 @@ struct alignas(64) Stencil {
             const bool inside = (offset > margin) & (offset < extent);
             const Real ux = offset * inverse_h, uy = (block.v[Y][k] - oy) * inverse_h;
             Real bx = std::trunc(ux - Real(0.5)), by = std::trunc(uy - Real(0.5));
-            const Real dx = ux - bx, dy = uy - by;
+            const Real dx = inside ? ux - bx : 0, dy = inside ? uy - by : 0;
             fx[k] = dx, fy[k] = dy, on[k] = inside ? Real(1) : Real(0);
-            wx[0][k] = Real(0.5) * square(Real(1.5) - dx), wy[0][k] = Real(0.5) * square(Real(1.5) - dy);
-            wx[1][k] = Real(0.75) - square(dx - 1), wy[1][k] = Real(0.75) - square(dy - 1);
-            wx[2][k] = Real(0.5) * square(dx - Real(0.5)), wy[2][k] = Real(0.5) * square(dy - Real(0.5));
+            wx[0][k] = inside ? Real(0.5) * square(Real(1.5) - dx) : 0;
+            wx[1][k] = inside ? Real(0.75) - square(dx - 1) : 0;
+            wx[2][k] = inside ? Real(0.5) * square(dx - Real(0.5)) : 0;
+            wy[0][k] = inside ? Real(0.5) * square(Real(1.5) - dy) : 0;
+            wy[1][k] = inside ? Real(0.75) - square(dy - 1) : 0;
+            wy[2][k] = inside ? Real(0.5) * square(dy - Real(0.5)) : 0;
             // Clamped before the conversion, which is undefined for large numbers; a NaN ends at the low end.
             bx = bx > low ? bx : low, by = by > low ? by : low;
             bx = bx < high ? bx : high, by = by < high ? by : high;
@@ -57,53 +60,39 @@ struct alignas(64) Stencil {
     }
 };
 
-// Values of a block's nine nodes, node 3 p + q first, with a number of components.
-template <int components> struct alignas(64) Nodes {
-    Real v[9][components][LANES];
-};
+INLINE Real8 eight(const Real* from) { return *reinterpret_cast<const Real8*>(from); }
 
-// Read nodes of two components: a row of three is six numbers, and two more are loaded and forgotten. Addresses are
-// valid also for particles that take no part; what they read is never used.
-INLINE void gather(const Real* grid, const Stencil& at, int width, Nodes<2>& out) {
-    for (int k = 0; k < LANES; k += 8)
-        three([&](int p) {
-            Real8 row[8];
-            for (int l = 0; l < 8; ++l)
-                row[l] = *reinterpret_cast<const Row8*>(grid + 2 * (at.node[k + l] + p * width));
-            transpose(row);
-            three([&](int q) {
-                *reinterpret_cast<Real8*>(&out.v[3 * p + q][0][k]) = row[2 * q];
-                *reinterpret_cast<Real8*>(&out.v[3 * p + q][1][k]) = row[2 * q + 1];
-            });
-        });
+INLINE void put(Real8 value, Real* to) { *reinterpret_cast<Real8*>(to) = value; }
+
+// Read the nodes of eight particles, two numbers each: `use(p, row)` gets the nodes (p, q) as row[2 q] and row[2 q + 1]. A
+// row of three nodes is six numbers; two more are loaded and forgotten. Addresses are valid also for particles that take
+// no part, but what is read there is rubbish.
+template <class Function> INLINE void read_eight(const int32_t* node, int width, const Real* grid, Function use) {
+    three([&](int p) {
+        Real8 row[8];
+        for (int l = 0; l < 8; ++l) row[l] = *reinterpret_cast<const Row8*>(grid + 2 * (node[l] + p * width));
+        transpose(row);
+        use(p, row);
+    });
 }
 
-// The same for nodes of one component.
-INLINE void gather(const Real* grid, const Stencil& at, int width, Nodes<1>& out) {
-    for (int k = 0; k < LANES; k += 4)
-        three([&](int p) {
-            Real4 row[4];
-            for (int l = 0; l < 4; ++l) row[l] = *reinterpret_cast<const Row4*>(grid + at.node[k + l] + p * width);
-            transpose(row);
-            three([&](int q) { *reinterpret_cast<Real4*>(&out.v[3 * p + q][0][k]) = row[q]; });
+// Add to the nodes of eight particles, numbers four by four: `value(p, q, numbers)` says what for a node. Aligned nodes
+// never overlap in part, so what was stored a moment ago is forwarded to the next load. Particles that take no part must
+// give zeros; they add them somewhere.
+template <class Function> INLINE void add_eight(const int32_t* node, int width, Real* grid, Function value) {
+    Real4* row[8];
+    for (int l = 0; l < 8; ++l) row[l] = reinterpret_cast<Real4*>(grid) + node[l];
+    three([&](int p) {
+        three([&](int q) {
+            Real8 numbers[4] = {};
+            value(p, q, numbers);
+            transpose(numbers);
+            for (int l = 0; l < 4; ++l) {
+                row[l][p * width + q] += half(numbers[l], 0);
+                row[l + 4][p * width + q] += half(numbers[l], 1);
+            }
         });
-}
-
-// Add to nodes of four numbers, of which the last `4 - components` are padding. Aligned nodes never overlap in part, so
-// what was stored a moment ago is forwarded to the next load.
-template <int components> INLINE void scatter(const Nodes<components>& in, const Stencil& at, int width, Real* grid) {
-    for (int k = 0; k < LANES; k += 4)
-        three([&](int p) {
-            three([&](int q) {
-                Real4 value[4] = {};
-                for (int c = 0; c < components; ++c)
-                    value[c] = *reinterpret_cast<const Real4*>(&in.v[3 * p + q][c][k]);
-                transpose(value);
-                for (int l = 0; l < 4; ++l)
-                    if (at.on[k + l] != 0)
-                        *reinterpret_cast<Real4*>(grid + 4 * (at.node[k + l] + p * width + q)) += value[l];
-            });
-        });
+    });
 }
 
 // A grid of nodes of four numbers on which sums build up. Nodes within `cleared` are zero or being added to; others hold
