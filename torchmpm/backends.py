@@ -36,7 +36,7 @@ def runs_native(solver: Solver, state: ParticleState) -> bool:
     Raises:
         ValueError: The backend is ``"native"`` and cannot run this.
     """
-    if solver.backend != "native":
+    if solver.backend not in ("auto", "native"):
         return False
     reason = native.unsupported(solver, state.dtype, state.device)
     if solver.backend == "native":

@@ -43,6 +43,16 @@ INLINE void constrain(const Scene& scene, uint32_t code, Real (&v)[2]) {
         if (code & 255) constrain(scene.rules[(code & 255) - 1], v);
 }
 
+// One thread's share of the rows of a box.
+struct Rows {
+    int begin, end;
+
+    Rows(const Box& box, int rank, int team) {
+        const int count = box.empty() ? 0 : box.i1 - box.i0 + 1;
+        begin = box.i0 + count * rank / team, end = box.i0 + count * (rank + 1) / team;
+    }
+};
+
 // The nodes of one row on which someone may ask for a velocity, and those of them that exist.
 struct Span {
     int begin, end, inner_begin, inner_end;  // end is one past the last
@@ -67,7 +77,8 @@ INLINE void collect(Sums* sums, int parts, const Box& box, int i, int width, Rea
     }
 }
 
-// What the adjoint wants to know of the nodes of a substep: velocity before gravity, and one over the mass.
+// What the adjoint wants to know of a row of nodes, from the first of its box: velocity before gravity, and one over the
+// mass.
 struct Record {
     Real *velocity = nullptr, *inverse_mass = nullptr;
 };
@@ -89,7 +100,7 @@ INLINE void node_velocities(const Scene& scene, const Real* gravity, const RuleT
         out[2 * j + 1] = (in[4 * j + 1] * inverse + gy) * damping;
     }
     if (record.velocity) {
-        Real *raw = record.velocity + 2 * i * scene.width, *inverse_mass = record.inverse_mass + i * scene.width;
+        Real *raw = record.velocity - 2 * span.begin, *inverse_mass = record.inverse_mass - span.begin;
 #pragma omp simd
         for (int j = span.inner_begin; j < span.inner_end; ++j) {
             const Real inverse = 1 / (in[4 * j + 2] + epsilon);

@@ -38,7 +38,7 @@ class Call(ctypes.Structure):
     _NUMBERS = ("batch", "particles", "substeps", "threads")
     _INPUTS = ("description", "planes", "field", "origin", "shift", "gravity", "values")
     _SIZES = ("values_batch", "columns")
-    _OUTPUTS = ("result",)
+    _OUTPUTS = ("result", "result_bar", "planes_bar", "field_bar", "origin_bar", "gravity_bar", "values_bar")
     _fields_ = [
         *((name, ctypes.c_int64) for name in _NUMBERS),
         *((name, ctypes.c_void_p) for name in _INPUTS),

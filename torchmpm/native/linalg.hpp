@@ -42,7 +42,7 @@ INLINE Mat2 join(Parts v) {
 
 // Length and direction of the larger part: the sum of the singular values, and the orthogonal factor R of F = R S.
 struct Direction {
-    Real total, cos, sin;
+    Real total, inverse, cos, sin;  // inverse is one over the total, and 1 for F = 0
     bool proper, empty;
 };
 
@@ -50,7 +50,18 @@ INLINE Direction direction(Parts v) {
     const Real length2 = square(v.m1) + square(v.m2);
     const bool empty = length2 == 0;
     const Real total = std::sqrt(empty ? Real(1) : length2), inverse = 1 / total;
-    return {empty ? Real(0) : total, empty ? Real(1) : v.m1 * inverse, v.m2 * inverse, v.proper, empty};
+    return {empty ? Real(0) : total, inverse, empty ? Real(1) : v.m1 * inverse, v.m2 * inverse, v.proper, empty};
 }
 
 INLINE Mat2 orthogonal(Direction d) { return join({d.cos, d.sin, 0, 0, d.proper}); }
+
+// Adjoint of a direction, and what it means for the larger part.
+struct DirectionBar {
+    Real total, cos, sin;
+};
+
+INLINE Parts adjoint(Direction d, DirectionBar bar, Real n1, Real n2) {
+    const Real turn = (d.sin * bar.cos - d.cos * bar.sin) * d.inverse;
+    const Real m1 = d.sin * turn + bar.total * d.cos, m2 = bar.total * d.sin - d.cos * turn;
+    return {d.empty ? Real(0) : m1, d.empty ? bar.sin : m2, n1, n2, d.proper};
+}

@@ -10,9 +10,12 @@ enum class Kind : int { elastic = 0, von_mises = 1, soil = 2 };
 struct Values {
     Real mass, factor, mu2, lam, slope2, ratio, plus, minus;
 
-    Real low() const { return slope2; }
-    Real high() const { return ratio; }
-    Real hardening() const { return plus; }
+    INLINE Real& low() { return slope2; }
+    INLINE Real& high() { return ratio; }
+    INLINE Real& hardening() { return plus; }
+    INLINE Real low() const { return slope2; }
+    INLINE Real high() const { return ratio; }
+    INLINE Real hardening() const { return plus; }
 };
 constexpr int VALUES = 8;
 

@@ -2,7 +2,7 @@
 #include <exception>
 #include <memory>
 
-#include "step.hpp"
+#include "adjoint.hpp"
 
 namespace {
 
@@ -70,4 +70,6 @@ template <class Pass> int run(const Call* call, char* scratch) {
 extern "C" {
 size_t torchmpm_forward_bytes(const Call* call) { return measure<Forward>(call); }
 int torchmpm_forward(const Call* call, char* scratch) { return run<Forward>(call, scratch); }
+size_t torchmpm_backward_bytes(const Call* call) { return measure<Adjoint>(call); }
+int torchmpm_backward(const Call* call, char* scratch) { return run<Adjoint>(call, scratch); }
 }

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 KINDS: tuple[type, ...] = (Elastic, VonMises, Soil)
 #: Rows of the table of values, see ``struct Values`` in ``material.hpp``.
 ROWS = 8
+#: Numbers of a description before those of the bodies.
+_HEAD = 9
 #: A node remembers its rule in one byte.
 MAX_RULES = 254
 
@@ -99,7 +101,7 @@ def description(solver: Solver, widths: list[int], mass_epsilon: float) -> Tenso
         low, high = material.hardening_range if isinstance(material, Soil) else (1.0, 1.0)
         cutoff = material.shear_cutoff if isinstance(material, Soil) else 0.0
         kind = KINDS.index(type(material))
-        numbers += [body.count, kind, body.muscle, width > 1, first, low, high, cutoff]
+        numbers += [body.count, kind, body.muscle, width, first, low, high, cutoff]
         first += width
     for rule in solver.rules:
         ends = [
@@ -108,3 +110,10 @@ def description(solver: Solver, widths: list[int], mass_epsilon: float) -> Tenso
         axis, sign = "xy".index(rule.direction[1]), 1.0 if rule.direction[0] == "+" else -1.0
         numbers += [axis, sign, *ends[0], *ends[1], rule.friction, rule.frame == "world"]
     return torch.tensor(numbers, dtype=torch.float64)
+
+
+def body_widths(description: Tensor) -> list[tuple[int, int]]:
+    """Particles and columns of each body, read back from :func:`description`."""
+    head = description.tolist()
+    bodies = int(head[_HEAD - 2])
+    return [(int(head[k]), int(head[k + 3])) for k in range(_HEAD, _HEAD + 8 * bodies, 8)]

@@ -63,7 +63,7 @@ struct Scene {
         int first = 0;
         for (int k = 0; k < count; ++k, d += 8) {
             const Bounds bounds{Real(d[5]), Real(d[6]), Real(d[7]), stretch_floor};
-            bodies.push_back({int(d[0]), Kind(int(d[1])), d[2] != 0, d[3] != 0, int(d[4]), bounds, first, blocks});
+            bodies.push_back({int(d[0]), Kind(int(d[1])), d[2] != 0, d[3] > 1, int(d[4]), bounds, first, blocks});
             first += bodies[k].count;
             blocks += (bodies[k].count + LANES - 1) / LANES;
             body_of_block.resize(blocks, k);

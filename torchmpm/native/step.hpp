@@ -127,15 +127,17 @@ PASS void scatter(const Scene& scene, const Impulse& in, const Stencil& at, Real
 
 // Where the forward pass leaves what the adjoint needs; null pointers keep nothing.
 struct Tape {
-    Block* states = nullptr;         // [substeps][blocks] at the start of each substep
-    Real* velocity = nullptr;        // [substeps][2 cells] of nodes, before gravity
-    Real* inverse_mass = nullptr;    // [substeps][cells]
-    Box* boxes = nullptr;            // [substeps] of nodes in use
+    Block* states = nullptr;        // [substeps][blocks] at the start of each substep
+    Real* velocity = nullptr;       // two numbers a node in use, one substep after the other: before gravity
+    Real* inverse_mass = nullptr;   // one number a node in use
+    Box* boxes = nullptr;           // [substeps] nodes in use
+    size_t* offsets = nullptr;      // [substeps] where a substep's nodes begin
 
-    Record record(const Scene& scene, int64_t substep) const {
+    Record record(int64_t substep, int i) const {
         if (!velocity) return {};
-        const size_t cells = size_t(scene.width) * scene.width;
-        return {velocity + 2 * cells * substep, inverse_mass + cells * substep};
+        const Box& box = boxes[substep];
+        const size_t node = offsets[substep] + size_t(i - box.i0) * (box.j1 - box.j0 + 1);
+        return {velocity + 2 * node, inverse_mass + node};
     }
 };
 
@@ -160,6 +162,12 @@ public:
         own_blocks([&](int, int block) { store(scene, block, element, work.state[block], scene.call.result); });
     }
 
+    // The blocks that are this thread's to advance.
+    template <class Function> void own_blocks(Function f) const {
+        for (int part = rank; part < scene.parts; part += team)
+            for (int block = scene.part_begin(part); block < scene.part_begin(part + 1); ++block) f(part, block);
+    }
+
 private:
     const Scene& scene;
     Workspace& work;
@@ -169,11 +177,6 @@ private:
     Stencil at;
     Pull pull;
     Impulse impulse;
-
-    template <class Function> void own_blocks(Function f) {
-        for (int part = rank; part < scene.parts; part += team)
-            for (int block = scene.part_begin(part); block < scene.part_begin(part + 1); ++block) f(part, block);
-    }
 
     void prepare() {
         own_blocks([&](int, int block) {
@@ -221,14 +224,22 @@ private:
     void nodes(int64_t substep) {
         Box box;
         for (const Sums& part : work.sums) box.include(part.box);
-        const int rows = box.empty() ? 0 : box.i1 - box.i0 + 1;
+        if (tape.boxes) remember(substep, box);
         Real* total = work.total + rank * Workspace::row_length(scene);
-        for (int i = box.i0 + rows * rank / team; i < box.i0 + rows * (rank + 1) / team; ++i) {
+        const Rows rows(box, rank, team);
+        for (int i = rows.begin; i < rows.end; ++i) {
             collect(work.sums.data(), scene.parts, box, i, scene.width, total);
             node_velocities(scene, scene.call.gravity + 2 * element, work.rules, box, i, total, work.velocity,
-                            tape.record(scene, substep));
+                            tape.record(substep, i));
         }
-        if (tape.boxes && rank == 0) tape.boxes[substep] = box;
+        work.barrier.wait();
+    }
+
+    void remember(int64_t substep, const Box& box) {
+        if (rank == 0) {
+            tape.boxes[substep] = box;
+            tape.offsets[substep] = substep ? tape.offsets[substep - 1] + tape.boxes[substep - 1].nodes() : 0;
+        }
         work.barrier.wait();
     }
 };

@@ -13,6 +13,7 @@ struct Box {
     int i0 = 1 << 28, i1 = -1, j0 = 1 << 28, j1 = -1;
 
     bool empty() const { return i1 < i0; }
+    size_t nodes() const { return empty() ? 0 : size_t(i1 - i0 + 1) * (j1 - j0 + 1); }
     bool holds(const Box& o) const { return o.empty() || (i0 <= o.i0 && o.i1 <= i1 && j0 <= o.j0 && o.j1 <= j1); }
     void include(const Box& o) {
         i0 = std::min(i0, o.i0), i1 = std::max(i1, o.i1), j0 = std::min(j0, o.j0), j1 = std::max(j1, o.j1);
