@@ -86,6 +86,8 @@ private:
         for (int part = rank; part < scene.parts; part += team) work.sums[part].box = {};
         forward.own_blocks([&](int part, int index) {
             const Block* state = work.tape.states + substep * scene.blocks + index;
+            if (arriving) prefetch(state + 1, sizeof(Block));
+            if (leaving) prefetch(state + 1 - scene.blocks, 2 * LANES * sizeof(Real));
             if (arriving) {
                 at.locate(scene, origin, *state);
                 take(index, *state, part);
@@ -101,13 +103,18 @@ private:
         work.barrier.wait();
     }
 
+    // The tape of a large scene lies beyond the caches, and its blocks too far apart for processors to see what comes.
+    static void prefetch(const Block* block, size_t size) {
+        for (size_t line = 0; line < size; line += 64) __builtin_prefetch(reinterpret_cast<const char*>(block) + line, 0, 2);
+    }
+
     void take(int index, const Block& state, int part) {
         const Body& body = scene.body(index);
         Block& bar = work.bars[index];
         const bool pulls = body.muscle && scene.muscles;
         if (pulls) {
             field.read(scene, at, work.field);
-            pull.sample(scene, at, work.field);
+            sample(field, at, pull);
         } else if (scene.muscles) {
             pull.none();
         }

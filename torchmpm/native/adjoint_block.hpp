@@ -15,6 +15,20 @@ struct alignas(64) Nodes {
     }
 };
 
+// Muscle actuation from the nodes that were read.
+PASS void sample(const Nodes& field, const Stencil& at, Pull& out) {
+#pragma omp simd
+    for (int k = 0; k < LANES; ++k) {
+        Real sum[2] = {0, 0};
+        three([&](int p) {
+            for (int c = 0; c < 2; ++c)
+                sum[c] += at.wx[p][k] * (at.wy[0][k] * field.v[3 * p][c][k] + at.wy[1][k] * field.v[3 * p + 1][c][k] +
+                                         at.wy[2][k] * field.v[3 * p + 2][c][k]);
+        });
+        out.x[k] = sum[0], out.y[k] = sum[1];
+    }
+}
+
 // Nodes of one number.
 struct alignas(64) Masses {
     Real v[9][LANES];

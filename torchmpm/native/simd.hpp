@@ -6,6 +6,7 @@
 #include <type_traits>
 
 #define INLINE inline __attribute__((always_inline))
+#define INLINE_LAMBDA __attribute__((always_inline))
 // Work on a whole block: a call costs nothing there, and profiles can tell one from the other.
 #define PASS inline __attribute__((noinline))
 #define PASS_MEMBER __attribute__((noinline))

@@ -198,12 +198,18 @@ private:
                 at.locate(scene, origin, block);
                 advance(scene, work.velocity, at, block);
             }
-            if (tape.states) tape.states[substep * scene.blocks + index] = block;
+            if (tape.states) keep(block, scene.body(index), tape.states[substep * scene.blocks + index]);
             if (!leaving) return;
             at.locate(scene, origin, block);
             give(index, block, work.sums[part]);
         });
         work.barrier.wait();
+    }
+
+    // Only soil has a Jp that anyone asks for.
+    static void keep(const Block& block, const Body& body, Block& to) {
+        const int planes = body.kind == Kind::soil ? PLANES : JP;
+        std::copy_n(block.v[0], planes * LANES, to.v[0]);
     }
 
     void give(int index, Block& block, Sums& sums) {

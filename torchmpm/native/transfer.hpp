@@ -69,7 +69,7 @@ INLINE void put(Real8 value, Real* to) { *reinterpret_cast<Real8*>(to) = value; 
 // row of three nodes is six numbers; two more are loaded and forgotten. Addresses are valid also for particles that take
 // no part, but what is read there is rubbish.
 template <class Function> INLINE void read_eight(const int32_t* node, int width, const Real* grid, Function use) {
-    three([&](int p) {
+    three([&](int p) INLINE_LAMBDA {
         Real8 row[8];
         for (int l = 0; l < 8; ++l) row[l] = *reinterpret_cast<const Row8*>(grid + 2 * (node[l] + p * width));
         transpose(row);
@@ -83,8 +83,8 @@ template <class Function> INLINE void read_eight(const int32_t* node, int width,
 template <class Function> INLINE void add_eight(const int32_t* node, int width, Real* grid, Function value) {
     Real4* row[8];
     for (int l = 0; l < 8; ++l) row[l] = reinterpret_cast<Real4*>(grid) + node[l];
-    three([&](int p) {
-        three([&](int q) {
+    three([&](int p) INLINE_LAMBDA {
+        three([&](int q) INLINE_LAMBDA {
             Real8 numbers[4] = {};
             value(p, q, numbers);
             transpose(numbers);
