@@ -17,6 +17,7 @@ from torchmpm.boundary import Face, VelocityRule, constrain, faces
 from torchmpm.grid import PAD, Grid
 from torchmpm.linalg import Mat2, matmul
 from torchmpm.material import Material, Sym2, Value, column
+from torchmpm.native.library import NO_COMPILER
 from torchmpm.rollout import check_repetition, repeated
 from torchmpm.spline import Stencil, stencil
 from torchmpm.state import ParticleState
@@ -135,9 +136,7 @@ class Solver:
         if self.backend not in BACKENDS:
             raise ValueError(f"backend must be one of {BACKENDS}, got {self.backend!r}")
         if self.backend in ("compile", "native") and not compiler_found():
-            raise ValueError(
-                f"backend {self.backend!r} needs a C++ compiler (g++, clang++ or $CXX), found none: use 'eager'"
-            )
+            raise ValueError(f"backend {self.backend!r} {NO_COMPILER}")
 
     @property
     def num_particles(self) -> int:

@@ -80,7 +80,8 @@ def test_auto_is_eager_where_it_does_not(
 def test_auto_without_a_compiler(
     fresh_warnings: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(shutil, "which", lambda name: None)
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
     state = lively(30)
     results = [robot(30, backend=backend).step(state, substeps=2) for backend in ("auto", "eager")]
     assert_identical(*results)
@@ -108,7 +109,8 @@ def test_unknown_backend() -> None:
 
 @pytest.mark.parametrize("backend", ["compile", "native"])
 def test_missing_compiler_is_said_at_once(monkeypatch: pytest.MonkeyPatch, backend: str) -> None:
-    monkeypatch.setattr(shutil, "which", lambda name: None)
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
     message = rf"backend '{backend}' needs a C\+\+ compiler .* found none: use 'eager'"
     with pytest.raises(ValueError, match=message):
         robot(5, backend=backend)

@@ -29,6 +29,8 @@ _FLAGS = (
     "-pthread",
 )
 _X86_FLAGS = ("-mprefer-vector-width=512",)
+#: What a user reads behind the name of the backend.
+NO_COMPILER = "needs a C++ compiler (g++, clang++ or $CXX), found none: use 'eager'"
 _logger = logging.getLogger(__name__)
 
 
@@ -56,10 +58,9 @@ def find_compiler() -> tuple[str, ...] | None:
     return None
 
 
-def cache_folder() -> Path:
+def cache_folder() -> str:
     """Where compiled kernels are kept: ``$XDG_CACHE_HOME/torchmpm``, by default ``~/.cache/torchmpm``."""
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    return Path(base) / "torchmpm"
+    return os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "torchmpm")
 
 
 def load(real: str) -> ctypes.CDLL:
@@ -74,18 +75,19 @@ def load(real: str) -> ctypes.CDLL:
     Raises:
         ValueError: There is no compiler, or it failed; the message holds what it said.
     """
-    compiler = find_compiler()
-    if compiler is None:
-        raise ValueError("backend 'native' needs a C++ compiler (g++, clang++ or $CXX), found none: use 'eager'")
-    loaded = _load(compiler, real, str(cache_folder()))
+    # All that decides what is loaded; the search itself would cost more than a substep.
+    loaded = _load(real, cache_folder(), os.environ.get("CXX"), os.environ.get("PATH"))
     if isinstance(loaded, str):
-        raise ValueError(f"backend 'native' could not be built: {loaded}")
+        raise ValueError(f"backend 'native' {loaded}")
     return loaded
 
 
 @functools.cache
-def _load(compiler: tuple[str, ...], real: str, folder: str) -> ctypes.CDLL | str:
+def _load(real: str, folder: str, *_: str | None) -> ctypes.CDLL | str:
     """Find or build the library; a failure comes back as text, so that it is not tried again in this process."""
+    compiler = find_compiler()
+    if compiler is None:
+        return NO_COMPILER
     flags = [*_FLAGS, *(_X86_FLAGS if platform.machine() in ("x86_64", "AMD64") else ()), f"-DTORCHMPM_REAL={real}"]
     command = [*compiler, *flags, str(_SOURCES / "native.cpp"), "-o"]
     path = Path(folder) / f"native-{_key(command)}.so"
@@ -104,14 +106,16 @@ def _load(compiler: tuple[str, ...], real: str, folder: str) -> ctypes.CDLL | st
         _logger.info("compiling kernels for %s with %s", real, compiler[0])
         done = subprocess.run([*command, str(fresh)], capture_output=True, text=True, check=False)
         if done.returncode != 0:
-            return f"{shlex.join(command)} failed with code {done.returncode}:\n{done.stderr[-4000:]}"
+            return (
+                f"could not be built: {shlex.join(command)} failed with code {done.returncode}:\n{done.stderr[-4000:]}"
+            )
         if path.name:
             os.replace(fresh, path)  # in one piece, whoever else builds at the same time
             fresh = path
         try:
             return ctypes.CDLL(str(fresh))
         except OSError as error:
-            return f"the compiled library does not load: {error}"
+            return f"could not be built: the compiled library does not load: {error}"
 
 
 def _key(command: list[str]) -> str:

@@ -45,11 +45,11 @@ def _run(name: str, dtype: torch.dtype, call: Call) -> None:
     Raises:
         MemoryError: There was not enough memory.
     """
-    library = library_for(dtype)
-    measure, function = getattr(library, f"torchmpm_{name}_bytes"), getattr(library, f"torchmpm_{name}")
+    library, reference = library_for(dtype), ctypes.byref(call)
+    measure = library[f"torchmpm_{name}_bytes"]
     measure.restype = ctypes.c_size_t
-    with _scratch(measure(ctypes.byref(call))) as address:
-        if function(ctypes.byref(call), ctypes.c_void_p(address)):
+    with _scratch(measure(reference)) as address:
+        if library[f"torchmpm_{name}"](reference, ctypes.c_void_p(address)):
             raise MemoryError("backend 'native' ran out of memory")
 
 
