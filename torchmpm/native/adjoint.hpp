@@ -35,26 +35,27 @@ class Adjoint {
 public:
     using Work = AdjointWorkspace;
 
-    Adjoint(const Scene& scene, Work& work, int rank, int team)
-        : scene(scene), work(work), rank(rank), team(team), forward(scene, work, rank, team, work.tape) {}
+    Adjoint(const Scene& scene, Work& work, Member& member)
+        : scene(scene), work(work), member(member), forward(scene, work, member, work.tape) {}
 
-    // All members of the team call this together.
-    void run(int64_t which) {
+    // All members of the team call this together. False for those who need not go on.
+    bool run(int64_t which) {
         element = which;
-        forward.run(element);
+        if (!forward.run(element)) return false;
         prepare();
         const int64_t substeps = scene.call.substeps;
         for (int64_t s = substeps; s >= 0; --s) {
             particles(s, s < substeps, s > 0);
-            if (s > 0) nodes(s - 1);
+            if (s > 0 && !nodes(s - 1)) return false;
         }
         finish();
+        return true;
     }
 
 private:
     const Scene& scene;
     Work& work;
-    const int rank, team;
+    Member& member;
     Forward forward;
     int64_t element = 0;
     Stencil at;
@@ -68,7 +69,7 @@ private:
 
     void prepare() {
         pull.none();
-        for (int part = rank; part < scene.parts; part += team) {
+        for (int part = member.rank; part < scene.parts; part += member.team) {
             std::fill_n(origin_bar(part), 2 * LANES, Real(0));
             if (!work.field_bar.empty()) work.field_bar[part].cleared = {};
         }
@@ -77,13 +78,13 @@ private:
             if (work.values_bar)
                 std::fill_n(work.values_bar + size_t(block) * VALUES * LANES, VALUES * LANES, Real(0));
         });
-        if (rank == 0) std::fill_n(work.gravity_bar, 2 * scene.width, Real(0));
+        if (member.rank == 0) std::fill_n(work.gravity_bar, 2 * scene.width, Real(0));
     }
 
     // Finish the adjoint of the substep that starts at `substep`, begin that of the one before.
     void particles(int64_t substep, bool arriving, bool leaving) {
         const Real* origin = scene.call.origin + 2 * element;
-        for (int part = rank; part < scene.parts; part += team) work.sums[part].box = {};
+        for (int part = member.rank; part < scene.parts; part += member.team) work.sums[part].box = {};
         forward.own_blocks([&](int part, int index) {
             const Block* state = work.tape.states + substep * scene.blocks + index;
             if (arriving) prefetch(state + 1, sizeof(Block));
@@ -100,7 +101,7 @@ private:
             sums.box.include(at.box);
             scatter(scene, impulse, at, sums.nodes);
         });
-        work.barrier.wait();
+        member.wait();
     }
 
     // The tape of a large scene lies beyond the caches, and its blocks too far apart for processors to see what comes.
@@ -134,16 +135,16 @@ private:
         }
     }
 
-    void nodes(int64_t substep) {
+    bool nodes(int64_t substep) {
         const Box& box = work.tape.boxes[substep];
-        Real* total = work.total + rank * Workspace::row_length(scene);
-        const Rows rows(box, rank, team);
+        Real* total = work.total + member.rank * Workspace::row_length(scene);
+        const Rows rows(box, member.rank, member.team);
         for (int i = rows.begin; i < rows.end; ++i) {
             collect(work.sums.data(), scene.parts, box, i, scene.width, total);
             node_adjoint(scene, scene.call.gravity + 2 * element, work.rules, box, i, total,
                          work.tape.record(substep, i), work.velocity, work.nodes, work.gravity_bar + 2 * i);
         }
-        work.barrier.wait();
+        return member.goes_on();
     }
 
     // Hand out the derivatives.
@@ -154,7 +155,7 @@ private:
             if (work.values_bar) store_values(block);
         });
         if (call.field_bar) store_field();
-        if (rank != 0) return;
+        if (member.rank != 0) return;
         for (int c = 0; c < 2; ++c) {
             Real sum = 0, total = 0;
             for (int i = 0; i < scene.width; ++i) sum += work.gravity_bar[2 * i + c];
@@ -175,7 +176,7 @@ private:
     void store_field() {
         const int n = scene.resolution, width = scene.width;
         Real* out = scene.call.field_bar + 2 * element * n * n;
-        for (int i = n * rank / team; i < n * (rank + 1) / team; ++i)
+        for (int i = n * member.rank / member.team; i < n * (member.rank + 1) / member.team; ++i)
             for (int c = 0; c < 2; ++c) {
                 Real* row = out + (c * n + i) * n;
                 std::fill_n(row, n, Real(0));

@@ -28,19 +28,18 @@ template <class Pass> bool run_batch(const Scene& scene, Shape shape, char* scra
     Arena arena(scratch);
     std::vector<std::unique_ptr<Work>> work;
     for (int t = 0; t < shape.teams; ++t) work.push_back(std::make_unique<Work>(scene, arena, shape.team));
-    std::vector<std::unique_ptr<Pass>> passes;
-    for (int index = 0; index < shape.team * shape.teams; ++index)
-        passes.push_back(
-            std::make_unique<Pass>(scene, *work[index / shape.team], index % shape.team, shape.team));
     std::atomic<int64_t> next{0};
     return run_together(shape.team * shape.teams, [&](int index) {
         Work& own = *work[index / shape.team];
+        Member member{index % shape.team, shape.team, own.barrier};
+        Pass pass(scene, own, member);
         while (true) {
-            if (index % shape.team == 0) own.element = next.fetch_add(1);
+            if (member.rank == 0) own.element = next.fetch_add(1), own.barrier.begin();
             own.barrier.wait();
             const int64_t element = own.element;
             if (element >= scene.call.batch) return;
-            passes[index]->run(element);
+            pass.run(element);
+            member.team = shape.team;
             own.barrier.wait();
         }
     });

@@ -145,33 +145,34 @@ class Forward {
 public:
     using Work = Workspace;
 
-    Forward(const Scene& scene, Workspace& work, int rank, int team, Tape tape = {})
-        : scene(scene), work(work), rank(rank), team(team), tape(tape) {}
+    Forward(const Scene& scene, Workspace& work, Member& member, Tape tape = {})
+        : scene(scene), work(work), member(member), tape(tape) {}
 
-    // All members of the team call this together.
-    void run(int64_t which) {
+    // All members of the team call this together. False for those who need not go on.
+    bool run(int64_t which) {
         element = which;
         prepare();
         const int64_t substeps = scene.call.substeps;
         for (int64_t s = 0; s < substeps; ++s) {
             particles(s, s > 0, true);
-            nodes(s);
+            if (!nodes(s)) return false;
         }
-        if (tape.states) return;
+        if (tape.states) return true;
         particles(substeps, true, false);
         own_blocks([&](int, int block) { store(scene, block, element, work.state[block], scene.call.result); });
+        return true;
     }
 
     // The blocks that are this thread's to advance.
     template <class Function> void own_blocks(Function f) const {
-        for (int part = rank; part < scene.parts; part += team)
+        for (int part = member.rank; part < scene.parts; part += member.team)
             for (int block = scene.part_begin(part); block < scene.part_begin(part + 1); ++block) f(part, block);
     }
 
 private:
     const Scene& scene;
     Workspace& work;
-    const int rank, team;
+    Member& member;
     const Tape tape;
     int64_t element = 0;
     Stencil at;
@@ -183,15 +184,15 @@ private:
             load(scene, block, element, scene.call.planes, work.state[block]);
             load_values(scene, block, element, work.values);
         });
-        if (rank == 0) work.rules.build(scene, scene.call.shift + 2 * element);
-        if (rank == team - 1 && scene.muscles) load_field(scene, element, work.field);
+        if (member.rank == 0) work.rules.build(scene, scene.call.shift + 2 * element);
+        if (member.rank == member.team - 1 && scene.muscles) load_field(scene, element, work.field);
         pull.none();
-        work.barrier.wait();
+        member.wait();
     }
 
     void particles(int64_t substep, bool arriving, bool leaving) {
         const Real* origin = scene.call.origin + 2 * element;
-        for (int part = rank; part < scene.parts; part += team) work.sums[part].box = {};
+        for (int part = member.rank; part < scene.parts; part += member.team) work.sums[part].box = {};
         own_blocks([&](int part, int index) {
             Block& block = work.state[index];
             if (arriving) {
@@ -203,7 +204,7 @@ private:
             at.locate(scene, origin, block);
             give(index, block, work.sums[part]);
         });
-        work.barrier.wait();
+        member.wait();
     }
 
     // Only soil has a Jp that anyone asks for.
@@ -227,25 +228,25 @@ private:
         scatter(scene, impulse, at, sums.nodes);
     }
 
-    void nodes(int64_t substep) {
+    bool nodes(int64_t substep) {
         Box box;
         for (const Sums& part : work.sums) box.include(part.box);
         if (tape.boxes) remember(substep, box);
-        Real* total = work.total + rank * Workspace::row_length(scene);
-        const Rows rows(box, rank, team);
+        Real* total = work.total + member.rank * Workspace::row_length(scene);
+        const Rows rows(box, member.rank, member.team);
         for (int i = rows.begin; i < rows.end; ++i) {
             collect(work.sums.data(), scene.parts, box, i, scene.width, total);
             node_velocities(scene, scene.call.gravity + 2 * element, work.rules, box, i, total, work.velocity,
                             tape.record(substep, i));
         }
-        work.barrier.wait();
+        return member.goes_on();
     }
 
     void remember(int64_t substep, const Box& box) {
-        if (rank == 0) {
+        if (member.rank == 0) {
             tape.boxes[substep] = box;
             tape.offsets[substep] = substep ? tape.offsets[substep - 1] + tape.boxes[substep - 1].nodes() : 0;
         }
-        work.barrier.wait();
+        member.wait();
     }
 };
