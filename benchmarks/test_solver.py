@@ -1,6 +1,7 @@
 """Cost of a substep in the scene of RUN: a plastic robot with muscles on the floor, float32, 128x128 nodes."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -18,10 +19,18 @@ RULES = (
 CENTRE, RADIUS = (0.09, 0.25), 0.09
 
 
-BACKENDS = [
-    "eager",
-    pytest.param("compile", marks=pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")),
-]
+SIZES = {"1x22000": (1, 22_000), "1x2000": (1, 2_000), "16x2000": (16, 2_000), "64x2000": (64, 2_000)}
+needs_compiler = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+
+
+def cases(**sizes: str) -> pytest.MarkDecorator:
+    """Parameters for the given sizes of each backend; what would take minutes is left out."""
+    parameters = [
+        pytest.param(name, *SIZES[size], id=f"{size}-{name}", marks=() if name == "eager" else needs_compiler)
+        for name, listed in sizes.items()
+        for size in listed.split()
+    ]
+    return pytest.mark.parametrize(("backend", "batch", "count"), parameters)
 
 
 def scene(
@@ -43,10 +52,7 @@ def scene(
     return solver, state, actuation, origin
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize(
-    ("batch", "count"), [(1, 22_000), (1, 2_000), (16, 2_000)], ids=["1x22000", "1x2000", "16x2000"]
-)
+@cases(eager="1x22000 1x2000 16x2000", compile="1x22000 1x2000 16x2000", native=" ".join(SIZES))
 def test_forward(per_substep, backend: str, batch: int, count: int) -> None:
     solver, state, actuation, origin = scene(backend, batch, count)
 
@@ -58,8 +64,32 @@ def test_forward(per_substep, backend: str, batch: int, count: int) -> None:
     per_substep(run, particles=batch * count, substeps=100, rounds=8)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize(("batch", "count"), [(1, 2_000)], ids=["1x2000"])
+@needs_compiler
+@pytest.mark.parametrize("bodies", ["robot", "robot+ball", "robot+soil", "own-values"])
+def test_materials(per_substep, bodies: str) -> None:
+    """What other bodies cost natively, next to a robot alone."""
+    count = 22_000
+    solver, state, actuation, origin = scene("native", 1, count)
+    robot, half = solver.bodies[0], count // 2
+    gel = robot.material
+    per_particle = torchmpm.VonMises(gel.mu * torch.ones(1, count), gel.lam, gel.yield_stress)
+    others = {
+        "robot": (robot,),
+        "robot+ball": (replace(robot, count=half), torchmpm.Body(half, torchmpm.Elastic(gel.mu, gel.lam), 2.0)),
+        "robot+soil": (replace(robot, count=half), torchmpm.Body(half, torchmpm.Soil(2083.0, 1389.0), 2.0)),
+        "own-values": (replace(robot, material=per_particle),),
+    }
+    solver = replace(solver, bodies=others[bodies])
+
+    def run() -> None:
+        with torch.no_grad():
+            end = solver.step(state, actuation, substeps=100, origin=origin)
+        assert torchmpm.diagnostics.finite(end).all()
+
+    per_substep(run, particles=count, substeps=100, rounds=8)
+
+
+@cases(eager="1x2000", compile="1x2000", native=" ".join(SIZES))
 def test_forward_backward(per_substep, backend: str, batch: int, count: int) -> None:
     solver, state, actuation, origin = scene(backend, batch, count)
     actuation.requires_grad_()

@@ -3,26 +3,61 @@
 from __future__ import annotations
 
 import functools
-import os
-import shutil
+import logging
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from torchmpm import native
+from torchmpm.native.library import find_compiler
+
 if TYPE_CHECKING:
     from torchmpm.solver import Scene, Solver
+    from torchmpm.state import ParticleState
 
 Planes = tuple[Tensor, ...]
 
-#: ``"auto"`` stands for ``"eager"`` until a faster backend starts without a wait.
-BACKENDS = ("auto", "eager", "compile")
+BACKENDS = ("auto", "eager", "compile", "native")
+_logger = logging.getLogger(__name__)
 
 
 def compiler_found() -> bool:
-    """Whether ``"compile"`` can work on the CPU: TorchInductor needs a C++ compiler (``$CXX``, g++ or clang++)."""
-    return shutil.which(os.environ.get("CXX", "g++")) is not None or shutil.which("clang++") is not None
+    """Whether ``"native"``, and ``"compile"`` on the CPU, can work: is there a C++ compiler ($CXX, g++ or clang++)?"""
+    return find_compiler() is not None
+
+
+def runs_native(solver: Solver, state: ParticleState) -> bool:
+    """Whether a step from this state is one for :mod:`torchmpm.native`.
+
+    ``"auto"`` takes it wherever it works. Where it does not on a CPU, a warning is logged once that says why.
+
+    Raises:
+        ValueError: The backend is ``"native"`` and cannot run this.
+    """
+    if solver.backend not in ("auto", "native"):
+        return False
+    reason = native.unsupported(solver, state.dtype, state.device)
+    if solver.backend == "native":
+        if reason is not None:
+            raise ValueError(f"backend 'native' cannot run this: {reason}; use 'eager'")
+        return True
+    if state.device.type != "cpu":
+        return False
+    if reason is None:
+        try:
+            native.load(state.dtype)
+        except ValueError as error:
+            reason = str(error)
+    if reason is not None:
+        _warn_once(reason)
+    return reason is None
+
+
+@functools.cache
+def _warn_once(reason: str) -> None:
+    _logger.warning("the physics runs operator by operator, many times slower than it could: %s", reason)
 
 
 def substep_function(solver: Solver, scene: Scene) -> Callable[[Planes], Planes]:

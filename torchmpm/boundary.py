@@ -83,6 +83,11 @@ class Face:
     friction: Tensor | None
 
 
+def node_shift(grid: Grid, origin: Tensor) -> Tensor:
+    """Whole nodes between the world's origin and the window's, truncated towards zero, (B, 2) int64."""
+    return torch.trunc(origin.detach() * (1.0 / grid.h)).to(torch.int64)
+
+
 def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Face, ...]:
     """Turn rules into masks; the window does not move during a step, so this is done once a step.
 
@@ -92,7 +97,7 @@ def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Fa
         origin: (B, 2) lower left corner of the window in the world, m.
     """
     window = torch.arange(-PAD, grid.resolution + PAD, device=origin.device)[None]
-    shift = torch.trunc(origin.detach() * (1.0 / grid.h)).to(torch.int64)
+    shift = node_shift(grid, origin)
     result = []
     for direction in dict.fromkeys(rule.direction for rule in rules):
         active = torch.zeros(1, grid.width, grid.width, dtype=torch.bool, device=origin.device)

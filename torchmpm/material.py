@@ -89,6 +89,12 @@ def _exp(value: Value) -> Value:
     return value.exp() if isinstance(value, Tensor) else math.exp(value)
 
 
+def yield_ratio(limit: Value) -> Value:
+    """Ratio of the principal stretches at yield, for a limit of :func:`von_mises_return`."""
+    excess = 2.0 * (limit * limit - NORM_EPSILON)
+    return _exp(_sqrt(excess.clamp_min(NORM_EPSILON) if isinstance(excess, Tensor) else max(excess, NORM_EPSILON)))
+
+
 def von_mises_return(F: Mat2, limit: Value) -> Mat2:
     """Closest point on the von Mises yield surface in principal logarithmic strains.
 
@@ -104,9 +110,7 @@ def von_mises_return(F: Mat2, limit: Value) -> Mat2:
         F: Trial deformation gradient, planes (B, N).
         limit: Yield stress / (2 mu), a number or broadcastable to (B, N).
     """
-    excess = 2.0 * (limit * limit - NORM_EPSILON)
-    gap = _sqrt(excess.clamp_min(NORM_EPSILON) if isinstance(excess, Tensor) else max(excess, NORM_EPSILON))
-    ratio = _exp(gap)  # of the principal stretches at yield
+    ratio = yield_ratio(limit)
     slope = (ratio - 1.0) / (ratio + 1.0)  # difference over sum of the stretches at yield
     p, q, r, s = split(F)
     rotation, reflection = p.square() + q.square(), r.square() + s.square()
@@ -245,8 +249,7 @@ class Soil(Elastic):
 
     Snow plasticity (Stomakhin et al., "A material point method for snow simulation", 2013) with the values of
     DittoGym's DIG. The plastic volume ratio Jp collects the area that stretches lost to their bounds; the elastic
-    constants are multiplied by ``exp(hardening (1 - Jp))`` within ``hardening_range``, Jp being that of the substep
-    before.
+    constants are multiplied by ``exp(hardening (1 - Jp))`` within ``hardening_range``, with Jp of the substep before.
 
     Attributes:
         mu: Second Lame parameter at Jp = 1, Pa.

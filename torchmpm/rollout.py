@@ -25,6 +25,14 @@ def _apply(step: Callable[[State, Input], State], value: Input, state: State) ->
     return step(state, value)
 
 
+def check_repetition(times: int, segment: int | None) -> None:
+    """Raise the errors of :func:`repeated`."""
+    if times < 0:
+        raise ValueError(f"times must not be negative, got {times}")
+    if segment is not None and segment < 1:
+        raise ValueError(f"segment must be at least 1 or None, got {segment}")
+
+
 def repeated(step: Callable[[State], State], state: State, times: int, *, segment: int | None = None) -> State:
     """Apply ``step`` to ``state`` again and again.
 
@@ -39,10 +47,7 @@ def repeated(step: Callable[[State], State], state: State, times: int, *, segmen
     Raises:
         ValueError: ``times`` is negative or ``segment`` is below 1.
     """
-    if times < 0:
-        raise ValueError(f"times must not be negative, got {times}")
-    if segment is not None and segment < 1:
-        raise ValueError(f"segment must be at least 1 or None, got {segment}")
+    check_repetition(times, segment)
     if segment is None or segment >= times or not torch.is_grad_enabled():
         for _ in range(times):
             state = step(state)

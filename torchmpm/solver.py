@@ -11,13 +11,14 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchmpm import muscle, transfer
-from torchmpm.backends import BACKENDS, compiler_found, substep_function
+from torchmpm import muscle, native, transfer
+from torchmpm.backends import BACKENDS, compiler_found, runs_native, substep_function
 from torchmpm.boundary import Face, VelocityRule, constrain, faces
 from torchmpm.grid import PAD, Grid
 from torchmpm.linalg import Mat2, matmul
 from torchmpm.material import Material, Sym2, Value, column
-from torchmpm.rollout import repeated
+from torchmpm.native.library import NO_COMPILER
+from torchmpm.rollout import check_repetition, repeated
 from torchmpm.spline import Stencil, stencil
 from torchmpm.state import ParticleState
 
@@ -112,7 +113,8 @@ class Solver:
         damping: Factor on every node velocity in every substep (1 = none).
         rules: Velocity rules, see :class:`torchmpm.VelocityRule`.
         dt: Duration of a substep, s.
-        backend: ``"eager"``, ``"compile"`` or ``"auto"``, see :func:`torchmpm.backends.substep_function`.
+        backend: ``"native"`` (fused kernels on the CPU, :mod:`torchmpm.native`), ``"eager"`` or ``"compile"`` (see
+            :func:`torchmpm.backends.substep_function`), or ``"auto"``: native where it works, else eager.
 
     Raises:
         ValueError: No bodies, ``dt`` not positive, or an unknown or unavailable backend.
@@ -133,8 +135,8 @@ class Solver:
             raise ValueError(f"dt must be positive, got {self.dt}")
         if self.backend not in BACKENDS:
             raise ValueError(f"backend must be one of {BACKENDS}, got {self.backend!r}")
-        if self.backend == "compile" and not compiler_found():
-            raise ValueError("backend 'compile' needs a C++ compiler (g++, clang++ or $CXX), found none: use 'eager'")
+        if self.backend in ("compile", "native") and not compiler_found():
+            raise ValueError(f"backend {self.backend!r} {NO_COMPILER}")
 
     @property
     def num_particles(self) -> int:
@@ -160,19 +162,25 @@ class Solver:
                 indices (i, j) rightwards and upwards; constant during the step. ``None`` for none.
             substeps: Number of substeps.
             origin: (B, 2) lower left corner of the window in the world, m; ``None`` for (0, 0).
-            segment: Substeps between checkpoints when gradients are enabled, see :func:`torchmpm.repeated`.
+            segment: Substeps between checkpoints when gradients are enabled, see :func:`torchmpm.repeated`. The native
+                backend has no use for it: it keeps the start of the step and replays the substeps.
 
         Returns:
             The new state, differentiable in state, actuation, material values, masses and gravity.
 
         Raises:
-            ValueError: Shapes, dtypes or devices do not fit together.
+            ValueError: Shapes, dtypes or devices do not fit together, or the native backend was chosen and cannot run
+                this.
         """
+        check_repetition(substeps, segment)
+        if runs_native(self, state):
+            origin = self.check(state, actuation, origin)
+            return native.step(self, state, actuation, origin, substeps, mass_epsilon=MASS_EPSILON)
         substep = substep_function(self, self.scene(state, actuation, origin))
         return ParticleState.from_planes(repeated(substep, state.planes(), substeps, segment=segment))
 
-    def scene(self, state: ParticleState, actuation: Tensor | None = None, origin: Tensor | None = None) -> Scene:
-        """Check the arguments of a step and prepare what its substeps share; see :meth:`step`."""
+    def check(self, state: ParticleState, actuation: Tensor | None, origin: Tensor | None) -> Tensor:
+        """Check the arguments of a step, see :meth:`step`, and fill in the origin."""
         batch, nodes = state.batch_size, self.grid.resolution
         if state.num_particles != self.num_particles:
             raise ValueError(f"state has {state.num_particles} particles, the solver's bodies {self.num_particles}")
@@ -185,7 +193,11 @@ class Solver:
                     f"{name} must be {state.dtype} on {state.device} of shape {shape}, "
                     f"got {value.dtype} on {value.device} of shape {tuple(value.shape)}"
                 )
-        origin = state.x.new_zeros(batch, 2) if origin is None else origin
+        return state.x.new_zeros(batch, 2) if origin is None else origin
+
+    def scene(self, state: ParticleState, actuation: Tensor | None = None, origin: Tensor | None = None) -> Scene:
+        """Check the arguments of a step and prepare what its substeps share; see :meth:`step`."""
+        origin, nodes = self.check(state, actuation, origin), self.grid.resolution
         inside = pad(state.x.new_ones(nodes, nodes), [PAD] * 4).flatten()[None]
         if actuation is not None:
             actuation = pad(actuation, [PAD] * 4).flatten(2).transpose(0, 1).contiguous()

@@ -136,7 +136,11 @@ class ParticleState:
     @classmethod
     def from_planes(cls, planes: tuple[Tensor, ...]) -> ParticleState:
         """Inverse of :meth:`planes`; the planes stay contiguous behind the documented shapes."""
-        stacked = torch.stack(planes)
+        return cls.from_stack(torch.stack(planes))
+
+    @classmethod
+    def from_stack(cls, stacked: Tensor) -> ParticleState:
+        """The same from one tensor (13, B, N), of which the fields become views."""
         vector, matrix = (lambda p: p.movedim(0, -1)), (lambda p: p.movedim(0, -1).unflatten(-1, (2, 2)))
         return cls(vector(stacked[0:2]), vector(stacked[2:4]), matrix(stacked[4:8]), matrix(stacked[8:12]), stacked[12])
 

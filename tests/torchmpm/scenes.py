@@ -6,6 +6,8 @@ from torch import Tensor
 from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VelocityRule, VonMises
 
 GRID = Grid(16)
+#: Of the solvers made here, unless a test says otherwise; some files run their tests once with each.
+BACKEND = "eager"
 FLOOR = VelocityRule("-y", j=(None, 4))
 
 
@@ -56,6 +58,7 @@ def robot(count: int, **changes: object) -> Solver:
         "bodies": (body,),
         "gravity": (0.5, -9.8),
         "rules": (VelocityRule("-y", j=(None, 6), friction=float("inf")),),
+        "backend": BACKEND,
     }
     return Solver(**(options | changes))
 

@@ -2,13 +2,14 @@
 
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
-from scenes import assert_close, lively, normal, robot, robot_and_ball
+from scenes import assert_close, assert_identical, lively, normal, robot, robot_and_ball
 from torch import Tensor
 
-from torchmpm import ParticleState, Solver
+from torchmpm import Body, ParticleState, Solver, VonMises, backends
 from torchmpm.backends import BACKENDS, compiler_found
 
 
@@ -36,22 +37,83 @@ def test_compiled_equals_eager() -> None:
         torch.testing.assert_close(one, other, rtol=0, atol=1e-10 * other.abs().max().item())
 
 
-def test_auto_is_eager() -> None:
+@pytest.fixture
+def fresh_warnings() -> None:
+    """A process that has not said anything yet."""
+    backends._warn_once.cache_clear()
+
+
+def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.message for record in caplog.records if record.name == "torchmpm.backends"]
+
+
+@pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+def test_auto_is_native_where_that_works(fresh_warnings: None, caplog: pytest.LogCaptureFixture) -> None:
     state = lively(30)
-    results = [robot(30, backend=backend).step(state, substeps=5) for backend in ("auto", "eager")]
-    assert torch.equal(results[0].x, results[1].x)
+    results = [robot(30, backend=backend).step(state, substeps=5) for backend in ("auto", "native")]
+    assert_identical(*results)
+    assert messages(caplog) == []
+
+
+class Own(VonMises):
+    """Somebody's material."""
+
+
+@pytest.mark.parametrize(
+    ("change", "dtype", "reason"),
+    [
+        ({"bodies": (Body(30, Own(500.0, 50.0, 60.0)),)}, torch.float64, "a body has Own"),
+        ({}, torch.bfloat16, "the state is torch.bfloat16"),
+    ],
+)
+def test_auto_is_eager_where_it_does_not(
+    fresh_warnings: None, caplog: pytest.LogCaptureFixture, change: dict, dtype: torch.dtype, reason: str
+) -> None:
+    """And says why, once."""
+    state = lively(30).to(dtype)
+    results = [robot(30, backend=b, **change).step(state, substeps=2) for b in ("auto", "eager", "auto")]
+    assert_identical(results[0], results[1])
+    (message,) = messages(caplog)
+    assert reason in message and "operator by operator" in message
+
+
+def test_auto_without_a_compiler(
+    fresh_warnings: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
+    state = lively(30)
+    results = [robot(30, backend=backend).step(state, substeps=2) for backend in ("auto", "eager")]
+    assert_identical(*results)
+    (message,) = messages(caplog)
+    assert "needs a C++ compiler (g++, clang++ or $CXX), found none" in message
+
+
+def test_auto_with_a_compiler_that_fails(
+    fresh_warnings: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("CXX", "false")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    state = lively(30)
+    results = [robot(30, backend=backend).step(state, substeps=2) for backend in ("auto", "eager")]
+    assert_identical(*results)
+    (message,) = messages(caplog)
+    assert "could not be built" in message and "failed with code 1" in message
 
 
 def test_unknown_backend() -> None:
-    with pytest.raises(ValueError, match=r"backend must be one of \('auto', 'eager', 'compile'\), got 'warp'"):
+    with pytest.raises(ValueError, match=r"backend must be one of \('auto', .*'native'\), got 'warp'"):
         robot(5, backend="warp")
-    assert BACKENDS == ("auto", "eager", "compile")
+    assert BACKENDS == ("auto", "eager", "compile", "native")
 
 
-def test_missing_compiler_is_said_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchmpm.solver.compiler_found", lambda: False)
-    with pytest.raises(ValueError, match=r"backend 'compile' needs a C\+\+ compiler .* found none: use 'eager'"):
-        robot(5, backend="compile")
+@pytest.mark.parametrize("backend", ["compile", "native"])
+def test_missing_compiler_is_said_at_once(monkeypatch: pytest.MonkeyPatch, backend: str) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
+    message = rf"backend '{backend}' needs a C\+\+ compiler .* found none: use 'eager'"
+    with pytest.raises(ValueError, match=message):
+        robot(5, backend=backend)
     robot(5, backend="eager")
 
 
@@ -62,6 +124,7 @@ def test_missing_compiler_is_said_at_once(monkeypatch: pytest.MonkeyPatch) -> No
         ({"clang++"}, None, True),
         (set(), None, False),
         ({"g++"}, "icpx", False),
+        ({"icpx"}, "icpx -pipe", True),
         ({"icpx"}, "icpx", True),
     ],
 )

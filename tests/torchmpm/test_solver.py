@@ -2,11 +2,12 @@
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import scenes
 import torch
 from scenes import (
     GRID,
@@ -22,8 +23,19 @@ from scenes import (
 from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VelocityRule, VonMises, diagnostics, fixed
+from torchmpm.backends import compiler_found
 
 R, H = GRID.resolution, GRID.h
+
+
+@pytest.fixture(scope="module", autouse=True, params=["eager", "native"])
+def backend(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Everything in this file holds for the plain substep and for the kernels."""
+    if request.param == "native" and not compiler_found():
+        pytest.skip("no C++ compiler")
+    scenes.BACKEND, before = request.param, scenes.BACKEND
+    yield request.param
+    scenes.BACKEND = before
 
 
 def field(batch: int = 1, size: float = 60.0, seed: int = 0) -> Tensor:
@@ -171,7 +183,7 @@ def test_one_particle() -> None:
     """Alone in the window it falls; in single precision too."""
     for dtype in (torch.float64, torch.float32):
         state = ParticleState.at_rest(torch.tensor([[[0.5, 0.6]]], dtype=dtype))
-        solver = Solver(GRID, (Body(1, Elastic(500.0, 50.0)),), gravity=(0.0, -10.0))
+        solver = Solver(GRID, (Body(1, Elastic(500.0, 50.0)),), gravity=(0.0, -10.0), backend=scenes.BACKEND)
         result = solver.step(state, substeps=100)
         assert result.v[0, 0].tolist() == pytest.approx([0.0, -0.1], rel=1e-4)
         assert result.x[0, 0].tolist() == pytest.approx([0.5, 0.6 - 0.5 * 10.0 * 0.01**2 * 1.01], rel=1e-5)
@@ -347,7 +359,7 @@ def test_angular_momentum_in_free_space(muscles: bool) -> None:
 
 def test_energy_of_an_elastic_body() -> None:
     """APIC may lose energy, an elastic body in free space gains none to speak of (1e-3 over 100 substeps)."""
-    solver = Solver(GRID, (Body(400, Elastic(300.0, 80.0), mass=2.0),))
+    solver = Solver(GRID, (Body(400, Elastic(300.0, 80.0), mass=2.0),), backend=scenes.BACKEND)
     state = lively(400, strain=0.03)
 
     def energy(state: ParticleState) -> float:

@@ -1,0 +1,172 @@
+"""The native kernels against the plain substep, in every material and batch."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from native_scenes import NAMES, moving, solvers
+from scenes import assert_close, assert_identical, lively, normal, robot
+
+from torchmpm import Body, Grid, ParticleState, Solver, VelocityRule, VonMises
+from torchmpm.backends import compiler_found
+
+pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+
+COUNT = 300
+
+
+def both(solver: Solver, *arguments: object, **options: object) -> tuple[ParticleState, ParticleState]:
+    """The final states of the native and of the eager backend."""
+    native, eager = (replace(solver, backend=name).step(*arguments, **options) for name in ("native", "eager"))
+    return native, eager
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.parametrize("name", NAMES)
+def test_equals_eager(name: str, batch: int) -> None:
+    """To 1e-10 over 100 substeps in double precision: particles leave the window, touch rules, flow, harden."""
+    state, field, origin = moving(COUNT, batch)
+    native, eager = both(solvers(COUNT, batch)[name], state, field, substeps=100, origin=origin)
+    assert_close(native, eager, 1e-10)
+    assert (eager.x - state.x).abs().max() > 0.003
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_single_precision(name: str) -> None:
+    """As near to double precision as the plain substep is in single precision, give or take a factor of three."""
+    state, field, origin = moving(COUNT, 2)
+    solver = solvers(COUNT, 2)[name]
+    exact = replace(solver, backend="eager").step(state, field, substeps=20, origin=origin)
+    native, eager = both(solver, state.to(torch.float32), field.float(), substeps=20, origin=origin.float())
+    assert native.dtype == torch.float32
+    for field_name in ("x", "v", "C", "F", "Jp"):
+        true = getattr(exact, field_name)
+        mine, plain = ((getattr(s, field_name).double() - true).norm() for s in (native, eager))
+        assert mine <= 3.0 * plain + 1e-6 * true.norm(), field_name
+
+
+@pytest.mark.parametrize(("batch", "count"), [(1, 1), (2, 1), (1, 63), (1, 64), (3, 65), (1, 2500), (2, 9000)])
+def test_sizes(batch: int, count: int) -> None:
+    """Around the sizes of blocks and of groups of blocks."""
+    state = lively(count, batch)
+    native, eager = both(robot(count), state, 40.0 * normal(batch, 2, 16, 16, seed=1), substeps=3)
+    assert_close(native, eager, 1e-12)
+
+
+def test_muscles_without_actuation_and_actuation_without_muscles() -> None:
+    state = lively(30)
+    assert_close(*both(robot(30), state, substeps=10), 1e-12)
+    passive = robot(30, bodies=(Body(30, VonMises(500.0, 50.0, 60.0)),))
+    assert_close(*both(passive, state, normal(1, 2, 16, 16, seed=1), substeps=10), 1e-12)
+
+
+def test_window_of_another_size_and_spacing() -> None:
+    solver = robot(50, grid=Grid(33, spacing=0.05, margin=0.01), rules=(VelocityRule("-y", j=(None, 10)),))
+    state = lively(50, corner=(0.9, 0.4))
+    assert_close(*both(solver, state, normal(1, 2, 33, 33, seed=1), substeps=20), 1e-11)
+
+
+def test_state_in_other_strides() -> None:
+    """Fields as users build them, not as planes."""
+    state, field, origin = moving(60, 2)
+    state = ParticleState(
+        *(getattr(state, name).transpose(0, 1).contiguous().transpose(0, 1) for name in "xvCF"), state.Jp
+    )
+    transposed = field.transpose(2, 3).contiguous().transpose(2, 3)
+    assert_close(*both(robot(60), state, transposed, substeps=5, origin=origin.T.contiguous().T), 1e-12)
+
+
+def test_no_substeps() -> None:
+    state = lively(20)
+    assert_identical(robot(20, backend="native").step(state, substeps=0), state)
+
+
+def test_all_outside_keep_everything() -> None:
+    state = lively(30, corner=(3.0, 0.4))
+    assert_identical(robot(30, backend="native").step(state, substeps=10), state)
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_threads_make_no_difference(batch: int) -> None:
+    """Bit by bit: sums are taken in one order, however many threads share them."""
+    state, field, origin = moving(2700, batch)
+    solver = replace(solvers(2700, batch)["three bodies"], backend="native")
+    before = torch.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 2, 2, 5):
+            torch.set_num_threads(threads)
+            results.append(solver.step(state, field, substeps=20, origin=origin))
+    finally:
+        torch.set_num_threads(before)
+    for result in results[1:]:
+        assert_identical(result, results[0])
+
+
+def test_an_element_of_a_batch_is_the_same_alone() -> None:
+    """Bit by bit."""
+    state, field, origin = moving(1500, 4)
+    solver = replace(solvers(1500, 4)["three bodies"], backend="native")
+    together = solver.step(state, field, substeps=20, origin=origin)
+    for i in range(4):
+        alone = solver.step(state[i], field[i : i + 1], substeps=20, origin=origin[i : i + 1])
+        assert_identical(alone, together[i])
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e30, -1e30])
+@pytest.mark.parametrize("name", ["x", "v", "C", "F", "Jp", "actuation", "origin"])
+def test_a_broken_element_harms_no_other(name: str, value: float) -> None:
+    """Not by a bit, wherever the number is; and it stays broken, it is not hidden."""
+    state, field, origin = moving(90, 3)
+    solver = replace(solvers(90, 3)["three bodies"], backend="native")
+    sound = solver.step(state, field, substeps=15, origin=origin)
+    given = {"actuation": field, "origin": origin} | {n: getattr(state, n) for n in ("x", "v", "C", "F", "Jp")}
+    broken = given[name].clone()
+    broken[1].view(-1)[:: 5 if name != "origin" else 1] = value
+    given[name] = broken
+    result = solver.step(
+        ParticleState(*(given[n] for n in ("x", "v", "C", "F", "Jp"))),
+        given["actuation"],
+        substeps=15,
+        origin=given["origin"],
+    )
+    for i in (0, 2):
+        assert_identical(result[i], sound[i])
+    if name in ("v", "C", "F") and abs(value) != 1e30:
+        assert not all(plane.isfinite().all() for plane in result[1].planes())
+
+
+def test_lower_end_of_the_window() -> None:
+    """There the weights are extrapolated, and nodes of negative mass arise: few substeps stay comparable."""
+    state = lively(200, 2, corner=(0.0, -0.1))
+    assert_close(*both(robot(200, rules=()), state, substeps=2), 1e-10)
+
+
+@pytest.mark.parametrize("y", [float("nan"), 1e30, -1e30, 1e9, -5.0, 5.0])
+def test_positions_no_address_exists_for(y: float) -> None:
+    """Above and below the window there is nothing: nodes that do not exist give velocity zero."""
+    state = lively(20)
+    x = state.x.clone()
+    x[:, 3, 1] = y
+    native, eager = both(robot(20, rules=()), replace(state, x=x), substeps=3)
+    others = [k for k in range(20) if k != 3]
+    torch.testing.assert_close(native.x[:, others], eager.x[:, others], rtol=0, atol=1e-13)
+    torch.testing.assert_close(
+        native.v[:, 3], torch.full_like(eager.v[:, 3], float("nan") if y != y else 0.0), equal_nan=True
+    )
+
+
+def test_unsupported_scenes_are_named() -> None:
+    class Own(VonMises):
+        """Somebody's material."""
+
+    body = Body(10, Own(500.0, 50.0, 60.0))
+    with pytest.raises(
+        ValueError, match="cannot run this: it knows the materials Elastic, VonMises, Soil, a body has Own"
+    ):
+        robot(10, bodies=(body,), backend="native").step(lively(10))
+    with pytest.raises(ValueError, match=r"it computes in float32 or float64, the state is torch\.float16"):
+        robot(10, backend="native").step(lively(10).to(torch.float16))
+    rules = (VelocityRule("-y"),) * 300
+    with pytest.raises(ValueError, match="at most 254 velocity rules, got 300"):
+        robot(10, rules=rules, backend="native").step(lively(10))

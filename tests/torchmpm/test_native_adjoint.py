@@ -1,0 +1,278 @@
+"""The hand-derived adjoint against automatic differentiation of the plain substep."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from native_scenes import NAMES, RULES, moving, solvers, values
+from scenes import lively, normal, robot
+from torch import Tensor
+
+from torchmpm import Body, Elastic, ParticleState, Soil, Solver, VonMises, trajectory
+from torchmpm.backends import compiler_found
+from torchmpm.native import ops
+
+pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+
+COUNT = 120
+STATE = ("x", "v", "C", "F", "Jp")
+Leaves = dict[str, Tensor]
+
+
+def state_leaves(count: int, batch: int) -> Leaves:
+    """State, actuation and origin of :func:`native_scenes.moving`."""
+    state, field, origin = moving(count, batch)
+    return {name: getattr(state, name) for name in STATE} | {"actuation": field, "origin": origin}
+
+
+def value_leaves(count: int, batch: int) -> Leaves:
+    """Every material value in one of the shapes that are accepted."""
+    part = count // 3
+    return {
+        "mu": 500.0 * values(batch, seed=1),
+        "lam": 50.0 * values(batch, part, seed=2),
+        "yield_stress": torch.tensor(60.0, dtype=torch.float64),
+        "mass": 2.0 * values(batch, part, seed=3),
+        "volume": values(batch, seed=4),
+        "soil_mu": 800.0 * values(batch, part, seed=5),
+        "soil_lam": torch.tensor(500.0, dtype=torch.float64),
+        "compression": 0.025 * values(batch, seed=6),
+        "stretch": 0.01 * values(1, part, seed=7),
+        "hardening": 10.0 * values(batch, seed=8),
+        "soil_mass": 1.5 * values(batch, seed=9),
+        "ball_mu": torch.tensor(300.0, dtype=torch.float64),
+        "ball_volume": 1.5 * values(batch, 1, seed=10),
+        "gravity": 9.0 * normal(batch, 2, seed=11),
+    }
+
+
+def varied(count: int, given: Leaves) -> Solver:
+    """Three bodies of the values of :func:`value_leaves`."""
+    part = count // 3
+    ground = Soil(
+        given["soil_mu"],
+        given["soil_lam"],
+        given["compression"],
+        given["stretch"],
+        given["hardening"],
+        (0.5, 2.0),
+        1e-3,
+    )
+    sheet = VonMises(given["mu"], given["lam"], given["yield_stress"])
+    bodies = (
+        Body(part, sheet, given["mass"], given["volume"], muscle=True),
+        Body(part, ground, given["soil_mass"]),
+        Body(part, Elastic(given["ball_mu"], 80.0), volume=given["ball_volume"]),
+    )
+    return robot(count, bodies=bodies, gravity=given["gravity"], rules=RULES[1:], damping=0.999)
+
+
+def loss(final: ParticleState) -> Tensor:
+    """A random combination of everything, brought to one size."""
+    sizes = {"x": 1.0, "v": 0.2, "C": 0.01, "F": 1.0, "Jp": 1.0}
+    fields = enumerate((getattr(final, name), size) for name, size in sizes.items())
+    return sum(size * (normal(*t.shape, seed=20 + k).to(t) * t).sum() for k, (t, size) in fields)
+
+
+def gradients(
+    solver: Callable[[Leaves], Solver], given: Leaves, wanted: tuple[str, ...], substeps: int, backend: str
+) -> Leaves:
+    """Derivatives of :func:`loss` in what is wanted."""
+    given = {name: value.detach().clone().requires_grad_(name in wanted) for name, value in given.items()}
+    start = ParticleState(*(given[name] for name in STATE))
+    run = replace(solver(given), backend=backend)
+    final = run.step(start, given["actuation"], substeps=substeps, origin=given["origin"])
+    found = torch.autograd.grad(loss(final), [given[name] for name in wanted], allow_unused=True)
+    return {n: torch.zeros_like(given[n]) if g is None else g for n, g in zip(wanted, found, strict=True)}
+
+
+def assert_gradients_close(found: Leaves, expected: Leaves, tolerance: float) -> None:
+    """Compare relative to the largest number of each."""
+    for name, value in expected.items():
+        error = (found[name] - value).abs().max().item() / max(value.abs().max().item(), 1e-12)
+        assert found[name].shape == value.shape
+        assert error <= tolerance, f"{name} differs by {error:.1e}"
+
+
+@pytest.mark.parametrize("substeps", [1, 25])
+@pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.parametrize("name", NAMES)
+def test_in_state_actuation_and_origin(name: str, batch: int, substeps: int) -> None:
+    given = state_leaves(COUNT, batch)
+    found, expected = (
+        gradients(lambda _: solvers(COUNT, batch)[name], given, tuple(given), substeps, backend)
+        for backend in ("native", "eager")
+    )
+    assert_gradients_close(found, expected, 1e-10)
+    assert expected["x"].abs().max() > 0
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+def test_in_values(batch: int) -> None:
+    given, wanted = state_leaves(COUNT, batch) | value_leaves(COUNT, batch), tuple(value_leaves(3, 1))
+    found, expected = (
+        gradients(lambda leaves: varied(COUNT, leaves), given, wanted, 25, backend) for backend in ("native", "eager")
+    )
+    assert_gradients_close(found, expected, 1e-9)
+    assert all(value.abs().max() > 0 for value in expected.values()), "every value must matter in this scene"
+
+
+@pytest.mark.parametrize("wanted", ["actuation", "mu", "gravity", "x", "origin"])
+def test_in_one_thing_alone(wanted: str) -> None:
+    given = state_leaves(60, 2) | value_leaves(60, 2)
+    found, expected = (
+        gradients(lambda leaves: varied(60, leaves), given, (wanted,), 5, backend) for backend in ("native", "eager")
+    )
+    assert_gradients_close(found, expected, 1e-10)
+
+
+def test_value_of_one_simulation_shared_by_many() -> None:
+    """Numbers of shape (1, N) and () belong to the whole batch."""
+    given = state_leaves(30, 3) | {"mu": 500.0 * values(1, 30, seed=1), "gravity": torch.tensor([0.5, -9.0]).double()}
+
+    def solver(leaves: Leaves) -> Solver:
+        return robot(30, bodies=(Body(30, Elastic(leaves["mu"], 50.0)),), gravity=leaves["gravity"])
+
+    found, expected = (gradients(solver, given, ("mu", "gravity"), 5, backend) for backend in ("native", "eager"))
+    assert_gradients_close(found, expected, 1e-10)
+
+
+@pytest.mark.parametrize("name", ["von Mises", "elastic"])
+def test_single_precision(name: str) -> None:
+    given = state_leaves(COUNT, 2)
+    wanted = ("x", "v", "C", "F", "actuation")
+    double = gradients(lambda _: solvers(COUNT, 2)[name], given, wanted, 20, "eager")
+    single = {key: value.float() for key, value in given.items()}
+    found = gradients(lambda _: solvers(COUNT, 2)[name], single, wanted, 20, "native")
+    assert_gradients_close({n: v.double() for n, v in found.items()}, double, 2e-3)
+
+
+def test_corners_have_the_derivatives_of_the_plain_substep() -> None:
+    """F = I, F = 0, rotations, det F = 0, mirrored; at rest, and at the bounds of soil."""
+    F = torch.eye(2, dtype=torch.float64).repeat(1, 12, 1, 1)
+    F[0, 1], F[0, 2], F[0, 3] = 0.0, torch.tensor([[0.0, -1.0], [1.0, 0.0]]), torch.tensor([[1.0, 0.0], [0.0, -1.0]])
+    F[0, 4], F[0, 5] = torch.tensor([[1.0, 0.0], [0.0, 0.0]]), torch.tensor([[1.0, 1e-7], [0.0, 1.0]])
+    F[0, 6], F[0, 7] = 0.975 * F[0, 6], 1.0045 * F[0, 7]
+    state = replace(ParticleState.at_rest(lively(12).x), F=F)
+    given = {name: getattr(state, name) for name in STATE}
+    given |= {"actuation": torch.zeros(1, 2, 16, 16).double(), "origin": torch.zeros(1, 2).double()}
+    for material in (Elastic(300.0, 80.0), VonMises(500.0, 50.0, 60.0), Soil(800.0, 500.0)):
+        body = Body(12, material, muscle=True)
+        found, expected = (
+            gradients(lambda _, b=body: robot(12, bodies=(b,)), given, ("x", "v", "C", "F", "Jp"), 1, backend)
+            for backend in ("native", "eager")
+        )
+        assert all(value.isfinite().all() for value in found.values())
+        assert_gradients_close(found, expected, 1e-10)
+
+
+def test_all_outside_pass_their_gradient_through() -> None:
+    given = state_leaves(30, 2)
+    given["x"] = given["x"] + torch.tensor([5.0, 0.0])
+    found = gradients(lambda _: robot(30), given, ("x", "v", "F", "actuation"), 10, "native")
+    expected = gradients(lambda _: robot(30), given, ("x", "v", "F", "actuation"), 10, "eager")
+    for name, value in expected.items():
+        assert torch.equal(found[name], value)
+
+
+def test_threads_and_batch_make_no_difference() -> None:
+    """Bit by bit, as forward."""
+    given = state_leaves(2700, 3)
+    wanted = ("x", "F", "actuation", "origin")
+    before = torch.get_num_threads()
+    try:
+        results = []
+        for threads in (1, 2, 2, 5):
+            torch.set_num_threads(threads)
+            results.append(gradients(lambda _: solvers(2700, 3)["three bodies"], given, wanted, 8, "native"))
+    finally:
+        torch.set_num_threads(before)
+    for result in results[1:]:
+        assert all(torch.equal(result[name], results[0][name]) for name in wanted)
+
+
+@pytest.mark.parametrize("name", ["x", "v", "F", "actuation"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30])
+def test_a_broken_element_harms_no_other(name: str, value: float) -> None:
+    given = state_leaves(90, 3)
+    wanted = (*STATE, "actuation")
+
+    def run(leaves: Leaves) -> Leaves:
+        leaves = {n: v.detach().clone().requires_grad_(n in wanted) for n, v in leaves.items()}
+        start = ParticleState(*(leaves[n] for n in STATE))
+        solver = replace(solvers(90, 3)["three bodies"], backend="native")
+        final = solver.step(start, leaves["actuation"], substeps=10, origin=leaves["origin"])
+        weights = [normal(*getattr(final, n).shape[1:], seed=k) for k, n in enumerate(STATE)]
+        total = sum((getattr(final, n)[i] * w).sum() for i in (0, 2) for n, w in zip(STATE, weights, strict=True))
+        return dict(zip(wanted, torch.autograd.grad(total, [leaves[n] for n in wanted]), strict=True))
+
+    sound = run(given)
+    broken = given[name].clone()
+    broken[1].view(-1)[::5] = value
+    found = run(given | {name: broken})
+    for key in wanted:
+        assert torch.equal(found[key][[0, 2]], sound[key][[0, 2]]), key
+
+
+def test_checkpoints_of_a_trajectory() -> None:
+    """Steps nest in torchmpm.trajectory like those of the plain substep."""
+    state = lively(30)
+    fields = [(60.0 * normal(1, 2, 16, 16, seed=k)).requires_grad_() for k in range(3)]
+    results = []
+    for backend, checkpointed in (("eager", False), ("native", False), ("native", True)):
+        solver = robot(30, backend=backend)
+        final, _ = trajectory(
+            lambda s, a, solver=solver: solver.step(s, a, substeps=4),
+            state,
+            fields,
+            observe=lambda s: None,
+            checkpointed=checkpointed,
+        )
+        results.append(torch.autograd.grad(loss(final), fields))
+    for result in results[1:]:
+        for one, other in zip(result, results[0], strict=True):
+            torch.testing.assert_close(one, other, rtol=0, atol=1e-12 * other.abs().max().item())
+
+
+def test_second_derivatives_are_refused() -> None:
+    v = lively(10).v.clone().requires_grad_()
+    final = robot(10, backend="native").step(replace(lively(10), v=v), substeps=2)
+    (first,) = torch.autograd.grad(final.x.square().sum(), v, create_graph=True)
+    with pytest.raises(RuntimeError, match="backend 'native' has no second derivatives: use backend 'eager'"):
+        torch.autograd.grad(first.sum(), v)
+
+
+def test_no_graph_without_gradients() -> None:
+    state = replace(lively(10), v=torch.ones(1, 10, 2, dtype=torch.float64, requires_grad=True))
+    solver = robot(10, backend="native")
+    with torch.no_grad():
+        assert not solver.step(state, substeps=4).x.requires_grad
+    assert solver.step(state, substeps=4).x.requires_grad
+
+
+def operator_arguments() -> tuple[object, ...]:
+    """Arguments of the operator as Solver.step passes them."""
+    seen = []
+
+    def record(*arguments: object) -> Tensor:
+        seen.append(arguments)
+        return ops.native_step(*arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("torchmpm.native.ops", type("Recorder", (), {"native_step": staticmethod(record)}))
+        state, field, origin = moving(30, 2)
+        solver = replace(solvers(30, 2)["tensor values"], backend="native")
+        solver.step(state, field, substeps=2, origin=origin)
+    (arguments,) = seen
+    return arguments
+
+
+def test_operator_keeps_the_rules_of_torch() -> None:
+    """Schema, fake tensors, and autograd, as torch.library.opcheck knows them."""
+    arguments = [
+        a.clone().requires_grad_() if isinstance(a, Tensor) and k in (0, 1, 4) else a
+        for k, a in enumerate(operator_arguments())
+    ]
+    tests = ("test_schema", "test_autograd_registration", "test_faketensor")
+    torch.library.opcheck(ops.native_step, tuple(arguments), test_utils=tests)

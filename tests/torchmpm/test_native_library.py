@@ -1,0 +1,119 @@
+"""Compiling the kernels: once per machine, safely, and with clear words where it cannot be done."""
+
+import ctypes
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from scenes import lively, robot
+
+from torchmpm.backends import compiler_found
+from torchmpm.native import library
+
+
+@pytest.fixture(autouse=True)
+def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    """An empty cache, and a process that has not loaded anything."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    library._load.cache_clear()
+    yield
+    library._load.cache_clear()
+
+
+def script(tmp_path: Path, body: str) -> str:
+    """A stand-in for a compiler that counts its runs and then does ``body``; ``$last`` is where its output belongs."""
+    path = tmp_path / "c++"
+    path.write_text(f'#!/bin/sh\necho run >> "{tmp_path}/runs"\nfor last; do :; done\n{body}\n')
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return str(path)
+
+
+def runs(tmp_path: Path) -> int:
+    """How often the stand-in was called."""
+    log = tmp_path / "runs"
+    return len(log.read_text().splitlines()) if log.exists() else 0
+
+
+@pytest.fixture
+def quick_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A compiler that hands out some shared library that exists anyway."""
+    monkeypatch.setenv("CXX", script(tmp_path, f'cp "{torch._C.__file__}" "$last"'))
+
+
+def test_no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
+    assert not compiler_found()
+    message = r"backend 'native' needs a C\+\+ compiler \(g\+\+, clang\+\+ or \$CXX\), found none: use 'eager'"
+    with pytest.raises(ValueError, match=message):
+        robot(5, backend="native")
+    with pytest.raises(ValueError, match=message):
+        library.load("float")
+
+
+def test_failing_compiler_is_quoted_and_not_asked_twice(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("CXX", script(tmp_path, "echo 'no room on device' >&2; exit 3"))
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"(?s)could not be built: .*failed with code 3:\nno room on device"):
+            robot(5, backend="native").step(lively(5))
+    assert runs(tmp_path) == 1
+    assert list((tmp_path / "cache").rglob("*.so")) == []
+
+
+def test_result_that_does_not_load(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("CXX", script(tmp_path, 'echo rubbish > "$last"'))
+    with pytest.raises(ValueError, match="could not be built: the compiled library does not load"):
+        library.load("float")
+
+
+def test_kept_on_disk(quick_compiler: None, tmp_path: Path) -> None:
+    first = library.load("float")
+    assert library.load("float") is first
+    library._load.cache_clear()  # as in the next process
+    assert isinstance(library.load("float"), ctypes.CDLL)
+    assert runs(tmp_path) == 1
+    library.load("double")
+    assert runs(tmp_path) == 2
+    files = list((tmp_path / "cache" / "torchmpm").iterdir())
+    assert len(files) == 2 and all(file.suffix == ".so" for file in files)
+
+
+def test_damaged_file_is_replaced(quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    library.load("float")
+    (file,) = (tmp_path / "cache" / "torchmpm").iterdir()
+    damaged = tmp_path / "other" / "torchmpm" / file.name
+    damaged.parent.mkdir(parents=True)
+    damaged.write_bytes(b"half a library")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
+    library.load("float")
+    assert runs(tmp_path) == 2
+    assert damaged.read_bytes() == file.read_bytes()
+
+
+def test_another_source_is_another_file(quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    library.load("float")
+    for name, value in (("_processor", lambda: "another processor"), ("_FLAGS", ("-O0",))):
+        monkeypatch.setattr(library, name, value)
+        library._load.cache_clear()
+        library.load("float")
+    assert runs(tmp_path) == 3
+    assert len(list((tmp_path / "cache" / "torchmpm").iterdir())) == 3
+
+
+def test_folder_that_cannot_be_written(quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Then each process compiles for itself and leaves nothing behind."""
+    (tmp_path / "cache").write_text("a file where the folder should be")
+    assert isinstance(library.load("float"), ctypes.CDLL)
+    library._load.cache_clear()
+    library.load("float")
+    assert runs(tmp_path) == 2
+
+
+@pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+def test_compiler_with_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
+    command = library.find_compiler()
+    assert command is not None
+    monkeypatch.setenv("CXX", f"{command[0]} -pipe")
+    assert library.find_compiler() == (command[0], "-pipe")

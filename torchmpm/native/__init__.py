@@ -1,0 +1,72 @@
+"""The substep as fused C++ kernels on the CPU, compiled on first use.
+
+``library`` compiles and loads them, ``pack`` brings a solver into the tables they read, ``ops`` makes them operators of
+torch. The kernels, in the order in which they build on each other: ``simd``, ``linalg``, ``material``, ``scene``,
+``transfer``, ``grid``, ``team``, ``workspace``, ``step``, ``native.cpp``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchmpm.boundary import node_shift
+from torchmpm.native import ops, pack
+from torchmpm.native.pack import unsupported
+from torchmpm.state import ParticleState
+
+if TYPE_CHECKING:
+    from torchmpm.solver import Solver
+
+__all__ = ["load", "step", "unsupported"]
+
+
+def load(dtype: torch.dtype) -> None:
+    """Compile and load the kernels for a dtype, unless that has been done.
+
+    Raises:
+        ValueError: There is no compiler, or it failed.
+    """
+    ops.library_for(dtype)
+
+
+def step(
+    solver: Solver,
+    state: ParticleState,
+    actuation: Tensor | None,
+    origin: Tensor,
+    substeps: int,
+    *,
+    mass_epsilon: float,
+) -> ParticleState:
+    """Advance a state whose arguments were checked; see :meth:`torchmpm.Solver.step`.
+
+    Args:
+        solver: The solver.
+        state: Where the particles are.
+        actuation: (B, 2, G, G) or ``None``.
+        origin: (B, 2).
+        substeps: Number of substeps, not negative.
+        mass_epsilon: Added to the mass of a node before the division, kg.
+
+    Raises:
+        ValueError: There is no compiler, or it failed.
+    """
+    if substeps == 0:
+        return state
+    origin = origin.contiguous()
+    table, widths = pack.values(solver, state.Jp)
+    gravity = torch.as_tensor(solver.gravity, dtype=state.dtype).expand(state.batch_size, 2).contiguous()
+    planes = ops.native_step(
+        torch.stack(state.planes()),
+        None if actuation is None else actuation.contiguous(),
+        origin,
+        gravity,
+        table,
+        node_shift(solver.grid, origin),
+        pack.description(solver, widths, mass_epsilon),
+        substeps,
+    )
+    return ParticleState.from_stack(planes)

@@ -1,0 +1,118 @@
+// The middle of a substep: from sums on the nodes to velocities, with gravity, damping and the velocity rules.
+#pragma once
+#include "transfer.hpp"
+
+// Which rule holds on each node: one byte per slot, 0 for none, else its index plus one.
+struct RuleTable {
+    uint32_t* code;
+
+    void build(const Scene& scene, const int64_t* shift) {
+        const int width = scene.width;
+        std::fill_n(code, width * width, 0u);
+        for (size_t r = 0; r < scene.rules.size(); ++r) {
+            const Rule& rule = scene.rules[r];
+            int range[2][2];
+            for (int axis = 0; axis < 2; ++axis) {
+                const double offset = PAD - (rule.world ? double(shift[axis]) : 0.0);
+                range[axis][0] = int(std::min(std::max(rule.range[axis][0] + offset, 0.0), double(width)));
+                range[axis][1] = int(std::min(std::max(rule.range[axis][1] + offset, -1.0), double(width - 1)));
+            }
+            const int bit = 8 * rule.slot;
+            for (int i = range[0][0]; i <= range[0][1]; ++i)
+                for (int j = range[1][0]; j <= range[1][1]; ++j) {
+                    uint32_t& c = code[i * width + j];
+                    if (!(c >> bit & 255)) c |= uint32_t(r + 1) << bit;
+                }
+        }
+    }
+};
+
+// Velocity of one node under one rule.
+INLINE void constrain(const Rule& rule, Real (&v)[2]) {
+    Real &normal = v[rule.axis], &tangent = v[1 - rule.axis];
+    if (!(rule.sign > 0 ? normal > 0 : normal < 0)) return;
+    if (std::isinf(rule.friction))
+        tangent = 0;
+    else if (rule.friction != 0)
+        tangent = std::copysign(at_least(std::abs(tangent) - rule.friction * std::abs(normal), 0), tangent);
+    normal = 0;
+}
+
+INLINE void constrain(const Scene& scene, uint32_t code, Real (&v)[2]) {
+    for (; code; code >>= 8)
+        if (code & 255) constrain(scene.rules[(code & 255) - 1], v);
+}
+
+// One thread's share of the rows of a box.
+struct Rows {
+    int begin, end;
+
+    Rows(const Box& box, int rank, int team) {
+        const int count = box.empty() ? 0 : box.i1 - box.i0 + 1;
+        begin = box.i0 + count * rank / team, end = box.i0 + count * (rank + 1) / team;
+    }
+};
+
+// The nodes of one row on which someone may ask for a velocity, and those of them that exist.
+struct Span {
+    int begin, end, inner_begin, inner_end;  // end is one past the last
+
+    Span(const Scene& scene, const Box& box, int i) : begin(box.j0), end(box.j1 + 1) {
+        const bool exists = i >= PAD && i < PAD + scene.resolution;
+        inner_begin = exists ? std::min(std::max(begin, PAD), end) : end;
+        inner_end = exists ? std::max(std::min(end, PAD + scene.resolution), inner_begin) : end;
+    }
+};
+
+// Add up the parts of row i into `total` (four numbers a node, from node box.j0), and clear them for the next substep.
+INLINE void collect(Sums* sums, int parts, const Box& box, int i, int width, Real* total) {
+    std::fill_n(total, 4 * (box.j1 - box.j0 + 1), Real(0));
+    for (int part = 0; part < parts; ++part) {
+        const Box& own = sums[part].box;
+        if (i < own.i0 || i > own.i1) continue;
+        Real* from = sums[part].nodes + 4 * (i * width + own.j0);
+        Real* to = total + 4 * (own.j0 - box.j0);
+        const int count = 4 * (own.j1 - own.j0 + 1);
+        for (int k = 0; k < count; ++k) to[k] += from[k], from[k] = 0;
+    }
+}
+
+// What the adjoint wants to know of a row of nodes, from the first of its box: velocity before gravity, and one over the
+// mass.
+struct Record {
+    Real *velocity = nullptr, *inverse_mass = nullptr;
+};
+
+// Velocities of row i from the collected mass and momentum.
+INLINE void node_velocities(const Scene& scene, const Real* gravity, const RuleTable& rules, const Box& box, int i,
+                            const Real* total, Real* velocity, Record record) {
+    const Span span(scene, box, i);
+    const Real gx = scene.dt * gravity[0], gy = scene.dt * gravity[1], damping = scene.damping;
+    const Real epsilon = scene.mass_epsilon;
+    Real* out = velocity + 2 * i * scene.width;
+    for (int j = span.begin; j < span.inner_begin; ++j) out[2 * j] = out[2 * j + 1] = 0;
+    for (int j = span.inner_end; j < span.end; ++j) out[2 * j] = out[2 * j + 1] = 0;
+    const Real* in = total - 4 * span.begin;
+#pragma omp simd
+    for (int j = span.inner_begin; j < span.inner_end; ++j) {
+        const Real inverse = 1 / (in[4 * j + 2] + epsilon);
+        out[2 * j] = (in[4 * j] * inverse + gx) * damping;
+        out[2 * j + 1] = (in[4 * j + 1] * inverse + gy) * damping;
+    }
+    if (record.velocity) {
+        Real *raw = record.velocity - 2 * span.begin, *inverse_mass = record.inverse_mass - span.begin;
+#pragma omp simd
+        for (int j = span.inner_begin; j < span.inner_end; ++j) {
+            const Real inverse = 1 / (in[4 * j + 2] + epsilon);
+            inverse_mass[j] = inverse;
+            raw[2 * j] = in[4 * j] * inverse, raw[2 * j + 1] = in[4 * j + 1] * inverse;
+        }
+    }
+    const uint32_t* code = rules.code + i * scene.width;
+    for (int j = span.inner_begin; j < span.inner_end; ++j)
+        if (code[j]) {
+            Real v[2] = {out[2 * j], out[2 * j + 1]};
+            constrain(scene, code[j], v);
+            out[2 * j] = v[0], out[2 * j + 1] = v[1];
+        }
+}

@@ -1,0 +1,138 @@
+"""Compiles the kernels on first use, keeps them on disk, and loads them."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import logging
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+_SOURCES = Path(__file__).parent
+#: Not -ffast-math: it lets compilers assume that there is no NaN.
+_FLAGS = (
+    "-std=c++17",
+    "-O3",
+    "-march=native",
+    "-ffp-contract=fast",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fopenmp-simd",
+    "-fPIC",
+    "-shared",
+    "-pthread",
+)
+_X86_FLAGS = ("-mprefer-vector-width=512",)
+#: What a user reads behind the name of the backend.
+NO_COMPILER = "needs a C++ compiler (g++, clang++ or $CXX), found none: use 'eager'"
+_logger = logging.getLogger(__name__)
+
+
+class Call(ctypes.Structure):
+    """The arguments of one call, as ``struct Call`` in ``scene.hpp``: four numbers, then addresses."""
+
+    _NUMBERS = ("batch", "particles", "substeps", "threads")
+    _INPUTS = ("description", "planes", "field", "origin", "shift", "gravity", "values")
+    _SIZES = ("values_batch", "columns")
+    _OUTPUTS = ("result", "result_bar", "planes_bar", "field_bar", "origin_bar", "gravity_bar", "values_bar")
+    _fields_ = [
+        *((name, ctypes.c_int64) for name in _NUMBERS),
+        *((name, ctypes.c_void_p) for name in _INPUTS),
+        *((name, ctypes.c_int64) for name in _SIZES),
+        *((name, ctypes.c_void_p) for name in _OUTPUTS),
+    ]
+
+
+def find_compiler() -> tuple[str, ...] | None:
+    """The C++ compiler as a command: ``$CXX`` or else g++, and clang++ where that is not installed."""
+    for command in (os.environ.get("CXX") or "g++", "clang++"):
+        words = tuple(shlex.split(command))
+        if words and shutil.which(words[0]) is not None:
+            return words
+    return None
+
+
+def cache_folder() -> str:
+    """Where compiled kernels are kept: ``$XDG_CACHE_HOME/torchmpm``, by default ``~/.cache/torchmpm``."""
+    return os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "torchmpm")
+
+
+def load(real: str) -> ctypes.CDLL:
+    """The compiled kernels for one scalar type.
+
+    The first call on a machine compiles them, which takes some seconds; later processes find them in
+    :func:`cache_folder`. Where that cannot be written each process compiles its own.
+
+    Args:
+        real: ``"float"`` or ``"double"``.
+
+    Raises:
+        ValueError: There is no compiler, or it failed; the message holds what it said.
+    """
+    # All that decides what is loaded; the search itself would cost more than a substep.
+    loaded = _load(real, cache_folder(), os.environ.get("CXX"), os.environ.get("PATH"))
+    if isinstance(loaded, str):
+        raise ValueError(f"backend 'native' {loaded}")
+    return loaded
+
+
+@functools.cache
+def _load(real: str, folder: str, *_: str | None) -> ctypes.CDLL | str:
+    """Find or build the library; a failure comes back as text, so that it is not tried again in this process."""
+    compiler = find_compiler()
+    if compiler is None:
+        return NO_COMPILER
+    flags = [*_FLAGS, *(_X86_FLAGS if platform.machine() in ("x86_64", "AMD64") else ()), f"-DTORCHMPM_REAL={real}"]
+    command = [*compiler, *flags, str(_SOURCES / "native.cpp"), "-o"]
+    path = Path(folder) / f"native-{_key(command)}.so"
+    try:
+        return ctypes.CDLL(str(path))
+    except OSError:
+        pass  # not there yet, or damaged
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        scratch = tempfile.TemporaryDirectory(dir=path.parent)
+    except OSError as error:
+        _logger.info("compiled kernels cannot be kept in %s (%s)", folder, error)
+        path, scratch = Path(), tempfile.TemporaryDirectory()
+    with scratch:
+        fresh = Path(scratch.name) / "native.so"
+        _logger.info("compiling kernels for %s with %s", real, compiler[0])
+        done = subprocess.run([*command, str(fresh)], capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            return (
+                f"could not be built: {shlex.join(command)} failed with code {done.returncode}:\n{done.stderr[-4000:]}"
+            )
+        if path.name:
+            os.replace(fresh, path)  # in one piece, whoever else builds at the same time
+            fresh = path
+        try:
+            return ctypes.CDLL(str(fresh))
+        except OSError as error:
+            return f"could not be built: the compiled library does not load: {error}"
+
+
+def _key(command: list[str]) -> str:
+    """Changes with the sources, the command, the compiler itself, and the processor it compiles for."""
+    compiler = Path(shutil.which(command[0]) or command[0])
+    facts = [*command[:-2], f"{compiler.resolve()} {compiler.stat().st_mtime_ns}", _processor()]
+    digest = hashlib.sha256("\n".join(facts).encode())
+    for source in sorted((*_SOURCES.glob("*.hpp"), *_SOURCES.glob("*.cpp"))):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:24]
+
+
+def _processor() -> str:
+    """Model and instruction sets, because kernels compiled for one processor may not run on another."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return f"{platform.machine()} {platform.processor()}"
+    facts = {line.partition(":")[0].strip(): line for line in reversed(lines)}
+    return "\n".join(facts.get(name, "") for name in ("model name", "flags", "Features"))

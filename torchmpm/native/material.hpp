@@ -1,0 +1,102 @@
+// Return maps and stresses, see torchmpm/material.py for the formulas and their sources.
+#pragma once
+#include "linalg.hpp"
+
+enum class Kind : int { elastic = 0, von_mises = 1, soil = 2 };
+
+// One column of the table of values. `factor` is -dt V 4/h^2; `slope2` the square of difference over sum of the stretches
+// at yield, `ratio` their ratio, `plus` and `minus` sum and difference of its square root and the inverse. Soil has its
+// own meaning for three of these.
+struct Values {
+    Real mass, factor, mu2, lam, slope2, ratio, plus, minus;
+
+    INLINE Real& low() { return slope2; }
+    INLINE Real& high() { return ratio; }
+    INLINE Real& hardening() { return plus; }
+    INLINE Real low() const { return slope2; }
+    INLINE Real high() const { return ratio; }
+    INLINE Real hardening() const { return plus; }
+};
+constexpr int VALUES = 8;
+constexpr Real LARGEST_JP = Real(1e30);  // as in material.py
+
+// Column k of a block whose particles have their own values, or the only column.
+template <bool varying> INLINE Values values_at(const Real* table, int k) {
+    const Real* t = table + k;
+    const int stride = varying ? LANES : 1;
+    return {t[0],          t[stride],     t[2 * stride], t[3 * stride],
+            t[4 * stride], t[5 * stride], t[6 * stride], t[7 * stride]};
+}
+
+struct Bounds {
+    Real hardening_low, hardening_high, shear_cutoff, stretch_floor;
+};
+
+struct Sym2 {
+    Real xx, xy, yy;
+};
+
+// Each takes the trial deformation to the returned one in place and gives the direction of R, which both share.
+INLINE Direction elastic_return(const Mat2& F) { return direction(split(F)); }
+
+INLINE Direction von_mises_return(const Values& m, Bounds bounds, Mat2& F) {
+    const Parts v = split(F);
+    const Direction R = direction(v);
+    const Real large = square(v.m1) + square(v.m2), small = square(v.n1) + square(v.n2);
+    const bool beyond = small > m.slope2 * large;
+    const Real total = beyond ? R.total : Real(1), difference = std::sqrt(beyond ? small : Real(0.25));
+    const Real major = at_least(Real(0.5) * (total + difference), bounds.stretch_floor);
+    const Real minor = at_least(Real(0.5) * (total - difference), bounds.stretch_floor);
+    const bool yields = beyond & (major > minor * m.ratio);
+    const Real mean = Real(0.5) * std::sqrt(major * minor);
+    const Real grow_total = mean * m.plus, grow_difference = mean * (m.minus / difference);
+    const Mat2 returned = join(
+        {grow_total * R.cos, grow_total * R.sin, grow_difference * v.n1, grow_difference * v.n2, v.proper});
+    F = select(yields, returned, F);
+    return R;
+}
+
+INLINE Real clamped(Real s, Real low, Real high) { return s < low ? low : (s > high ? high : s); }
+
+INLINE Direction soil_return(const Values& m, Bounds bounds, Mat2& F, Real& Jp) {
+    const Real low = m.low(), high = m.high();
+    const Parts v = split(F);
+    const Direction R = direction(v);
+    const Real along = v.n1 * R.cos + v.n2 * R.sin;
+    const bool drop = std::abs(v.n2 * R.cos - v.n1 * R.sin) < 2 * bounds.shear_cutoff;
+    const Real n1 = drop ? along * R.cos : v.n1, n2 = drop ? along * R.sin : v.n2;
+    const Real square2 = square(n1) + square(n2);
+    const bool round = square2 == 0;
+    const Real root = std::sqrt(round ? Real(1) : square2), difference = round ? Real(0) : root;
+    const Real first = Real(0.5) * (R.total + difference), second = Real(0.5) * (R.total - difference);
+    const Real major = clamped(first, low, high), minor = clamped(second, low, high);
+    const Real kept = (first >= low) & (first <= high) ? Real(1) : Real(0);
+    const Real ratio = Real(0.5) * (round ? kept : (major - minor) / root), sum = Real(0.5) * (major + minor);
+    F = join({sum * R.cos, sum * R.sin, ratio * n1, ratio * n2, v.proper});
+    const Real grown = Jp * (first * second / (major * minor));
+    Jp = grown > LARGEST_JP ? LARGEST_JP : grown;
+    return R;
+}
+
+template <Kind kind> INLINE Direction return_map(const Values& m, Bounds bounds, Mat2& F, Real& Jp) {
+    if (kind == Kind::von_mises) return von_mises_return(m, bounds, F);
+    if (kind == Kind::soil) return soil_return(m, bounds, F, Jp);
+    return elastic_return(F);
+}
+
+// Factor on the elastic constants; Jp is that of before the return map.
+template <Kind kind> INLINE Real hardened(const Values& m, Bounds bounds, Real Jp) {
+    if (kind != Kind::soil) return 1;
+    return clamped(exponential(m.hardening() * (1 - Jp)), bounds.hardening_low, bounds.hardening_high);
+}
+
+// Kirchhoff stress of the fixed corotated solid plus the muscles' F diag(pull) F^T.
+template <Kind kind> INLINE Sym2 stress(const Values& m, Real hard, Mat2 F, Direction R, Real pull_x, Real pull_y) {
+    const Mat2 D = F + Real(-1) * orthogonal(R);
+    const Real J = kind == Kind::soil ? std::abs(det(F)) : det(F);
+    const Real pressure = hard * m.lam * (J * (J - 1)), mu2 = hard * m.mu2;
+    const Real xx = mu2 * (D.a * F.a + D.b * F.b) + pressure + pull_x * F.a * F.a + pull_y * F.b * F.b;
+    const Real xy = mu2 * (D.a * F.c + D.b * F.d) + pull_x * F.a * F.c + pull_y * F.b * F.d;
+    const Real yy = mu2 * (D.c * F.c + D.d * F.d) + pressure + pull_x * F.c * F.c + pull_y * F.d * F.d;
+    return {xx, xy, yy};
+}

@@ -1,0 +1,151 @@
+// Adjoints of material.hpp. Names with `bar` are derivatives of a loss. At corners the derivative is that of the side which
+// automatic differentiation of torchmpm/material.py takes.
+#pragma once
+#include "material.hpp"
+
+// Derivatives in the material values, the muscles, the hardening factor, and the direction R.
+struct MaterialBar {
+    Values values;
+    Real pull_x, pull_y, hard;
+    DirectionBar R;
+};
+
+// From the derivative in the Kirchhoff stress to those in the returned F (added to F_bar) and in all else.
+template <Kind kind>
+INLINE void stress_adjoint(const Values& m, Real hard, Mat2 F, Direction R, Real pull_x, Real pull_y, Sym2 bar,
+                           Mat2& F_bar, MaterialBar& out) {
+    const Mat2 D = F + Real(-1) * orthogonal(R);
+    const Real mu2 = hard * m.mu2, xx = bar.xx, xy = bar.xy, yy = bar.yy;
+    const Mat2 D_bar{mu2 * (xx * F.a + xy * F.c), mu2 * (xx * F.b + xy * F.d), mu2 * yy * F.c, mu2 * yy * F.d};
+    const Parts R_bar = split(D_bar, R.proper);
+    out.R = {0, -R_bar.m1, -R_bar.m2};
+
+    const Real signed_J = det(F), J = kind == Kind::soil ? std::abs(signed_J) : signed_J;
+    const Real J_bar = (xx + yy) * hard * m.lam * (2 * J - 1);
+    const Real side = kind != Kind::soil ? Real(1) : signed_J > 0 ? Real(1) : signed_J < 0 ? Real(-1) : Real(0);
+    const Real area = side * J_bar;
+
+    const Real pull_xa = pull_x * F.a, pull_xc = pull_x * F.c, pull_yb = pull_y * F.b, pull_yd = pull_y * F.d;
+    F_bar.a += D_bar.a + mu2 * xx * D.a + area * F.d + 2 * xx * pull_xa + xy * pull_xc;
+    F_bar.b += D_bar.b + mu2 * xx * D.b - area * F.c + 2 * xx * pull_yb + xy * pull_yd;
+    F_bar.c += D_bar.c + mu2 * (xy * D.a + yy * D.c) - area * F.b + xy * pull_xa + 2 * yy * pull_xc;
+    F_bar.d += D_bar.d + mu2 * (xy * D.b + yy * D.d) + area * F.a + xy * pull_yb + 2 * yy * pull_yd;
+    out.pull_x = xx * F.a * F.a + xy * F.a * F.c + yy * F.c * F.c;
+    out.pull_y = xx * F.b * F.b + xy * F.b * F.d + yy * F.d * F.d;
+
+    const Real of_mu2 = xx * (D.a * F.a + D.b * F.b) + xy * (D.a * F.c + D.b * F.d) + yy * (D.c * F.c + D.d * F.d);
+    const Real of_lam = (xx + yy) * (J * (J - 1));
+    out.values.mu2 = hard * of_mu2, out.values.lam = hard * of_lam;
+    out.hard = m.mu2 * of_mu2 + m.lam * of_lam;
+}
+
+// Derivative in Jp through the hardening factor; that in the exponent goes to the values.
+template <Kind kind> INLINE Real hardened_adjoint(const Values& m, Bounds bounds, Real Jp, MaterialBar& bar) {
+    if (kind != Kind::soil) return 0;
+    const Real power = exponential(m.hardening() * (1 - Jp));
+    const bool free = (power >= bounds.hardening_low) & (power <= bounds.hardening_high);
+    const Real exponent = free ? bar.hard * power : 0;
+    bar.values.hardening() = exponent * (1 - Jp);
+    return -exponent * m.hardening();
+}
+
+// Each takes the derivative in the returned F, and that in R which the stress left in `bar`, to the trial F in place.
+INLINE void elastic_adjoint(Mat2 F, MaterialBar& bar, Mat2& F_bar) {
+    F_bar = F_bar + join(adjoint(direction(split(F)), bar.R, 0, 0));
+}
+
+INLINE void von_mises_adjoint(const Values& m, Bounds bounds, Mat2 F, MaterialBar& bar, Mat2& F_bar) {
+    const Parts v = split(F);
+    const Direction R = direction(v);
+    const Real large = square(v.m1) + square(v.m2), small = square(v.n1) + square(v.n2);
+    const bool beyond = small > m.slope2 * large;
+    const Real total = beyond ? R.total : Real(1), inverse = 1 / std::sqrt(beyond ? small : Real(0.25));
+    const Real difference = beyond ? small * inverse : Real(0.5);
+    const Real first = Real(0.5) * (total + difference), second = Real(0.5) * (total - difference);
+    const Real major = at_least(first, bounds.stretch_floor), minor = at_least(second, bounds.stretch_floor);
+    const bool yields = beyond & (major > minor * m.ratio);
+    const Real mean = Real(0.5) * std::sqrt(major * minor);
+    const Real grow_total = mean * m.plus, grow_difference = mean * (m.minus * inverse);
+
+    const Parts v_bar = split(F_bar, v.proper);
+    const Real of_total = v_bar.m1 * R.cos + v_bar.m2 * R.sin, of_difference = v_bar.n1 * v.n1 + v_bar.n2 * v.n2;
+    const Real mean_bar = of_total * m.plus + of_difference * m.minus * inverse;
+    const Real major_bar = first >= bounds.stretch_floor ? mean_bar * mean / (2 * major) : 0;
+    const Real minor_bar = second >= bounds.stretch_floor ? mean_bar * mean / (2 * minor) : 0;
+    const Real difference_bar = Real(0.5) * (major_bar - minor_bar) - of_difference * grow_difference * inverse;
+    const Real along = difference_bar * inverse;
+    bar.values.plus = yields ? of_total * mean : 0;
+    bar.values.minus = yields ? of_difference * mean * inverse : 0;
+    bar.R.total = yields ? Real(0.5) * (major_bar + minor_bar) : 0;
+    bar.R.cos += yields ? grow_total * v_bar.m1 : 0;
+    bar.R.sin += yields ? grow_total * v_bar.m2 : 0;
+    const Real n1 = yields ? grow_difference * v_bar.n1 + along * v.n1 : 0;
+    const Real n2 = yields ? grow_difference * v_bar.n2 + along * v.n2 : 0;
+    const Mat2 through{yields ? 0 : F_bar.a, yields ? 0 : F_bar.b, yields ? 0 : F_bar.c, yields ? 0 : F_bar.d};
+    F_bar = through + join(adjoint(R, bar.R, n1, n2));
+}
+
+// Takes the derivative in Jp along: from that of after the return map to the part of it that reaches the one before.
+INLINE void soil_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, MaterialBar& bar, Mat2& F_bar, Real& Jp_bar) {
+    const Real low = m.low(), high = m.high();
+    const Parts v = split(F);
+    const Direction R = direction(v);
+    const Real along = v.n1 * R.cos + v.n2 * R.sin;
+    const bool drop = std::abs(v.n2 * R.cos - v.n1 * R.sin) < 2 * bounds.shear_cutoff;
+    const Real n1 = drop ? along * R.cos : v.n1, n2 = drop ? along * R.sin : v.n2;
+    const Real square2 = square(n1) + square(n2);
+    const bool round = square2 == 0;
+    const Real root = std::sqrt(round ? Real(1) : square2), difference = round ? Real(0) : root;
+    const Real first = Real(0.5) * (R.total + difference), second = Real(0.5) * (R.total - difference);
+    const Real major = clamped(first, low, high), minor = clamped(second, low, high);
+    const Real kept = (first >= low) & (first <= high) ? Real(1) : Real(0);
+    const Real ratio = Real(0.5) * (round ? kept : (major - minor) / root), sum = Real(0.5) * (major + minor);
+    const Real squeezed = first * second / (major * minor);
+    Jp_bar = Jp * squeezed > LARGEST_JP ? Real(0) : Jp_bar;
+    const Real squeezed_bar = Jp_bar * Jp;
+
+    const Parts v_bar = split(F_bar, v.proper);
+    const Real sum_bar = v_bar.m1 * R.cos + v_bar.m2 * R.sin;
+    const Real ratio_bar = round ? 0 : v_bar.n1 * n1 + v_bar.n2 * n2;
+    const Real major_bar = Real(0.5) * (sum_bar + ratio_bar / root) - squeezed_bar * squeezed / major;
+    const Real minor_bar = Real(0.5) * (sum_bar - ratio_bar / root) - squeezed_bar * squeezed / minor;
+    const Real area = squeezed_bar / (major * minor);
+    const bool low1 = first < low, high1 = first > high, low2 = second < low, high2 = second > high;
+    const Real first_bar = area * second + (low1 | high1 ? 0 : major_bar);
+    const Real second_bar = area * first + (low2 | high2 ? 0 : minor_bar);
+    bar.values.low() = (low1 ? major_bar : 0) + (low2 ? minor_bar : 0);
+    bar.values.high() = (high1 ? major_bar : 0) + (high2 ? minor_bar : 0);
+    Jp_bar *= squeezed;
+
+    const Real difference_bar = round ? 0 : Real(0.5) * (first_bar - second_bar) - ratio_bar * ratio / root;
+    Real n1_bar = ratio * v_bar.n1 + difference_bar * n1 / root, n2_bar = ratio * v_bar.n2 + difference_bar * n2 / root;
+    const Real along_bar = n1_bar * R.cos + n2_bar * R.sin;
+    bar.R.total = Real(0.5) * (first_bar + second_bar);
+    bar.R.cos += sum * v_bar.m1 + (drop ? along * n1_bar + along_bar * v.n1 : 0);
+    bar.R.sin += sum * v_bar.m2 + (drop ? along * n2_bar + along_bar * v.n2 : 0);
+    n1_bar = drop ? along_bar * R.cos : n1_bar, n2_bar = drop ? along_bar * R.sin : n2_bar;
+    F_bar = join(adjoint(R, bar.R, n1_bar, n2_bar));
+}
+
+// Adjoint of return map and stress together. `F` is the trial deformation, `S_bar` the derivative in S = factor tau, which
+// becomes `S`; F_bar and Jp_bar go from the returned to the trial ones in place.
+template <Kind kind>
+INLINE MaterialBar material_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, Real pull_x, Real pull_y,
+                                    Sym2 S_bar, Mat2& F_bar, Real& Jp_bar, Sym2& S) {
+    MaterialBar bar{};
+    Mat2 returned = F;
+    Real Jp_after = Jp;
+    const Direction R = return_map<kind>(m, bounds, returned, Jp_after);
+    const Real hard = hardened<kind>(m, bounds, Jp);
+    const Sym2 tau = stress<kind>(m, hard, returned, R, pull_x, pull_y);
+    bar.values.factor = S_bar.xx * tau.xx + S_bar.xy * tau.xy + S_bar.yy * tau.yy;
+    S = {m.factor * tau.xx, m.factor * tau.xy, m.factor * tau.yy};
+    const Sym2 tau_bar{m.factor * S_bar.xx, m.factor * S_bar.xy, m.factor * S_bar.yy};
+    stress_adjoint<kind>(m, hard, returned, R, pull_x, pull_y, tau_bar, F_bar, bar);
+    const Real Jp_hard = hardened_adjoint<kind>(m, bounds, Jp, bar);
+    if (kind == Kind::elastic) elastic_adjoint(F, bar, F_bar);
+    if (kind == Kind::von_mises) von_mises_adjoint(m, bounds, F, bar, F_bar);
+    if (kind == Kind::soil) soil_adjoint(m, bounds, F, Jp, bar, F_bar, Jp_bar);
+    Jp_bar += Jp_hard;
+    return bar;
+}

@@ -1,0 +1,119 @@
+"""Brings a solver into the tables of numbers that the kernels read."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchmpm.material import STRETCH_FLOOR, Elastic, Soil, Value, VonMises, column, yield_ratio
+
+if TYPE_CHECKING:
+    from torchmpm.solver import Body, Solver
+
+#: The materials that the kernels know, in the order of ``enum class Kind``.
+KINDS: tuple[type, ...] = (Elastic, VonMises, Soil)
+#: Rows of the table of values, see ``struct Values`` in ``material.hpp``.
+ROWS = 8
+#: Numbers of a description before those of the bodies.
+_HEAD = 9
+#: A node remembers its rule in one byte.
+MAX_RULES = 254
+
+
+def unsupported(solver: Solver, dtype: torch.dtype, device: torch.device) -> str | None:
+    """Why the kernels cannot run this solver on such a state, or ``None`` if they can."""
+    if device.type != "cpu":
+        return f"it runs on the CPU, the state is on {device}"
+    if dtype not in (torch.float32, torch.float64):
+        return f"it computes in float32 or float64, the state is {dtype}"
+    for body in solver.bodies:
+        if type(body.material) not in KINDS:
+            names = ", ".join(kind.__name__ for kind in KINDS)
+            return f"it knows the materials {names}, a body has {type(body.material).__name__}"
+    if len(solver.rules) > MAX_RULES:
+        return f"it takes at most {MAX_RULES} velocity rules, got {len(solver.rules)}"
+    return None
+
+
+def values(solver: Solver, like: Tensor) -> tuple[Tensor, list[int]]:
+    """Material values, masses and volumes, with the graph of those that are tensors.
+
+    A body whose values are the same for all its particles has one column, another one column per particle.
+
+    Args:
+        solver: The solver.
+        like: (B, N) a plane of the state.
+
+    Returns:
+        The table, (8, 1 or B, columns), and how many of its columns belong to each body.
+    """
+    tables = []
+    for body, part in solver.parts():
+        rows = _rows(solver, body, like[:, part])
+        if all(isinstance(row, (int, float)) for row in rows):
+            tables.append(like.new_tensor(rows).view(ROWS, 1, 1))
+        else:
+            planes = [torch.as_tensor(row, dtype=like.dtype, device=like.device) for row in rows]
+            planes = [plane.reshape(1, 1) if plane.ndim == 0 else plane for plane in planes]
+            tables.append(torch.stack(torch.broadcast_tensors(*planes)))
+    batch = max(table.shape[1] for table in tables)
+    widths = [table.shape[2] for table in tables]
+    return torch.cat([table.expand(-1, batch, -1) for table in tables], dim=2).contiguous(), widths
+
+
+def _rows(solver: Solver, body: Body, like: Tensor) -> list[Value]:
+    """The eight values of a body in the order of ``struct Values``."""
+    material = body.material
+    assert isinstance(material, Elastic)
+
+    def value(name: str) -> Value:
+        return column(getattr(material, name), like, name)
+
+    mu, lam = value("mu"), value("lam")
+    factor = -solver.dt * (4.0 / solver.grid.h**2) * column(body.volume, like, "volume")
+    rows: list[Value] = [column(body.mass, like, "mass"), factor, 2.0 * mu, lam]
+    if isinstance(material, VonMises):
+        ratio = yield_ratio(value("yield_stress") / (2.0 * mu))
+        slope, root = (ratio - 1.0) / (ratio + 1.0), ratio**0.5
+        return [*rows, slope * slope, ratio, root + 1.0 / root, root - 1.0 / root]
+    if isinstance(material, Soil):
+        return [*rows, 1.0 - value("compression"), 1.0 + value("stretch"), value("hardening"), 0.0]
+    return [*rows, 0.0, 0.0, 0.0, 0.0]
+
+
+def description(solver: Solver, widths: list[int], mass_epsilon: float) -> Tensor:
+    """Everything else that is constant, as ``Scene::Scene`` in ``scene.hpp`` reads it.
+
+    Args:
+        solver: The solver.
+        widths: Columns of each body in the table of :func:`values`.
+        mass_epsilon: Added to the mass of a node before a division, kg.
+    """
+    grid = solver.grid
+    numbers = [grid.resolution, grid.h, solver.dt, grid.margin, solver.damping, mass_epsilon, STRETCH_FLOOR]
+    numbers += [len(solver.bodies), len(solver.rules)]
+    first = 0
+    for body, width in zip(solver.bodies, widths, strict=True):
+        material = body.material
+        low, high = material.hardening_range if isinstance(material, Soil) else (1.0, 1.0)
+        cutoff = material.shear_cutoff if isinstance(material, Soil) else 0.0
+        kind = KINDS.index(type(material))
+        numbers += [body.count, kind, body.muscle, width, first, low, high, cutoff]
+        first += width
+    for rule in solver.rules:
+        ends = [
+            (-math.inf if low is None else low, math.inf if high is None else high) for low, high in (rule.i, rule.j)
+        ]
+        axis, sign = "xy".index(rule.direction[1]), 1.0 if rule.direction[0] == "+" else -1.0
+        numbers += [axis, sign, *ends[0], *ends[1], rule.friction, rule.frame == "world"]
+    return torch.tensor(numbers, dtype=torch.float64)
+
+
+def body_widths(description: Tensor) -> list[tuple[int, int]]:
+    """Particles and columns of each body, read back from :func:`description`."""
+    head = description.tolist()
+    bodies = int(head[_HEAD - 2])
+    return [(int(head[k]), int(head[k + 3])) for k in range(_HEAD, _HEAD + 8 * bodies, 8)]

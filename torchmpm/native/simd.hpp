@@ -1,0 +1,107 @@
+// Scalars, blocks of particles, and the few vector idioms that compilers do not find by themselves.
+#pragma once
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <type_traits>
+
+#define INLINE inline __attribute__((always_inline))
+#define INLINE_LAMBDA __attribute__((always_inline))
+// Work on a whole block: a call costs nothing there, and profiles can tell one from the other.
+#define PASS inline __attribute__((noinline))
+#define PASS_MEMBER __attribute__((noinline))
+
+using Real = TORCHMPM_REAL;
+
+constexpr int LANES = 64;  // particles per block; blocks never mix bodies
+constexpr int PAD = 3;     // as torchmpm.grid.PAD
+
+typedef Real Real4 __attribute__((vector_size(4 * sizeof(Real))));
+typedef Real Real8 __attribute__((vector_size(8 * sizeof(Real))));
+// The same without a promise of alignment, for rows of nodes.
+typedef Real Row4 __attribute__((vector_size(4 * sizeof(Real)), aligned(sizeof(Real)), may_alias));
+typedef Real Row8 __attribute__((vector_size(8 * sizeof(Real)), aligned(sizeof(Real)), may_alias));
+
+#if defined(__clang__) || __GNUC__ >= 12
+#define SHUFFLE(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else
+template <class V> struct Index;
+template <> struct Index<Real4> {
+    typedef std::conditional<sizeof(Real) == 4, int32_t, int64_t>::type Element;
+    typedef Element type __attribute__((vector_size(4 * sizeof(Real))));
+};
+template <> struct Index<Real8> {
+    typedef std::conditional<sizeof(Real) == 4, int32_t, int64_t>::type Element;
+    typedef Element type __attribute__((vector_size(8 * sizeof(Real))));
+};
+#define SHUFFLE(a, b, ...) __builtin_shuffle(a, b, Index<decltype(a)>::type{__VA_ARGS__})
+#endif
+
+template <class Function> INLINE void three(Function f) {
+    f(0);
+    f(1);
+    f(2);
+}
+
+INLINE Real square(Real a) { return a * a; }
+// Both let a NaN in `a` through.
+INLINE Real at_least(Real a, Real low) { return a < low ? low : a; }
+INLINE Real at_most(Real a, Real high) { return a > high ? high : a; }
+
+INLINE void transpose(Real4 (&v)[4]) {
+    const Real4 a = SHUFFLE(v[0], v[1], 0, 4, 1, 5), b = SHUFFLE(v[0], v[1], 2, 6, 3, 7);
+    const Real4 c = SHUFFLE(v[2], v[3], 0, 4, 1, 5), d = SHUFFLE(v[2], v[3], 2, 6, 3, 7);
+    v[0] = SHUFFLE(a, c, 0, 1, 4, 5), v[1] = SHUFFLE(a, c, 2, 3, 6, 7);
+    v[2] = SHUFFLE(b, d, 0, 1, 4, 5), v[3] = SHUFFLE(b, d, 2, 3, 6, 7);
+}
+
+// Both halves on their own.
+INLINE void transpose(Real8 (&v)[4]) {
+    const Real8 a = SHUFFLE(v[0], v[1], 0, 8, 1, 9, 4, 12, 5, 13), b = SHUFFLE(v[0], v[1], 2, 10, 3, 11, 6, 14, 7, 15);
+    const Real8 c = SHUFFLE(v[2], v[3], 0, 8, 1, 9, 4, 12, 5, 13), d = SHUFFLE(v[2], v[3], 2, 10, 3, 11, 6, 14, 7, 15);
+    v[0] = SHUFFLE(a, c, 0, 1, 8, 9, 4, 5, 12, 13), v[1] = SHUFFLE(a, c, 2, 3, 10, 11, 6, 7, 14, 15);
+    v[2] = SHUFFLE(b, d, 0, 1, 8, 9, 4, 5, 12, 13), v[3] = SHUFFLE(b, d, 2, 3, 10, 11, 6, 7, 14, 15);
+}
+
+INLINE Real4 half(const Real8& v, int which) {
+    Real4 result;
+    __builtin_memcpy(&result, reinterpret_cast<const char*>(&v) + which * sizeof(Real4), sizeof(Real4));
+    return result;
+}
+
+INLINE void transpose(Real8 (&v)[8]) {
+    Real8 t[8], u[8];
+    for (int i = 0; i < 8; i += 2) {
+        t[i] = SHUFFLE(v[i], v[i + 1], 0, 8, 1, 9, 4, 12, 5, 13);
+        t[i + 1] = SHUFFLE(v[i], v[i + 1], 2, 10, 3, 11, 6, 14, 7, 15);
+    }
+    for (int i = 0; i < 8; i += 4)
+        for (int k = 0; k < 2; ++k) {
+            u[i + 2 * k] = SHUFFLE(t[i + k], t[i + k + 2], 0, 1, 8, 9, 4, 5, 12, 13);
+            u[i + 2 * k + 1] = SHUFFLE(t[i + k], t[i + k + 2], 2, 3, 10, 11, 6, 7, 14, 15);
+        }
+    for (int i = 0; i < 4; ++i) {
+        v[i] = SHUFFLE(u[i], u[i + 4], 0, 1, 2, 3, 8, 9, 10, 11);
+        v[i + 4] = SHUFFLE(u[i], u[i + 4], 4, 5, 6, 7, 12, 13, 14, 15);
+    }
+}
+
+// e^x without a call, so that loops over it become vectors: 2^n times a Taylor polynomial on |r| <= ln(2) / 2.
+INLINE Real exponential(Real x) {
+    constexpr bool single = sizeof(Real) == 4;
+    constexpr Real limit = single ? 250 : 2040;
+    Real n = std::nearbyint(x * Real(1.4426950408889634));
+    n = n > -limit ? n : -limit;  // also takes a NaN, which stays in r
+    n = n < limit ? n : limit;
+    const Real r = (x - n * Real(single ? 0.693359375 : 0.693145751953125)) -
+                   n * Real(single ? -2.12194440e-4 : 1.42860682030941723212e-6);
+    Real sum = 1;
+    for (int k = single ? 8 : 14; k > 0; --k) sum = 1 + sum * r * (Real(1) / Real(k));
+    // Two factors: each a power of two that exists, their product may overflow to infinity or vanish.
+    const int first = int(n) / 2, second = int(n) - first;
+    const auto power = [](int e) {
+        const typename std::conditional<single, uint32_t, uint64_t>::type one = 1, bias = single ? 127 : 1023;
+        return __builtin_bit_cast(Real, (one * e + bias) << (single ? 23 : 52));
+    };
+    return sum * power(first) * power(second);
+}

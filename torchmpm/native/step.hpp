@@ -1,0 +1,252 @@
+// A step of many substeps. One pass over the particles finishes a substep and begins the next: read velocities from the
+// nodes, move, deform, add mass and momentum to the nodes.
+#pragma once
+#include "workspace.hpp"
+
+// What a block's particles give to the nodes, zero for those that take no part: mass, momentum, and the affine momentum -dt V 4/h^2 tau + m C.
+struct alignas(64) Impulse {
+    Real mass[LANES], vx[LANES], vy[LANES], affine[4][LANES];
+};
+
+// Muscle actuation of a block's particles.
+struct alignas(64) Pull {
+    Real x[LANES], y[LANES];
+
+    void none() { std::fill_n(x, LANES, Real(0)), std::fill_n(y, LANES, Real(0)); }
+
+    PASS_MEMBER void sample(const Scene& scene, const Stencil& at, const Real* field) {
+        for (int k = 0; k < LANES; k += 8) {
+            Real8 sum[2] = {};
+            read_eight(at.node + k, scene.width, field, [&](int p, const Real8(&row)[8]) {
+                for (int c = 0; c < 2; ++c)
+                    sum[c] += eight(at.wx[p] + k) * (eight(at.wy[0] + k) * row[c] + eight(at.wy[1] + k) * row[2 + c] +
+                                                     eight(at.wy[2] + k) * row[4 + c]);
+            });
+            put(sum[0], x + k), put(sum[1], y + k);
+        }
+    }
+};
+
+// New velocity and affine matrix from the velocities of the nodes, and the way they carry the particles.
+PASS void advance(const Scene& scene, const Real* velocity, const Stencil& at, Block& block) {
+    const Real dt = scene.dt, scale = 4 * scene.inverse_h;
+    for (int k = 0; k < LANES; k += 8) {
+        const Real8 fx = eight(at.fx + k), fy = eight(at.fy + k);
+        const Real8 w0 = eight(at.wy[0] + k), w1 = eight(at.wy[1] + k), w2 = eight(at.wy[2] + k);
+        const Real8 d0 = w0 * -fy, d1 = w1 * (1 - fy), d2 = w2 * (2 - fy);
+        Real8 v[2] = {}, slope_x[2] = {}, slope_y[2] = {};
+        read_eight(at.node + k, scene.width, velocity, [&](int p, const Real8(&row)[8]) {
+            const Real8 w = eight(at.wx[p] + k), d = w * (Real(p) - fx);
+            for (int c = 0; c < 2; ++c) {
+                const Real8 across = w0 * row[c] + w1 * row[2 + c] + w2 * row[4 + c];
+                const Real8 tilt = d0 * row[c] + d1 * row[2 + c] + d2 * row[4 + c];
+                v[c] += w * across, slope_x[c] += d * across, slope_y[c] += w * tilt;
+            }
+        });
+        const auto on = eight(at.on + k) != 0;
+        const auto update = [&](int plane, Real8 value) {
+            put(on ? value : eight(block.v[plane] + k), block.v[plane] + k);
+        };
+        for (int c = 0; c < 2; ++c) {
+            update(X + c, eight(block.v[X + c] + k) + dt * v[c]);
+            update(VX + c, v[c]);
+            update(C0 + 2 * c, scale * slope_x[c]);
+            update(C1 + 2 * c, scale * slope_y[c]);
+        }
+    }
+}
+
+INLINE Mat2 matrix(const Block& block, int first, int k) {
+    return {block.v[first][k], block.v[first + 1][k], block.v[first + 2][k], block.v[first + 3][k]};
+}
+
+// I + dt C
+INLINE Mat2 growth(Real dt, Mat2 C) { return {1 + dt * C.a, dt * C.b, dt * C.c, 1 + dt * C.d}; }
+
+// Deform one particle and find what it gives to the nodes. A function of its own, because structures that are declared in
+// the body of a vector loop would be kept in memory.
+template <Kind kind>
+INLINE void deform_one(Real dt, Values m, Bounds bounds, bool on, Real pull_x, Real pull_y, int k, Block& block,
+                       Impulse& out) {
+    const Mat2 C = matrix(block, C0, k), old = matrix(block, F0, k);
+    const Real before = block.v[JP][k], hard = hardened<kind>(m, bounds, before);
+    Mat2 F = matmul(growth(dt, C), old);
+    Real Jp = before;
+    const Direction R = return_map<kind>(m, bounds, F, Jp);
+    const Sym2 tau = stress<kind>(m, hard, F, R, pull_x, pull_y);
+    out.mass[k] = on ? m.mass : 0;
+    out.vx[k] = on ? m.mass * block.v[VX][k] : 0;
+    out.vy[k] = on ? m.mass * block.v[VY][k] : 0;
+    out.affine[0][k] = on ? m.factor * tau.xx + m.mass * C.a : 0;
+    out.affine[1][k] = on ? m.factor * tau.xy + m.mass * C.b : 0;
+    out.affine[2][k] = on ? m.factor * tau.xy + m.mass * C.c : 0;
+    out.affine[3][k] = on ? m.factor * tau.yy + m.mass * C.d : 0;
+    block.v[F0][k] = on ? F.a : old.a, block.v[F1][k] = on ? F.b : old.b;
+    block.v[F2][k] = on ? F.c : old.c, block.v[F3][k] = on ? F.d : old.d;
+    if (kind == Kind::soil) block.v[JP][k] = on ? Jp : before;
+}
+
+template <Kind kind, bool varying>
+void deform(const Scene& scene, const Real* table, Bounds bounds, const Stencil& at, const Pull& pull, Block& block,
+            Impulse& out) {
+    const Real dt = scene.dt;
+    const Values shared = values_at<false>(table, 0);
+#pragma omp simd
+    for (int k = 0; k < LANES; ++k)
+        deform_one<kind>(dt, varying ? values_at<true>(table, k) : shared, bounds, at.on[k] != 0, pull.x[k], pull.y[k],
+                         k, block, out);
+}
+
+INLINE void deform(const Scene& scene, const Body& body, const Real* table, const Stencil& at, const Pull& pull,
+                   Block& block, Impulse& out) {
+    using Function = void (*)(const Scene&, const Real*, Bounds, const Stencil&, const Pull&, Block&, Impulse&);
+    static constexpr Function table_of[3][2] = {
+        {deform<Kind::elastic, false>, deform<Kind::elastic, true>},
+        {deform<Kind::von_mises, false>, deform<Kind::von_mises, true>},
+        {deform<Kind::soil, false>, deform<Kind::soil, true>},
+    };
+    table_of[int(body.kind)][body.varying](scene, table, body.bounds, at, pull, block, out);
+}
+
+// Add mass and momentum to the nodes.
+PASS void scatter(const Scene& scene, const Impulse& in, const Stencil& at, Real* grid) {
+    const Real h = scene.h;
+    for (int k = 0; k < LANES; k += 8) {
+        const Real8 fx = eight(at.fx + k), fy = eight(at.fy + k), mass = eight(in.mass + k);
+        const Real8 vx = eight(in.vx + k), vy = eight(in.vy + k);
+        const Real8 xx = h * eight(in.affine[0] + k), xy = h * eight(in.affine[1] + k);
+        const Real8 yx = h * eight(in.affine[2] + k), yy = h * eight(in.affine[3] + k);
+        add_eight(at.node + k, scene.width, grid, [&](int p, int q, Real8(&out)[4]) {
+            const Real8 dx = Real(p) - fx, dy = Real(q) - fy, w = eight(at.wx[p] + k) * eight(at.wy[q] + k);
+            out[0] = w * (vx + xx * dx + xy * dy);
+            out[1] = w * (vy + yx * dx + yy * dy);
+            out[2] = w * mass;
+        });
+    }
+}
+
+// Where the forward pass leaves what the adjoint needs; null pointers keep nothing.
+struct Tape {
+    Block* states = nullptr;        // [substeps][blocks] at the start of each substep
+    Real* velocity = nullptr;       // two numbers a node in use, one substep after the other: before gravity
+    Real* inverse_mass = nullptr;   // one number a node in use
+    Box* boxes = nullptr;           // [substeps] nodes in use
+    size_t* offsets = nullptr;      // [substeps] where a substep's nodes begin
+
+    Record record(int64_t substep, int i) const {
+        if (!velocity) return {};
+        const Box& box = boxes[substep];
+        const size_t node = offsets[substep] + size_t(i - box.i0) * (box.j1 - box.j0 + 1);
+        return {velocity + 2 * node, inverse_mass + node};
+    }
+};
+
+class Forward {
+public:
+    using Work = Workspace;
+
+    Forward(const Scene& scene, Workspace& work, Member& member, Tape tape = {})
+        : scene(scene), work(work), member(member), tape(tape) {}
+
+    // All members of the team call this together. False for those who need not go on.
+    bool run(int64_t which) {
+        element = which;
+        prepare();
+        const int64_t substeps = scene.call.substeps;
+        for (int64_t s = 0; s < substeps; ++s) {
+            particles(s, s > 0, true);
+            if (!nodes(s)) return false;
+        }
+        if (tape.states) return true;
+        particles(substeps, true, false);
+        own_blocks([&](int, int block) { store(scene, block, element, work.state[block], scene.call.result); });
+        return true;
+    }
+
+    // The blocks that are this thread's to advance.
+    template <class Function> void own_blocks(Function f) const {
+        for (int part = member.rank; part < scene.parts; part += member.team)
+            for (int block = scene.part_begin(part); block < scene.part_begin(part + 1); ++block) f(part, block);
+    }
+
+private:
+    const Scene& scene;
+    Workspace& work;
+    Member& member;
+    const Tape tape;
+    int64_t element = 0;
+    Stencil at;
+    Pull pull;
+    Impulse impulse;
+
+    void prepare() {
+        own_blocks([&](int, int block) {
+            load(scene, block, element, scene.call.planes, work.state[block]);
+            load_values(scene, block, element, work.values);
+        });
+        if (member.rank == 0) work.rules.build(scene, scene.call.shift + 2 * element);
+        if (member.rank == member.team - 1 && scene.muscles) load_field(scene, element, work.field);
+        pull.none();
+        member.wait();
+    }
+
+    void particles(int64_t substep, bool arriving, bool leaving) {
+        const Real* origin = scene.call.origin + 2 * element;
+        for (int part = member.rank; part < scene.parts; part += member.team) work.sums[part].box = {};
+        own_blocks([&](int part, int index) {
+            Block& block = work.state[index];
+            if (arriving) {
+                at.locate(scene, origin, block);
+                advance(scene, work.velocity, at, block);
+            }
+            if (tape.states) keep(block, scene.body(index), tape.states[substep * scene.blocks + index]);
+            if (!leaving) return;
+            at.locate(scene, origin, block);
+            give(index, block, work.sums[part]);
+        });
+        member.wait();
+    }
+
+    // Only soil has a Jp that anyone asks for.
+    static void keep(const Block& block, const Body& body, Block& to) {
+        const int planes = body.kind == Kind::soil ? PLANES : JP;
+        std::copy_n(block.v[0], planes * LANES, to.v[0]);
+    }
+
+    void give(int index, Block& block, Sums& sums) {
+        const Body& body = scene.body(index);
+        const bool pulls = body.muscle && scene.muscles;
+        if (pulls) {
+            pull.sample(scene, at, work.field);
+        } else if (scene.muscles) {
+            pull.none();
+        }
+        Real uniform[VALUES];
+        deform(scene, body, work.values_of(scene, index, element, uniform), at, pull, block, impulse);
+        sums.reserve(at.box, scene.width);
+        sums.box.include(at.box);
+        scatter(scene, impulse, at, sums.nodes);
+    }
+
+    bool nodes(int64_t substep) {
+        Box box;
+        for (const Sums& part : work.sums) box.include(part.box);
+        if (tape.boxes) remember(substep, box);
+        Real* total = work.total + member.rank * Workspace::row_length(scene);
+        const Rows rows(box, member.rank, member.team);
+        for (int i = rows.begin; i < rows.end; ++i) {
+            collect(work.sums.data(), scene.parts, box, i, scene.width, total);
+            node_velocities(scene, scene.call.gravity + 2 * element, work.rules, box, i, total, work.velocity,
+                            tape.record(substep, i));
+        }
+        return member.goes_on();
+    }
+
+    void remember(int64_t substep, const Box& box) {
+        if (member.rank == 0) {
+            tape.boxes[substep] = box;
+            tape.offsets[substep] = substep ? tape.offsets[substep - 1] + tape.boxes[substep - 1].nodes() : 0;
+        }
+        member.wait();
+    }
+};

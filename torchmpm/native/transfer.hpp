@@ -1,0 +1,122 @@
+// Stencils, and the movement of numbers between particles and nodes.
+#pragma once
+#include "scene.hpp"
+
+enum Plane : int { X = 0, Y, VX, VY, C0, C1, C2, C3, F0, F1, F2, F3, JP, PLANES };
+
+struct alignas(64) Block {
+    Real v[PLANES][LANES];
+};
+
+// Inclusive range of nodes on the padded grid.
+struct Box {
+    int i0 = 1 << 28, i1 = -1, j0 = 1 << 28, j1 = -1;
+
+    bool empty() const { return i1 < i0; }
+    size_t nodes() const { return empty() ? 0 : size_t(i1 - i0 + 1) * (j1 - j0 + 1); }
+    bool holds(const Box& o) const { return o.empty() || (i0 <= o.i0 && o.i1 <= i1 && j0 <= o.j0 && o.j1 <= j1); }
+    void include(const Box& o) {
+        i0 = std::min(i0, o.i0), i1 = std::max(i1, o.i1), j0 = std::min(j0, o.j0), j1 = std::max(j1, o.j1);
+    }
+};
+
+struct alignas(64) Stencil {
+    Real wx[3][LANES], wy[3][LANES];  // weights
+    Real fx[LANES], fy[LANES];        // distance from the first node in cells; all zero for others
+    Real on[LANES];                   // 1 for particles that take part, 0 for others
+    int32_t node[LANES];              // first node
+    Box box;                          // all nodes of particles that take part
+
+    PASS_MEMBER void locate(const Scene& scene, const Real* origin, const Block& block) {
+        const Real ox = origin[0], oy = origin[1], inverse_h = scene.inverse_h;
+        const Real margin = scene.margin, extent = scene.extent;
+        const Real low = -PAD, high = Real(scene.resolution);
+        const int width = scene.width, none = 1 << 28;
+        int i0 = none, i1 = -none, j0 = none, j1 = -none;
+#pragma omp simd reduction(min : i0, j0) reduction(max : i1, j1)
+        for (int k = 0; k < LANES; ++k) {
+            const Real offset = block.v[X][k] - ox;
+            const bool inside = (offset > margin) & (offset < extent);
+            const Real ux = offset * inverse_h, uy = (block.v[Y][k] - oy) * inverse_h;
+            Real bx = std::trunc(ux - Real(0.5)), by = std::trunc(uy - Real(0.5));
+            const Real dx = inside ? ux - bx : 0, dy = inside ? uy - by : 0;
+            fx[k] = dx, fy[k] = dy, on[k] = inside ? Real(1) : Real(0);
+            wx[0][k] = inside ? Real(0.5) * square(Real(1.5) - dx) : 0;
+            wx[1][k] = inside ? Real(0.75) - square(dx - 1) : 0;
+            wx[2][k] = inside ? Real(0.5) * square(dx - Real(0.5)) : 0;
+            wy[0][k] = inside ? Real(0.5) * square(Real(1.5) - dy) : 0;
+            wy[1][k] = inside ? Real(0.75) - square(dy - 1) : 0;
+            wy[2][k] = inside ? Real(0.5) * square(dy - Real(0.5)) : 0;
+            // Clamped before the conversion, which is undefined for large numbers; a NaN ends at the low end.
+            bx = bx > low ? bx : low, by = by > low ? by : low;
+            bx = bx < high ? bx : high, by = by < high ? by : high;
+            const int i = int(bx) + PAD, j = int(by) + PAD;
+            node[k] = i * width + j;
+            const int ilow = inside ? i : none, ihigh = inside ? i : -none;
+            const int jlow = inside ? j : none, jhigh = inside ? j : -none;
+            i0 = ilow < i0 ? ilow : i0, i1 = ihigh > i1 ? ihigh : i1;
+            j0 = jlow < j0 ? jlow : j0, j1 = jhigh > j1 ? jhigh : j1;
+        }
+        box = i1 < 0 ? Box{} : Box{i0, i1 + 2, j0, j1 + 2};
+    }
+};
+
+INLINE Real8 eight(const Real* from) { return *reinterpret_cast<const Real8*>(from); }
+
+INLINE void put(Real8 value, Real* to) { *reinterpret_cast<Real8*>(to) = value; }
+
+// Read the nodes of eight particles, two numbers each: `use(p, row)` gets the nodes (p, q) as row[2 q] and row[2 q + 1]. A
+// row of three nodes is six numbers; two more are loaded and forgotten. Addresses are valid also for particles that take
+// no part, but what is read there is rubbish.
+template <class Function> INLINE void read_eight(const int32_t* node, int width, const Real* grid, Function use) {
+    three([&](int p) INLINE_LAMBDA {
+        Real8 row[8];
+        for (int l = 0; l < 8; ++l) row[l] = *reinterpret_cast<const Row8*>(grid + 2 * (node[l] + p * width));
+        transpose(row);
+        use(p, row);
+    });
+}
+
+// Add to the nodes of eight particles, numbers four by four: `value(p, q, numbers)` says what for a node. Aligned nodes
+// never overlap in part, so what was stored a moment ago is forwarded to the next load. Particles that take no part must
+// give zeros; they add them somewhere.
+template <class Function> INLINE void add_eight(const int32_t* node, int width, Real* grid, Function value) {
+    Real4* row[8];
+    for (int l = 0; l < 8; ++l) row[l] = reinterpret_cast<Real4*>(grid) + node[l];
+    three([&](int p) INLINE_LAMBDA {
+        three([&](int q) INLINE_LAMBDA {
+            Real8 numbers[4] = {};
+            value(p, q, numbers);
+            transpose(numbers);
+            for (int l = 0; l < 4; ++l) {
+                row[l][p * width + q] += half(numbers[l], 0);
+                row[l + 4][p * width + q] += half(numbers[l], 1);
+            }
+        });
+    });
+}
+
+// A grid of nodes of four numbers on which sums build up. Nodes within `cleared` are zero or being added to; others hold
+// rubbish.
+struct Sums {
+    Real* nodes;
+    Box box;      // nodes added to since the last reset
+    Box cleared;
+
+    void reserve(const Box& wanted, int width) {
+        if (cleared.holds(wanted)) return;
+        Box next = cleared;
+        next.include({wanted.i0 - 4, wanted.i1 + 4, wanted.j0 - 4, wanted.j1 + 4});
+        next = {std::max(next.i0, 0), std::min(next.i1, width - 1), std::max(next.j0, 0), std::min(next.j1, width - 1)};
+        for (int i = next.i0; i <= next.i1; ++i) {
+            const bool known = cleared.i0 <= i && i <= cleared.i1;
+            clear(i, next.j0, known ? cleared.j0 - 1 : next.j1, width);
+            if (known) clear(i, cleared.j1 + 1, next.j1, width);
+        }
+        cleared = next;
+    }
+
+    void clear(int i, int j0, int j1, int width) {
+        if (j1 >= j0) std::fill_n(nodes + 4 * (i * width + j0), 4 * (j1 - j0 + 1), Real(0));
+    }
+};
