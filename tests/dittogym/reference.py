@@ -46,6 +46,7 @@ SMALL = {
 SHARES = ("grow", "catch", "slot")
 EPISODE = {
     "com": 1e-4,
+    "com_object": 1e-4,
     "anchor": 1e-4,
     "x_std": 1e-4,
     "v_mean": 1e-2,
@@ -125,7 +126,7 @@ def _first_grid(data: dict[str, np.ndarray], env: dittogym.TorchEnv, recorded: t
         "sub1_grid_actuation": worst(ours, recorded.numpy()),
         "sub1_particle_actuation": worst(along, data["sub1_particle_actuation"]),
         # On nodes with next to no mass, velocity is a quotient of two rounding errors.
-        "sub1_grid_v": worst(velocity * heavy, data["sub1_grid_v"] * heavy),
+        "sub1_grid_v": worst(velocity.numpy() * heavy, data["sub1_grid_v"] * heavy),
         "sub1_grid_m": worst(on_nodes(grid.momentum[0, 0]), data["sub1_grid_m"]),
     }
 
@@ -139,6 +140,8 @@ def episode_errors(data: dict[str, np.ndarray]) -> dict[str, float]:
         observation, reward, terminated, _, info = env.step(action(data, env, t))
         x, v, F = env.state.x[0, :robot], env.state.v[0], env.state.F[0, :robot]
         rows["com"].append(info["com"][0])
+        if "object_com" in info:
+            rows["com_object"].append(info["object_com"][0])
         rows["anchor"].append(env.env_state.origin[0])
         rows["x_std"].append(x.std(0, correction=0))
         rows["v_mean"].append(v[:robot].mean(0))
@@ -148,8 +151,8 @@ def episode_errors(data: dict[str, np.ndarray]) -> dict[str, float]:
         rows["kinetic"].append(0.5 * (torch.as_tensor(data["mass"]) * v.square().sum(-1)).sum())
         rows["det_F_mean"].append(torch.linalg.det(F).mean())
         rows["obs"].append(observation[0])
-    ours = {name: torch.stack(values).numpy() for name, values in rows.items()}
-    errors = {name: worst(ours[name], data[name]) for name in EPISODE}
+    ours = {name: torch.stack(values).numpy() for name, values in rows.items() if values}
+    errors = {name: worst(values, data[name]) for name, values in ours.items()}
     if env.spec.name in SHARES and robot != env.spec.robot.count:
         del errors["reward"]
     else:

@@ -170,3 +170,18 @@ def test_unsupported_scenes_are_named() -> None:
     rules = (VelocityRule("-y"),) * 300
     with pytest.raises(ValueError, match="at most 254 velocity rules, got 300"):
         robot(10, rules=rules, backend="native").step(lively(10))
+
+
+def test_grains_pulled_apart_for_ever() -> None:
+    """Jp reaches its limit in some particles within a substep; values and derivatives agree on both sides of it."""
+    solver, state = solvers(30, 1)["soil"], lively(30, 1, strain=0.0)
+    Jp = torch.linspace(0.2, 0.9999, 30, dtype=torch.float64)[None] * 1e30
+    results = []
+    for backend in ("native", "eager"):
+        F = (2.0 * state.F).requires_grad_()
+        final = replace(solver, backend=backend).step(replace(state, F=F, Jp=Jp))
+        results.append((final.detach(), torch.autograd.grad((final.Jp / 1e30).sum(), F)[0]))
+    (native, slope), (eager, expected) = results
+    assert eager.Jp.max() == 1e30 and (expected != 0).any() and (expected == 0).all(-1).all(-1).any()
+    torch.testing.assert_close(native.Jp, eager.Jp, rtol=1e-13, atol=0)
+    torch.testing.assert_close(slope, expected, rtol=1e-12, atol=1e-14)
