@@ -12,7 +12,7 @@ import torch
 import dittogym
 
 STEPS = 30
-RANKED = {"run": 100, "kick": 100, "shapematch": 30}
+RANKED = {"shapematch": 30, "obstacle": 150, "catch": 150, "run": 150, "kick": 150}
 
 
 def sine(env: dittogym.TorchEnv, t: int) -> torch.Tensor:
@@ -60,7 +60,7 @@ def rewards(task: str, particles: str, policy, steps: int, backend: str) -> tupl
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--policies", type=int, default=0, help="random policies to rank in each of three tasks")
+    parser.add_argument("--policies", type=int, default=0, help="random policies to rank in each of five tasks")
     parser.add_argument("--backend", default="auto", help="of the solver")
     arguments = parser.parse_args()
     print("| task | actions | return full | return lite | difference a step | centre of mass, at most (m) |")

@@ -16,7 +16,7 @@ import dittogym
 STEPS = 100
 SIZE = 320
 #: Without gravity and ground to hold it a robot is torn by strong waves.
-STRENGTH = {"shapematch": 0.25}
+STRENGTH = {"shapematch": 0.5}
 
 
 def wave(env: dittogym.TorchEnv, t: int) -> torch.Tensor:
