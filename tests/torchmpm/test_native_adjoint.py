@@ -235,6 +235,26 @@ def test_checkpoints_of_a_trajectory() -> None:
             torch.testing.assert_close(one, other, rtol=0, atol=1e-12 * other.abs().max().item())
 
 
+def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To keep the tape within bounds; the gradients are the same."""
+    given, wanted = state_leaves(60, 2), ("x", "v", "actuation", "origin")
+    whole = gradients(lambda _: solvers(60, 2)["three bodies"], given, wanted, 10, "native")
+    calls, step = [], ops.native_step
+    monkeypatch.setattr(ops, "native_step", lambda *arguments: calls.append(arguments[-1]) or step(*arguments))
+    monkeypatch.setattr(ops, "KEPT_BYTES", 4 * ops.KEPT_BYTES // ops.tape_limit(torch.empty(13, 2, 60).double(), 22))
+    cut = gradients(lambda _: solvers(60, 2)["three bodies"], given, wanted, 10, "native")
+    assert calls == [4, 4, 2]
+    assert_gradients_close(cut, whole, 1e-14)
+
+
+def test_scratch_memory_is_kept_once_and_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot(10, backend="native").step(lively(10), substeps=2)
+    assert len(ops._kept) == 1 and ops._kept[0].numel() <= ops.KEPT_BYTES
+    monkeypatch.setattr(ops, "KEPT_BYTES", 10)
+    robot(10, backend="native").step(lively(10), substeps=2)
+    assert ops._kept == []
+
+
 def test_second_derivatives_are_refused() -> None:
     v = lively(10).v.clone().requires_grad_()
     final = robot(10, backend="native").step(replace(lively(10), v=v), substeps=2)
@@ -253,15 +273,10 @@ def test_no_graph_without_gradients() -> None:
 
 def operator_arguments() -> tuple[object, ...]:
     """Arguments of the operator as Solver.step passes them."""
-    seen = []
-
-    def record(*arguments: object) -> Tensor:
-        seen.append(arguments)
-        return ops.native_step(*arguments)
-
+    seen, step = [], ops.native_step
+    state, field, origin = moving(30, 2)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("torchmpm.native.ops", type("Recorder", (), {"native_step": staticmethod(record)}))
-        state, field, origin = moving(30, 2)
+        patch.setattr(ops, "native_step", lambda *arguments: seen.append(arguments) or step(*arguments))
         solver = replace(solvers(30, 2)["tensor values"], backend="native")
         solver.step(state, field, substeps=2, origin=origin)
     (arguments,) = seen

@@ -2,7 +2,13 @@
 
 ``library`` compiles and loads them, ``pack`` brings a solver into the tables they read, ``ops`` makes them operators of
 torch. The kernels, in the order in which they build on each other: ``simd``, ``linalg``, ``material``, ``scene``,
-``transfer``, ``grid``, ``team``, ``workspace``, ``step``, ``native.cpp``.
+``transfer``, ``grid``, ``team``, ``workspace``, ``step``; the adjoint: ``material_adjoint``, ``grid_adjoint``,
+``adjoint_block``, ``adjoint``; ``native.cpp`` is what is compiled.
+
+A simulation's particles are cut into blocks of 64, each of one body. One pass over the blocks reads velocities from the
+nodes, moves and deforms the particles, and adds mass and momentum to the nodes for the next substep. The sums of a few
+groups of blocks are kept apart and added in one order: results do not depend on the number of threads, nor on what else
+is in the batch, by a bit. The adjoint replays a step from its start onto a tape, then goes back with the same passes.
 """
 
 from __future__ import annotations
@@ -58,15 +64,13 @@ def step(
         return state
     origin = origin.contiguous()
     table, widths = pack.values(solver, state.Jp)
+    field = None if actuation is None else actuation.contiguous()
     gravity = torch.as_tensor(solver.gravity, dtype=state.dtype).expand(state.batch_size, 2).contiguous()
-    planes = ops.native_step(
-        torch.stack(state.planes()),
-        None if actuation is None else actuation.contiguous(),
-        origin,
-        gravity,
-        table,
-        node_shift(solver.grid, origin),
-        pack.description(solver, widths, mass_epsilon),
-        substeps,
-    )
+    shift, description = node_shift(solver.grid, origin), pack.description(solver, widths, mass_epsilon)
+    planes = torch.stack(state.planes())
+    # With gradients a call keeps its start and needs a tape of all its substeps later, which must not grow endlessly.
+    limit = ops.tape_limit(planes, solver.grid.width) if torch.is_grad_enabled() else substeps
+    for start in range(0, substeps, limit):
+        length = min(limit, substeps - start)
+        planes = ops.native_step(planes, field, origin, gravity, table, shift, description, length)
     return ParticleState.from_stack(planes)

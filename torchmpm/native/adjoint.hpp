@@ -13,7 +13,7 @@ struct AdjointWorkspace : Workspace {
     Real* values_bar;        // [blocks][VALUES][LANES]
     std::vector<Sums> field_bar;  // [parts], two numbers in use
 
-    AdjointWorkspace(const Scene& scene, Arena& arena, int team) : Workspace(scene, arena, team) {
+    AdjointWorkspace(const Scene& scene, Arena& arena, int members) : Workspace(scene, arena, members) {
         const size_t cells = size_t(scene.width) * scene.width, slack = 8, substeps = scene.call.substeps;
         tape.states = arena.take<Block>(substeps * scene.blocks);
         tape.velocity = arena.take<Real>(2 * cells * substeps);
@@ -38,18 +38,19 @@ public:
     Adjoint(const Scene& scene, Work& work, Member& member)
         : scene(scene), work(work), member(member), forward(scene, work, member, work.tape) {}
 
-    // All members of the team call this together. False for those who need not go on.
-    bool run(int64_t which) {
+    // All members of the team call this together.
+    void run(int64_t which) {
         element = which;
-        if (!forward.run(element)) return false;
+        forward.run(element);
         prepare();
         const int64_t substeps = scene.call.substeps;
         for (int64_t s = substeps; s >= 0; --s) {
             particles(s, s < substeps, s > 0);
-            if (s > 0 && !nodes(s - 1)) return false;
+            if (s == 0) break;
+            nodes(s - 1);
+            member.finish(s, s == 1);
         }
         finish();
-        return true;
     }
 
 private:
@@ -69,7 +70,7 @@ private:
 
     void prepare() {
         pull.none();
-        for (int part = member.rank; part < scene.parts; part += member.team) {
+        for (int part = member.rank; part < scene.parts; part += member.size) {
             std::fill_n(origin_bar(part), 2 * LANES, Real(0));
             if (!work.field_bar.empty()) work.field_bar[part].cleared = {};
         }
@@ -84,7 +85,7 @@ private:
     // Finish the adjoint of the substep that starts at `substep`, begin that of the one before.
     void particles(int64_t substep, bool arriving, bool leaving) {
         const Real* origin = scene.call.origin + 2 * element;
-        for (int part = member.rank; part < scene.parts; part += member.team) work.sums[part].box = {};
+        for (int part = member.rank; part < scene.parts; part += member.size) work.sums[part].box = {};
         forward.own_blocks([&](int part, int index) {
             const Block* state = work.tape.states + substep * scene.blocks + index;
             if (arriving) prefetch(state + 1, sizeof(Block));
@@ -135,16 +136,15 @@ private:
         }
     }
 
-    bool nodes(int64_t substep) {
+    void nodes(int64_t substep) {
         const Box& box = work.tape.boxes[substep];
         Real* total = work.total + member.rank * Workspace::row_length(scene);
-        const Rows rows(box, member.rank, member.team);
+        const Rows rows(box, member.rank, member.size);
         for (int i = rows.begin; i < rows.end; ++i) {
             collect(work.sums.data(), scene.parts, box, i, scene.width, total);
             node_adjoint(scene, scene.call.gravity + 2 * element, work.rules, box, i, total,
                          work.tape.record(substep, i), work.velocity, work.nodes, work.gravity_bar + 2 * i);
         }
-        return member.goes_on();
     }
 
     // Hand out the derivatives.
@@ -176,7 +176,7 @@ private:
     void store_field() {
         const int n = scene.resolution, width = scene.width;
         Real* out = scene.call.field_bar + 2 * element * n * n;
-        for (int i = n * member.rank / member.team; i < n * (member.rank + 1) / member.team; ++i)
+        for (int i = n * member.rank / member.size; i < n * (member.rank + 1) / member.size; ++i)
             for (int c = 0; c < 2; ++c) {
                 Real* row = out + (c * n + i) * n;
                 std::fill_n(row, n, Real(0));

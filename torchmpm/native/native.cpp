@@ -31,16 +31,15 @@ template <class Pass> bool run_batch(const Scene& scene, Shape shape, char* scra
     std::atomic<int64_t> next{0};
     return run_together(shape.team * shape.teams, [&](int index) {
         Work& own = *work[index / shape.team];
-        Member member{index % shape.team, shape.team, own.barrier};
+        Member member{index % shape.team, shape.team, own.team};
         Pass pass(scene, own, member);
         while (true) {
-            if (member.rank == 0) own.element = next.fetch_add(1), own.barrier.begin();
-            own.barrier.wait();
+            if (member.rank == 0) own.element = next.fetch_add(1), own.team.begin(false);
+            member.wait();
             const int64_t element = own.element;
             if (element >= scene.call.batch) return;
             pass.run(element);
-            member.team = shape.team;
-            own.barrier.wait();
+            member.wait();
         }
     });
 }

@@ -148,24 +148,24 @@ public:
     Forward(const Scene& scene, Workspace& work, Member& member, Tape tape = {})
         : scene(scene), work(work), member(member), tape(tape) {}
 
-    // All members of the team call this together. False for those who need not go on.
-    bool run(int64_t which) {
+    // All members of the team call this together.
+    void run(int64_t which) {
         element = which;
         prepare();
         const int64_t substeps = scene.call.substeps;
         for (int64_t s = 0; s < substeps; ++s) {
             particles(s, s > 0, true);
-            if (!nodes(s)) return false;
+            nodes(s);
+            member.finish(s, s == substeps - 1);
         }
-        if (tape.states) return true;
+        if (tape.states) return;
         particles(substeps, true, false);
         own_blocks([&](int, int block) { store(scene, block, element, work.state[block], scene.call.result); });
-        return true;
     }
 
     // The blocks that are this thread's to advance.
     template <class Function> void own_blocks(Function f) const {
-        for (int part = member.rank; part < scene.parts; part += member.team)
+        for (int part = member.rank; part < scene.parts; part += member.size)
             for (int block = scene.part_begin(part); block < scene.part_begin(part + 1); ++block) f(part, block);
     }
 
@@ -185,14 +185,14 @@ private:
             load_values(scene, block, element, work.values);
         });
         if (member.rank == 0) work.rules.build(scene, scene.call.shift + 2 * element);
-        if (member.rank == member.team - 1 && scene.muscles) load_field(scene, element, work.field);
+        if (member.rank == member.size - 1 && scene.muscles) load_field(scene, element, work.field);
         pull.none();
         member.wait();
     }
 
     void particles(int64_t substep, bool arriving, bool leaving) {
         const Real* origin = scene.call.origin + 2 * element;
-        for (int part = member.rank; part < scene.parts; part += member.team) work.sums[part].box = {};
+        for (int part = member.rank; part < scene.parts; part += member.size) work.sums[part].box = {};
         own_blocks([&](int part, int index) {
             Block& block = work.state[index];
             if (arriving) {
@@ -228,18 +228,17 @@ private:
         scatter(scene, impulse, at, sums.nodes);
     }
 
-    bool nodes(int64_t substep) {
+    void nodes(int64_t substep) {
         Box box;
         for (const Sums& part : work.sums) box.include(part.box);
         if (tape.boxes) remember(substep, box);
         Real* total = work.total + member.rank * Workspace::row_length(scene);
-        const Rows rows(box, member.rank, member.team);
+        const Rows rows(box, member.rank, member.size);
         for (int i = rows.begin; i < rows.end; ++i) {
             collect(work.sums.data(), scene.parts, box, i, scene.width, total);
             node_velocities(scene, scene.call.gravity + 2 * element, work.rules, box, i, total, work.velocity,
                             tape.record(substep, i));
         }
-        return member.goes_on();
     }
 
     void remember(int64_t substep, const Box& box) {

@@ -16,10 +16,11 @@
 
 // Where the threads of a team wait for each other.
 class Barrier {
+public:
     using Clock = std::chrono::steady_clock;
 
-public:
-    bool disbanded = false;
+    const int size;
+    std::atomic<int64_t> lost{0};  // nanoseconds that members waited in vain, all together
 
     explicit Barrier(int members) : size(members) {}
 
@@ -42,43 +43,65 @@ public:
                 std::this_thread::yield();
             else
                 std::this_thread::sleep_for(std::chrono::microseconds(50));
-        lost += (Clock::now() - since).count();
-    }
-
-    void begin() { disbanded = false, lost = 0, start = Clock::now(); }
-
-    // Beside other programs, threads that wait for each other many times a millisecond are slower together than one of
-    // them alone. Called by the first member while the others are about to wait.
-    void judge() {
-        const Clock::rep passed = (Clock::now() - start).count();
-        disbanded = passed > Clock::duration(std::chrono::microseconds(300)).count() && 4 * lost > passed * (size - 1);
+        lost += std::chrono::nanoseconds(Clock::now() - since).count();
     }
 
 private:
-    const int size;
-    Clock::time_point start{};
     alignas(64) std::atomic<int> waiting{0};
     alignas(64) std::atomic<int> phase{0};
-    std::atomic<Clock::rep> lost{0};
+};
+
+// What a team knows in common. Beside other programs, threads that wait for each other many times a millisecond are slower
+// together than one of them alone: then the first goes on alone, and calls the others back after a while.
+struct Team {
+    using Clock = Barrier::Clock;
+
+    Barrier barrier;
+    bool dismissed = false;  // the first member's last word to the others
+    int64_t substep = 0;     // where it was when it called them
+    bool alone = false;      // known to the first member only, as is all below
+    Clock::time_point since{};
+
+    explicit Team(int members) : barrier(members) {}
+
+    void begin(bool by_itself) { alone = by_itself, barrier.lost = 0, since = Clock::now(); }
+
+    int64_t nanoseconds() const { return std::chrono::nanoseconds(Clock::now() - since).count(); }
+    bool in_vain() const {
+        const int64_t passed = nanoseconds();
+        return passed > 300000 && 4 * barrier.lost > passed * (barrier.size - 1);
+    }
 };
 
 // One thread's place in its team.
 struct Member {
-    int rank, team;
-    Barrier& barrier;
+    int rank, size;
+    Team& team;
 
     void wait() {
-        if (team > 1) barrier.wait();
+        if (size > 1) team.barrier.wait();
     }
 
-    // Wait, and say whether this thread goes on: the team may leave the rest to its first member.
-    bool goes_on() {
-        if (team == 1) return true;
-        if (rank == 0) barrier.judge();
-        barrier.wait();
-        if (!barrier.disbanded) return true;
-        team = 1;
-        return rank == 0;
+    // At the end of a substep, the last of several or not: wait for the others. Those whom the first member leaves behind
+    // sleep until it calls, and then are at its substep.
+    void finish(int64_t& substep, bool last) {
+        if (team.barrier.size == 1) return;
+        if (rank > 0) {
+            team.barrier.wait();
+            if (!team.dismissed) return;
+            team.barrier.wait();
+            substep = team.substep;
+        } else if (team.alone) {
+            if (!last && team.nanoseconds() < 3000000) return;
+            team.substep = substep, size = team.barrier.size;
+            team.barrier.wait();
+            team.begin(false);
+        } else {
+            team.dismissed = !last && team.in_vain();
+            if (team.dismissed) size = 1;
+            team.barrier.wait();
+            if (team.dismissed) team.begin(true);
+        }
     }
 };
 

@@ -29,16 +29,16 @@ struct Workspace {
     Real* total;       // [threads of the team] one row of nodes of four numbers
     RuleTable rules;
     std::vector<Sums> sums;  // [parts]
-    Barrier barrier;
+    Team team;
     std::atomic<int64_t> element{0};
 
-    Workspace(const Scene& scene, Arena& arena, int team) : barrier(team) {
+    Workspace(const Scene& scene, Arena& arena, int members) : team(members) {
         const size_t cells = size_t(scene.width) * scene.width, slack = 8;
         state = arena.take<Block>(scene.blocks);
         values = scene.varying ? arena.take<Real>(size_t(scene.blocks) * VALUES * LANES) : nullptr;
         field = scene.muscles ? arena.take<Real>(2 * cells + slack) : nullptr;
         velocity = arena.take<Real>(2 * cells + slack);
-        total = arena.take<Real>(size_t(team) * row_length(scene));
+        total = arena.take<Real>(size_t(members) * row_length(scene));
         rules.code = arena.take<uint32_t>(cells);
         sums.resize(scene.parts);
         for (Sums& part : sums) part.nodes = arena.take<Real>(4 * cells);
