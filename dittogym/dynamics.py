@@ -188,8 +188,6 @@ def observe(model: Model, state: EnvState) -> Tensor:
     seen = finite & model.solver.grid.contains(particles.x[..., 0], origin[:, 0:1])
     silent = ~model.per_particle(tuple(body.moves_visibly for body in spec.bodies), origin)
     speaks = (seen & ~silent)[..., None]
-    boxes = [box for obstacle in spec.obstacles for box in obstacle.drawn]
-    boxes += [] if spec.goal is None else [obs.goal_box(spec.goal)]
     row, column = obs.crop_corner(in_window(spec.view, state.centre.detach(), origin))
     sight = obs.Sight(
         position=particles.x - origin[:, None],
@@ -198,11 +196,19 @@ def observe(model: Model, state: EnvState) -> Tensor:
         silent=silent,
         row=row,
         column=column,
-        mask=obs.background(boxes, origin, row, column),
+        background=_background(spec, origin, row, column),
     )
     if model.pixels:
         return obs.quantise(obs.pixel_means(sight))
     return obs.quantise(obs.splat_means(sight, model.per_particle(model.shares, origin)))
+
+
+def _background(spec: TaskSpec, origin: Tensor, row: Tensor, column: Tensor) -> obs.Background | None:
+    boxes = spec.drawn
+    if boxes and spec.window.follow is None and None not in spec.view:
+        corner = int(row[0, 0]), int(column[0, 0])
+        return obs.draw_boxes_once(boxes, (spec.window.left, 0.0), *corner, origin.dtype, origin.device)
+    return obs.draw_boxes(boxes, origin, row, column)
 
 
 def judge(model: Model, state: EnvState, field: Tensor, observation: Tensor) -> tuple[EnvState, Outcome]:

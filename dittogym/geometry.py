@@ -12,6 +12,8 @@ from torchmpm.boundary import Range
 NODES = 128
 #: Top of the floor in nodes; the surface lies between this node and the next.
 FLOOR_NODE = 19
+#: Ten fine pixels of the observation's raster, 1,024 to the metre.
+MARK = 10 / 1024
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,12 @@ class Box:
 def nodes(left: float = -math.inf, right: float = math.inf, bottom: float = -math.inf, top: float = math.inf) -> Box:
     """A box whose bounds are counted in nodes from the world's origin."""
     return Box(left / NODES, right / NODES, bottom / NODES, top / NODES)
+
+
+def mark(point: tuple[float, float]) -> Box:
+    """What the observation shows of a goal: fine pixels less than ten away in both directions."""
+    x, y = point
+    return Box(x - MARK, x + MARK, y - MARK, y + MARK)
 
 
 @dataclass(frozen=True)

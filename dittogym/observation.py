@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -33,6 +34,18 @@ def crop_corner(centre: Tensor) -> tuple[Tensor, Tensor]:
     return RASTER - below - 2 * half, column
 
 
+class Background(NamedTuple):
+    """What is drawn besides particles.
+
+    Attributes:
+        mask: (1 or B, 512, 512) bool, fine pixels of the crop that are set.
+        share: (1 or B, 64, 64) share of an image pixel that is set.
+    """
+
+    mask: Tensor
+    share: Tensor
+
+
 class Sight(NamedTuple):
     """What an observation is made from.
 
@@ -43,7 +56,7 @@ class Sight(NamedTuple):
         silent: (N,) bool, particles that only the occupancy channel shows.
         row: First fine row of the crop, (B, 1).
         column: First fine column of the crop, (B, 1).
-        mask: (B, 512, 512) bool, fine pixels of the crop that obstacles and goals set.
+        background: What obstacles and goals set; ``None`` for nothing.
     """
 
     position: Tensor
@@ -52,28 +65,33 @@ class Sight(NamedTuple):
     silent: Tensor
     row: Tensor
     column: Tensor
-    mask: Tensor
+    background: Background | None
 
 
-def goal_box(goal: tuple[float, float]) -> Box:
-    """What the observation shows of a goal: pixels less than ten fine pixels away in both directions."""
-    reach = 10 / RASTER
-    return Box(goal[0] - reach, goal[0] + reach, goal[1] - reach, goal[1] + reach)
-
-
-def background(boxes: Sequence[Box], origin: Tensor, row: Tensor, column: Tensor) -> Tensor:
-    """Fine pixels of the crop that obstacles and goals set, (B, 512, 512) bool.
+def draw_boxes(boxes: Sequence[Box], origin: Tensor, row: Tensor, column: Tensor) -> Background | None:
+    """Draw boxes for windows at ``origin`` (B, 2) and crops that begin at ``row`` and ``column`` (B, 1).
 
     A pixel belongs to a box if its left edge and its upper edge lie in it.
     """
-    pixels = torch.arange(SIZE * BLOCK, device=origin.device)
     if not boxes:
-        return torch.zeros(len(origin), SIZE * BLOCK, SIZE * BLOCK, dtype=torch.bool, device=origin.device)
+        return None
+    pixels = torch.arange(SIZE * BLOCK, device=origin.device)
     x = (column + pixels) / RASTER + origin[:, 0:1]
     y = (RASTER - row - pixels) / RASTER + origin[:, 1:2]
     across = torch.stack([_between(x, box.left, box.right, box.closed) for box in boxes], dim=1)
     along = torch.stack([_between(y, box.bottom, box.top, box.closed) for box in boxes], dim=2)
-    return along.float() @ across.float() > 0
+    mask = along.float() @ across.float() > 0
+    share = mask.view(-1, SIZE, BLOCK, SIZE, BLOCK).to(origin.dtype).mean((2, 4))
+    return Background(mask, share)
+
+
+@functools.lru_cache(maxsize=64)
+def draw_boxes_once(
+    boxes: tuple[Box, ...], origin: tuple[float, float], row: int, column: int, dtype: torch.dtype, device: torch.device
+) -> Background | None:
+    """What :func:`draw_boxes` returns where neither window nor crop moves, kept for the next picture."""
+    place = torch.tensor([origin], dtype=dtype, device=device)
+    return draw_boxes(boxes, place, *(torch.tensor([[first]], device=device) for first in (row, column)))
 
 
 def _between(value: Tensor, low: float, high: float, closed: bool) -> Tensor:
@@ -86,7 +104,7 @@ def pixel_means(sight: Sight) -> Tensor:
     Returns:
         (B, 3, 64, 64) means over image pixels of occupancy and both velocities.
     """
-    position, velocity, seen, silent, row, column, mask = sight
+    position, velocity, seen, silent, row, column, drawn = sight
     batch, count = seen.shape
     width = SIZE * BLOCK
     r = torch.trunc((1.0 - position[..., 1]) * float(RASTER)).to(torch.int64) - row
@@ -100,13 +118,15 @@ def pixel_means(sight: Sight) -> Tensor:
     last = torch.full((batch, width * width), -1, dtype=torch.int64, device=r.device)
     last = last.scatter_reduce(1, fine, order, "amax")
     wins = seen & (last.gather(1, fine) == order)
-    new = wins & ~mask.flatten(1).gather(1, fine)
+    new = wins if drawn is None else wins & ~drawn.mask.flatten(1).expand(batch, -1).gather(1, fine)
     values = torch.stack((new.to(velocity.dtype), *(wins * v for v in velocity.unbind(-1))))
     coarse = (r // BLOCK) * SIZE + c // BLOCK
     sums = torch.zeros(3, batch, SIZE * SIZE, dtype=velocity.dtype, device=r.device)
     sums = sums.scatter_add(2, coarse.expand(3, -1, -1), values).view(3, batch, SIZE, SIZE)
-    sums[0] += mask.view(batch, SIZE, BLOCK, SIZE, BLOCK).sum((2, 4))
-    return sums.transpose(0, 1) / BLOCK**2
+    means = sums.transpose(0, 1) / BLOCK**2
+    if drawn is not None:
+        means[:, 0] += drawn.share
+    return means
 
 
 def splat_means(sight: Sight, shares: Tensor) -> Tensor:
@@ -122,7 +142,7 @@ def splat_means(sight: Sight, shares: Tensor) -> Tensor:
     Returns:
         (B, 3, 64, 64) means over image pixels of occupancy and both velocities.
     """
-    position, velocity, seen, silent, row, column, mask = sight
+    position, velocity, seen, silent, row, column, drawn = sight
     batch = len(seen)
     u = position[..., 0] * (RASTER / BLOCK) - column / BLOCK - 0.5
     w = (1.0 - position[..., 1]) * (RASTER / BLOCK) - row / BLOCK - 0.5
@@ -141,7 +161,7 @@ def splat_means(sight: Sight, shares: Tensor) -> Tensor:
     sums = torch.zeros(4, batch, SIZE * SIZE, dtype=velocity.dtype, device=u.device)
     sums = sums.scatter_add(2, ids.expand(4, -1, -1), values).view(4, batch, SIZE, SIZE)
     expected, heard = sums[0], sums[1]
-    free = 1.0 - mask.view(batch, SIZE, BLOCK, SIZE, BLOCK).to(velocity.dtype).mean((2, 4))
+    free = 1.0 if drawn is None else 1.0 - drawn.share
     hit = 1.0 - torch.exp(-heard / SATURATION)
     per_particle = torch.where(heard > 0, hit / torch.where(heard > 0, heard, 1.0), 0.0)
     occupancy = 1.0 - free * torch.exp(-expected / SATURATION)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor
 
-from dittogym.geometry import Obstacle
+from dittogym.geometry import Box, Obstacle, mark
 from dittogym.shapes import Shape
 from torchmpm import Material, ParticleState
 
@@ -188,3 +188,9 @@ class TaskSpec:
     def bodies(self) -> tuple[Body, ...]:
         """Robot and objects in particle order."""
         return (self.robot, *self.objects)
+
+    @property
+    def drawn(self) -> tuple[Box, ...]:
+        """What the robot sees of obstacles and goal."""
+        boxes = tuple(box for obstacle in self.obstacles for box in obstacle.drawn)
+        return boxes if self.goal is None else (*boxes, mark(self.goal))

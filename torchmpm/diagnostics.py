@@ -57,7 +57,7 @@ def potential_energy(solver: Solver, state: ParticleState) -> Tensor:
 
 def finite(state: ParticleState) -> Tensor:
     """Which simulations consist of finite numbers only, (B,) bool."""
-    return torch.stack([torch.isfinite(plane).all(-1) for plane in state.planes()]).all(0)
+    return torch.isfinite(torch.stack(state.planes())).all(2).all(0)
 
 
 def impulses(

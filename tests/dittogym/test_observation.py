@@ -19,6 +19,12 @@ def loop_raster(position: np.ndarray, velocity: np.ndarray, row: int, column: in
     return fine.reshape(3, 64, 8, 64, 8).mean((2, 4))
 
 
+def background(mask: np.ndarray) -> obs.Background:
+    """Any set of fine pixels (B, 512, 512)."""
+    pixels = torch.as_tensor(mask)
+    return obs.Background(pixels, pixels.view(-1, 64, 8, 64, 8).double().mean((2, 4)))
+
+
 def test_pixels_equal_the_loop() -> None:
     rng = np.random.default_rng(0)
     position = rng.uniform(-0.1, 1.1, (2, 4000, 2))
@@ -28,9 +34,7 @@ def test_pixels_equal_the_loop() -> None:
     mask = rng.random((2, 512, 512)) < 0.01
     p, v = torch.as_tensor(position), torch.as_tensor(velocity)
     seen = (p[..., 0] > 0) & (p[..., 0] < 1)
-    ours = obs.pixel_means(
-        obs.Sight(p, v, seen, torch.zeros(4000, dtype=torch.bool), row, column, torch.as_tensor(mask))
-    )
+    ours = obs.pixel_means(obs.Sight(p, v, seen, torch.zeros(4000, dtype=torch.bool), row, column, background(mask)))
     for i in range(2):
         kept = seen[i].numpy()
         loop = loop_raster(position[i][kept], velocity[i][kept], int(row[i]), int(column[i]), mask[i])
@@ -44,13 +48,12 @@ def test_splat_is_the_mean_of_random_rasters() -> None:
     """
     generator = torch.Generator().manual_seed(0)
     corner = (torch.tensor([[256]]), torch.tensor([[256]]))
-    mask = torch.zeros(1, 512, 512, dtype=torch.bool)
     means = {}
     for count, share in ((40000, None), (4000, 10.0)):
         position = 0.4 + 0.2 * torch.rand(1, count, 2, generator=generator, dtype=torch.float64)
         velocity = torch.tensor([1.5, -0.5], dtype=torch.float64).expand(1, count, 2)
         seen = torch.ones(1, count, dtype=torch.bool)
-        sight = obs.Sight(position, velocity, seen, ~seen[0], *corner, mask)
+        sight = obs.Sight(position, velocity, seen, ~seen[0], *corner, None)
         image = obs.pixel_means(sight) if share is None else obs.splat_means(sight, torch.full((count,), share))
         means[count] = image[0, :, 25:38, 25:38].mean((1, 2))
     assert means[4000].tolist() == pytest.approx(means[40000].tolist(), rel=0.08)
@@ -64,8 +67,7 @@ def test_silent_particles_are_seen_but_do_not_move(raster) -> None:
     means = {}
     for silent in ([False, True], [True, True], [False, False]):
         here = torch.full((1, 2, 2), 0.5)
-        mask = torch.zeros(1, 512, 512, dtype=torch.bool)
-        sight = obs.Sight(here, velocity, torch.ones(1, 2, dtype=torch.bool), torch.tensor(silent), *corner, mask)
+        sight = obs.Sight(here, velocity, torch.ones(1, 2, dtype=torch.bool), torch.tensor(silent), *corner, None)
         if all(silent):
             sight = sight._replace(velocity=torch.zeros(1, 2, 2))
         means[tuple(silent)] = raster(sight)[0].sum((1, 2))
@@ -97,7 +99,7 @@ def test_background_pixels_of_a_box() -> None:
     """The right beam of GROW: published as fine rows and columns of the whole raster."""
     origin = torch.tensor([[-0.5, 0.0]], dtype=torch.float64)
     row, column = torch.tensor([[512]]), torch.tensor([[512]])
-    mask = obs.background([Box(15 / 128, 31 / 128, 38 / 128, 41 / 128)], origin, row, column)[0]
+    mask = obs.draw_boxes([Box(15 / 128, 31 / 128, 38 / 128, 41 / 128)], origin, row, column).mask[0]
     rows, columns = mask.nonzero().unbind(1)
     assert (columns.min() + 512, columns.max() + 512) == (633, 759)
     above_ground = 1024 - (rows + 512)

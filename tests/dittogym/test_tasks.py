@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import dittogym
+from dittogym import observation as obs
 from dittogym.window import window_origin
 from torchmpm import Grid
 from torchmpm.boundary import constrain, faces
@@ -125,17 +126,13 @@ def test_velocity_rules_are_the_published_ones(task: str) -> None:
 
 def drawn_pixels(task: str, origin_x: float) -> torch.Tensor:
     """Fine pixels of the whole window that obstacles and goal set, (1024, 1024)."""
-    from dittogym import observation as obs
-
-    spec = dittogym.make_spec(task)
-    boxes = [box for obstacle in spec.obstacles for box in obstacle.drawn]
-    boxes += [] if spec.goal is None else [obs.goal_box(spec.goal)]
     origin = torch.tensor([[origin_x, 0.0]], dtype=torch.float64)
-    quarters = [
-        [obs.background(boxes, origin, torch.tensor([[row]]), torch.tensor([[column]]))[0] for column in (0, 512)]
-        for row in (0, 512)
-    ]
-    return torch.cat([torch.cat(half, 1) for half in quarters], 0)
+
+    def quarter(row: int, column: int) -> torch.Tensor:
+        drawn = obs.draw_boxes(dittogym.make_spec(task).drawn, origin, torch.tensor([[row]]), torch.tensor([[column]]))
+        return torch.zeros(512, 512, dtype=torch.bool) if drawn is None else drawn.mask[0]
+
+    return torch.cat([torch.cat([quarter(row, column) for column in (0, 512)], 1) for row in (0, 512)], 0)
 
 
 def published_pixels(task: str, origin_x: float) -> torch.Tensor:
