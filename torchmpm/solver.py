@@ -166,7 +166,7 @@ class Solver:
                 backend has no use for it: it keeps the start of the step and replays the substeps.
 
         Returns:
-            The new state, differentiable in state, actuation, material values, masses and gravity.
+            The new state, differentiable in state, actuation, origin, material values, masses, volumes and gravity.
 
         Raises:
             ValueError: Shapes, dtypes or devices do not fit together, or the native backend was chosen and cannot run
