@@ -13,7 +13,6 @@ from typing import Any
 import dittogym
 from cfp.config import Config, EnvironmentConfig, LearningConfig, NetworkConfig, Preset, ReportConfig, merge
 from cfp.errors import ConfigError
-from torchmpm.backends import compiler_found
 
 
 @dataclass(frozen=True)
@@ -83,16 +82,11 @@ def preset(task: str, name: str = "quick") -> Config:
         alpha=numbers.alpha,
         gate_bias=(numbers.gate_bias,),
         gate_penalty=(numbers.gate_penalty,),
-        environment=EnvironmentConfig(num_envs=1, particles="full", parity="reference", backend=_backend()),
+        environment=EnvironmentConfig(num_envs=1, particles="full", parity="reference"),
         network=NetworkConfig("aligned", numbers.split, 0.25 if numbers.split else 1.0),
         report=ReportConfig(eval_deterministic=task == "shapematch"),
     )
     return paper if name == "paper" else _quick(paper)
-
-
-def _backend() -> str:
-    """Compiled physics where it can be had: training takes many steps of the same shapes."""
-    return "compile" if compiler_found() else "eager"
 
 
 def _quick(paper: Config) -> Config:
@@ -105,7 +99,7 @@ def _quick(paper: Config) -> Config:
         handover=(3_200,),
         random_steps=(480, 100),
         alpha=(0.5 * paper.alpha[0], paper.alpha[1]),
-        environment=EnvironmentConfig(backend=_backend()),
+        environment=EnvironmentConfig(),
         network=replace(paper.network, interpolation="half_pixel"),
         learning=LearningConfig(
             batch_size=64, learning_rate=1e-3, gamma=0.9, tau=0.01, buffer_size=20_000, gradient_steps=4

@@ -16,7 +16,6 @@ from cfp.errors import CFPError, ConfigError, NonFiniteError
 from cfp.presets import preset
 from cfp.process import Stopped, StopSignals, keep_memory
 from cfp.runner import Runner, holds_run, read_config
-from torchmpm.backends import compiler_found
 
 
 @dataclass(frozen=True)
@@ -111,8 +110,6 @@ def train(config: Config, folder: Path, resume: bool = False) -> None:
         runner = Runner(config, folder, resume, signals)
         if config.environment.backend == "compile":
             print("compiling the physics; the first time on a machine this takes half a minute ...")
-        elif not compiler_found():
-            print("no C++ compiler found: the physics runs operator by operator, about three times slower")
         runner.train()
     runner.finish()
 
