@@ -34,12 +34,12 @@ template <class Pass> bool run_batch(const Scene& scene, Shape shape, char* scra
         Member member{index % shape.team, shape.team, own.team};
         Pass pass(scene, own, member);
         while (true) {
-            if (member.rank == 0) own.element = next.fetch_add(1), own.team.begin(false);
-            member.wait();
+            if (member.rank == 0) own.element = next.fetch_add(1);
+            member.wait(false);
             const int64_t element = own.element;
             if (element >= scene.call.batch) return;
             pass.run(element);
-            member.wait();
+            member.wait(false);
         }
     });
 }

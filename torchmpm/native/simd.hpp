@@ -24,17 +24,12 @@ typedef Real Row8 __attribute__((vector_size(8 * sizeof(Real)), aligned(sizeof(R
 
 #if defined(__clang__) || __GNUC__ >= 12
 #define SHUFFLE(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
-#else
-template <class V> struct Index;
-template <> struct Index<Real4> {
-    typedef std::conditional<sizeof(Real) == 4, int32_t, int64_t>::type Element;
-    typedef Element type __attribute__((vector_size(4 * sizeof(Real))));
+#else  // GCC 11
+template <int count> struct Index {
+    using Element = std::conditional<sizeof(Real) == 4, int32_t, int64_t>::type;
+    typedef Element type __attribute__((vector_size(count * sizeof(Real))));
 };
-template <> struct Index<Real8> {
-    typedef std::conditional<sizeof(Real) == 4, int32_t, int64_t>::type Element;
-    typedef Element type __attribute__((vector_size(8 * sizeof(Real))));
-};
-#define SHUFFLE(a, b, ...) __builtin_shuffle(a, b, Index<decltype(a)>::type{__VA_ARGS__})
+#define SHUFFLE(a, b, ...) __builtin_shuffle(a, b, Index<sizeof(a) / sizeof(Real)>::type{__VA_ARGS__})
 #endif
 
 template <class Function> INLINE void three(Function f) {
@@ -44,9 +39,8 @@ template <class Function> INLINE void three(Function f) {
 }
 
 INLINE Real square(Real a) { return a * a; }
-// Both let a NaN in `a` through.
+// Lets a NaN in `a` through.
 INLINE Real at_least(Real a, Real low) { return a < low ? low : a; }
-INLINE Real at_most(Real a, Real high) { return a > high ? high : a; }
 
 INLINE void transpose(Real4 (&v)[4]) {
     const Real4 a = SHUFFLE(v[0], v[1], 0, 4, 1, 5), b = SHUFFLE(v[0], v[1], 2, 6, 3, 7);

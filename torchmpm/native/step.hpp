@@ -187,7 +187,8 @@ private:
         if (member.rank == 0) work.rules.build(scene, scene.call.shift + 2 * element);
         if (member.rank == member.size - 1 && scene.muscles) load_field(scene, element, work.field);
         pull.none();
-        member.wait();
+        member.wait(false);
+        if (member.rank == 0) work.team.begin(false);
     }
 
     void particles(int64_t substep, bool arriving, bool leaving) {

@@ -24,7 +24,8 @@ public:
 
     explicit Barrier(int members) : size(members) {}
 
-    void wait() {
+    // Unless the wait `counts`, it is not one in vain however long it lasts.
+    void wait(bool counts) {
         if (size == 1) return;
         const int now = phase.load(std::memory_order_relaxed);
         if (waiting.fetch_add(1, std::memory_order_acq_rel) == size - 1) {
@@ -43,7 +44,7 @@ public:
                 std::this_thread::yield();
             else
                 std::this_thread::sleep_for(std::chrono::microseconds(50));
-        lost += std::chrono::nanoseconds(Clock::now() - since).count();
+        if (counts) lost += std::chrono::nanoseconds(Clock::now() - since).count();
     }
 
 private:
@@ -69,7 +70,7 @@ struct Team {
     int64_t nanoseconds() const { return std::chrono::nanoseconds(Clock::now() - since).count(); }
     bool in_vain() const {
         const int64_t passed = nanoseconds();
-        return passed > 300000 && 4 * barrier.lost > passed * (barrier.size - 1);
+        return passed > 1000000 && 2 * barrier.lost > passed * (barrier.size - 1);
     }
 };
 
@@ -78,8 +79,8 @@ struct Member {
     int rank, size;
     Team& team;
 
-    void wait() {
-        if (size > 1) team.barrier.wait();
+    void wait(bool counts = true) {
+        if (size > 1) team.barrier.wait(counts);
     }
 
     // At the end of a substep, the last of several or not: wait for the others. Those whom the first member leaves behind
@@ -87,19 +88,19 @@ struct Member {
     void finish(int64_t& substep, bool last) {
         if (team.barrier.size == 1) return;
         if (rank > 0) {
-            team.barrier.wait();
+            team.barrier.wait(true);
             if (!team.dismissed) return;
-            team.barrier.wait();
+            team.barrier.wait(false);
             substep = team.substep;
         } else if (team.alone) {
-            if (!last && team.nanoseconds() < 3000000) return;
+            if (!last && team.nanoseconds() < 5000000) return;
             team.substep = substep, size = team.barrier.size;
-            team.barrier.wait();
+            team.barrier.wait(false);
             team.begin(false);
         } else {
             team.dismissed = !last && team.in_vain();
             if (team.dismissed) size = 1;
-            team.barrier.wait();
+            team.barrier.wait(true);
             if (team.dismissed) team.begin(true);
         }
     }

@@ -1,5 +1,7 @@
 // Memory of one simulation while it runs. A team of threads has one and uses it again for each of its simulations.
 #pragma once
+#include <limits>
+
 #include "grid.hpp"
 #include "team.hpp"
 
