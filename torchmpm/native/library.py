@@ -35,18 +35,46 @@ _logger = logging.getLogger(__name__)
 
 
 class Call(ctypes.Structure):
-    """The arguments of one call, as ``struct Call`` in ``scene.hpp``: four numbers, then addresses."""
+    """The arguments of one call, as ``struct Call`` in ``scene.hpp``."""
 
+    _POOL = ("pool_parallel", "pool_rank", "pool_team_size")
     _NUMBERS = ("batch", "particles", "substeps", "threads")
     _INPUTS = ("description", "planes", "field", "origin", "shift", "gravity", "values")
     _SIZES = ("values_batch", "columns")
     _OUTPUTS = ("result", "result_bar", "planes_bar", "field_bar", "origin_bar", "gravity_bar", "values_bar")
     _fields_ = [
         *((name, ctypes.c_int64) for name in _NUMBERS),
+        *((name, ctypes.c_void_p) for name in _POOL),
         *((name, ctypes.c_void_p) for name in _INPUTS),
         *((name, ctypes.c_int64) for name in _SIZES),
         *((name, ctypes.c_void_p) for name in _OUTPUTS),
     ]
+
+
+@functools.cache
+def thread_pool() -> dict[str, int]:
+    """Addresses of the functions through which torch's OpenMP threads are reached; empty where it uses others.
+
+    Also empty in a process forked from one that had them: there they do not exist, and calling them would never return.
+    """
+    functions = ("GOMP_parallel", "omp_get_thread_num", "omp_get_num_threads")
+    program = ctypes.CDLL(None)
+    if _forked or not all(hasattr(program, function) for function in functions):
+        return {}
+    addresses = [ctypes.cast(getattr(program, function), ctypes.c_void_p).value for function in functions]
+    return {name: address for name, address in zip(Call._POOL, addresses, strict=True) if address}
+
+
+_forked = False
+
+
+def _after_fork() -> None:
+    global _forked
+    _forked = True
+    thread_pool.cache_clear()
+
+
+os.register_at_fork(after_in_child=_after_fork)
 
 
 def find_compiler() -> tuple[str, ...] | None:

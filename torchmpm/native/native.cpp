@@ -29,7 +29,7 @@ template <class Pass> bool run_batch(const Scene& scene, Shape shape, char* scra
     std::vector<std::unique_ptr<Work>> work;
     for (int t = 0; t < shape.teams; ++t) work.push_back(std::make_unique<Work>(scene, arena, shape.team));
     std::atomic<int64_t> next{0};
-    return run_together(shape.team * shape.teams, [&](int index) {
+    return run_together(scene.call.pool, shape.team * shape.teams, [&](int index) {
         Work& own = *work[index / shape.team];
         Member member{index % shape.team, shape.team, own.team};
         Pass pass(scene, own, member);

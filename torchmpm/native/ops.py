@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchmpm.native.library import Call, load
+from torchmpm.native.library import Call, load, thread_pool
 from torchmpm.native.pack import ROWS, body_widths
 
 _REAL = {torch.float32: "float", torch.float64: "double"}
@@ -136,6 +136,7 @@ def _call(
         values=_address(values),
         values_batch=values.shape[1],
         columns=values.shape[2],
+        **thread_pool(),
     )
 
 

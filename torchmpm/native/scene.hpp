@@ -26,8 +26,16 @@ struct Rule {
 };
 
 // Tensors of one call, all contiguous; a null pointer stands for one that is not there.
+// Functions of GNU OpenMP, whose threads torch computes with; null where it has others.
+struct Pool {
+    void (*parallel)(void (*)(void*), void*, unsigned, unsigned);
+    int (*rank)();
+    int (*team_size)();
+};
+
 struct Call {
     int64_t batch, particles, substeps, threads;
+    Pool pool;
     const double* description;
     const Real* planes;      // (13, batch, particles)
     const Real* field;       // (batch, 2, resolution, resolution)

@@ -1,5 +1,5 @@
-// Threads that live for one call. None waits idle between calls, so nothing spins beside other programs and a forked
-// process inherits nothing.
+// Threads: those of torch where they can be had. After an operator torch's threads keep their cores for some milliseconds,
+// waiting for the next; threads of our own would have to share the cores with them. Elsewhere threads live for one call.
 #pragma once
 #include <atomic>
 #include <chrono>
@@ -106,9 +106,29 @@ struct Member {
     }
 };
 
+template <class Function> bool run_in_pool(const Pool& pool, int threads, Function function) {
+    struct Job {
+        const Pool& pool;
+        int threads;
+        Function& function;
+        std::atomic<bool> done;
+    } job{pool, threads, function, {true}};
+    pool.parallel(
+        [](void* data) {
+            Job& job = *static_cast<Job*>(data);
+            if (job.pool.team_size() == job.threads)
+                job.function(job.pool.rank());
+            else
+                job.done = false;
+        },
+        &job, unsigned(threads), 0);
+    return job.done;
+}
+
 // Run `function(rank)` for all ranks at once, the first on this thread. Returns false, without having called it, where
-// the system gives out no more threads.
-template <class Function> bool run_together(int threads, Function function) {
+// there are not as many threads.
+template <class Function> bool run_together(const Pool& pool, int threads, Function function) {
+    if (threads > 1 && pool.parallel) return run_in_pool(pool, threads, function);
     std::atomic<int> gate{0};  // 1: go, 2: go home
     std::vector<std::thread> others;
     const auto enter = [&](int rank) {
