@@ -51,13 +51,11 @@ def place(field: Tensor, centre: Tensor, nodes: int) -> Tensor:
     Returns:
         (B, 2, nodes, nodes); zero off the patch, which is kept whole inside the window.
     """
-    patch = field.shape[-1]
+    batch, _, patch, _ = field.shape
     base = torch.trunc(nodes * centre.detach() - patch / 2).to(torch.int64).clamp(0, nodes - patch)
-    for axis in (0, 1):
-        index = torch.arange(nodes, device=field.device) - base[:, axis : axis + 1]
-        covered = (index >= 0) & (index < patch)
-        shape = [len(index), 1, 1, 1]
-        shape[2 + axis] = nodes
-        field = torch.take_along_dim(field, index.clamp(0, patch - 1).view(shape), dim=2 + axis)
-        field = field * covered.view(shape)
-    return field
+    along = torch.arange(patch, device=field.device)
+    i, j = ((base[:, axis : axis + 1] + along) for axis in (0, 1))
+    which = torch.arange(batch, device=field.device)
+    result = field.new_zeros(batch, nodes, nodes, 2)
+    result[which[:, None, None], i[:, :, None], j[:, None, :]] = field.permute(0, 2, 3, 1)
+    return result.permute(0, 3, 1, 2)
