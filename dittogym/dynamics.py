@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
@@ -107,8 +108,14 @@ class Model:
 
     def per_particle(self, values: tuple[float, ...] | tuple[bool, ...], like: Tensor) -> Tensor:
         """Values of the bodies as (N,) over all particles, on the device of ``like``."""
-        counts = torch.tensor([body.count for body in self.solver.bodies])
-        return torch.tensor(values).repeat_interleave(counts).to(like.device)
+        return _per_particle(tuple(body.count for body in self.solver.bodies), values, like.device)
+
+
+@functools.lru_cache(maxsize=64)
+def _per_particle(
+    counts: tuple[int, ...], values: tuple[float, ...] | tuple[bool, ...], device: torch.device
+) -> Tensor:
+    return torch.tensor(values).repeat_interleave(torch.tensor(counts)).to(device)
 
 
 def make_model(
@@ -184,14 +191,15 @@ def observe(model: Model, state: EnvState) -> Tensor:
     """The image (B, 3, 64, 64) uint8; particles that are not finite are not drawn."""
     spec = model.spec
     particles, origin = state.particles.detach(), state.origin.detach()
-    finite = torch.isfinite(particles.x).all(-1) & torch.isfinite(particles.v).all(-1)
+    finite = torch.isfinite((particles.x + particles.v).sum(-1))
     seen = finite & model.solver.grid.contains(particles.x[..., 0], origin[:, 0:1])
-    silent = ~model.per_particle(tuple(body.moves_visibly for body in spec.bodies), origin)
-    speaks = (seen & ~silent)[..., None]
+    visible = tuple(body.moves_visibly for body in spec.bodies)
+    silent = None if all(visible) else ~model.per_particle(visible, origin)
+    speaks = seen if silent is None else seen & ~silent
     row, column = obs.crop_corner(in_window(spec.view, state.centre.detach(), origin))
     sight = obs.Sight(
         position=particles.x - origin[:, None],
-        velocity=(2.0 * torch.where(speaks, particles.v, 0.0)).clamp(-obs.CLIP, obs.CLIP),
+        velocity=(2.0 * torch.where(speaks[..., None], particles.v, 0.0)).clamp(-obs.CLIP, obs.CLIP),
         seen=seen,
         silent=silent,
         row=row,

@@ -14,6 +14,8 @@ from torchmpm.spline import quadratic_weights
 
 #: Pixels of the image per axis, fine pixels per image pixel and axis, fine pixels of the whole window.
 SIZE, BLOCK, RASTER = 64, 8, 1024
+#: Pixels around the image that splats at its edge reach into.
+FRAME = 3
 #: Velocities are doubled and clipped to this before averaging.
 CLIP = 10.0
 #: Occupancy of a cell in which n full-size particles are expected: 1 - exp(-n / SATURATION). Thrown at random into the
@@ -53,7 +55,7 @@ class Sight(NamedTuple):
         position: (B, N, 2) window coordinates, m.
         velocity: (B, N, 2) doubled, clipped velocities; zero for silent particles.
         seen: (B, N) bool, particles that are drawn.
-        silent: (N,) bool, particles that only the occupancy channel shows.
+        silent: (N,) bool, particles that only the occupancy channel shows; ``None`` for none.
         row: First fine row of the crop, (B, 1).
         column: First fine column of the crop, (B, 1).
         background: What obstacles and goals set; ``None`` for nothing.
@@ -62,7 +64,7 @@ class Sight(NamedTuple):
     position: Tensor
     velocity: Tensor
     seen: Tensor
-    silent: Tensor
+    silent: Tensor | None
     row: Tensor
     column: Tensor
     background: Background | None
@@ -113,7 +115,8 @@ def pixel_means(sight: Sight) -> Tensor:
     r, c = torch.where(seen, r, 0), torch.where(seen, c, 0)
     fine = r * width + c
     # Silent particles leave the velocity of a pixel to any other particle in it.
-    rank = torch.arange(count, device=r.device) + torch.where(silent, 0, count)
+    rank = torch.arange(count, device=r.device)
+    rank = rank if silent is None else rank + torch.where(silent, 0, count)
     order = torch.where(seen, rank, -1)
     last = torch.full((batch, width * width), -1, dtype=torch.int64, device=r.device)
     last = last.scatter_reduce(1, fine, order, "amax")
@@ -143,29 +146,30 @@ def splat_means(sight: Sight, shares: Tensor) -> Tensor:
         (B, 3, 64, 64) means over image pixels of occupancy and both velocities.
     """
     position, velocity, seen, silent, row, column, drawn = sight
-    batch = len(seen)
+    batch, width = len(seen), SIZE + 2 * FRAME
     u = position[..., 0] * (RASTER / BLOCK) - column / BLOCK - 0.5
     w = (1.0 - position[..., 1]) * (RASTER / BLOCK) - row / BLOCK - 0.5
-    seen = seen & (u.abs() < 2 * SIZE) & (w.abs() < 2 * SIZE)
-    u, w = torch.where(seen, u, 0.0), torch.where(seen, w, 0.0)
+    middle, reach = 0.5 * SIZE, 0.5 * SIZE + 1.5
+    near = seen & ((u - middle).abs() < reach) & ((w - middle).abs() < reach)
+    u, w = torch.where(near, u, 0.0), torch.where(near, w, 0.0)
     base_u, base_w = torch.floor(u - 0.5), torch.floor(w - 0.5)
-    weight = quadratic_weights(w - base_w)[:, :, None] * quadratic_weights(u - base_u)[:, None]
+    across = quadratic_weights(u - base_u) * (near * shares)[:, None]
+    weight = (quadratic_weights(w - base_w)[:, :, None] * across[:, None]).flatten(1, 2)
+    first = ((base_w + FRAME) * width + base_u + FRAME).to(torch.int64)
     offset = torch.arange(3, device=u.device)
-    r = base_w.to(torch.int64)[:, None, None] + offset[:, None, None]
-    c = base_u.to(torch.int64)[:, None, None] + offset[:, None]
-    inside = (r >= 0) & (r < SIZE) & (c >= 0) & (c < SIZE) & seen[:, None, None]
-    ids = (r.clamp(0, SIZE - 1) * SIZE + c.clamp(0, SIZE - 1)).flatten(1)
-    weight = torch.where(inside, weight, 0.0) * shares
-    moving = weight * ~silent
-    values = torch.stack((weight, moving, *(moving * v[:, None, None] for v in velocity.unbind(-1)))).flatten(2)
-    sums = torch.zeros(4, batch, SIZE * SIZE, dtype=velocity.dtype, device=u.device)
-    sums = sums.scatter_add(2, ids.expand(4, -1, -1), values).view(4, batch, SIZE, SIZE)
-    expected, heard = sums[0], sums[1]
+    ids = (first[:, None] + (offset[:, None] * width + offset).view(9, 1)).flatten(1)
+    moving = weight if silent is None else weight * ~silent
+    rows = [weight, *(moving * v[:, None] for v in velocity.unbind(-1))]
+    rows += [] if silent is None else [moving]
+    sums = torch.zeros(len(rows), batch, width**2, dtype=velocity.dtype, device=u.device)
+    sums = sums.scatter_add(2, ids.expand(len(rows), -1, -1), torch.stack(rows).flatten(2))
+    sums = sums.view(-1, batch, width, width)[..., FRAME:-FRAME, FRAME:-FRAME]
+    expected, heard = sums[0], sums[0 if silent is None else 3]
     free = 1.0 if drawn is None else 1.0 - drawn.share
     hit = 1.0 - torch.exp(-heard / SATURATION)
     per_particle = torch.where(heard > 0, hit / torch.where(heard > 0, heard, 1.0), 0.0)
     occupancy = 1.0 - free * torch.exp(-expected / SATURATION)
-    return torch.stack((occupancy, sums[2] * per_particle, sums[3] * per_particle), dim=1)
+    return torch.stack((occupancy, sums[1] * per_particle, sums[2] * per_particle), dim=1)
 
 
 def quantise(means: Tensor) -> Tensor:
