@@ -1,14 +1,13 @@
-"""The substep of ``torchmpm.Solver`` for one von Mises robot with muscles, written in Taichi, as something to compare with.
+"""The substep of ``torchmpm.Solver`` for one von Mises robot with muscles, in Taichi, as something to compare with.
 
 Made to be fast in Taichi: return mapping and polar factor in closed form instead of ``ti.svd``, nodes without mass
-skipped, and one kernel call a substep going forward. For gradients it does what DiffTaichi does: particles have one slot for every
-substep, and the reverse pass fills the one grid again before the gradient kernels run.
+skipped, and one kernel call a substep going forward. For gradients it does what DiffTaichi does: particles have one
+slot for every substep, and the reverse pass fills the one grid again before the gradient kernels run.
 
 Call ``ti.init(ti.cpu, ...)`` before making a :class:`TaichiRobot`; the next ``ti.init`` makes it invalid.
 """
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import taichi as ti
@@ -43,17 +42,17 @@ class TaichiRobot:
         limit = gel.yield_stress / (2 * gel.mu)
         self.ratio = math.exp(math.sqrt(2 * (limit * limit - 1e-8)))  # of the principal stretches at yield
         self.root = math.sqrt(self.ratio)
-        shift = math.trunc(origin_x / self.h)
-        self.rules = [
-            ("xy".index(rule.direction[1]), 1 if rule.direction[0] == "+" else -1, math.isinf(rule.friction))
-            + tuple(
-                bound if bound is not None else default
-                for bounds in (rule.i, rule.j)
-                for bound, default in zip(bounds, (-(10**6), 10**6), strict=True)
+        self.shift = math.trunc(origin_x / self.h)
+        far = 10**6
+        self.rules = []
+        for rule in solver.rules:
+            assert rule.frame == "world" and rule.friction in (0.0, math.inf)
+            axis, sign = "xy".index(rule.direction[1]), 1 if rule.direction[0] == "+" else -1
+            i0, i1, j0, j1 = (
+                default if bound is None else bound
+                for bound, default in zip((*rule.i, *rule.j), (-far, far, -far, far), strict=True)
             )
-            for rule in solver.rules
-        ]
-        self.shift = shift
+            self.rules.append((axis, sign, math.isinf(rule.friction), i0, i1, j0, j1))
 
         grads = history > 0
         particles = (max(history, 1) + 1, batch, body.count)
@@ -83,11 +82,14 @@ class TaichiRobot:
                 self.substep(min(t, 1), 1)
         ti.sync()
 
-    def gradient(self) -> ti.MatrixField:
-        """Derivative of the mean final x in the actuation, after ``run(history)``; on padded nodes, (batch, i, j)."""
+    def gradient(self, cotangent: np.ndarray) -> ti.MatrixField:
+        """Take the derivative in final positions (batch, count, 2) back to the actuation, after ``run(history)``.
+
+        The result is a field over nodes, (batch, i, j), with ``PAD`` more on every side.
+        """
         for field in (self.x, self.v, self.C, self.F, self.actuation):
             field.grad.fill(0.0)
-        self._seed(self.history)
+        self._seed(cotangent)
         for t in reversed(range(self.history)):
             self._reset()
             self._to_grid(t, t + 1)
@@ -101,26 +103,34 @@ class TaichiRobot:
     @ti.kernel
     def substep(self, now: ti.i32, then: ti.i32):
         """One substep from one slot into another, or in place."""
-        self.reset()
-        self.to_grid(now, then)
-        self.on_grid()
-        self.to_particles(now, then)
+        for b, i, j in self.node_mass:
+            self.reset(b, i, j)
+        for b, n in ti.ndrange(self.batch, self.count):
+            self.to_grid(now, then, b, n)
+        for b, i, j in self.node_mass:
+            self.on_grid(b, i, j)
+        for b, n in ti.ndrange(self.batch, self.count):
+            self.to_particles(now, then, b, n)
 
     @ti.kernel
     def _reset(self):
-        self.reset()
+        for b, i, j in self.node_mass:
+            self.reset(b, i, j)
 
     @ti.kernel
     def _to_grid(self, now: ti.i32, then: ti.i32):
-        self.to_grid(now, then)
+        for b, n in ti.ndrange(self.batch, self.count):
+            self.to_grid(now, then, b, n)
 
     @ti.kernel
     def _on_grid(self):
-        self.on_grid()
+        for b, i, j in self.node_mass:
+            self.on_grid(b, i, j)
 
     @ti.kernel
     def _to_particles(self, now: ti.i32, then: ti.i32):
-        self.to_particles(now, then)
+        for b, n in ti.ndrange(self.batch, self.count):
+            self.to_particles(now, then, b, n)
 
     @ti.kernel
     def _start(self, x: ti.types.ndarray()):
@@ -131,21 +141,20 @@ class TaichiRobot:
             self.F[0, b, p] = ti.Matrix.identity(ti.f32, 2)
 
     @ti.kernel
-    def _seed(self, slot: ti.i32):
+    def _seed(self, cotangent: ti.types.ndarray()):
         for b, p in ti.ndrange(self.batch, self.count):
-            self.x.grad[slot, b, p] = ti.Vector([1.0 / (self.batch * self.count), 0.0])
+            self.x.grad[self.history, b, p] = ti.Vector([cotangent[b, p, 0], cotangent[b, p, 1]])
 
     @ti.func
-    def reset(self):
+    def reset(self, b, i, j):
         """Empty the nodes that have something."""
-        for b, i, j in self.node_mass:
-            if self.node_mass[b, i, j] > 0.0:
-                self.node_mass[b, i, j] = 0.0
-                self.momentum[b, i, j] = ti.Vector.zero(ti.f32, 2)
-                if ti.static(self.history > 0):
-                    self.node_mass.grad[b, i, j] = 0.0
-                    self.momentum.grad[b, i, j] = ti.Vector.zero(ti.f32, 2)
-                    self.velocity.grad[b, i, j] = ti.Vector.zero(ti.f32, 2)
+        if self.node_mass[b, i, j] > 0.0:
+            self.node_mass[b, i, j] = 0.0
+            self.momentum[b, i, j] = ti.Vector.zero(ti.f32, 2)
+            if ti.static(self.history > 0):
+                self.node_mass.grad[b, i, j] = 0.0
+                self.momentum.grad[b, i, j] = ti.Vector.zero(ti.f32, 2)
+                self.velocity.grad[b, i, j] = ti.Vector.zero(ti.f32, 2)
 
     @ti.func
     def inside(self, x):
@@ -177,7 +186,10 @@ class TaichiRobot:
             major, minor = ti.max(0.5 * (total + difference), FLOOR), ti.max(0.5 * (total - difference), FLOOR)
             if major > minor * self.ratio:
                 half = 0.5 * ti.sqrt(major * minor)
-                grow, shrink = half * (self.root + 1.0 / self.root) / total, half * (self.root - 1.0 / self.root) / difference
+                grow, shrink = (
+                    half * (self.root + 1.0 / self.root) / total,
+                    half * (self.root - 1.0 / self.root) / difference,
+                )
                 a = ti.select(rotation >= reflection, grow, shrink)
                 c = ti.select(rotation >= reflection, shrink, grow)
                 F = ti.Matrix([[p * a + r * c, s * c - q * a], [q * a + s * c, p * a - r * c]])
@@ -199,69 +211,66 @@ class TaichiRobot:
         return R
 
     @ti.func
-    def to_grid(self, now, then):
+    def to_grid(self, now, then, b, n):
         """Deform, return, sample the muscles, find the stress, and scatter mass and momentum."""
-        for b, n in ti.ndrange(self.batch, self.count):
-            x = self.x[now, b, n]
-            if self.inside(x):
-                C = self.C[now, b, n]
-                F = self.returned((ti.Matrix.identity(ti.f32, 2) + self.dt * C) @ self.F[now, b, n])
-                self.F[then, b, n] = F
-                base, f = self.place(x)
-                w = self.weights(f)
-                pull = ti.Vector.zero(ti.f32, 2)
-                for i, j in ti.static(ti.ndrange(3, 3)):
-                    pull += w[i][0] * w[j][1] * self.actuation[b, base[0] + i, base[1] + j]
-                J = F.determinant()
-                R = self.polar(F)
-                muscle = ti.Matrix([[pull[0], 0.0], [0.0, pull[1]]])
-                tau = (2.0 * self.mu * (F - R) + F @ muscle) @ F.transpose()
-                tau += self.lam * J * (J - 1.0) * ti.Matrix.identity(ti.f32, 2)
-                P = -self.dt * self.volume * 4.0 * self.inverse_h**2 * tau + self.mass * C
-                momentum = self.mass * self.v[now, b, n]
-                for i, j in ti.static(ti.ndrange(3, 3)):
-                    weight = w[i][0] * w[j][1]
-                    d = (ti.Vector([float(i), float(j)]) - f) * self.h
-                    self.momentum[b, base[0] + i, base[1] + j] += weight * (momentum + P @ d)
-                    self.node_mass[b, base[0] + i, base[1] + j] += weight * self.mass
-            else:
-                self.F[then, b, n] = self.F[now, b, n]
+        x = self.x[now, b, n]
+        if self.inside(x):
+            C = self.C[now, b, n]
+            F = self.returned((ti.Matrix.identity(ti.f32, 2) + self.dt * C) @ self.F[now, b, n])
+            self.F[then, b, n] = F
+            base, f = self.place(x)
+            w = self.weights(f)
+            pull = ti.Vector.zero(ti.f32, 2)
+            for i, j in ti.static(ti.ndrange(3, 3)):
+                pull += w[i][0] * w[j][1] * self.actuation[b, base[0] + i, base[1] + j]
+            J = F.determinant()
+            R = self.polar(F)
+            muscle = ti.Matrix([[pull[0], 0.0], [0.0, pull[1]]])
+            tau = (2.0 * self.mu * (F - R) + F @ muscle) @ F.transpose()
+            tau += self.lam * J * (J - 1.0) * ti.Matrix.identity(ti.f32, 2)
+            P = -self.dt * self.volume * 4.0 * self.inverse_h**2 * tau + self.mass * C
+            momentum = self.mass * self.v[now, b, n]
+            for i, j in ti.static(ti.ndrange(3, 3)):
+                weight = w[i][0] * w[j][1]
+                d = (ti.Vector([float(i), float(j)]) - f) * self.h
+                self.momentum[b, base[0] + i, base[1] + j] += weight * (momentum + P @ d)
+                self.node_mass[b, base[0] + i, base[1] + j] += weight * self.mass
+        else:
+            self.F[then, b, n] = self.F[now, b, n]
 
     @ti.func
-    def on_grid(self):
+    def on_grid(self, b, i, j):
         """Velocity of the nodes that have mass: gravity, damping, rules."""
-        for b, i, j in self.node_mass:
-            mass = self.node_mass[b, i, j]
-            if mass > 0.0 and ti.max(i, j) < self.nodes + PAD and ti.min(i, j) >= PAD:
-                v = self.momentum[b, i, j] / (mass + 1e-10) + self.dt * ti.Vector([self.gravity[0], self.gravity[1]])
-                v *= self.damping
-                world_i, world_j = i - PAD + self.shift, j - PAD
-                for k in ti.static(range(len(self.rules))):
-                    axis, sign, stick, i0, i1, j0, j1 = ti.static(self.rules[k])
-                    hit = i0 <= world_i and world_i <= i1 and j0 <= world_j and world_j <= j1 and sign * v[axis] > 0.0
-                    if ti.static(stick):
-                        v[1 - axis] = ti.select(hit, 0.0, v[1 - axis])
-                    v[axis] = ti.select(hit, 0.0, v[axis])
-                self.velocity[b, i, j] = v
+        mass = self.node_mass[b, i, j]
+        if mass > 0.0 and ti.max(i, j) < self.nodes + PAD and ti.min(i, j) >= PAD:
+            v = self.momentum[b, i, j] / (mass + 1e-10) + self.dt * ti.Vector([self.gravity[0], self.gravity[1]])
+            v *= self.damping
+            world_i, world_j = i - PAD + self.shift, j - PAD
+            for k in ti.static(range(len(self.rules))):
+                axis, sign, stick, i0, i1, j0, j1 = ti.static(self.rules[k])
+                hit = i0 <= world_i and world_i <= i1 and j0 <= world_j and world_j <= j1 and sign * v[axis] > 0.0
+                if ti.static(stick):
+                    v[1 - axis] = ti.select(hit, 0.0, v[1 - axis])
+                v[axis] = ti.select(hit, 0.0, v[axis])
+            self.velocity[b, i, j] = v
 
     @ti.func
-    def to_particles(self, now, then):
+    def to_particles(self, now, then, b, n):
         """Gather velocity and affine matrix, and move."""
-        for b, n in ti.ndrange(self.batch, self.count):
-            x = self.x[now, b, n]
-            if self.inside(x):
-                base, f = self.place(x)
-                w = self.weights(f)
-                v = ti.Vector.zero(ti.f32, 2)
-                C = ti.Matrix.zero(ti.f32, 2, 2)
-                for i, j in ti.static(ti.ndrange(3, 3)):
-                    moved = w[i][0] * w[j][1] * self.velocity[b, base[0] + i, base[1] + j]
-                    v += moved
-                    C += 4.0 * self.inverse_h * moved.outer_product(ti.Vector([float(i), float(j)]) - f)
-                self.v[then, b, n] = v
-                self.C[then, b, n] = C
-                self.x[then, b, n] = x + self.dt * v
-            else:
-                self.v[then, b, n] = self.v[now, b, n]
-                self.C[then, b, n] = self.C[now, b, n]
-                self.x[then, b, n] = x
+        x = self.x[now, b, n]
+        if self.inside(x):
+            base, f = self.place(x)
+            w = self.weights(f)
+            v = ti.Vector.zero(ti.f32, 2)
+            C = ti.Matrix.zero(ti.f32, 2, 2)
+            for i, j in ti.static(ti.ndrange(3, 3)):
+                moved = w[i][0] * w[j][1] * self.velocity[b, base[0] + i, base[1] + j]
+                v += moved
+                C += 4.0 * self.inverse_h * moved.outer_product(ti.Vector([float(i), float(j)]) - f)
+            self.v[then, b, n] = v
+            self.C[then, b, n] = C
+            self.x[then, b, n] = x + self.dt * v
+        else:
+            self.v[then, b, n] = self.v[now, b, n]
+            self.C[then, b, n] = self.C[now, b, n]
+            self.x[then, b, n] = x
