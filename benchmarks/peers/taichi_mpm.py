@@ -103,18 +103,18 @@ class TaichiRobot:
     @ti.kernel
     def substep(self, now: ti.i32, then: ti.i32):
         """One substep from one slot into another, or in place."""
-        for b, i, j in self.node_mass:
+        for b, i, j in ti.ndrange(self.batch, self.nodes + 2 * PAD, self.nodes + 2 * PAD):
             self.reset(b, i, j)
         for b, n in ti.ndrange(self.batch, self.count):
             self.to_grid(now, then, b, n)
-        for b, i, j in self.node_mass:
+        for b, i, j in ti.ndrange(self.batch, self.nodes + 2 * PAD, self.nodes + 2 * PAD):
             self.on_grid(b, i, j)
         for b, n in ti.ndrange(self.batch, self.count):
             self.to_particles(now, then, b, n)
 
     @ti.kernel
     def _reset(self):
-        for b, i, j in self.node_mass:
+        for b, i, j in ti.ndrange(self.batch, self.nodes + 2 * PAD, self.nodes + 2 * PAD):
             self.reset(b, i, j)
 
     @ti.kernel
@@ -124,7 +124,7 @@ class TaichiRobot:
 
     @ti.kernel
     def _on_grid(self):
-        for b, i, j in self.node_mass:
+        for b, i, j in ti.ndrange(self.batch, self.nodes + 2 * PAD, self.nodes + 2 * PAD):
             self.on_grid(b, i, j)
 
     @ti.kernel
