@@ -16,6 +16,7 @@ from dittogym.reward import action_cost, measure, split_penalty
 from dittogym.spec import FAILURE_REWARD, Measurement, Moment, Outcome, TaskSpec
 from dittogym.window import in_window, window_origin
 from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VonMises, diagnostics
+from torchmpm.state import choose
 
 #: Terms that the engine adds to those of a task.
 RESERVED = {"split", "action", "alive", "failure"}
@@ -65,10 +66,7 @@ class EnvState:
 
     def where(self, mask: Tensor, other: EnvState) -> EnvState:
         """Whole batch elements from this state where ``mask`` (B,) holds, from ``other`` elsewhere."""
-        return self.map(
-            lambda mine, theirs: torch.where(mask.view(-1, *[1] * (mine.ndim - 1)), mine, theirs),
-            other,
-        )
+        return self.map(lambda mine, theirs: choose(mask, mine, theirs), other)
 
     def detach(self) -> EnvState:
         """The same numbers, cut off from the autograd graph."""

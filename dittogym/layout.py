@@ -12,6 +12,7 @@ from dittogym.spec import Body, TaskSpec
 from dittogym.window import window_origin
 from torchmpm import Grid, sampling
 from torchmpm.sampling import Points
+from torchmpm.state import choose
 
 #: ``"full"``, ``"lite"``, the number of robot particles, or the numbers for robot and object.
 Particles: TypeAlias = "str | int | tuple[int, ...]"
@@ -140,9 +141,7 @@ class Layouts:
         else:
             return self._positions
         if self._positions is not None:
-            positions = torch.where(
-                torch.as_tensor(mask, device=like.device)[:, None, None], positions, self._positions
-            )
+            positions = choose(torch.as_tensor(mask, device=like.device), positions, self._positions)
         self._samplers, self._positions = samplers, positions
         return positions
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dittogym.spec import TaskSpec
+from torchmpm.state import choose
 
 #: Values by name, (B,) each; ``gravity`` (B, 2).
 Physics: TypeAlias = Mapping[str, Tensor]
@@ -68,12 +69,7 @@ def merged(spec: TaskSpec, old: Physics, new: Physics, mask: Tensor, like: Tenso
         return dict(new)
     own = defaults(spec, like)
     names = [name for name in NAMES if name in old or name in new]
-    return {
-        name: torch.where(
-            mask.view(-1, *[1] * (own[name].ndim - 1)), new.get(name, own[name]), old.get(name, own[name])
-        )
-        for name in names
-    }
+    return {name: choose(mask, new.get(name, own[name]), old.get(name, own[name])) for name in names}
 
 
 def _expanded(value: Tensor, name: str, batch: int) -> Tensor:

@@ -19,6 +19,7 @@ from dittogym.reward import measure
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
 from torchmpm import ParticleState
+from torchmpm.state import choose
 
 Parity = Literal["clean", "reference"]
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -207,7 +208,7 @@ class TorchEnv:
             mine, seen = self._moment()
             physics = merged(self.spec, mine.physics, state.physics, chosen, self._like)
             state = replace(state, physics=physics).where(chosen, replace(mine, physics=physics))
-            observation = torch.where(chosen[:, None, None, None], observation, seen)
+            observation = choose(chosen, observation, seen)
         self._env_state, self._observation, self._field = state, observation, None
         return observation
 

@@ -14,6 +14,11 @@ from torch import Tensor
 _TRAILING = {"x": (2,), "v": (2,), "C": (2, 2), "F": (2, 2), "Jp": ()}
 
 
+def choose(mask: Bool[Tensor, " B"], one: Tensor, other: Tensor) -> Tensor:
+    """Whole batch elements of tensors (B, ...): from ``one`` where ``mask`` (B,) holds, from ``other`` elsewhere."""
+    return torch.where(mask.view(-1, *[1] * (one.ndim - 1)), one, other)
+
+
 @dataclass(frozen=True, eq=False)
 class ParticleState:
     """Positions, velocities and deformation of B independent simulations with N particles each.
@@ -118,10 +123,7 @@ class ParticleState:
 
     def where(self, mask: Bool[Tensor, " B"], other: ParticleState) -> ParticleState:
         """Take whole batch elements: this state where ``mask`` (B,) holds, ``other`` elsewhere."""
-        return self.map(
-            lambda mine, theirs: torch.where(mask.view(-1, *[1] * (mine.ndim - 1)), mine, theirs),
-            other,
-        )
+        return self.map(lambda mine, theirs: choose(mask, mine, theirs), other)
 
     def planes(self) -> tuple[Tensor, ...]:
         """The 13 component planes, each (B, N): x, v, C and F row by row, Jp."""

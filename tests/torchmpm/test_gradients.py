@@ -1,17 +1,16 @@
 """Derivatives of a rollout in everything it is differentiable in, against central differences and each other."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
-import scenes
 import torch
 from scenes import lively, normal, positions, robot
 from torch import Tensor
 
 from torchmpm import Body, Elastic, ParticleState, VelocityRule, VonMises
-from torchmpm.backends import compiler_found
+
+pytestmark = pytest.mark.usefixtures("backend")
 
 B, N = 2, 40
 SUBSTEPS = 20
@@ -22,16 +21,6 @@ SCENES = {
     "sticky floor": {"strain": 0.1, "rules": (VelocityRule("-y", j=(None, 7), friction=math.inf),)},
     "rubbing floor": {"strain": 0.1, "rules": (VelocityRule("-y", j=(None, 7), friction=0.3),)},
 }
-
-
-@pytest.fixture(scope="module", autouse=True, params=["eager", "native"])
-def backend(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Everything in this file holds for the plain substep and for the kernels."""
-    if request.param == "native" and not compiler_found():
-        pytest.skip("no C++ compiler")
-    scenes.BACKEND, before = request.param, scenes.BACKEND
-    yield request.param
-    scenes.BACKEND = before
 
 
 def inputs(strain: float) -> dict[str, Tensor]:

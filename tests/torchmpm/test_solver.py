@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -23,19 +23,10 @@ from scenes import (
 from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VelocityRule, VonMises, diagnostics, fixed
-from torchmpm.backends import compiler_found
+
+pytestmark = pytest.mark.usefixtures("backend")
 
 R, H = GRID.resolution, GRID.h
-
-
-@pytest.fixture(scope="module", autouse=True, params=["eager", "native"])
-def backend(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Everything in this file holds for the plain substep and for the kernels."""
-    if request.param == "native" and not compiler_found():
-        pytest.skip("no C++ compiler")
-    scenes.BACKEND, before = request.param, scenes.BACKEND
-    yield request.param
-    scenes.BACKEND = before
 
 
 def field(batch: int = 1, size: float = 60.0, seed: int = 0) -> Tensor:
