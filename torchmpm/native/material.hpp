@@ -58,15 +58,7 @@ INLINE Direction von_mises_return(const Values& m, Bounds bounds, Mat2& F) {
 
 INLINE Real clamped(Real s, Real low, Real high) { return s < low ? low : (s > high ? high : s); }
 
-// Principal stretches of soil brought into their range; its adjoint needs them all.
-struct Clamp {
-    Parts v;
-    Direction R;
-    Real along, n1, n2, root, first, second, major, minor, ratio, sum, squeezed;
-    bool drop, round;
-};
-
-INLINE Clamp clamp_stretches(const Values& m, Bounds bounds, const Mat2& F) {
+INLINE Direction soil_return(const Values& m, Bounds bounds, Mat2& F, Real& Jp) {
     const Real low = m.low(), high = m.high();
     const Parts v = split(F);
     const Direction R = direction(v);
@@ -80,16 +72,10 @@ INLINE Clamp clamp_stretches(const Values& m, Bounds bounds, const Mat2& F) {
     const Real major = clamped(first, low, high), minor = clamped(second, low, high);
     const Real kept = (first >= low) & (first <= high) ? Real(1) : Real(0);
     const Real ratio = Real(0.5) * (round ? kept : (major - minor) / root), sum = Real(0.5) * (major + minor);
-    const Real squeezed = first * second / (major * minor);
-    return {v, R, along, n1, n2, root, first, second, major, minor, ratio, sum, squeezed, drop, round};
-}
-
-INLINE Direction soil_return(const Values& m, Bounds bounds, Mat2& F, Real& Jp) {
-    const Clamp c = clamp_stretches(m, bounds, F);
-    F = join({c.sum * c.R.cos, c.sum * c.R.sin, c.ratio * c.n1, c.ratio * c.n2, c.v.proper});
-    const Real grown = Jp * c.squeezed;
+    F = join({sum * R.cos, sum * R.sin, ratio * n1, ratio * n2, v.proper});
+    const Real grown = Jp * (first * second / (major * minor));
     Jp = grown > LARGEST_JP ? LARGEST_JP : grown;
-    return c.R;
+    return R;
 }
 
 template <Kind kind> INLINE Direction return_map(const Values& m, Bounds bounds, Mat2& F, Real& Jp) {
