@@ -7,12 +7,13 @@ and Appendix B; parameter totals are held by a test.
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from dittogym.action import bicubic
 
 Interpolation = Literal["half_pixel", "aligned"]
 
@@ -32,25 +33,15 @@ RESOLUTIONS = (4, *_DECODERS)
 """Action grids R for which a head exists."""
 
 
-@lru_cache(maxsize=64)
-def _bicubic_matrix(before: int, after: int, aligned: bool) -> Tensor:
-    """Matrix (after, before) of one-dimensional bicubic interpolation, read off PyTorch's own on unit vectors."""
-    basis = torch.eye(before, dtype=torch.float64)[:, None, :, None].expand(-1, -1, -1, before)
-    image = F.interpolate(basis, size=(after, before), mode="bicubic", align_corners=aligned)
-    return image[:, 0, :, 0].T.contiguous()
-
-
 def upsample(action: Tensor, size: int, interpolation: Interpolation) -> Tensor:
     """Bicubic interpolation (kernel parameter -0.75) of an action image (B, 2, R, R) to (B, 2, size, size).
 
     The reference implementation aligns corners here but uses half-pixel centres in the environment, so that a closed
     gate does not reproduce the coarse force field there; ``"half_pixel"`` uses the environment's rule everywhere.
-    Written as two small matrix products, whose gradient is much faster than that of ``F.interpolate`` on a CPU.
     """
     if action.shape[-1] == size:
         return action
-    matrix = _bicubic_matrix(action.shape[-1], size, interpolation == "aligned").to(action)
-    return matrix @ action @ matrix.T
+    return bicubic(action, size, align_corners=interpolation == "aligned")
 
 
 def normalise_image(observation: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Literal
 
 import torch
@@ -35,9 +36,27 @@ def patch_field(action: Tensor, patch: int, max_actuation: float | Tensor) -> Te
     Returns:
         (B, 2, P, P), Pa.
     """
-    upsampled = interpolate(action, size=(patch, patch), mode="bicubic", align_corners=False)
+    upsampled = bicubic(action, patch)
     scale = max_actuation.view(-1, 1, 1, 1) if isinstance(max_actuation, Tensor) else max_actuation
     return scale * upsampled.clamp(-1.0, 1.0)
+
+
+def bicubic(image: Tensor, size: int, align_corners: bool = False) -> Tensor:
+    """Bicubic interpolation (a = -0.75) of square images (..., R, R) to (..., size, size).
+
+    Written as two small matrix products, which are several times faster on a CPU than PyTorch's own, forward and
+    backward.
+    """
+    matrix = _bicubic_matrix(image.shape[-1], size, align_corners, image.dtype, image.device)
+    return matrix @ image @ matrix.T
+
+
+@functools.lru_cache(maxsize=64)
+def _bicubic_matrix(before: int, after: int, align_corners: bool, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Matrix (after, before) of one-dimensional interpolation, read off PyTorch's own on unit vectors."""
+    basis = torch.eye(before, dtype=torch.float64)[:, None, :, None].expand(-1, -1, -1, before)
+    image = interpolate(basis, size=(after, before), mode="bicubic", align_corners=align_corners)
+    return image[:, 0, :, 0].T.contiguous().to(device, dtype)
 
 
 def place(field: Tensor, centre: Tensor, nodes: int) -> Tensor:
@@ -52,10 +71,15 @@ def place(field: Tensor, centre: Tensor, nodes: int) -> Tensor:
         (B, 2, nodes, nodes); zero off the patch, which is kept whole inside the window.
     """
     batch, _, patch, _ = field.shape
-    base = torch.trunc(nodes * centre.detach() - patch / 2).to(torch.int64).clamp(0, nodes - patch)
-    along = torch.arange(patch, device=field.device)
-    i, j = ((base[:, axis : axis + 1] + along) for axis in (0, 1))
-    which = torch.arange(batch, device=field.device)
-    result = field.new_zeros(batch, nodes, nodes, 2)
-    result[which[:, None, None], i[:, :, None], j[:, None, :]] = field.permute(0, 2, 3, 1)
-    return result.permute(0, 3, 1, 2)
+    # The conversion truncates, as in the reference.
+    i, j = (nodes * centre.detach() - patch / 2).to(torch.int64).clamp(0, nodes - patch).split(1, dim=1)
+    ids = i * nodes + j + _patch_ids(patch, nodes, field.device)
+    result = field.new_zeros(batch, 2, nodes * nodes)
+    return result.scatter(2, ids[:, None].expand(-1, 2, -1), field.flatten(2)).unflatten(2, (nodes, nodes))
+
+
+@functools.lru_cache(maxsize=16)
+def _patch_ids(patch: int, nodes: int, device: torch.device) -> Tensor:
+    """Where a patch in the corner of the window has its nodes among all of them, (P P)."""
+    along = torch.arange(patch, device=device)
+    return (along[:, None] * nodes + along).flatten()

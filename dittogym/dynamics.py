@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dittogym import native
 from dittogym import observation as obs
 from dittogym.action import patch_field, place
 from dittogym.physics import Physics
@@ -90,6 +91,11 @@ class Model:
     substeps: int
     shares: tuple[float, ...]
     pixels: bool
+
+    @functools.cached_property
+    def painter(self) -> native.Painter:
+        """Draws observations where the physics runs natively."""
+        return native.Painter(self)
 
     @property
     def robot(self) -> int:
@@ -187,6 +193,8 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
 
 def observe(model: Model, state: EnvState) -> Tensor:
     """The image (B, 3, 64, 64) uint8; particles that are not finite are not drawn."""
+    if native.paints(model, state):
+        return model.painter.paint(state)
     spec = model.spec
     particles, origin = state.particles.detach(), state.origin.detach()
     finite = torch.isfinite((particles.x + particles.v).sum(-1))
@@ -246,7 +254,7 @@ def judge(model: Model, state: EnvState, field: Tensor, observation: Tensor) -> 
     if weights.action:
         terms["action"] = -weights.action * action_cost(field)
     terms["alive"] = torch.full_like(now.split, weights.alive)
-    terms = {name: torch.where(finite, term, 0.0) for name, term in terms.items()}
+    terms = dict(zip(terms, torch.where(finite, torch.stack(tuple(terms.values())), 0.0).unbind(), strict=True))
     terms["failure"] = torch.where(finite, 0.0, FAILURE_REWARD).to(now.split)
     info = {"com": now.com, "split": now.split, "finite": finite, **own.info}
     if now.object_com is not None:

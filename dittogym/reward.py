@@ -51,8 +51,9 @@ def action_cost(field: Tensor) -> Tensor:
 def measure(particles: ParticleState, robot: int) -> Measurement:
     """Averages over the robot (the first ``robot`` particles) and, if there are more, over the object."""
     x, v = particles.x, particles.v
-    variance = x[:, :robot].var(dim=1, correction=0)
-    bodies = [x[:, :robot].mean(1), v[:, :robot].mean(1), variance.sum(-1).sqrt()]
+    com = x[:, :robot].mean(1)
+    variance = (x[:, :robot] - com[:, None]).square().mean(1)  # several times faster than Tensor.var
+    bodies = [com, v[:, :robot].mean(1), variance.sum(-1).sqrt()]
     if robot < x.shape[1]:
         bodies += [x[:, robot:].mean(1), v[:, robot:].mean(1)]
     return Measurement(*bodies)

@@ -18,6 +18,8 @@ def window_origin(spec: TaskSpec, com: Tensor) -> Tensor:
 def in_window(centre: Centre, com: Tensor, origin: Tensor) -> Tensor:
     """A centre rule in window coordinates, (B, 2), m."""
     relative = com - origin
+    if centre == (None, None):
+        return relative
     return torch.stack(
         [relative[:, i] if c is None else torch.full_like(relative[:, i], c) for i, c in enumerate(centre)], dim=1
     )

@@ -144,7 +144,18 @@ class ParticleState:
     def from_stack(cls, stacked: Tensor) -> ParticleState:
         """The same from one tensor (13, B, N), of which the fields become views."""
         vector, matrix = (lambda p: p.movedim(0, -1)), (lambda p: p.movedim(0, -1).unflatten(-1, (2, 2)))
-        return cls(vector(stacked[0:2]), vector(stacked[2:4]), matrix(stacked[4:8]), matrix(stacked[8:12]), stacked[12])
+        x, v, C, F = vector(stacked[0:2]), vector(stacked[2:4]), matrix(stacked[4:8]), matrix(stacked[8:12])
+        state = cls(x, v, C, F, stacked[12])
+        object.__setattr__(state, "_stack", stacked)
+        return state
+
+    def stack(self) -> Tensor:
+        """The :meth:`planes` as one tensor (13, B, N); no copy of what :meth:`from_stack` made, unless with a graph."""
+        stacked: Tensor | None = getattr(self, "_stack", None)
+        # With a graph the tensor goes through the fields, so that derivatives in them can be asked for.
+        if stacked is None or stacked.requires_grad or any(getattr(self, f.name).requires_grad for f in fields(self)):
+            return torch.stack(self.planes())
+        return stacked
 
     def map(self, function: Callable[..., Tensor], *others: ParticleState) -> ParticleState:
         """Apply ``function`` to every field, together with the same field of ``others``."""

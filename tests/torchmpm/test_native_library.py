@@ -17,9 +17,15 @@ from torchmpm.native import library
 def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     """An empty cache, and a process that has not loaded anything."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    library._load.cache_clear()
+    forget()
     yield
+    forget()
+
+
+def forget() -> None:
+    """As in the next process."""
     library._load.cache_clear()
+    library._loaded.clear()
 
 
 def script(tmp_path: Path, body: str) -> str:
@@ -71,7 +77,7 @@ def test_result_that_does_not_load(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 def test_kept_on_disk(quick_compiler: None, tmp_path: Path) -> None:
     first = library.load("float")
     assert library.load("float") is first
-    library._load.cache_clear()  # as in the next process
+    forget()
     assert isinstance(library.load("float"), ctypes.CDLL)
     assert runs(tmp_path) == 1
     library.load("double")
@@ -87,6 +93,7 @@ def test_damaged_file_is_replaced(quick_compiler: None, monkeypatch: pytest.Monk
     damaged.parent.mkdir(parents=True)
     damaged.write_bytes(b"half a library")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
+    forget()
     library.load("float")
     assert runs(tmp_path) == 2
     assert damaged.read_bytes() == file.read_bytes()
@@ -96,7 +103,7 @@ def test_another_source_is_another_file(quick_compiler: None, monkeypatch: pytes
     library.load("float")
     for name, value in (("_processor", lambda: "another processor"), ("_FLAGS", ("-O0",))):
         monkeypatch.setattr(library, name, value)
-        library._load.cache_clear()
+        forget()
         library.load("float")
     assert runs(tmp_path) == 3
     assert len(list((tmp_path / "cache" / "torchmpm").iterdir())) == 3
@@ -106,7 +113,7 @@ def test_folder_that_cannot_be_written(quick_compiler: None, monkeypatch: pytest
     """Then each process compiles for itself and leaves nothing behind."""
     (tmp_path / "cache").write_text("a file where the folder should be")
     assert isinstance(library.load("float"), ctypes.CDLL)
-    library._load.cache_clear()
+    forget()
     library.load("float")
     assert runs(tmp_path) == 2
 

@@ -67,7 +67,7 @@ def step(
     field = None if actuation is None else actuation.contiguous()
     gravity = torch.as_tensor(solver.gravity, dtype=state.dtype).expand(state.batch_size, 2).contiguous()
     shift, description = node_shift(solver.grid, origin), pack.description(solver, widths, mass_epsilon)
-    planes = torch.stack(state.planes())
+    planes = state.stack()
     # With gradients a call keeps its start and needs a tape of all its substeps later, which must not grow endlessly.
     limit = ops.tape_limit(planes, solver.grid.width) if torch.is_grad_enabled() else substeps
     for start in range(0, substeps, limit):

@@ -32,6 +32,8 @@ _X86_FLAGS = ("-mprefer-vector-width=512",)
 #: What a user reads behind the name of the backend.
 NO_COMPILER = "needs a C++ compiler (g++, clang++ or $CXX), found none: use 'eager'"
 _logger = logging.getLogger(__name__)
+#: What this process has loaded: looking for a compiler again would cost more than a substep.
+_loaded: dict[tuple[Path, tuple[str, ...]], ctypes.CDLL] = {}
 
 
 class Call(ctypes.Structure):
@@ -92,10 +94,7 @@ def cache_folder() -> str:
 
 
 def load(real: str) -> ctypes.CDLL:
-    """The compiled kernels for one scalar type.
-
-    The first call on a machine compiles them, which takes some seconds; later processes find them in
-    :func:`cache_folder`. Where that cannot be written each process compiles its own.
+    """The compiled kernels for one scalar type, see :func:`build`.
 
     Args:
         real: ``"float"`` or ``"double"``.
@@ -103,22 +102,40 @@ def load(real: str) -> ctypes.CDLL:
     Raises:
         ValueError: There is no compiler, or it failed; the message holds what it said.
     """
-    # All that decides what is loaded; the search itself would cost more than a substep.
-    loaded = _load(real, cache_folder(), os.environ.get("CXX"), os.environ.get("PATH"))
-    if isinstance(loaded, str):
-        raise ValueError(f"backend 'native' {loaded}")
-    return loaded
+    return build(_SOURCES / "native.cpp", f"-DTORCHMPM_REAL={real}")
+
+
+def build(source: Path, *options: str) -> ctypes.CDLL:
+    """A C++ file, which finds the headers of this folder and of its own, as a loaded library.
+
+    The first call on a machine compiles it, which takes some seconds; later processes find it in
+    :func:`cache_folder`. Where that cannot be written each process compiles its own.
+
+    Args:
+        source: The file.
+        options: For the compiler, beside those that all kernels are compiled with.
+
+    Raises:
+        ValueError: There is no compiler, or it failed; the message holds what it said.
+    """
+    library = _loaded.get((source, options))
+    if library is None:
+        found = _load(source, options, cache_folder(), os.environ.get("CXX"), os.environ.get("PATH"))
+        if isinstance(found, str):
+            raise ValueError(f"backend 'native' {found}")
+        library = _loaded[source, options] = found
+    return library
 
 
 @functools.cache
-def _load(real: str, folder: str, *_: str | None) -> ctypes.CDLL | str:
+def _load(source: Path, options: tuple[str, ...], folder: str, *_: str | None) -> ctypes.CDLL | str:
     """Find or build the library; a failure comes back as text, so that it is not tried again in this process."""
     compiler = find_compiler()
     if compiler is None:
         return NO_COMPILER
-    flags = [*_FLAGS, *(_X86_FLAGS if platform.machine() in ("x86_64", "AMD64") else ()), f"-DTORCHMPM_REAL={real}"]
-    command = [*compiler, *flags, str(_SOURCES / "native.cpp"), "-o"]
-    path = Path(folder) / f"native-{_key(command)}.so"
+    flags = [*_FLAGS, *(_X86_FLAGS if platform.machine() in ("x86_64", "AMD64") else ()), *options, f"-I{_SOURCES}"]
+    command = [*compiler, *flags, str(source), "-o"]
+    path = Path(folder) / f"{source.stem}-{_key(command, source.parent)}.so"
     try:
         return ctypes.CDLL(str(path))
     except OSError:
@@ -130,8 +147,8 @@ def _load(real: str, folder: str, *_: str | None) -> ctypes.CDLL | str:
         _logger.info("compiled kernels cannot be kept in %s (%s)", folder, error)
         path, scratch = Path(), tempfile.TemporaryDirectory()
     with scratch:
-        fresh = Path(scratch.name) / "native.so"
-        _logger.info("compiling kernels for %s with %s", real, compiler[0])
+        fresh = Path(scratch.name) / "fresh.so"
+        _logger.info("compiling %s with %s (once on this machine, some seconds)", source.name, compiler[0])
         done = subprocess.run([*command, str(fresh)], capture_output=True, text=True, check=False)
         if done.returncode != 0:
             return (
@@ -146,12 +163,12 @@ def _load(real: str, folder: str, *_: str | None) -> ctypes.CDLL | str:
             return f"could not be built: the compiled library does not load: {error}"
 
 
-def _key(command: list[str]) -> str:
+def _key(command: list[str], folder: Path) -> str:
     """Changes with the sources, the command, the compiler itself, and the processor it compiles for."""
     compiler = Path(shutil.which(command[0]) or command[0])
     facts = [*command[:-2], f"{compiler.resolve()} {compiler.stat().st_mtime_ns}", _processor()]
     digest = hashlib.sha256("\n".join(facts).encode())
-    for source in sorted((*_SOURCES.glob("*.hpp"), *_SOURCES.glob("*.cpp"))):
+    for source in sorted(file for place in {folder, _SOURCES} for file in place.glob("*.[ch]pp")):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:24]
 

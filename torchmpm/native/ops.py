@@ -59,10 +59,10 @@ def _run(name: str, dtype: torch.dtype, call: Call) -> None:
         MemoryError: There was not enough memory.
     """
     library, reference = library_for(dtype), ctypes.byref(call)
-    measure = library[f"torchmpm_{name}_bytes"]
+    measure = getattr(library, f"torchmpm_{name}_bytes")
     measure.restype = ctypes.c_size_t
     with _scratch(measure(reference)) as address:
-        if library[f"torchmpm_{name}"](reference, ctypes.c_void_p(address)):
+        if getattr(library, f"torchmpm_{name}")(reference, ctypes.c_void_p(address)):
             raise MemoryError("backend 'native' ran out of memory")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -19,6 +20,8 @@ KINDS: tuple[type, ...] = (Elastic, VonMises, Soil)
 ROWS = 8
 #: Numbers of a description before those of the bodies.
 _HEAD = 9
+#: Tables of solvers whose values are all numbers, by dtype; they stay the same.
+_numbers: WeakKeyDictionary[Solver, dict[torch.dtype, tuple[Tensor, list[int]]]] = WeakKeyDictionary()
 #: A node remembers its rule in one byte.
 MAX_RULES = 254
 
@@ -50,18 +53,25 @@ def values(solver: Solver, like: Tensor) -> tuple[Tensor, list[int]]:
     Returns:
         The table, (8, 1 or B, columns), and how many of its columns belong to each body.
     """
-    tables = []
+    known = _numbers.get(solver, {}).get(like.dtype)
+    if known is not None:
+        return known
+    tables, plain = [], True
     for body, part in solver.parts():
         rows = _rows(solver, body, like[:, part])
         if all(isinstance(row, (int, float)) for row in rows):
             tables.append(like.new_tensor(rows).view(ROWS, 1, 1))
         else:
+            plain = False
             planes = [torch.as_tensor(row, dtype=like.dtype, device=like.device) for row in rows]
             planes = [plane.reshape(1, 1) if plane.ndim == 0 else plane for plane in planes]
             tables.append(torch.stack(torch.broadcast_tensors(*planes)))
     batch = max(table.shape[1] for table in tables)
     widths = [table.shape[2] for table in tables]
-    return torch.cat([table.expand(-1, batch, -1) for table in tables], dim=2).contiguous(), widths
+    result = torch.cat([table.expand(-1, batch, -1) for table in tables], dim=2).contiguous(), widths
+    if plain:
+        _numbers.setdefault(solver, {})[like.dtype] = result
+    return result
 
 
 def _rows(solver: Solver, body: Body, like: Tensor) -> list[Value]:

@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "material.hpp"
+#include "team.hpp"
 
 struct Body {
     int count;         // particles
@@ -26,13 +27,6 @@ struct Rule {
 };
 
 // Tensors of one call, all contiguous; a null pointer stands for one that is not there.
-// Functions of GNU OpenMP, whose threads torch computes with; null where it has others.
-struct Pool {
-    void (*parallel)(void (*)(void*), void*, unsigned, unsigned);
-    int (*rank)();
-    int (*team_size)();
-};
-
 struct Call {
     int64_t batch, particles, substeps, threads;
     Pool pool;

@@ -14,6 +14,13 @@
 #define RELAX() ((void)0)
 #endif
 
+// Functions of GNU OpenMP, whose threads torch computes with; null where it has others.
+struct Pool {
+    void (*parallel)(void (*)(void*), void*, unsigned, unsigned);
+    int (*rank)();
+    int (*team_size)();
+};
+
 // Where the threads of a team wait for each other.
 class Barrier {
 public:

@@ -1,0 +1,90 @@
+"""The observation drawn by the C++ function equals the one that torch draws."""
+
+import math
+from dataclasses import replace
+from unittest import mock
+
+import pytest
+import torch
+from tiny import TASKS, actions, tiny
+
+import dittogym
+from dittogym import dynamics, native
+from torchmpm import ParticleState
+from torchmpm.backends import compiler_found
+
+pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+
+
+def both(env: dittogym.TorchEnv) -> tuple[torch.Tensor, torch.Tensor]:
+    """The present observation, natively and in torch."""
+    assert native.paints(env.model, env.env_state)
+    drawn = dynamics.observe(env.model, env.env_state)
+    with mock.patch.object(native, "paints", return_value=False):
+        return drawn, dynamics.observe(env.model, env.env_state)
+
+
+def put(env: dittogym.TorchEnv, x: torch.Tensor, v: torch.Tensor) -> None:
+    """Replace positions and velocities."""
+    old = env.state
+    env.env_state = replace(env.env_state, particles=ParticleState(x, v, old.C, old.F, old.Jp))
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("parity", ["clean", "reference"])
+@pytest.mark.parametrize("task", TASKS)
+def test_same_bytes(task: str, parity: str, dtype: str) -> None:
+    """Splats of the lite tier (clean) are added in another order: a byte may be one off. Pixels (reference) may not."""
+    env = tiny(task, 3, particles=600, parity=parity, dtype=dtype)
+    env.reset(seed=2)
+    with torch.no_grad():
+        for action in actions(env, 2):
+            env.step(action)
+    generator = torch.Generator().manual_seed(0)
+    x = env.state.x + 0.1 * torch.rand(env.state.x.shape, generator=generator, dtype=env.dtype)
+    put(env, x, 4.0 * torch.randn(x.shape, generator=generator, dtype=env.dtype))
+    ours, plain = both(env)
+    assert len(ours.unique()) > 20
+    assert (ours.int() - plain.int()).abs().max() <= (env.model.pixels is False)
+
+
+@pytest.mark.parametrize("parity", ["clean", "reference"])
+def test_what_is_not_drawn(parity: str) -> None:
+    """Particles that are not finite, or anywhere else in the world."""
+    env = tiny("kick", 2, parity=parity)
+    env.reset(seed=0)
+    x, v = env.state.x.clone(), env.state.v.clone()
+    x[0, 0, 0], x[0, 1, 1], v[0, 2, 0], v[0, 3, 1] = math.nan, math.inf, -math.inf, math.nan
+    x[1, :5] = torch.tensor([[9.0, 0.3], [-9.0, 0.3], [0.0, 1e30], [0.0, -0.5], [1e-9, 1.0]], dtype=env.dtype)
+    x[1, 5:10, 1] += 0.9
+    put(env, x, v)
+    ours, plain = both(env)
+    assert torch.equal(ours, plain)
+
+
+def test_centre_that_is_not_a_number() -> None:
+    """Then the robot itself is nowhere; its neighbours in the batch are drawn as ever."""
+    env = tiny("run", 2)
+    before = env.reset(seed=0)[0]
+    state = env.env_state
+    env.env_state = replace(state, centre=torch.tensor([[math.nan, math.nan], state.centre[1].tolist()]).to(env.dtype))
+    assert torch.equal(both(env)[0][1], before[1])
+
+
+def test_threads_share_a_batch() -> None:
+    env = tiny("catch", 5)
+    env.reset(seed=0)
+    threads, images = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            images.append(dynamics.observe(env.model, env.env_state))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(images[0], images[1]) and torch.equal(images[0], images[2])
+
+
+def test_eager_physics_draws_in_torch() -> None:
+    env = tiny("run", backend="eager")
+    with mock.patch.object(native.Painter, "paint", side_effect=AssertionError):
+        env.reset(seed=0)
