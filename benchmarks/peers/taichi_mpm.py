@@ -28,9 +28,14 @@ class TaichiRobot:
         batch: Number of simulations.
         history: Substeps that :meth:`gradient` can go back; 0 makes it forward only.
         origin_x: Left end of the windows, m.
+        block: Particles or nodes that a thread takes at a time. Threads that add to the same nodes wait for each other:
+            with particles in the order of their place and long blocks they seldom do.
     """
 
-    def __init__(self, solver: torchmpm.Solver, batch: int, history: int = 0, origin_x: float = 0.0) -> None:
+    def __init__(
+        self, solver: torchmpm.Solver, batch: int, history: int = 0, origin_x: float = 0.0, block: int = 128
+    ) -> None:
+        self.block = block
         (body,) = solver.bodies
         gel = body.material
         self.batch, self.count, self.history = batch, body.count, history
@@ -103,32 +108,40 @@ class TaichiRobot:
     @ti.kernel
     def substep(self, now: ti.i32, then: ti.i32):
         """One substep from one slot into another, or in place."""
+        ti.loop_config(block_dim=self.block)
         for b, i, j in ti.ndrange(self.batch, self.nodes + 2 * PAD, self.nodes + 2 * PAD):
             self.reset(b, i, j)
+        ti.loop_config(block_dim=self.block)
         for b, n in ti.ndrange(self.batch, self.count):
             self.to_grid(now, then, b, n)
+        ti.loop_config(block_dim=self.block)
         for b, i, j in ti.ndrange(self.batch, self.nodes + 2 * PAD, self.nodes + 2 * PAD):
             self.on_grid(b, i, j)
+        ti.loop_config(block_dim=self.block)
         for b, n in ti.ndrange(self.batch, self.count):
             self.to_particles(now, then, b, n)
 
     @ti.kernel
     def _reset(self):
+        ti.loop_config(block_dim=self.block)
         for b, i, j in ti.ndrange(self.batch, self.nodes + 2 * PAD, self.nodes + 2 * PAD):
             self.reset(b, i, j)
 
     @ti.kernel
     def _to_grid(self, now: ti.i32, then: ti.i32):
+        ti.loop_config(block_dim=self.block)
         for b, n in ti.ndrange(self.batch, self.count):
             self.to_grid(now, then, b, n)
 
     @ti.kernel
     def _on_grid(self):
+        ti.loop_config(block_dim=self.block)
         for b, i, j in ti.ndrange(self.batch, self.nodes + 2 * PAD, self.nodes + 2 * PAD):
             self.on_grid(b, i, j)
 
     @ti.kernel
     def _to_particles(self, now: ti.i32, then: ti.i32):
+        ti.loop_config(block_dim=self.block)
         for b, n in ti.ndrange(self.batch, self.count):
             self.to_particles(now, then, b, n)
 
