@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 KINDS: tuple[type, ...] = (Elastic, VonMises, Soil)
 #: Rows of the table of values, see ``struct Values`` in ``material.hpp``.
 ROWS = 8
-#: Numbers of a description before those of the bodies.
-_HEAD = 9
+#: Numbers of a description before those of the bodies, of each body, and of each rule.
+HEAD, BODY_NUMBERS, RULE_NUMBERS = 9, 8, 8
 #: A node remembers its rule in one byte.
 MAX_RULES = 254
 
@@ -115,5 +115,5 @@ def description(solver: Solver, widths: list[int], mass_epsilon: float) -> Tenso
 def body_widths(description: Tensor) -> list[tuple[int, int]]:
     """Particles and columns of each body, read back from :func:`description`."""
     head = description.tolist()
-    bodies = int(head[_HEAD - 2])
-    return [(int(head[k]), int(head[k + 3])) for k in range(_HEAD, _HEAD + 8 * bodies, 8)]
+    end = HEAD + BODY_NUMBERS * int(head[HEAD - 2])
+    return [(int(head[k]), int(head[k + 3])) for k in range(HEAD, end, BODY_NUMBERS)]
