@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import importlib.util
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -25,8 +28,13 @@ MAX_RULES = 254
 
 def unsupported(solver: Solver, dtype: torch.dtype, device: torch.device) -> str | None:
     """Why the kernels cannot run this solver on such a state, or ``None`` if they can."""
-    if device.type != "cpu":
-        return f"it runs on the CPU, the state is on {device}"
+    if device.type not in ("cpu", "cuda"):
+        return f"it runs on the CPU and on CUDA, the state is on {device}"
+    if device.type == "cuda":
+        if not triton_found():
+            return "on CUDA it needs Triton, which is not installed (torch's builds for CUDA bring it along)"
+        if torch.are_deterministic_algorithms_enabled() and not torch.is_deterministic_algorithms_warn_only_enabled():
+            return "on CUDA its sums are taken in no fixed order, torch.use_deterministic_algorithms(True) forbids that"
     if dtype not in (torch.float32, torch.float64):
         return f"it computes in float32 or float64, the state is {dtype}"
     for body in solver.bodies:
@@ -36,6 +44,18 @@ def unsupported(solver: Solver, dtype: torch.dtype, device: torch.device) -> str
     if len(solver.rules) > MAX_RULES:
         return f"it takes at most {MAX_RULES} velocity rules, got {len(solver.rules)}"
     return None
+
+
+@functools.cache
+def triton_found() -> bool:
+    """Whether Triton can be imported."""
+    return importlib.util.find_spec("triton") is not None
+
+
+def upload(numbers: Sequence[float], like: Tensor) -> Tensor:
+    """Numbers as a tensor of the dtype and on the device of ``like``; does not wait for the device."""
+    host = torch.tensor(numbers, dtype=like.dtype)
+    return host.pin_memory().to(like.device, non_blocking=True) if like.is_cuda else host
 
 
 def values(solver: Solver, like: Tensor) -> tuple[Tensor, list[int]]:
@@ -54,7 +74,7 @@ def values(solver: Solver, like: Tensor) -> tuple[Tensor, list[int]]:
     for body, part in solver.parts():
         rows = _rows(solver, body, like[:, part])
         if all(isinstance(row, (int, float)) for row in rows):
-            tables.append(like.new_tensor(rows).view(ROWS, 1, 1))
+            tables.append(upload([float(row) for row in rows], like).view(ROWS, 1, 1))
         else:
             planes = [torch.as_tensor(row, dtype=like.dtype, device=like.device) for row in rows]
             planes = [plane.reshape(1, 1) if plane.ndim == 0 else plane for plane in planes]

@@ -1,7 +1,7 @@
 """The substep as Triton kernels on CUDA; the operators of :mod:`torchmpm.native.ops` on tensors that live there.
 
-``programs`` launches the kernels of a step and of its adjoint, ``graphs`` keeps the launches as CUDA graphs. Kernels, in
-the order in which they build on each other: ``linalg``, ``material``, ``transfer``, ``grid``, ``step``; for the adjoint
+``programs`` launches the kernels of a step and of its adjoint, ``graphs`` keeps the launches as CUDA graphs. Kernels,
+in order, each built on those before: ``linalg``, ``material``, ``transfer``, ``grid``, ``step``; for the adjoint
 ``material_adjoint``, ``adjoint``. They are the formulas of the C++ kernels, a thread for each particle or node.
 
 Two launches make a substep: one over the particles, which reads velocities from the nodes, moves and deforms the
@@ -13,14 +13,12 @@ This package imports Triton; nothing else does.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from torchmpm.native.cuda.graphs import cache
-from torchmpm.native.cuda.programs import Backward, Forward, Inputs
-from torchmpm.native.cuda.tables import Tables, tables
+from torchmpm.native.cuda.programs import Backward, Forward, Inputs, Program
+from torchmpm.native.cuda.tables import tables
 
 __all__ = ["backward", "cache", "forward"]
 
@@ -36,7 +34,7 @@ def forward(
     substeps: int,
 ) -> Tensor:
     """Advance all simulations; see :func:`torchmpm.native.ops.native_step`."""
-    inputs = _inputs(planes, field, origin, gravity, values, shift)
+    inputs = Inputs(planes, field, origin, gravity, values, shift)
     (result,) = _run(Forward, inputs, description, substeps)
     return result
 
@@ -55,23 +53,20 @@ def backward(
     wants_values: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Adjoint of :func:`forward`; see :func:`torchmpm.native.ops.native_step_backward`."""
-    inputs = _inputs(planes, field, origin, gravity, values, shift, result_bar)
+    inputs = Inputs(planes, field, origin, gravity, values, shift, result_bar)
     planes_bar, field_bar, origin_bar, gravity_bar, values_bar = _run(
         Backward, inputs, description, substeps, wants_field, wants_values
     )
     return planes_bar, field_bar, origin_bar, gravity_bar, values_bar
 
 
-def _inputs(*tensors: Tensor | None) -> Inputs:
-    return Inputs(*(t if t is None else t.contiguous() for t in tensors))
-
-
-def _run(kind: Any, inputs: Inputs, description: Tensor, substeps: int, *wants: bool) -> tuple[Tensor, ...]:
+def _run(kind: type[Program], inputs: Inputs, description: Tensor, substeps: int, *wants: bool) -> tuple[Tensor, ...]:
     """Run a program, from a graph where that works: not while a caller records a graph of their own."""
+    inputs = inputs.map(Tensor.contiguous)
     planes, numbers = inputs.planes, tuple(description.tolist())
-    constants: Tables = tables(numbers, planes.dtype, planes.device)
+    constants = tables(numbers, planes.dtype, planes.device)
 
-    def build(own: Inputs) -> Any:
+    def build(own: Inputs) -> Program:
         return kind(own, constants, substeps, *wants)
 
     if planes.device.type != "cuda":
@@ -85,7 +80,6 @@ def _run(kind: Any, inputs: Inputs, description: Tensor, substeps: int, *wants: 
         return cache.run((kind, numbers, substeps, wants, shapes, stream), build, inputs)
 
 
-def _launched(program: Any) -> tuple[Tensor, ...]:
+def _launched(program: Program) -> tuple[Tensor, ...]:
     program.run()
-    results: tuple[Tensor, ...] = program.results()
-    return results
+    return program.results()

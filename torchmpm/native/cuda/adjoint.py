@@ -1,4 +1,4 @@
-"""The pass over the particles of the adjoint, as a kernel: it finishes one substep, going back, and begins the one before."""
+"""The passes over the particles in the adjoint of a substep, as kernels: before and after the one over the nodes."""
 
 import triton
 import triton.language as tl
@@ -8,36 +8,24 @@ from torchmpm.native.cuda.linalg import matmul
 from torchmpm.native.cuda.material import DT, INVERSE_H, H, read_values
 from torchmpm.native.cuda.material_adjoint import material_adjoint
 from torchmpm.native.cuda.step import deform, load_matrix, own_particles, store_matrix, values_at
-from torchmpm.native.cuda.transfer import field_at, gather, include, locate, pull, scatter, weight, weight_slope
+from torchmpm.native.cuda.transfer import SIZES, field_at, gather, include, locate, pull, scatter, weight, weight_slope
 
 
 @triton.jit
 def position_adjoint(
-    answers, first, width, fx, fy, on, ux, uy, mvx, mvy, mass, cxx, cxy, cyx, cyy, pxx, pxy, pyx, pyy,
+    answers, node, width, fx, fy, on, ux, uy, mvx, mvy, mass, cxx, cxy, cyx, cyy, pxx, pxy, pyx, pyy,
     field, i, j, gx, gy, resolution, MUSCLE: tl.constexpr,
 ):  # fmt: skip
     """Derivatives in the distances (fx, fy), through all weights and offsets of a substep, and that in the mass.
 
-    Args:
-        answers: Nodes of this simulation, from :func:`torchmpm.native.cuda.grid.node_adjoint`.
-        first: First nodes.
-        width: Nodes per axis with padding.
-        fx, fy: Distances in cells.
-        on: Who takes part.
-        ux, uy: Derivatives in the new velocity, that through the new position included.
-        mvx, mvy, mass: What the particle gives.
-        cxx, cxy, cyx, cyy: Derivatives in the new affine matrix, times 4/h.
-        pxx, pxy, pyx, pyy: The affine momentum, times h.
-        field: Actuation of this simulation.
-        i, j: First nodes, by axis.
-        gx, gy: Derivatives in the particle's actuation.
-        resolution: Nodes per axis.
-        MUSCLE: Whether there is actuation.
+    Takes the derivatives u in the new velocity (those through the new position included), 4/h times those in the new
+    affine matrix c, and those g in the actuation; and what the particle gives: momentum mv, mass, h times the affine
+    momentum p.
     """
     fx_bar, fy_bar, masses = tl.zeros_like(fx), tl.zeros_like(fx), tl.zeros_like(fx)
     for p in tl.static_range(3):
         for q in tl.static_range(3):
-            at = answers + ADJOINT * (first + p * width + q)
+            at = answers + ADJOINT * (node + p * width + q)
             vx, vy = tl.load(at, on, other=0.0), tl.load(at + 1, on, other=0.0)
             px, py, m = tl.load(at + 2, on, other=0.0), tl.load(at + 3, on, other=0.0), tl.load(at + 4, on, other=0.0)
             value = ux * vx + uy * vy + mass * m + mvx * px + mvy * py
@@ -62,33 +50,89 @@ def add(to, value, mask):
 
 
 @triton.jit
-def finish_substep(
-    state, bars, values_bar, field_bar, origin_bar, answers, field, origin, constants, bounds,
-    at, valid, stride, resolution, width, mass, factor, mu2, lam, s0, s1, s2, s3,
-    x_bar, y_bar, vx_bar, vy_bar, c0_bar, c1_bar, c2_bar, c3_bar,
-    KIND: tl.constexpr, MUSCLE: tl.constexpr, WANT_FIELD: tl.constexpr, WANT_VALUES: tl.constexpr,
-):  # fmt: skip
-    """Bring the derivatives in the state after a substep to those in ``state``, before it; add up all others.
-
-    Returns:
-        Derivatives in position, velocity and affine matrix before the substep.
-    """
-    h, inverse_h, dt = tl.load(constants + H), tl.load(constants + INVERSE_H), tl.load(constants + DT)
+def read_particle(state, at, stride, valid):
+    """Position, velocity and affine matrix of a state, or derivatives in them."""
     x, y = tl.load(state + at, valid, other=0.0), tl.load(state + stride + at, valid, other=0.0)
     vx, vy = tl.load(state + 2 * stride + at, valid, other=0.0), tl.load(state + 3 * stride + at, valid, other=0.0)
     c0, c1, c2, c3 = load_matrix(state + 4 * stride + at, stride, valid)
+    return x, y, vx, vy, c0, c1, c2, c3
+
+
+@triton.jit(do_not_specialize=SIZES)
+def begin_adjoint(
+    state, bars, sums, box, field, origin, values, constants, bounds,
+    particles, stride, first, count, blocks, column, columns, values_batch, resolution, width,
+    KIND: tl.constexpr, VARYING: tl.constexpr, MUSCLE: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Add to the nodes what the particles of one body gave them at the start of a substep, and derivatives at its end.
+
+    ``state`` holds planes (13, B, N) at the start, ``bars`` the derivatives in those at the end. The sums of a node
+    become momentum, mass, and the derivative in its velocity.
+    """
+    element, k, at, valid = own_particles(first, count, particles, blocks, BLOCK)
+    place = values_at(values, element, k, column, columns, values_batch, VARYING)
+    mass, factor, mu2, lam, s0, s1, s2, s3 = read_values(values, values_batch * columns, place, valid)
+    h, inverse_h, dt = tl.load(constants + H), tl.load(constants + INVERSE_H), tl.load(constants + DT)
+    x, y, vx, vy, c0, c1, c2, c3 = read_particle(state, at, stride, valid)
     f0, f1, f2, f3 = load_matrix(state + 8 * stride + at, stride, valid)
     Jp = tl.load(state + 12 * stride + at, valid, other=1.0)
-    on, i, j, fx, fy = locate(x, y, origin, valid, constants, resolution)
-    first = i * width + j
+    on, i, j, fx, fy = locate(x, y, origin + 2 * element, valid, constants, resolution)
+    node = i * width + j
+    sums += ADJOINT * element * width * width
+    pull_x, pull_y = tl.zeros_like(x), tl.zeros_like(x)
+    if MUSCLE:
+        plane = 2 * resolution * resolution * element
+        pull_x, pull_y = pull(field + plane, i, j, fx, fy, on, resolution)
+    _, _, _, _, _, xx, xy, yy = deform(
+        dt, c0, c1, c2, c3, f0, f1, f2, f3, Jp, factor, mu2, lam, s0, s1, s2, s3, pull_x, pull_y, constants, bounds,
+        KIND,
+    )  # fmt: skip
+    include(box + 4 * element, i, j, on)
+    scatter(
+        sums, node, width, fx, fy, on, mass * vx, mass * vy,
+        h * (xx + mass * c0), h * (xy + mass * c1), h * (xy + mass * c2), h * (yy + mass * c3), mass, True, ADJOINT,
+    )  # fmt: skip
+    x_bar, y_bar, vx_bar, vy_bar, c0_bar, c1_bar, c2_bar, c3_bar = read_particle(bars, at, stride, valid)
+    scale = 4.0 * inverse_h
+    scatter(
+        sums + 3, node, width, fx, fy, on, vx_bar + dt * x_bar, vy_bar + dt * y_bar,
+        scale * c0_bar, scale * c1_bar, scale * c2_bar, scale * c3_bar, mass, False, ADJOINT,
+    )  # fmt: skip
+
+
+@triton.jit(do_not_specialize=SIZES)
+def finish_adjoint(
+    state, bars, values_bar, field_bar, origin_bar, answers, field, origin, values, constants, bounds,
+    particles, stride, first, count, blocks, column, columns, values_batch, resolution, width,
+    KIND: tl.constexpr, VARYING: tl.constexpr, MUSCLE: tl.constexpr, WANT_FIELD: tl.constexpr,
+    WANT_VALUES: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Bring the derivatives in the state after a substep to those in the one before, in place; add up all others.
+
+    ``answers`` are those of :func:`torchmpm.native.cuda.grid.node_adjoint`.
+    """
+    element, k, at, valid = own_particles(first, count, particles, blocks, BLOCK)
+    place = values_at(values, element, k, column, columns, values_batch, VARYING)
+    mass, factor, mu2, lam, s0, s1, s2, s3 = read_values(values, values_batch * columns, place, valid)
+    h, inverse_h, dt = tl.load(constants + H), tl.load(constants + INVERSE_H), tl.load(constants + DT)
+    x, y, vx, vy, c0, c1, c2, c3 = read_particle(state, at, stride, valid)
+    f0, f1, f2, f3 = load_matrix(state + 8 * stride + at, stride, valid)
+    Jp = tl.load(state + 12 * stride + at, valid, other=1.0)
+    x_bar, y_bar, vx_bar, vy_bar, c0_bar, c1_bar, c2_bar, c3_bar = read_particle(bars, at, stride, valid)
     f0_bar, f1_bar, f2_bar, f3_bar = load_matrix(bars + 8 * stride + at, stride, valid)
     Jp_bar = tl.load(bars + 12 * stride + at, valid, other=0.0)
-
+    on, i, j, fx, fy = locate(x, y, origin + 2 * element, valid, constants, resolution)
+    node = i * width + j
+    answers += ADJOINT * element * width * width
+    plane = 2 * resolution * resolution * element
+    field += plane
+    field_bar += plane
+    origin_bar += 2 * element
     pull_x, pull_y = tl.zeros_like(x), tl.zeros_like(x)
     if MUSCLE:
         pull_x, pull_y = pull(field, i, j, fx, fy, on, resolution)
     # What the nodes say of momentum (m v) and affine momentum.
-    px_bar, py_bar, pxx_bar, pxy_bar, pyx_bar, pyy_bar = gather(answers + 2, first, width, fx, fy, on, ADJOINT)
+    px_bar, py_bar, pxx_bar, pxy_bar, pyx_bar, pyy_bar = gather(answers + 2, node, width, fx, fy, on, ADJOINT)
     pxx_bar, pxy_bar, pyx_bar, pyy_bar = h * pxx_bar, h * pxy_bar, h * pyx_bar, h * pyy_bar
     g0, g1, g2, g3 = 1.0 + dt * c0, dt * c1, dt * c2, 1.0 + dt * c3
     t0, t1, t2, t3 = matmul(g0, g1, g2, g3, f0, f1, f2, f3)
@@ -106,7 +150,7 @@ def finish_substep(
 
     scale = 4.0 * inverse_h
     fx_bar, fy_bar, masses = position_adjoint(
-        answers, first, width, fx, fy, on, vx_bar + dt * x_bar, vy_bar + dt * y_bar, mass * vx, mass * vy, mass,
+        answers, node, width, fx, fy, on, vx_bar + dt * x_bar, vy_bar + dt * y_bar, mass * vx, mass * vy, mass,
         scale * c0_bar, scale * c1_bar, scale * c2_bar, scale * c3_bar,
         h * (xx + mass * c0), h * (xy + mass * c1), h * (xy + mass * c2), h * (yy + mass * c3),
         field, i, j, pull_x_bar, pull_y_bar, resolution, MUSCLE,
@@ -114,15 +158,11 @@ def finish_substep(
     fx_bar, fy_bar = tl.where(on, fx_bar * inverse_h, 0.0), tl.where(on, fy_bar * inverse_h, 0.0)
     tl.atomic_add(origin_bar, -tl.sum(fx_bar, axis=0), sem="relaxed")
     tl.atomic_add(origin_bar + 1, -tl.sum(fy_bar, axis=0), sem="relaxed")
-    x_bar, y_bar = x_bar + fx_bar, y_bar + fy_bar
-    vx_bar, vy_bar = tl.where(on, mass * px_bar, vx_bar), tl.where(on, mass * py_bar, vy_bar)
-    c0_bar, c1_bar = tl.where(on, d0, c0_bar), tl.where(on, d1, c1_bar)
-    c2_bar, c3_bar = tl.where(on, d2, c2_bar), tl.where(on, d3, c3_bar)
-    tl.store(bars + at, x_bar, valid)
-    tl.store(bars + stride + at, y_bar, valid)
-    tl.store(bars + 2 * stride + at, vx_bar, valid)
-    tl.store(bars + 3 * stride + at, vy_bar, valid)
-    store_matrix(bars + 4 * stride + at, stride, c0_bar, c1_bar, c2_bar, c3_bar, valid)
+    tl.store(bars + at, x_bar + fx_bar, on)
+    tl.store(bars + stride + at, y_bar + fy_bar, on)
+    tl.store(bars + 2 * stride + at, mass * px_bar, on)
+    tl.store(bars + 3 * stride + at, mass * py_bar, on)
+    store_matrix(bars + 4 * stride + at, stride, d0, d1, d2, d3, on)
     store_matrix(bars + 8 * stride + at, stride, e0_bar, e1_bar, e2_bar, e3_bar, on)
     tl.store(bars + 12 * stride + at, new_Jp_bar, on)
     if MUSCLE and WANT_FIELD:
@@ -142,73 +182,3 @@ def finish_substep(
         add(values_bar + 5 * stride + at, s1_bar, on)
         add(values_bar + 6 * stride + at, s2_bar, on)
         add(values_bar + 7 * stride + at, s3_bar, on)
-    return x_bar, y_bar, vx_bar, vy_bar, c0_bar, c1_bar, c2_bar, c3_bar
-
-
-@triton.jit
-def begin_substep(
-    state, sums, box, field, origin, constants, bounds,
-    at, valid, stride, resolution, width, mass, factor, mu2, lam, s0, s1, s2, s3,
-    x_bar, y_bar, vx_bar, vy_bar, c0_bar, c1_bar, c2_bar, c3_bar,
-    KIND: tl.constexpr, MUSCLE: tl.constexpr,
-):  # fmt: skip
-    """Add mass and momentum of ``state`` to the nodes once more, and the derivatives in the node velocities."""
-    h, inverse_h, dt = tl.load(constants + H), tl.load(constants + INVERSE_H), tl.load(constants + DT)
-    x, y = tl.load(state + at, valid, other=0.0), tl.load(state + stride + at, valid, other=0.0)
-    vx, vy = tl.load(state + 2 * stride + at, valid, other=0.0), tl.load(state + 3 * stride + at, valid, other=0.0)
-    c0, c1, c2, c3 = load_matrix(state + 4 * stride + at, stride, valid)
-    f0, f1, f2, f3 = load_matrix(state + 8 * stride + at, stride, valid)
-    Jp = tl.load(state + 12 * stride + at, valid, other=1.0)
-    on, i, j, fx, fy = locate(x, y, origin, valid, constants, resolution)
-    first = i * width + j
-    pull_x, pull_y = tl.zeros_like(x), tl.zeros_like(x)
-    if MUSCLE:
-        pull_x, pull_y = pull(field, i, j, fx, fy, on, resolution)
-    _, _, _, _, _, xx, xy, yy = deform(
-        dt, c0, c1, c2, c3, f0, f1, f2, f3, Jp, factor, mu2, lam, s0, s1, s2, s3, pull_x, pull_y, constants, bounds,
-        KIND,
-    )  # fmt: skip
-    include(box, i, j, on)
-    scatter(
-        sums, first, width, fx, fy, on, mass * vx, mass * vy,
-        h * (xx + mass * c0), h * (xy + mass * c1), h * (xy + mass * c2), h * (yy + mass * c3), mass, True, ADJOINT,
-    )  # fmt: skip
-    scale = 4.0 * inverse_h
-    scatter(
-        sums + 3, first, width, fx, fy, on, vx_bar + dt * x_bar, vy_bar + dt * y_bar,
-        scale * c0_bar, scale * c1_bar, scale * c2_bar, scale * c3_bar, mass, False, ADJOINT,
-    )  # fmt: skip
-
-
-@triton.jit
-def adjoint_pass(
-    state, before, bars, values_bar, field_bar, origin_bar, sums, answers, box, field, origin, values, constants, bounds,
-    particles, stride, first, count, blocks, column, columns, values_batch, resolution, width,
-    KIND: tl.constexpr, VARYING: tl.constexpr, MUSCLE: tl.constexpr, WANT_FIELD: tl.constexpr,
-    WANT_VALUES: tl.constexpr, FINISH: tl.constexpr, BEGIN: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """Finish the adjoint of the substep that starts at ``state``, then begin that of the one from ``before``.
-
-    ``bars`` holds the derivatives in the state (13, B, N), which go back by a substep in place.
-    """
-    element, k, at, valid = own_particles(first, count, particles, blocks, BLOCK)
-    nodes = ADJOINT * element * width * width
-    place = values_at(values, element, k, column, columns, values_batch, VARYING)
-    mass, factor, mu2, lam, s0, s1, s2, s3 = read_values(values, values_batch * columns, place, valid)
-    plane = 2 * resolution * resolution * element
-    x_bar, y_bar = tl.load(bars + at, valid, other=0.0), tl.load(bars + stride + at, valid, other=0.0)
-    vx_bar, vy_bar = tl.load(bars + 2 * stride + at, valid, other=0.0), tl.load(bars + 3 * stride + at, valid, other=0.0)
-    c0_bar, c1_bar, c2_bar, c3_bar = load_matrix(bars + 4 * stride + at, stride, valid)
-    if FINISH:
-        x_bar, y_bar, vx_bar, vy_bar, c0_bar, c1_bar, c2_bar, c3_bar = finish_substep(
-            state, bars, values_bar, field_bar + plane, origin_bar + 2 * element, answers + nodes, field + plane,
-            origin + 2 * element, constants, bounds, at, valid, stride, resolution, width,
-            mass, factor, mu2, lam, s0, s1, s2, s3, x_bar, y_bar, vx_bar, vy_bar, c0_bar, c1_bar, c2_bar, c3_bar,
-            KIND, MUSCLE, WANT_FIELD, WANT_VALUES,
-        )  # fmt: skip
-    if BEGIN:
-        begin_substep(
-            before, sums + nodes, box + 4 * element, field + plane, origin + 2 * element, constants, bounds,
-            at, valid, stride, resolution, width, mass, factor, mu2, lam, s0, s1, s2, s3,
-            x_bar, y_bar, vx_bar, vy_bar, c0_bar, c1_bar, c2_bar, c3_bar, KIND, MUSCLE,
-        )  # fmt: skip

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from dataclasses import fields
 
 import torch
 from torch import Tensor
@@ -26,16 +25,16 @@ class Recorded:
     """
 
     def __init__(self, build: Callable[[Inputs], Program], inputs: Inputs) -> None:
-        self.inputs = Inputs(**{name: None if t is None else torch.empty_like(t) for name, t in tensors(inputs)})
-        self.program = build(self.inputs)
+        with torch.inference_mode(False):  # what is made inside of it cannot be changed outside
+            self.inputs = inputs.map(torch.empty_like)
+            self.program = build(self.inputs)
         self.graph: torch.cuda.CUDAGraph | None = None
         self.calls = 0
 
     def run(self, inputs: Inputs) -> tuple[Tensor, ...]:
         """Results for other inputs of the same shapes."""
-        for (_, own), (_, given) in zip(tensors(self.inputs), tensors(inputs), strict=True):
-            if own is not None and given is not None:
-                own.copy_(given)
+        for own, given in zip(self.inputs.tensors(), inputs.tensors(), strict=True):
+            own.copy_(given)
         self.calls += 1
         if self.calls == 2:
             self.graph = torch.cuda.CUDAGraph()
@@ -50,14 +49,8 @@ class Recorded:
 
     def size(self) -> int:
         """Bytes of all buffers."""
-        held = [t for t in vars(self.program).values() if isinstance(t, Tensor)]
-        held += [t for _, t in tensors(self.inputs) if t is not None]
+        held = [t for t in vars(self.program).values() if isinstance(t, Tensor)] + self.inputs.tensors()
         return sum(t.numel() * t.element_size() for t in held)
-
-
-def tensors(inputs: Inputs) -> list[tuple[str, Tensor | None]]:
-    """Inputs by name."""
-    return [(field.name, getattr(inputs, field.name)) for field in fields(inputs)]
 
 
 class Cache:
@@ -71,13 +64,11 @@ class Cache:
         """Results of the program of a key, which is built where there is none yet."""
         with self._lock:
             recorded = self._kept.pop(key, None) or Recorded(build, inputs)
-            self._kept[key] = recorded
-            self._trim()
+            if recorded.size() <= KEPT_BYTES:
+                self._kept[key] = recorded
+            while len(self._kept) > KEPT_GRAPHS or self.size() > KEPT_BYTES:
+                self._kept.popitem(last=False)
             return recorded.run(inputs)
-
-    def _trim(self) -> None:
-        while self._kept and (len(self._kept) > KEPT_GRAPHS or self.size() > KEPT_BYTES):
-            self._kept.popitem(last=False)
 
     def size(self) -> int:
         """Bytes of all buffers."""

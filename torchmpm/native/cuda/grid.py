@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 
 from torchmpm.native.cuda.material import DAMPING, DT, MASS_EPSILON
-from torchmpm.native.cuda.transfer import PAD
+from torchmpm.native.cuda.transfer import PAD, SIZES
 
 #: Numbers of a velocity rule, see :class:`torchmpm.native.cuda.tables.Tables`.
 RULE = tl.constexpr(9)
@@ -16,7 +16,7 @@ SUMS = tl.constexpr(4)
 ADJOINT = tl.constexpr(8)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def rule_codes(codes, rules, shift, rule_count, width, cells, programs, BLOCK: tl.constexpr):
     """Which rule holds on each node: one byte per slot, 0 for none, else its index plus one."""
     element = (tl.program_id(0) // programs).to(tl.int64)
@@ -29,7 +29,9 @@ def rule_codes(codes, rules, shift, rule_count, width, cells, programs, BLOCK: t
         rule = rules + RULE * r
         world = tl.load(rule + 7)
         x, y = i + world * shift_x, j + world * shift_y
-        inside = (x >= tl.load(rule + 2)) & (x <= tl.load(rule + 3)) & (y >= tl.load(rule + 4)) & (y <= tl.load(rule + 5))
+        inside = (
+            (x >= tl.load(rule + 2)) & (x <= tl.load(rule + 3)) & (y >= tl.load(rule + 4)) & (y <= tl.load(rule + 5))
+        )
         bit = 8 * tl.load(rule + 8).to(tl.int32)
         first = inside & (((code >> bit) & 255) == 0)
         code = tl.where(first, code | ((r + 1) << bit), code)
@@ -42,7 +44,12 @@ def read_rule(rules, code, SLOT: tl.constexpr):
     index = (code >> (8 * SLOT)) & 255
     some = index > 0
     rule = rules + RULE * (index - 1)
-    return tl.load(rule, some, other=0.0) > 0, tl.load(rule + 1, some, other=0.0), tl.load(rule + 6, some, other=0.0), some
+    return (
+        tl.load(rule, some, other=0.0) > 0,
+        tl.load(rule + 1, some, other=0.0),
+        tl.load(rule + 6, some, other=0.0),
+        some,
+    )
 
 
 @triton.jit
@@ -99,7 +106,7 @@ def raw_velocity(sums, gravity, constants, exists):
     return raw_x, raw_y, inverse, tl.where(exists, vx, 0.0), tl.where(exists, vy, 0.0)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def node_velocities(
     sums, velocity, boxes, codes, rules, gravity, constants, resolution, width, programs,
     SLOTS: tl.constexpr, BLOCK: tl.constexpr,
@@ -126,7 +133,7 @@ def node_velocities(
             tl.store(sums + SUMS * node + r, tl.zeros_like(vx), used)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def node_adjoint(
     sums, answers, boxes, codes, rules, gravity, gravity_bar, constants, resolution, width, programs,
     SLOTS: tl.constexpr, BLOCK: tl.constexpr,

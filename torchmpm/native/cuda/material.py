@@ -14,7 +14,6 @@ VON_MISES = tl.constexpr(1)
 SOIL = tl.constexpr(2)
 #: Places in the table of constants, see :class:`torchmpm.native.cuda.tables.Tables`.
 H, INVERSE_H, DT, MARGIN, EXTENT, DAMPING, MASS_EPSILON, STRETCH_FLOOR, LARGEST_JP = (tl.constexpr(k) for k in range(9))
-CONSTANTS = tl.constexpr(9)
 
 
 @triton.jit
@@ -71,9 +70,7 @@ def soil_return(a, b, c, d, Jp, low, high, constants, bounds):
     proper = larger_is_rotation(a, b, c, d)
     m1, m2, n1, n2 = split(a, b, c, d, proper)
     _, _, cos, sin, _ = direction(m1, m2)
-    n1, n2, _, _, _, _, first, second, major, minor, ratio = soil_parts(
-        m1, m2, n1, n2, low, high, tl.load(bounds + 2)
-    )
+    n1, n2, _, _, _, _, first, second, major, minor, ratio = soil_parts(m1, m2, n1, n2, low, high, tl.load(bounds + 2))
     sum = 0.5 * (major + minor)
     e, f, g, h = join(sum * cos, sum * sin, ratio * n1, ratio * n2, proper)
     largest = tl.load(constants + LARGEST_JP)

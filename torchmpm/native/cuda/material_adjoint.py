@@ -160,8 +160,8 @@ def material_adjoint(
     Takes the trial F, the derivatives in S = factor tau, and those in the returned F and Jp.
 
     Returns:
-        Derivatives in the trial F (four) and Jp, S itself (three), derivatives in both pulls, and in the values: factor,
-        2 mu, lam, and the four of the material.
+        Derivatives in the trial F (four) and Jp, S itself (three), derivatives in both pulls, and in the values:
+        factor, 2 mu, lam, and the four of the material.
     """
     e, f, g, h, _ = return_map(a, b, c, d, Jp, s0, s1, s2, s3, constants, bounds, KIND)
     r0, r1, r2, r3 = orthogonal(a, b, c, d)

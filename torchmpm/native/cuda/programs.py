@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchmpm.native.cuda.adjoint import adjoint_pass
+from torchmpm.native.cuda.adjoint import begin_adjoint, finish_adjoint
 from torchmpm.native.cuda.grid import ADJOINT, SUMS, node_adjoint, node_velocities, rule_codes
 from torchmpm.native.cuda.step import particles_pass
-from torchmpm.native.cuda.tables import BodyPart, Tables
+from torchmpm.native.cuda.tables import Tables
 from torchmpm.native.cuda.transfer import NOWHERE
 from torchmpm.native.pack import ROWS
 
@@ -33,6 +34,14 @@ class Inputs:
     shift: Tensor
     result_bar: Tensor | None = None
 
+    def map(self, function: Callable[[Tensor], Tensor]) -> Inputs:
+        """Apply a function to all tensors that are there."""
+        return replace(self, **{name: function(t) for name, t in vars(self).items() if t is not None})
+
+    def tensors(self) -> list[Tensor]:
+        """All that are there."""
+        return [t for t in vars(self).values() if t is not None]
+
 
 def launch(kernel: Any, programs: int, *arguments: Any, **constants: Any) -> None:
     """Run a kernel, on the GPU or in Triton's interpreter."""
@@ -53,7 +62,17 @@ class Program:
         self.cells = tables.width**2
         self.sums = planes.new_zeros(self.batch * self.cells * numbers)
         self.boxes = torch.empty(substeps, self.batch, 4, dtype=torch.int32, device=planes.device)
-        self.codes = torch.empty(self.batch * self.cells if tables.slots else 1, dtype=torch.int32, device=planes.device)
+        self.codes = torch.empty(
+            self.batch * self.cells if tables.slots else 1, dtype=torch.int32, device=planes.device
+        )
+
+    def run(self) -> None:
+        """Launch everything; allocates nothing."""
+        raise NotImplementedError
+
+    def results(self) -> tuple[Tensor, ...]:
+        """What the last run has found, in buffers of the program."""
+        raise NotImplementedError
 
     def prepare(self) -> None:
         """Empty the boxes and find the rule of each node."""
@@ -64,35 +83,33 @@ class Program:
         sizes = (len(rules), self.tables.width, self.cells, programs)
         launch(rule_codes, self.batch * programs, self.codes, rules, self.inputs.shift, *sizes)
 
-    def move(self, slots: tuple[Tensor, Tensor, Tensor], velocity: Tensor, box: Tensor, **flags: bool) -> None:
-        """Launch :func:`torchmpm.native.cuda.step.particles_pass` for each body; ``slots`` are its three buffers."""
-        for body in self.tables.bodies:
-            constants, sizes, kind = self.of_body(body)
-            launch(
-                particles_pass,
-                self.batch * -(-body.count // BLOCK),
-                *slots,
-                self.sums,
-                velocity,
-                box,
-                *constants,
-                *sizes,
-                **kind,
-                **flags,
-            )
-
-    def of_body(self, body: BodyPart) -> tuple[tuple[Tensor, ...], tuple[int, ...], dict[str, Any]]:
-        """What every pass over the particles of a body wants to know: tensors, sizes, and compile-time constants."""
+    def over_particles(self, kernel: Any, *buffers: Tensor, **flags: bool) -> None:
+        """Launch a pass over the particles for each body."""
         inputs, tables = self.inputs, self.tables
-        field = inputs.origin if inputs.field is None else inputs.field
-        tensors = (field, inputs.origin, inputs.values, tables.constants, tables.constants[body.bounds :])
+        field = inputs.origin if inputs.field is None else inputs.field  # nobody looks at one that is not there
         values_batch, columns = inputs.values.shape[1:]
-        sizes = (self.particles, self.batch * self.particles, body.first, body.count, -(-body.count // BLOCK))
-        sizes += (body.column, columns, values_batch, tables.resolution, tables.width)
-        muscle = body.muscle and inputs.field is not None
-        return tensors, sizes, {"KIND": body.kind, "VARYING": body.varying, "MUSCLE": muscle}
+        for body in tables.bodies:
+            blocks = -(-body.count // BLOCK)
+            constants = (tables.constants, tables.constants[body.bounds :])
+            sizes = [self.particles, self.batch * self.particles, body.first, body.count, blocks]
+            sizes += [body.column, columns, values_batch, tables.resolution, tables.width]
+            muscle = body.muscle and inputs.field is not None
+            kind = {"KIND": body.kind, "VARYING": body.varying, "MUSCLE": muscle}
+            tensors = (*buffers, field, inputs.origin, inputs.values, *constants)
+            launch(kernel, self.batch * blocks, *tensors, *sizes, **kind, **flags)
 
-    def nodes(self, kernel: Any, *buffers: Tensor, bars: tuple[Tensor, ...] = ()) -> None:
+    def advance(self, states: Sequence[Tensor], velocity: Tensor, *, TAPE: bool) -> None:
+        """From the planes in the first state to those in the last, a substep each; without ``TAPE`` all are one."""
+        last, flags = len(states) - 1, {"TAPE": TAPE}
+        for s in range(last):
+            around, box = (states[max(s - 1, 0)], states[s], states[s + 1]), self.boxes[s]
+            self.over_particles(particles_pass, *around, self.sums, velocity, box, ARRIVE=s > 0, LEAVE=True, **flags)
+            self.over_nodes(node_velocities, self.sums, velocity, box)
+        if last > 0:
+            end = (states[last - 1], states[last], states[last], self.sums, velocity, self.boxes[0])
+            self.over_particles(particles_pass, *end, ARRIVE=True, LEAVE=False, **flags)
+
+    def over_nodes(self, kernel: Any, *buffers: Tensor, bars: tuple[Tensor, ...] = ()) -> None:
         """Launch a pass over the nodes: ``buffers`` are sums, answers, and the box of the substep."""
         tables, inputs = self.tables, self.inputs
         programs = max(1, min(-(-self.cells // BLOCK), NODE_PROGRAMS // self.batch))
@@ -113,11 +130,7 @@ class Forward(Program):
         """Launch everything; allocates nothing."""
         self.state.copy_(self.inputs.planes)
         self.prepare()
-        state = (self.state, self.state, self.state)
-        for s in range(self.substeps):
-            self.move(state, self.velocity, self.boxes[s], ARRIVE=s > 0, LEAVE=True, TAPE=False)
-            self.nodes(node_velocities, self.sums, self.velocity, self.boxes[s])
-        self.move(state, self.velocity, self.boxes[0], ARRIVE=True, LEAVE=False, TAPE=False)
+        self.advance([self.state] * (self.substeps + 1), self.velocity, TAPE=False)
 
     def results(self) -> tuple[Tensor, ...]:
         """The planes of the new state."""
@@ -133,7 +146,8 @@ class Backward(Program):
     def __init__(self, inputs: Inputs, tables: Tables, substeps: int, wants_field: bool, wants_values: bool) -> None:
         super().__init__(inputs, tables, substeps, ADJOINT.value)
         planes, nothing = inputs.planes, inputs.planes.new_empty(0)
-        self.tape = planes.new_empty(substeps, *planes.shape)
+        length = -(-planes.numel() // 4) * 4  # whole fours, see tables
+        self.tape = planes.new_empty(substeps, length)[:, : planes.numel()].unflatten(1, planes.shape)
         self.answers = planes.new_empty(self.batch * self.cells * ADJOINT.value)
         self.bars, self.origin_bar, self.gravity_bar = (
             torch.empty_like(t) for t in (planes, inputs.origin, inputs.gravity)
@@ -145,38 +159,23 @@ class Backward(Program):
         """Launch everything; allocates nothing."""
         assert self.inputs.result_bar is not None
         self.prepare()
-        self.replay()
+        self.tape[0].copy_(self.inputs.planes)
+        self.advance(self.tape.unbind(), self.answers, TAPE=True)
         self.boxes.fill_(NOWHERE.value)
         self.bars.copy_(self.inputs.result_bar)
         for bar in (self.field_bar, self.values_bar, self.origin_bar, self.gravity_bar):
             bar.zero_()
-        for s in range(self.substeps, -1, -1):
+        for s in range(self.substeps - 1, -1, -1):
             self.go_back(s)
 
-    def replay(self) -> None:
-        """Fill the tape with the states at the start of the substeps."""
-        tape = self.tape
-        tape[0].copy_(self.inputs.planes)
-        for s in range(self.substeps):
-            slots = (tape[max(s - 1, 0)], tape[s], tape[min(s + 1, self.substeps - 1)])
-            self.move(slots, self.answers, self.boxes[s], ARRIVE=s > 0, LEAVE=s < self.substeps - 1, TAPE=True)
-            if s < self.substeps - 1:
-                self.nodes(node_velocities, self.sums, self.answers, self.boxes[s])
-
     def go_back(self, substep: int) -> None:
-        """Finish the adjoint of the substep that starts at ``substep``, and begin that of the one before."""
-        last = self.substeps - 1
-        state, before = self.tape[min(substep, last)], self.tape[max(substep - 1, 0)]
-        box, bars = self.boxes[max(substep - 1, 0)], (self.bars, self.values_bar, self.field_bar, self.origin_bar)
-        flags = {"WANT_FIELD": self.field_bar.numel() > 0, "WANT_VALUES": self.values_bar.numel() > 0}
-        flags |= {"FINISH": substep <= last, "BEGIN": substep > 0}
-        for body in self.tables.bodies:
-            constants, sizes, kind = self.of_body(body)
-            programs = self.batch * -(-body.count // BLOCK)
-            buffers = (state, before, *bars, self.sums, self.answers, box, *constants)
-            launch(adjoint_pass, programs, *buffers, *sizes, **kind, **flags)
-        if substep > 0:
-            self.nodes(node_adjoint, self.sums, self.answers, box, bars=(self.gravity_bar,))
+        """From derivatives in the state after a substep to those in the state before it."""
+        state, box = self.tape[substep], self.boxes[substep]
+        self.over_particles(begin_adjoint, state, self.bars, self.sums, box)
+        self.over_nodes(node_adjoint, self.sums, self.answers, box, bars=(self.gravity_bar,))
+        buffers = (state, self.bars, self.values_bar, self.field_bar, self.origin_bar, self.answers)
+        wants = {"WANT_FIELD": self.field_bar.numel() > 0, "WANT_VALUES": self.values_bar.numel() > 0}
+        self.over_particles(finish_adjoint, *buffers, **wants)
 
     def results(self) -> tuple[Tensor, ...]:
         """Derivatives in planes, field, origin, gravity and values."""

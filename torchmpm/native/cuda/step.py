@@ -6,7 +6,7 @@ import triton.language as tl
 from torchmpm.native.cuda.grid import SUMS
 from torchmpm.native.cuda.linalg import matmul
 from torchmpm.native.cuda.material import DT, INVERSE_H, H, hardened, orthogonal, read_values, return_map, stress
-from torchmpm.native.cuda.transfer import gather, include, locate, pull, scatter
+from torchmpm.native.cuda.transfer import SIZES, gather, include, locate, pull, scatter
 
 
 @triton.jit
@@ -59,7 +59,7 @@ def deform(
     return a, b, c, d, after, factor * xx, factor * xy, factor * yy
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def particles_pass(
     before, now, after, sums, velocity, box, field, origin, values, constants, bounds,
     particles, stride, first, count, blocks, column, columns, values_batch, resolution, width,

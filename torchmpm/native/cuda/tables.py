@@ -67,16 +67,18 @@ def tables(description: tuple[float, ...], dtype: torch.dtype, device: torch.dev
     resolution, h, dt, margin, damping, mass_epsilon, stretch_floor = description[:7]
     extent = resolution * h - margin
     constants = [h, 1.0 / h, dt, margin, extent, damping, mass_epsilon, stretch_floor, LARGEST_JP]
+    constants += [0.0] * 3  # parts of a table begin at whole fours, as Triton compiles a kernel anew for others
     body_count, rule_count = int(description[7]), int(description[8])
     bodies, first = [], 0
     for start in range(HEAD, HEAD + BODY_NUMBERS * body_count, BODY_NUMBERS):
         count, kind, muscle, columns, column, *bounds = description[start : start + BODY_NUMBERS]
         part = BodyPart(first, int(count), int(kind), bool(muscle), columns > 1, int(column), len(constants))
         bodies.append(part)
-        constants += bounds
+        constants += [*bounds, 0.0]
         first += int(count)
     start = HEAD + BODY_NUMBERS * body_count
-    rows, slots = [], {}
+    rows: list[list[float]] = []
+    slots: dict[tuple[float, ...], int] = {}
     for at in range(start, start + RULE_NUMBERS * rule_count, RULE_NUMBERS):
         rule = description[at : at + RULE_NUMBERS]
         rows.append([*rule, slots.setdefault(rule[:2], len(slots))])

@@ -12,6 +12,22 @@ from torchmpm.native.cuda.material import EXTENT, INVERSE_H, MARGIN
 PAD = tl.constexpr(_PAD)
 #: Larger than any node, in a box that holds none.
 NOWHERE = tl.constexpr(2**29)
+#: Sizes that kernels take; one compiled kernel serves all of them.
+SIZES = (
+    "particles",
+    "stride",
+    "first",
+    "count",
+    "blocks",
+    "column",
+    "columns",
+    "values_batch",
+    "resolution",
+    "width",
+    "programs",
+    "cells",
+    "rule_count",
+)
 
 
 @triton.jit
