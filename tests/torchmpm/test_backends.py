@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchmpm import Body, ParticleState, Solver, VonMises, backends
 from torchmpm.backends import BACKENDS, compiler_found
+from torchmpm.native import pack, unsupported
 
 
 def run(solver: Solver) -> tuple[ParticleState, tuple[Tensor, ...]]:
@@ -136,6 +137,18 @@ def test_compiler_search(
     if variable is not None:
         monkeypatch.setenv("CXX", variable)
     assert compiler_found() == found
+
+
+def test_what_native_wants_on_other_devices(monkeypatch: pytest.MonkeyPatch) -> None:
+    """None of this needs the device."""
+    cuda, single = torch.device("cuda"), torch.float32
+    assert "on the CPU and on CUDA, the state is on mps" in str(unsupported(robot(5), single, torch.device("mps")))
+    monkeypatch.setattr(pack, "triton_found", lambda: False)
+    assert "on CUDA it needs Triton, which is not installed" in str(unsupported(robot(5), single, cuda))
+    monkeypatch.setattr(pack, "triton_found", lambda: True)
+    assert unsupported(robot(5), single, cuda) is None
+    monkeypatch.setattr(torch, "are_deterministic_algorithms_enabled", lambda: True)
+    assert "taken in no fixed order" in str(unsupported(robot(5), single, cuda))
 
 
 @pytest.mark.cuda

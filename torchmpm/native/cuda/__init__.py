@@ -16,7 +16,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchmpm.native.cuda.graphs import cache
+from torchmpm.native.cuda.graphs import KEPT_SHARE, cache
 from torchmpm.native.cuda.programs import Backward, Forward, Inputs, Program
 from torchmpm.native.cuda.tables import tables
 
@@ -77,7 +77,8 @@ def _run(kind: type[Program], inputs: Inputs, description: Tensor, substeps: int
         shapes = (planes.shape, inputs.field is None, inputs.values.shape, planes.dtype, planes.device)
         # Two streams may run at once, so each has buffers of its own.
         stream = torch.cuda.current_stream().cuda_stream
-        return cache.run((kind, numbers, substeps, wants, shapes, stream), build, inputs)
+        most = KEPT_SHARE * torch.cuda.get_device_properties(planes.device).total_memory
+        return cache.run((kind, numbers, substeps, wants, shapes, stream), build, inputs, most)
 
 
 def _launched(program: Program) -> tuple[Tensor, ...]:

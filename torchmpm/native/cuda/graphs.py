@@ -11,10 +11,10 @@ from torch import Tensor
 
 from torchmpm.native.cuda.programs import Inputs, Program
 
-#: At most so many graphs are kept, and at most so many bytes in their buffers together; the longest unused go first.
-#: A call that needs more than that is launched kernel by kernel each time.
+#: At most so many graphs are kept, and at most this share of the device's memory in their buffers together; the longest
+#: unused go first. A call that needs more than that is launched kernel by kernel each time.
 KEPT_GRAPHS = 16
-KEPT_BYTES = 2**32
+KEPT_SHARE = 0.25
 
 
 class Recorded:
@@ -60,13 +60,13 @@ class Cache:
         self._kept: OrderedDict[Hashable, Recorded] = OrderedDict()
         self._lock = threading.Lock()
 
-    def run(self, key: Hashable, build: Callable[[Inputs], Program], inputs: Inputs) -> tuple[Tensor, ...]:
-        """Results of the program of a key, which is built where there is none yet."""
+    def run(self, key: Hashable, build: Callable[[Inputs], Program], inputs: Inputs, most: float) -> tuple[Tensor, ...]:
+        """Results of the program of a key, which is built where there is none yet; ``most`` bytes are kept."""
         with self._lock:
             recorded = self._kept.pop(key, None) or Recorded(build, inputs)
-            if recorded.size() <= KEPT_BYTES:
+            if recorded.size() <= most:
                 self._kept[key] = recorded
-            while len(self._kept) > KEPT_GRAPHS or self.size() > KEPT_BYTES:
+            while len(self._kept) > KEPT_GRAPHS or self.size() > most:
                 self._kept.popitem(last=False)
             return recorded.run(inputs)
 
