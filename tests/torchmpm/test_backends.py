@@ -1,5 +1,6 @@
 """Backends: the same numbers, and clear words where one cannot run."""
 
+import importlib.util
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -143,12 +144,19 @@ def test_what_native_wants_on_other_devices(monkeypatch: pytest.MonkeyPatch) -> 
     """None of this needs the device."""
     cuda, single = torch.device("cuda"), torch.float32
     assert "on the CPU and on CUDA, the state is on mps" in str(unsupported(robot(5), single, torch.device("mps")))
-    monkeypatch.setattr(pack, "triton_found", lambda: False)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CC", raising=False)
+    pack.triton_lacks.cache_clear()
     assert "on CUDA it needs Triton, which is not installed" in str(unsupported(robot(5), single, cuda))
-    monkeypatch.setattr(pack, "triton_found", lambda: True)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    pack.triton_lacks.cache_clear()
+    assert "needs a C compiler for Triton ($CC, gcc or clang)" in str(unsupported(robot(5), single, cuda))
+    monkeypatch.setenv("CC", "cc")
     assert unsupported(robot(5), single, cuda) is None
     monkeypatch.setattr(torch, "are_deterministic_algorithms_enabled", lambda: True)
     assert "taken in no fixed order" in str(unsupported(robot(5), single, cuda))
+    pack.triton_lacks.cache_clear()
 
 
 @pytest.mark.cuda

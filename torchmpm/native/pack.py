@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import importlib.util
 import math
+import os
+import shutil
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -31,8 +33,9 @@ def unsupported(solver: Solver, dtype: torch.dtype, device: torch.device) -> str
     if device.type not in ("cpu", "cuda"):
         return f"it runs on the CPU and on CUDA, the state is on {device}"
     if device.type == "cuda":
-        if not triton_found():
-            return "on CUDA it needs Triton, which is not installed (torch's builds for CUDA bring it along)"
+        missing = triton_lacks(os.environ.get("CC"), os.environ.get("PATH"))
+        if missing is not None:
+            return missing
         if torch.are_deterministic_algorithms_enabled() and not torch.is_deterministic_algorithms_warn_only_enabled():
             return "on CUDA its sums are taken in no fixed order, torch.use_deterministic_algorithms(True) forbids that"
     if dtype not in (torch.float32, torch.float64):
@@ -47,9 +50,13 @@ def unsupported(solver: Solver, dtype: torch.dtype, device: torch.device) -> str
 
 
 @functools.cache
-def triton_found() -> bool:
-    """Whether Triton can be imported."""
-    return importlib.util.find_spec("triton") is not None
+def triton_lacks(compiler: str | None, path: str | None) -> str | None:
+    """What keeps Triton from working, ``None`` if nothing does, with $CC and $PATH as given."""
+    if importlib.util.find_spec("triton") is None:
+        return "on CUDA it needs Triton, which is not installed (torch's builds for CUDA bring it along)"
+    if compiler is None and not any(shutil.which(name, path=path) for name in ("gcc", "clang")):
+        return "on CUDA it needs a C compiler for Triton ($CC, gcc or clang), found none"
+    return None
 
 
 def upload(numbers: Sequence[float], like: Tensor) -> Tensor:

@@ -70,6 +70,7 @@ def begin_adjoint(
     become momentum, mass, and the derivative in its velocity.
     """
     element, k, at, valid = own_particles(first, count, particles, blocks, BLOCK)
+    stride = stride.to(tl.int64)
     place = values_at(values, element, k, column, columns, values_batch, VARYING)
     mass, factor, mu2, lam, s0, s1, s2, s3 = read_values(values, values_batch * columns, place, valid)
     h, inverse_h, dt = tl.load(constants + H), tl.load(constants + INVERSE_H), tl.load(constants + DT)
@@ -112,6 +113,7 @@ def finish_adjoint(
     ``answers`` are those of :func:`torchmpm.native.cuda.grid.node_adjoint`.
     """
     element, k, at, valid = own_particles(first, count, particles, blocks, BLOCK)
+    stride = stride.to(tl.int64)
     place = values_at(values, element, k, column, columns, values_batch, VARYING)
     mass, factor, mu2, lam, s0, s1, s2, s3 = read_values(values, values_batch * columns, place, valid)
     h, inverse_h, dt = tl.load(constants + H), tl.load(constants + INVERSE_H), tl.load(constants + DT)

@@ -72,6 +72,7 @@ def particles_pass(
     ``after`` gets the next deformation. All three are one buffer, or with ``TAPE`` three neighbours on a tape.
     """
     element, k, at, valid = own_particles(first, count, particles, blocks, BLOCK)
+    stride = stride.to(tl.int64)
     origin += 2 * element
     cells = element * width * width
     h, inverse_h, dt = tl.load(constants + H), tl.load(constants + INVERSE_H), tl.load(constants + DT)
