@@ -179,7 +179,7 @@ def test_a_broken_element_harms_no_other(name: str, value: float) -> None:
     (together, of_all), (apart, of_some) = ends
     assert_close(together, apart, 1e-12)
     for one, other in zip(of_all, of_some, strict=True):
-        torch.testing.assert_close(one[[0, 2]], other[[0, 2]], rtol=1e-9, atol=1e-12)
+        torch.testing.assert_close(one[[0, 2]], other[[0, 2]], rtol=0, atol=1e-10 * other.abs().max().item())
 
 
 def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchmpm.native.cuda.graphs import KEPT_SHARE, cache
 from torchmpm.native.cuda.programs import Backward, Forward, Inputs, Program
-from torchmpm.native.cuda.tables import tables
+from torchmpm.native.cuda.tables import unpack
 
 __all__ = ["backward", "cache", "forward"]
 
@@ -64,10 +64,10 @@ def _run(kind: type[Program], inputs: Inputs, description: Tensor, substeps: int
     """Run a program, from a graph where that works: not while a caller records a graph of their own."""
     inputs = inputs.map(Tensor.contiguous)
     planes, numbers = inputs.planes, tuple(description.tolist())
-    constants = tables(numbers, planes.dtype, planes.device)
+    tables = unpack(numbers, planes.dtype, planes.device)
 
     def build(own: Inputs) -> Program:
-        return kind(own, constants, substeps, *wants)
+        return kind(own, tables, substeps, *wants)
 
     if planes.device.type != "cuda":
         return _launched(build(inputs))

@@ -62,7 +62,7 @@ class Tables:
 
 
 @functools.lru_cache(maxsize=64)
-def tables(description: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tables:
+def unpack(description: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tables:
     """The tables of a description, remembered, because to copy them to a device waits for it."""
     resolution, h, dt, margin, damping, mass_epsilon, stretch_floor = description[:7]
     extent = resolution * h - margin
