@@ -37,33 +37,31 @@ def compile_only(kernel, count, *arguments, **constants):
         seen.add(key)
         source = ASTSource(kernel, {n: signature[n] for n in kernel.arg_names}, constants)
         options = {"num_warps": programs.BLOCK // 32, "enable_fp_fusion": True}
-        done = triton.compile(source, target=GPUTarget("cuda", int(sys.argv[1]), 32), options=options)
+        done = triton.compile(source, target=GPUTarget("cuda", 80, 32), options=options)
         assert done.asm["cubin"]
         print(kernel.fn.__name__, flush=True)
 
 programs.launch = compile_only
-for dtype in (torch.float32, torch.float64):
-    for name in sys.argv[2:]:
-        calls = []
-        ops.native_step = lambda *arguments: calls.append(arguments) or arguments[0]
-        state, field, origin = (t.to(dtype) for t in moving(6, 2))
-        replace(solvers(6, 2)[name], backend="native").step(state, field, substeps=3, origin=origin)
-        (call,) = calls
-        cuda.forward(*call)
-        cuda.backward(call[0], *call, True, name == "tensor values")
+for name, dtype in (("tensor values", torch.float32), ("soil", torch.float64), ("von Mises", torch.float64)):
+    calls = []
+    ops.native_step = lambda *arguments: calls.append(arguments) or arguments[0]
+    state, field, origin = (t.to(dtype) for t in moving(6, 2))
+    replace(solvers(6, 2)[name], backend="native").step(state, field, substeps=3, origin=origin)
+    (call,) = calls
+    cuda.forward(*call)
+    cuda.backward(call[0], *call, True, name == "tensor values")
 """
 
 
-@pytest.mark.parametrize("capability", [80, 90])
-def test_every_kernel_compiles(capability: int, tmp_path: Path) -> None:
+def test_every_kernel_compiles(tmp_path: Path) -> None:
+    """In single precision, and but for elastic bodies in double."""
     root = Path(__file__).resolve().parents[2]
     environment = {
         **os.environ,
         "TRITON_CACHE_DIR": str(tmp_path),
         "PYTHONPATH": os.pathsep.join([str(root), *sys.path]),
     }
-    command = [sys.executable, "-c", PROGRAM, str(capability), "three bodies", "tensor values"]
-    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=root, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     kernels = {"rule_codes", "particles_pass", "node_velocities", "begin_adjoint", "node_adjoint", "finish_adjoint"}
     assert set(done.stdout.split()) == kernels

@@ -27,6 +27,7 @@ from torchmpm.native import ops
 pytestmark = [
     pytest.mark.skipif(not compiler_found(), reason="no C++ compiler"),
     pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # of numpy, which computes in the interpreter
+    *([pytest.mark.slow] if DEVICE == "cpu" else []),
 ]
 
 COUNT = 45
@@ -100,7 +101,7 @@ def test_corners_have_the_derivatives_of_the_plain_substep(material: Elastic) ->
     both_gradients(lambda _: solver, corner_leaves(), STATE, 1)
 
 
-@pytest.mark.parametrize("count", range(len(RULES) + 1))
+@pytest.mark.parametrize("count", [0, 1, 3, 4, len(RULES)])
 def test_rules(count: int) -> None:
     """From none to all directions, overlapping, with and without friction, in the world's and the window's frame."""
     given = state_leaves(30, 2)
