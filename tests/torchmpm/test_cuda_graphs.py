@@ -92,7 +92,10 @@ def events(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def record(graph: Graph, **_: object) -> Iterator[None]:
         happened.append("record")
         recording.append(graph)
-        yield
+        try:
+            yield
+        finally:
+            recording.clear()
 
     recording: list[Graph] = []
 
@@ -145,6 +148,21 @@ def test_what_is_kept_has_bounds(events: list[str], monkeypatch: pytest.MonkeyPa
     assert list(cache._kept) == ["d"] and cache.size() <= most
     cache.clear()
     assert len(cache) == 0
+
+
+def test_what_fails_is_forgotten(events: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    cache = graphs.Cache()
+    add_one(cache, "a", 1.0)
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="out of luck"):
+        patch.setattr(Adder, "run", raiser)
+        add_one(cache, "a", 1.0)
+    assert len(cache) == 0
+    assert add_one(cache, "a", 2.0) == 3.0
+
+
+def raiser(self: Adder) -> None:
+    """Stands for a kernel that cannot be launched."""
+    raise RuntimeError("out of luck")
 
 
 def test_buffers_made_in_inference_mode_serve_outside_of_it(events: list[str]) -> None:

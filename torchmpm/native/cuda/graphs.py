@@ -37,10 +37,11 @@ class Recorded:
             own.copy_(given)
         self.calls += 1
         if self.calls == 2:
-            self.graph = torch.cuda.CUDAGraph()
+            graph = torch.cuda.CUDAGraph()
             # Other threads may go on calling CUDA meanwhile.
-            with torch.cuda.graph(self.graph, capture_error_mode="thread_local"):
+            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
                 self.program.run()
+            self.graph = graph
         if self.graph is None:
             self.program.run()
         else:
@@ -64,11 +65,12 @@ class Cache:
         """Results of the program of a key, which is built where there is none yet; ``most`` bytes are kept."""
         with self._lock:
             recorded = self._kept.pop(key, None) or Recorded(build, inputs)
-            if recorded.size() <= most:
+            results = recorded.run(inputs)
+            if recorded.size() <= most:  # and did not fail: then its buffers are no longer what a run expects
                 self._kept[key] = recorded
             while len(self._kept) > KEPT_GRAPHS or self.size() > most:
                 self._kept.popitem(last=False)
-            return recorded.run(inputs)
+            return results
 
     def size(self) -> int:
         """Bytes of all buffers."""

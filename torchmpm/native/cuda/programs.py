@@ -62,9 +62,8 @@ class Program:
         self.cells = tables.width**2
         self.sums = planes.new_zeros(self.batch * self.cells * numbers)
         self.boxes = torch.empty(substeps, self.batch, 4, dtype=torch.int32, device=planes.device)
-        self.codes = torch.empty(
-            self.batch * self.cells if tables.slots else 1, dtype=torch.int32, device=planes.device
-        )
+        nodes = self.batch * self.cells if tables.slots else 1
+        self.codes = torch.empty(nodes, dtype=torch.int32, device=planes.device)
 
     def run(self) -> None:
         """Launch everything; allocates nothing."""
