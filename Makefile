@@ -6,11 +6,12 @@ PIP_FLAGS ?=
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt $(PIP_FLAGS)
 STAMP := .venv/.stamp-install
+TRITON_STAMP := .venv/.stamp-triton
 DOCS_STAMP := .venv/.stamp-docs
 DEMO := runs/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint docs bench clean
+.PHONY: help install demo test test-all test-gpu-kernels lint docs bench clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1: /p' Makefile
@@ -32,7 +33,7 @@ $(DOCS_STAMP): $(STAMP)
 
 # Threads that wait for each other by spinning stall for seconds as soon as another program wants a core. For
 # benchmarks, which have the machine to themselves, spinning is faster.
-demo test test-all: export OMP_WAIT_POLICY ?= PASSIVE
+demo test test-all test-gpu-kernels: export OMP_WAIT_POLICY ?= PASSIVE
 
 demo: install  ## train a small policy on SHAPE MATCH, with a video and a learning curve at the end
 	$(BIN)/python -m cfp.train --task shapematch --preset quick --seed 0 --out $(DEMO) --resume
@@ -43,6 +44,15 @@ test: install  ## fast tests
 
 test-all: install  ## all tests, slow ones and those for CUDA included
 	$(BIN)/python -m pytest -m ""
+
+# torch's builds for CUDA bring Triton along, in a version of their choice.
+$(TRITON_STAMP): $(STAMP)
+	@echo "Installing Triton (a large download the first time) ..."
+	@$(BIN)/python -c "import triton" 2>/dev/null || $(PIP) "triton>=3.3"
+	@touch $@
+
+test-gpu-kernels: $(TRITON_STAMP)  ## tests of the CUDA kernels: on a GPU, else in an interpreter and a compiler
+	$(BIN)/python -m pytest -m "" $(addprefix tests/torchmpm/test_cuda_,kernels.py graphs.py compilation.py)
 
 lint: install  ## style, formatting, types
 	$(BIN)/ruff check .

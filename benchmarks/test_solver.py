@@ -20,21 +20,36 @@ CENTRE, RADIUS = (0.09, 0.25), 0.09
 
 
 SIZES = {"1x22000": (1, 22_000), "1x2000": (1, 2_000), "16x2000": (16, 2_000), "64x2000": (64, 2_000)}
+#: Only a GPU has work for so many.
+LARGE = {"1024x2000": (1024, 2_000)}
 needs_compiler = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
 
 
 def cases(**sizes: str) -> pytest.MarkDecorator:
-    """Parameters for the given sizes of each backend; what would take minutes is left out."""
+    """Parameters for the given sizes of each backend; what would take minutes is left out. On a GPU, every size."""
     parameters = [
-        pytest.param(name, *SIZES[size], id=f"{size}-{name}", marks=() if name == "eager" else needs_compiler)
+        pytest.param(name, *SIZES[size], "cpu", id=f"{size}-{name}", marks=() if name == "eager" else needs_compiler)
         for name, listed in sizes.items()
         for size in listed.split()
     ]
-    return pytest.mark.parametrize(("backend", "batch", "count"), parameters)
+    if torch.cuda.is_available():
+        parameters += [
+            pytest.param(name, *size, "cuda", id=f"{label}-{name}-cuda", marks=needs_compiler)
+            for name in ("eager", "native")
+            for label, size in (SIZES | LARGE).items()
+            if name == "native" or label in sizes["eager"].split()
+        ]
+    return pytest.mark.parametrize(("backend", "batch", "count", "device"), parameters)
+
+
+def finish(device: str) -> None:
+    """Wait until all is computed."""
+    if device == "cuda":
+        torch.cuda.synchronize()
 
 
 def scene(
-    backend: str, batch: int, count: int
+    backend: str, batch: int, count: int, device: str = "cpu"
 ) -> tuple[torchmpm.Solver, torchmpm.ParticleState, torch.Tensor, torch.Tensor]:
     """Solver, state, actuation and window origin of RUN; the robot weighs the same for every ``count``."""
     share = 22_000 / count
@@ -49,16 +64,17 @@ def scene(
     wave = 45.0 * torch.sin(torch.arange(128) / 8.0)
     actuation = wave[:, None].expand(batch, 2, 128, 128).contiguous()
     origin = torch.tensor([CENTRE[0] - 0.4, 0.0]).expand(batch, -1)
-    return solver, state, actuation, origin
+    return solver, state.to(device), actuation.to(device), origin.to(device)
 
 
 @cases(eager="1x22000 1x2000 16x2000", compile="1x22000 1x2000 16x2000", native=" ".join(SIZES))
-def test_forward(per_substep, backend: str, batch: int, count: int) -> None:
-    solver, state, actuation, origin = scene(backend, batch, count)
+def test_forward(per_substep, backend: str, batch: int, count: int, device: str) -> None:
+    solver, state, actuation, origin = scene(backend, batch, count, device)
 
     def run() -> None:
         with torch.no_grad():
             end = solver.step(state, actuation, substeps=100, origin=origin)
+        finish(device)
         assert torchmpm.diagnostics.finite(end).all()
 
     per_substep(run, particles=batch * count, substeps=100, rounds=8)
@@ -90,13 +106,14 @@ def test_materials(per_substep, bodies: str) -> None:
 
 
 @cases(eager="1x2000", compile="1x2000", native=" ".join(SIZES))
-def test_forward_backward(per_substep, backend: str, batch: int, count: int) -> None:
-    solver, state, actuation, origin = scene(backend, batch, count)
+def test_forward_backward(per_substep, backend: str, batch: int, count: int, device: str) -> None:
+    solver, state, actuation, origin = scene(backend, batch, count, device)
     actuation.requires_grad_()
 
     def run() -> None:
         end = solver.step(state, actuation, substeps=100, origin=origin)
         (gradient,) = torch.autograd.grad(end.x, actuation, torch.sin(40 * state.x))
+        finish(device)
         assert gradient.isfinite().all() and gradient.any()
 
     per_substep(run, particles=batch * count, substeps=100, rounds=5)

@@ -31,7 +31,8 @@ def compiler_found() -> bool:
 def runs_native(solver: Solver, state: ParticleState) -> bool:
     """Whether a step from this state is one for :mod:`torchmpm.native`.
 
-    ``"auto"`` takes it wherever it works. Where it does not on a CPU, a warning is logged once that says why.
+    ``"auto"`` takes it on the CPU wherever it works. Where it does not, a warning is logged once that says why. On CUDA
+    it waits to be asked for: its kernels there have been tested, but on no device yet.
 
     Raises:
         ValueError: The backend is ``"native"`` and cannot run this.
@@ -43,11 +44,11 @@ def runs_native(solver: Solver, state: ParticleState) -> bool:
         if reason is not None:
             raise ValueError(f"backend 'native' cannot run this: {reason}; use 'eager'")
         return True
-    if state.device.type != "cpu":
-        return False
+    if reason is None and state.device.type == "cuda":
+        reason = "backend 'native' has not been tried on a CUDA device yet: choose it to do so"
     if reason is None:
         try:
-            native.load(state.dtype)
+            native.load(state.dtype, state.device)
         except ValueError as error:
             reason = str(error)
     if reason is not None:

@@ -113,8 +113,9 @@ class Solver:
         damping: Factor on every node velocity in every substep (1 = none).
         rules: Velocity rules, see :class:`torchmpm.VelocityRule`.
         dt: Duration of a substep, s.
-        backend: ``"native"`` (fused kernels on the CPU, :mod:`torchmpm.native`), ``"eager"`` or ``"compile"`` (see
-            :func:`torchmpm.backends.substep_function`), or ``"auto"``: native where it works, else eager.
+        backend: ``"native"`` (fused kernels, :mod:`torchmpm.native`: C++ on the CPU, Triton on CUDA), ``"eager"`` or
+            ``"compile"`` (see :func:`torchmpm.backends.substep_function`), or ``"auto"``: native on a CPU where it
+            works, else eager.
 
     Raises:
         ValueError: No bodies, ``dt`` not positive, or an unknown or unavailable backend.

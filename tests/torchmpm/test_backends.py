@@ -1,5 +1,6 @@
 """Backends: the same numbers, and clear words where one cannot run."""
 
+import importlib.util
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from torchmpm import Body, ParticleState, Solver, VonMises, backends
 from torchmpm.backends import BACKENDS, compiler_found
+from torchmpm.native import pack, unsupported
 
 
 def run(solver: Solver) -> tuple[ParticleState, tuple[Tensor, ...]]:
@@ -136,6 +138,25 @@ def test_compiler_search(
     if variable is not None:
         monkeypatch.setenv("CXX", variable)
     assert compiler_found() == found
+
+
+def test_what_native_wants_on_other_devices(monkeypatch: pytest.MonkeyPatch) -> None:
+    """None of this needs the device."""
+    cuda, single = torch.device("cuda"), torch.float32
+    assert "on the CPU and on CUDA, the state is on mps" in str(unsupported(robot(5), single, torch.device("mps")))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CC", raising=False)
+    pack.triton_lacks.cache_clear()
+    assert "on CUDA it needs Triton, which is not installed" in str(unsupported(robot(5), single, cuda))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    pack.triton_lacks.cache_clear()
+    assert "needs a C compiler for Triton ($CC, gcc or clang)" in str(unsupported(robot(5), single, cuda))
+    monkeypatch.setenv("CC", "cc")
+    assert unsupported(robot(5), single, cuda) is None
+    monkeypatch.setattr(torch, "are_deterministic_algorithms_enabled", lambda: True)
+    assert "taken in no fixed order" in str(unsupported(robot(5), single, cuda))
+    pack.triton_lacks.cache_clear()
 
 
 @pytest.mark.cuda

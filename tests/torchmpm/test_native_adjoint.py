@@ -148,23 +148,25 @@ def test_single_precision(name: str) -> None:
     assert_gradients_close({n: v.double() for n, v in found.items()}, double, 2e-3)
 
 
-def test_corners_have_the_derivatives_of_the_plain_substep() -> None:
-    """F = I, F = 0, rotations, det F = 0, mirrored; at rest, and at the bounds of soil."""
+def corner_leaves() -> Leaves:
+    """At rest: F = I, F = 0, rotations, det F = 0, mirrored, and at the bounds of soil."""
     F = torch.eye(2, dtype=torch.float64).repeat(1, 12, 1, 1)
     F[0, 1], F[0, 2], F[0, 3] = 0.0, torch.tensor([[0.0, -1.0], [1.0, 0.0]]), torch.tensor([[1.0, 0.0], [0.0, -1.0]])
     F[0, 4], F[0, 5] = torch.tensor([[1.0, 0.0], [0.0, 0.0]]), torch.tensor([[1.0, 1e-7], [0.0, 1.0]])
     F[0, 6], F[0, 7] = 0.975 * F[0, 6], 1.0045 * F[0, 7]
     state = replace(ParticleState.at_rest(lively(12).x), F=F)
     given = {name: getattr(state, name) for name in STATE}
-    given |= {"actuation": torch.zeros(1, 2, 16, 16).double(), "origin": torch.zeros(1, 2).double()}
-    for material in (Elastic(300.0, 80.0), VonMises(500.0, 50.0, 60.0), Soil(800.0, 500.0)):
-        body = Body(12, material, muscle=True)
-        found, expected = (
-            gradients(lambda _, b=body: robot(12, bodies=(b,)), given, ("x", "v", "C", "F", "Jp"), 1, backend)
-            for backend in ("native", "eager")
-        )
-        assert all(value.isfinite().all() for value in found.values())
-        assert_gradients_close(found, expected, 1e-10)
+    return given | {"actuation": torch.zeros(1, 2, 16, 16).double(), "origin": torch.zeros(1, 2).double()}
+
+
+@pytest.mark.parametrize("material", [Elastic(300.0, 80.0), VonMises(500.0, 50.0, 60.0), Soil(800.0, 500.0)])
+def test_corners_have_the_derivatives_of_the_plain_substep(material: Elastic) -> None:
+    solver = robot(12, bodies=(Body(12, material, muscle=True),))
+    found, expected = (
+        gradients(lambda _: solver, corner_leaves(), STATE, 1, backend) for backend in ("native", "eager")
+    )
+    assert all(value.isfinite().all() for value in found.values())
+    assert_gradients_close(found, expected, 1e-10)
 
 
 def test_all_outside_pass_their_gradient_through() -> None:

@@ -1,9 +1,10 @@
-"""The substep as fused C++ kernels on the CPU, compiled on first use.
+"""The substep as fused kernels: in C++ on the CPU, compiled on first use, and in Triton on CUDA.
 
-``library`` compiles and loads them, ``pack`` brings a solver into the tables they read, ``ops`` makes them operators of
-torch. The kernels, in the order in which they build on each other: ``simd``, ``linalg``, ``material``, ``scene``,
-``transfer``, ``grid``, ``team``, ``workspace``, ``step``; the adjoint: ``material_adjoint``, ``grid_adjoint``,
-``adjoint_block``, ``adjoint``; ``native.cpp`` is what is compiled.
+``pack`` brings a solver into the tables they read, ``ops`` makes them operators of torch.
+:mod:`torchmpm.native.cuda` has all that is for CUDA. The rest is for the CPU: ``library`` compiles and loads. The
+kernels, in the order in which they build on each other: ``simd``, ``linalg``, ``material``, ``scene``, ``transfer``,
+``grid``, ``team``, ``workspace``, ``step``; the adjoint: ``material_adjoint``, ``grid_adjoint``, ``adjoint_block``,
+``adjoint``; ``native.cpp`` is what is compiled.
 
 A simulation's particles are cut into blocks of 64, each of one body. One pass over the blocks reads velocities from the
 nodes, moves and deforms the particles, and adds mass and momentum to the nodes for the next substep. The sums of a few
@@ -29,13 +30,14 @@ if TYPE_CHECKING:
 __all__ = ["load", "step", "unsupported"]
 
 
-def load(dtype: torch.dtype) -> None:
-    """Compile and load the kernels for a dtype, unless that has been done.
+def load(dtype: torch.dtype, device: torch.device) -> None:
+    """Compile and load the kernels for a dtype, unless that has been done; on CUDA the first step does it.
 
     Raises:
         ValueError: There is no compiler, or it failed.
     """
-    ops.library_for(dtype)
+    if device.type == "cpu":
+        ops.library_for(dtype)
 
 
 def step(
@@ -65,7 +67,8 @@ def step(
     origin = origin.contiguous()
     table, widths = pack.values(solver, state.Jp)
     field = None if actuation is None else actuation.contiguous()
-    gravity = torch.as_tensor(solver.gravity, dtype=state.dtype).expand(state.batch_size, 2).contiguous()
+    given = solver.gravity if isinstance(solver.gravity, Tensor) else pack.upload(solver.gravity, state.Jp)
+    gravity = given.to(state.Jp).expand(state.batch_size, 2).contiguous()
     shift, description = node_shift(solver.grid, origin), pack.description(solver, widths, mass_epsilon)
     planes = state.stack()
     # With gradients a call keeps its start and needs a tape of all its substeps later, which must not grow endlessly.

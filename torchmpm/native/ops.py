@@ -17,6 +17,8 @@ _REAL = {torch.float32: "float", torch.float64: "double"}
 #: Scratch memory up to this size, bytes, is kept for the next call: fresh pages cost a third of a backward pass. It is
 #: enough for 190 substeps of 22,000 particles in single precision; longer steps are cut.
 KEPT_BYTES = 2**28
+#: The tape on CUDA takes no more than this, bytes.
+CUDA_TAPE_BYTES = 2**31
 _kept: list[Tensor] = []
 
 
@@ -36,13 +38,15 @@ def _scratch(size: int) -> Iterator[int]:
 
 
 def tape_limit(planes: Tensor, width: int) -> int:
-    """How many substeps the adjoint can replay at once within :data:`KEPT_BYTES`.
+    """How many substeps the adjoint can replay at once within :data:`KEPT_BYTES`, or :data:`CUDA_TAPE_BYTES`.
 
     Args:
         planes: (13, B, N).
         width: Nodes per axis with their padding.
     """
     rows, batch, particles = planes.shape
+    if planes.is_cuda:
+        return max(1, CUDA_TAPE_BYTES // (planes.element_size() * rows * particles * batch))
     substep = planes.element_size() * (rows * particles + 3 * width**2) * min(batch, torch.get_num_threads())
     return max(1, KEPT_BYTES // substep)
 
@@ -98,7 +102,7 @@ def native_step(
         gravity: (B, 2) acceleration, m/s^2.
         values: (8, 1 or B, columns) from :func:`torchmpm.native.pack.values`.
         shift: (B, 2) int64, nodes between the world's origin and the window's.
-        description: float64, from :func:`torchmpm.native.pack.description`.
+        description: float64 on the CPU, from :func:`torchmpm.native.pack.description`.
         substeps: Number of substeps, at least 1.
 
     Returns:
@@ -110,6 +114,13 @@ def native_step(
     call.result = _address(result)
     _run("forward", planes.dtype, call)
     return result
+
+
+@native_step.register_kernel("cuda")
+def _(*arguments: Any) -> Tensor:
+    from torchmpm.native import cuda  # not at the top: it imports Triton
+
+    return cuda.forward(*arguments)
 
 
 def _call(
@@ -196,6 +207,13 @@ def native_step_backward(
     call.values_bar = _address(values_bar) if wants_values else None
     _run("backward", planes.dtype, call)
     return outputs
+
+
+@native_step_backward.register_kernel("cuda")
+def _(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    from torchmpm.native import cuda
+
+    return cuda.backward(*arguments)
 
 
 def _backward_outputs(

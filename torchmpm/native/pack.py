@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+import importlib.util
 import math
+import os
+import shutil
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
@@ -18,18 +23,26 @@ if TYPE_CHECKING:
 KINDS: tuple[type, ...] = (Elastic, VonMises, Soil)
 #: Rows of the table of values, see ``struct Values`` in ``material.hpp``.
 ROWS = 8
-#: Numbers of a description before those of the bodies.
-_HEAD = 9
-#: Tables of solvers whose values are all numbers, by dtype; they stay the same.
-_numbers: WeakKeyDictionary[Solver, dict[torch.dtype, tuple[Tensor, list[int]]]] = WeakKeyDictionary()
+#: Tables of solvers whose values are all numbers, by dtype and device; they stay the same.
+_numbers: WeakKeyDictionary[Solver, dict[tuple[torch.dtype, torch.device], tuple[Tensor, list[int]]]] = (
+    WeakKeyDictionary()
+)
+#: Numbers of a description before those of the bodies, of each body, and of each rule.
+HEAD, BODY_NUMBERS, RULE_NUMBERS = 9, 8, 8
 #: A node remembers its rule in one byte.
 MAX_RULES = 254
 
 
 def unsupported(solver: Solver, dtype: torch.dtype, device: torch.device) -> str | None:
     """Why the kernels cannot run this solver on such a state, or ``None`` if they can."""
-    if device.type != "cpu":
-        return f"it runs on the CPU, the state is on {device}"
+    if device.type not in ("cpu", "cuda"):
+        return f"it runs on the CPU and on CUDA, the state is on {device}"
+    if device.type == "cuda":
+        missing = triton_lacks(os.environ.get("CC"), os.environ.get("PATH"))
+        if missing is not None:
+            return missing
+        if torch.are_deterministic_algorithms_enabled() and not torch.is_deterministic_algorithms_warn_only_enabled():
+            return "on CUDA its sums are taken in no fixed order, torch.use_deterministic_algorithms(True) forbids that"
     if dtype not in (torch.float32, torch.float64):
         return f"it computes in float32 or float64, the state is {dtype}"
     for body in solver.bodies:
@@ -39,6 +52,22 @@ def unsupported(solver: Solver, dtype: torch.dtype, device: torch.device) -> str
     if len(solver.rules) > MAX_RULES:
         return f"it takes at most {MAX_RULES} velocity rules, got {len(solver.rules)}"
     return None
+
+
+@functools.cache
+def triton_lacks(compiler: str | None, path: str | None) -> str | None:
+    """What keeps Triton from working, ``None`` if nothing does, with $CC and $PATH as given."""
+    if importlib.util.find_spec("triton") is None:
+        return "on CUDA it needs Triton, which is not installed (torch's builds for CUDA bring it along)"
+    if compiler is None and not any(shutil.which(name, path=path) for name in ("gcc", "clang")):
+        return "on CUDA it needs a C compiler for Triton ($CC, gcc or clang), found none"
+    return None
+
+
+def upload(numbers: Sequence[float], like: Tensor) -> Tensor:
+    """Numbers as a tensor of the dtype and on the device of ``like``; does not wait for the device."""
+    host = torch.tensor(numbers, dtype=like.dtype)
+    return host.pin_memory().to(like.device, non_blocking=True) if like.is_cuda else host
 
 
 def values(solver: Solver, like: Tensor) -> tuple[Tensor, list[int]]:
@@ -53,14 +82,14 @@ def values(solver: Solver, like: Tensor) -> tuple[Tensor, list[int]]:
     Returns:
         The table, (8, 1 or B, columns), and how many of its columns belong to each body.
     """
-    known = _numbers.get(solver, {}).get(like.dtype)
+    known = _numbers.get(solver, {}).get((like.dtype, like.device))
     if known is not None:
         return known
     tables, plain = [], True
     for body, part in solver.parts():
         rows = _rows(solver, body, like[:, part])
         if all(isinstance(row, (int, float)) for row in rows):
-            tables.append(like.new_tensor(rows).view(ROWS, 1, 1))
+            tables.append(upload([float(row) for row in rows], like).view(ROWS, 1, 1))
         else:
             plain = False
             planes = [torch.as_tensor(row, dtype=like.dtype, device=like.device) for row in rows]
@@ -70,7 +99,7 @@ def values(solver: Solver, like: Tensor) -> tuple[Tensor, list[int]]:
     widths = [table.shape[2] for table in tables]
     result = torch.cat([table.expand(-1, batch, -1) for table in tables], dim=2).contiguous(), widths
     if plain:
-        _numbers.setdefault(solver, {})[like.dtype] = result
+        _numbers.setdefault(solver, {})[like.dtype, like.device] = result
     return result
 
 
@@ -125,5 +154,5 @@ def description(solver: Solver, widths: list[int], mass_epsilon: float) -> Tenso
 def body_widths(description: Tensor) -> list[tuple[int, int]]:
     """Particles and columns of each body, read back from :func:`description`."""
     head = description.tolist()
-    bodies = int(head[_HEAD - 2])
-    return [(int(head[k]), int(head[k + 3])) for k in range(_HEAD, _HEAD + 8 * bodies, 8)]
+    end = HEAD + BODY_NUMBERS * int(head[HEAD - 2])
+    return [(int(head[k]), int(head[k + 3])) for k in range(HEAD, end, BODY_NUMBERS)]

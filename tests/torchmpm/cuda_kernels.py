@@ -1,0 +1,36 @@
+"""Runs the CUDA kernels wherever tests run: on a GPU, or in Triton's interpreter on the CPU."""
+
+import importlib.util
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+import torch
+
+if importlib.util.find_spec("triton") is None:
+    pytest.skip("no Triton", allow_module_level=True)
+
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+
+
+@contextmanager
+def interpreted() -> Iterator[None]:
+    """Triton's interpreter where there is no GPU; all others who use Triton in this process want its compiler."""
+    with pytest.MonkeyPatch.context() as patch:
+        if DEVICE == "cpu":
+            patch.setenv("TRITON_INTERPRET", "1")
+        yield
+
+
+with interpreted():  # read where a kernel is defined, those of Triton itself included
+    from torchmpm.native import cuda
+
+
+@contextmanager
+def in_use() -> Iterator[None]:
+    """Meanwhile, tensors on the CPU go to the CUDA kernels instead of those in C++."""
+    with interpreted(), torch.library._scoped_library("torchmpm", "IMPL") as library:
+        if DEVICE == "cpu":
+            library.impl("native_step", cuda.forward, "CPU")
+            library.impl("native_step_backward", cuda.backward, "CPU")
+        yield

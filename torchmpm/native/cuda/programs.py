@@ -1,0 +1,181 @@
+"""The sequences of kernels behind the operators of torch: a step, and its adjoint."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchmpm.native.cuda.adjoint import begin_adjoint, finish_adjoint
+from torchmpm.native.cuda.grid import ADJOINT, SUMS, node_adjoint, node_velocities, rule_codes
+from torchmpm.native.cuda.step import particles_pass
+from torchmpm.native.cuda.tables import Tables
+from torchmpm.native.cuda.transfer import NOWHERE
+from torchmpm.native.pack import ROWS
+
+#: Particles, or nodes, of a program: one per thread.
+BLOCK = 128
+#: Programs for the nodes of all simulations together, at most, unless there are more simulations.
+NODE_PROGRAMS = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """Tensors of a call, contiguous and on one device; see :func:`torchmpm.native.ops.native_step`."""
+
+    planes: Tensor
+    field: Tensor | None
+    origin: Tensor
+    gravity: Tensor
+    values: Tensor
+    shift: Tensor
+    result_bar: Tensor | None = None
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Inputs:
+        """Apply a function to all tensors that are there."""
+        return replace(self, **{name: function(t) for name, t in vars(self).items() if t is not None})
+
+    def tensors(self) -> list[Tensor]:
+        """All that are there."""
+        return [t for t in vars(self).values() if t is not None]
+
+
+def launch(kernel: Any, programs: int, *arguments: Any, **constants: Any) -> None:
+    """Run a kernel, on the GPU or in Triton's interpreter."""
+    kernel[(programs,)](*arguments, **constants, BLOCK=BLOCK, num_warps=BLOCK // 32, enable_fp_fusion=True)
+
+
+class Program:
+    """What a step and its adjoint share: buffers, and the launches of one substep.
+
+    Sums on the nodes are zero between launches. A box of nodes per substep and simulation starts empty, widens with the
+    particles, and tells the passes over the nodes where to read.
+    """
+
+    def __init__(self, inputs: Inputs, tables: Tables, substeps: int, numbers: int) -> None:
+        planes = inputs.planes
+        self.inputs, self.tables, self.substeps = inputs, tables, substeps
+        self.batch, self.particles = planes.shape[1:]
+        self.cells = tables.width**2
+        self.sums = planes.new_zeros(self.batch * self.cells * numbers)
+        self.boxes = torch.empty(substeps, self.batch, 4, dtype=torch.int32, device=planes.device)
+        nodes = self.batch * self.cells if tables.slots else 1
+        self.codes = torch.empty(nodes, dtype=torch.int32, device=planes.device)
+
+    def run(self) -> None:
+        """Launch everything; allocates nothing."""
+        raise NotImplementedError
+
+    def results(self) -> tuple[Tensor, ...]:
+        """What the last run has found, in buffers of the program."""
+        raise NotImplementedError
+
+    def prepare(self) -> None:
+        """Empty the boxes and find the rule of each node."""
+        self.boxes.fill_(NOWHERE.value)
+        if not self.tables.slots:
+            return
+        rules, programs = self.tables.rules, -(-self.cells // BLOCK)
+        sizes = (len(rules), self.tables.width, self.cells, programs)
+        launch(rule_codes, self.batch * programs, self.codes, rules, self.inputs.shift, *sizes)
+
+    def over_particles(self, kernel: Any, *buffers: Tensor, **flags: bool) -> None:
+        """Launch a pass over the particles for each body."""
+        inputs, tables = self.inputs, self.tables
+        field = inputs.origin if inputs.field is None else inputs.field  # nobody looks at one that is not there
+        values_batch, columns = inputs.values.shape[1:]
+        for body in tables.bodies:
+            blocks = -(-body.count // BLOCK)
+            constants = (tables.constants, tables.constants[body.bounds :])
+            sizes = [self.particles, self.batch * self.particles, body.first, body.count, blocks]
+            sizes += [body.column, columns, values_batch, tables.resolution, tables.width]
+            muscle = body.muscle and inputs.field is not None
+            kind = {"KIND": body.kind, "VARYING": body.varying, "MUSCLE": muscle}
+            tensors = (*buffers, field, inputs.origin, inputs.values, *constants)
+            launch(kernel, self.batch * blocks, *tensors, *sizes, **kind, **flags)
+
+    def advance(self, states: Sequence[Tensor], velocity: Tensor, *, TAPE: bool) -> None:
+        """From the planes in the first state to those in the last, a substep each; without ``TAPE`` all are one."""
+        last, flags = len(states) - 1, {"TAPE": TAPE}
+        for s in range(last):
+            around, box = (states[max(s - 1, 0)], states[s], states[s + 1]), self.boxes[s]
+            self.over_particles(particles_pass, *around, self.sums, velocity, box, ARRIVE=s > 0, LEAVE=True, **flags)
+            self.over_nodes(node_velocities, self.sums, velocity, box)
+        if last > 0:
+            end = (states[last - 1], states[last], states[last], self.sums, velocity, self.boxes[0])
+            self.over_particles(particles_pass, *end, ARRIVE=True, LEAVE=False, **flags)
+
+    def over_nodes(self, kernel: Any, *buffers: Tensor, bars: tuple[Tensor, ...] = ()) -> None:
+        """Launch a pass over the nodes: ``buffers`` are sums, answers, and the box of the substep."""
+        tables, inputs = self.tables, self.inputs
+        programs = max(1, min(-(-self.cells // BLOCK), NODE_PROGRAMS // self.batch))
+        tensors = (*buffers, self.codes, tables.rules, inputs.gravity, *bars, tables.constants)
+        sizes = (tables.resolution, tables.width, programs)
+        launch(kernel, self.batch * programs, *tensors, *sizes, SLOTS=tables.slots)
+
+
+class Forward(Program):
+    """A step: a pass over the particles, then over the nodes, for each substep."""
+
+    def __init__(self, inputs: Inputs, tables: Tables, substeps: int) -> None:
+        super().__init__(inputs, tables, substeps, SUMS.value)
+        self.state = torch.empty_like(inputs.planes)
+        self.velocity = inputs.planes.new_empty(self.batch * self.cells * 2)
+
+    def run(self) -> None:
+        """Launch everything; allocates nothing."""
+        self.state.copy_(self.inputs.planes)
+        self.prepare()
+        self.advance([self.state] * (self.substeps + 1), self.velocity, TAPE=False)
+
+    def results(self) -> tuple[Tensor, ...]:
+        """The planes of the new state."""
+        return (self.state,)
+
+
+class Backward(Program):
+    """The adjoint of a step: replays its substeps onto a tape of states, then goes back through them.
+
+    What the nodes were is not on the tape: going back, mass and momentum are added up once more.
+    """
+
+    def __init__(self, inputs: Inputs, tables: Tables, substeps: int, wants_field: bool, wants_values: bool) -> None:
+        super().__init__(inputs, tables, substeps, ADJOINT.value)
+        planes, nothing = inputs.planes, inputs.planes.new_empty(0)
+        length = -(-planes.numel() // 4) * 4  # whole fours, see tables
+        self.tape = planes.new_empty(substeps, length)[:, : planes.numel()].unflatten(1, planes.shape)
+        self.answers = planes.new_empty(self.batch * self.cells * ADJOINT.value)
+        self.bars, self.origin_bar, self.gravity_bar = (
+            torch.empty_like(t) for t in (planes, inputs.origin, inputs.gravity)
+        )
+        self.field_bar = nothing if inputs.field is None or not wants_field else torch.empty_like(inputs.field)
+        self.values_bar = planes.new_empty(ROWS, *planes.shape[1:]) if wants_values else nothing.clone()
+
+    def run(self) -> None:
+        """Launch everything; allocates nothing."""
+        assert self.inputs.result_bar is not None
+        self.prepare()
+        self.tape[0].copy_(self.inputs.planes)
+        self.advance(self.tape.unbind(), self.answers, TAPE=True)
+        self.boxes.fill_(NOWHERE.value)
+        self.bars.copy_(self.inputs.result_bar)
+        for bar in (self.field_bar, self.values_bar, self.origin_bar, self.gravity_bar):
+            bar.zero_()
+        for s in range(self.substeps - 1, -1, -1):
+            self.go_back(s)
+
+    def go_back(self, substep: int) -> None:
+        """From derivatives in the state after a substep to those in the state before it."""
+        state, box = self.tape[substep], self.boxes[substep]
+        self.over_particles(begin_adjoint, state, self.bars, self.sums, box)
+        self.over_nodes(node_adjoint, self.sums, self.answers, box, bars=(self.gravity_bar,))
+        buffers = (state, self.bars, self.values_bar, self.field_bar, self.origin_bar, self.answers)
+        wants = {"WANT_FIELD": self.field_bar.numel() > 0, "WANT_VALUES": self.values_bar.numel() > 0}
+        self.over_particles(finish_adjoint, *buffers, **wants)
+
+    def results(self) -> tuple[Tensor, ...]:
+        """Derivatives in planes, field, origin, gravity and values."""
+        return self.bars, self.field_bar, self.origin_bar, self.gravity_bar, self.values_bar
