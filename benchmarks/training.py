@@ -1,7 +1,7 @@
 """What a training step costs and where its time goes: `python benchmarks/training.py`.
 
 Prints seconds an update (batches of the quick and the paper preset, float32 and bfloat16 in turn), training steps a
-second of the quick preset with the shares of simulation, updates and the rest, and steps a second of environments alone.
+second of the quick preset with the shares of simulation, updates and the rest, and environment steps a second alone.
 """
 
 import argparse
