@@ -102,12 +102,13 @@ def timed(owner: object, name: str, clock: dict[str, float]) -> Iterator[None]:
 
 def training(config: Config, steps: int) -> None:
     """Print training steps a second and their shares."""
-    print("| level | robots | precision | training steps/s | simulation | update | rest |\n" + "| --- " * 7 + "|")
+    print("| level | robots | updates a step | precision | training steps/s | simulation | updates | rest |")
+    print("| --- " * 8 + "|")
     for level in (0, 1):
-        for num_envs, count in ((1, config.learning.gradient_steps), (config.environment.num_envs, 1)):
-            model, clock = make_model(config, level, num_envs), dict[str, float]()
+        for num_envs, gradient_steps in ((1, 1), (config.environment.num_envs, config.learning.gradient_steps)):
+            learning = replace(config.learning, gradient_steps=gradient_steps)
+            model, clock = make_model(replace(config, learning=learning), level, num_envs), dict[str, float]()
             model.learn(config.learning.batch_size + 2 * num_envs)
-            model.gradient_steps = max(1, model.gradient_steps // count)
             with timed(model.env, "step", clock), timed(model, "train", clock):
                 start = time.perf_counter()
                 model.learn(steps * num_envs, reset_num_timesteps=False)
@@ -115,7 +116,8 @@ def training(config: Config, steps: int) -> None:
             simulation, update = clock["step"] / total, clock["train"] / total
             shares = " | ".join(f"{100 * share:.0f} %" for share in (simulation, update, 1 - simulation - update))
             precision = "bfloat16" if model.losses.bfloat16 else "float32"
-            print(f"| {level + 1} | {num_envs} | {precision} | {steps * num_envs / total:.1f} | {shares} |", flush=True)
+            head = f"| {level + 1} | {num_envs} | {gradient_steps} | {precision}"
+            print(f"{head} | {steps * num_envs / total:.1f} | {shares} |", flush=True)
 
 
 def environments(steps: int) -> None:
