@@ -121,7 +121,7 @@ class CFP(SAC):
         gate_penalty: float = 0.0,
         reward_momentum: float = 0.99,
         max_grad_norm: float = 10.0,
-        precision: Precision = "auto",
+        precision: Precision = "float32",
         compile: bool = False,
         **sac_options: Any,
     ) -> None:

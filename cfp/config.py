@@ -74,7 +74,7 @@ class LearningConfig:
     """Momentum of the running reward mean and variance."""
     max_grad_norm: float = 10.0
     """Largest gradient norm of one parameter tensor."""
-    precision: Precision = "auto"
+    precision: Precision = "float32"
     """Of the networks in updates: float32, bfloat16, or auto (bfloat16 on CPUs with instructions for it)."""
     compile: bool = False
     """Run the updates through torch.compile."""

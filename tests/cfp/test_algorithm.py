@@ -23,8 +23,7 @@ ALPHA, RHO, GAMMA, LIMIT = 0.03, 0.7, 0.9, 0.05
 
 def make_model(spec, env=None, **options):
     env = env or FakeEnv(num_envs=2, resolution=spec.resolutions[-1])
-    settings = {"buffer_size": 400, "batch_size": 8, "seed": 0, "device": "cpu", "precision": "float32"}
-    settings |= {"policy_kwargs": {"spec": spec}}
+    settings = {"buffer_size": 400, "batch_size": 8, "seed": 0, "device": "cpu", "policy_kwargs": {"spec": spec}}
     model = CFP(CFPPolicy, monitored(env), **(settings | options))
     model.set_logger(Logger(None, []))
     return model
