@@ -10,12 +10,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from cfp import joint
 from cfp.networks import (
     IMAGE_SIZE,
     RESOLUTIONS,
     Encoder,
     Interpolation,
     PairEncoder,
+    at_least_float32,
     initialise,
     make_head,
     normalise_image,
@@ -113,18 +115,23 @@ class Actor(nn.Module):
         """Parameters that an optimiser may change: all but those of frozen coarser levels."""
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
-    def own_action(self, latent: Tensor, deterministic: bool) -> tuple[Tensor, Tensor]:
-        """Draw tanh(m + s eps) and its log-density from a latent (B, 32, 4, 4); deterministic means eps = 0."""
-        mean: Tensor = self.mean(latent)
-        std = F.softplus(3 * self.std(latent) - 1).clamp(*STD_BOUNDS)
+    def own_action(self, latent: Tensor, deterministic: bool, *heads: nn.Sequential) -> tuple[Tensor, ...]:
+        """Draw tanh(m + s eps) from a latent (B, 32, 4, 4); deterministic means eps = 0.
+
+        Returns:
+            The action, its log-density, and what further heads give for the latent.
+        """
+        mean, width, *others = map(at_least_float32, joint.decode([self.mean, self.std, *heads], latent))
+        std = F.softplus(3 * width - 1).clamp(*STD_BOUNDS)
         noise = torch.zeros_like(mean) if deterministic else torch.randn_like(mean)
         action = torch.tanh(mean + std * noise)
-        return action, squashed_log_prob(noise, std, action)
+        return action, squashed_log_prob(noise, std, action), *others
 
     def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
         """Draw an action for uint8 observations (B, 3, 64, 64)."""
         latent = self.encoder(normalise_image(observation))
-        return Sample(*self.own_action(latent, deterministic), None)
+        action, log_prob = self.own_action(latent, deterministic)
+        return Sample(action, log_prob, None)
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> Tensor:
         """The action (B, 2, R, R) for uint8 observations (B, 3, 64, 64)."""
@@ -163,8 +170,8 @@ class ResidualActor(Actor):
             coarse = upsample(self.coarse(observation, deterministic), self.resolution, self.interpolation)
         patch = upsample(coarse, IMAGE_SIZE, self.interpolation)
         latent = self.encoder(normalise_image(observation), patch)
-        residual, log_prob = self.own_action(latent, deterministic)
-        gate = self.gate_scale * torch.sigmoid(self.gate(latent) + self.gate_bias)
+        residual, log_prob, logit = self.own_action(latent, deterministic, self.gate)
+        gate = self.gate_scale * torch.sigmoid(logit + self.gate_bias)
         return Sample(gate * residual + (1 - gate) * coarse, log_prob, gate)
 
 

@@ -17,12 +17,11 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
-from stable_baselines3.common.utils import polyak_update
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from cfp.actor import Actor
 from cfp.errors import NonFiniteError
+from cfp.losses import Losses, Precision
 from cfp.networks import TwinCritic
 from cfp.policy import CFPPolicy
 from cfp.replay import ReplayRing
@@ -70,8 +69,9 @@ class RewardStatistics(nn.Module):
 
 def clip_each(parameters: list[nn.Parameter], limit: float) -> None:
     """Scale the gradient of every parameter tensor, each by itself, to a norm of at most ``limit``."""
-    for parameter in parameters:
-        nn.utils.clip_grad_norm_(parameter, limit)
+    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    norms = torch.stack(torch._foreach_norm(gradients))
+    torch._foreach_mul_(gradients, list((limit / (norms + 1e-6)).clamp(max=1.0).unbind()))
 
 
 class CFP(SAC):
@@ -95,6 +95,9 @@ class CFP(SAC):
         gate_penalty: Weight rho of ``mean ||g||_2 / R`` in the actor loss (stage 2).
         reward_momentum: Momentum of the reward statistics.
         max_grad_norm: Largest gradient norm of one parameter tensor.
+        precision: Of convolutions and matrix products in an update, see `cfp.losses.choose_precision`. Acting is always
+            in float32.
+        compile: Run the losses through ``torch.compile``.
         sac_options: Further options of stable-baselines3's SAC.
     """
 
@@ -118,6 +121,8 @@ class CFP(SAC):
         gate_penalty: float = 0.0,
         reward_momentum: float = 0.99,
         max_grad_norm: float = 10.0,
+        precision: Precision = "float32",
+        compile: bool = False,
         **sac_options: Any,
     ) -> None:
         """Create networks, replay buffer and reward statistics."""
@@ -125,6 +130,7 @@ class CFP(SAC):
         self.gate_penalty = gate_penalty
         self.reward_momentum = reward_momentum
         self.max_grad_norm = max_grad_norm
+        self.precision, self.compile = precision, compile
         sac_options.setdefault("replay_buffer_class", ReplayRing)
         sac_options.setdefault("replay_buffer_kwargs", {"seed": sac_options.get("seed")})
         super().__init__(
@@ -144,6 +150,7 @@ class CFP(SAC):
     def _setup_model(self) -> None:
         super()._setup_model()
         self.reward_statistics = RewardStatistics(self.reward_momentum).to(self.device)
+        self.losses = Losses(self.device, self.precision, self.compile)
 
     def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
         """Actor, critics and target critics with their own types."""
@@ -174,45 +181,28 @@ class CFP(SAC):
     def update(self, batch: ReplayBufferSamples) -> dict[str, Tensor]:
         """Do one update on a batch and return what it is judged by (0-dimensional tensors, see `METRICS`)."""
         _, critic, target = self.networks()
-        rewards = self.reward_statistics(batch.rewards)
-        scalars = self._update_critic(batch, rewards)
-        scalars |= self._update_actor(batch.observations)
-        polyak_update(critic.parameters(), target.parameters(), self.tau)
+        now, later = map(self.losses.prepare, (batch.observations, batch.next_observations))
+        scalars = self._update_critic(now, later, batch)
+        scalars |= self._update_actor(now)
+        with torch.no_grad():
+            torch._foreach_lerp_(list(target.parameters()), list(critic.parameters()), self.tau)
         scalars["reward_mean"] = self.reward_statistics.mean
         scalars["reward_std"] = self.reward_statistics.variance.sqrt()
         return scalars
 
-    def critic_target_values(self, batch: ReplayBufferSamples, rewards: Tensor) -> Tensor:
-        """Regression target ``y = r + c gamma (min Q'(s', a') - alpha log pi(a'|s'))``, (B, 1), without gradient.
-
-        The continuation flag c is ``1 - batch.dones``; a time limit does not end the task.
-        """
-        actor, _, target = self.networks()
-        with torch.no_grad():
-            action, log_prob, _ = actor.sample(batch.next_observations)
-            value = torch.minimum(*target(batch.next_observations, action))
-            soft_value = value - self.ent_coef_tensor * log_prob[:, None]
-            return rewards + (1 - batch.dones) * self.gamma * soft_value
-
-    def _update_critic(self, batch: ReplayBufferSamples, rewards: Tensor) -> dict[str, Tensor]:
-        _, critic, _ = self.networks()
-        wanted = self.critic_target_values(batch, rewards)
-        values = critic(batch.observations, batch.actions)
-        loss = torch.stack([F.mse_loss(value, wanted) for value in values]).sum()
+    def _update_critic(self, now: Tensor, later: Tensor, batch: ReplayBufferSamples) -> dict[str, Tensor]:
+        actor, critic, target = self.networks()
+        rewards = self.reward_statistics(batch.rewards)
+        goes_on = 1 - batch.dones
+        wanted = self.losses.critic_target(actor, target, later, rewards, goes_on, self.ent_coef_tensor, self.gamma)
+        loss = self.losses.critic_loss(critic, now, batch.actions, wanted)
         self._descend(loss, critic.optimizer, list(critic.parameters()), "critic")
         return {"critic_loss": loss.detach(), "q_target": wanted.mean()}
 
-    def _update_actor(self, observations: Tensor) -> dict[str, Tensor]:
+    def _update_actor(self, now: Tensor) -> dict[str, Tensor]:
         actor, critic, _ = self.networks()
         critic.requires_grad_(False)  # spares the critics' weight gradients, which would be thrown away
-        action, log_prob, gate = actor.sample(observations)
-        value = torch.minimum(*critic(observations, action))
-        loss = (self.ent_coef_tensor * log_prob[:, None] - value).mean()
-        scalars = {"q": value.detach().mean(), "entropy": -log_prob.detach().mean()}
-        if gate is not None:
-            penalty = self.gate_penalty * gate.flatten(1).norm(dim=1).mean() / actor.resolution
-            loss = loss + penalty
-            scalars |= {"gate": gate.detach().mean(), "gate_penalty": penalty.detach()}
+        loss, scalars = self.losses.actor_loss(actor, critic, now, self.ent_coef_tensor, self.gate_penalty)
         self._descend(loss, actor.optimizer, actor.trainable_parameters(), "actor")
         critic.requires_grad_(True)
         return scalars | {"actor_loss": loss.detach()}
@@ -257,7 +247,7 @@ class CFP(SAC):
         return [*modules, "reward_statistics"], tensors
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "reward_statistics"]
+        return [*super()._excluded_save_params(), "reward_statistics", "losses"]
 
     @property
     def action_resolution(self) -> int:

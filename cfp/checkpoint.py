@@ -17,6 +17,7 @@ from cfp.algorithm import CFP
 from cfp.config import Config, to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.files import write_atomically
+from cfp.presets import from_json
 from cfp.replay import ReplayArchive, ReplayRing
 from cfp.vec_env import TorchVecEnv
 
@@ -205,10 +206,12 @@ def restore_random(model: CFP, state: dict[str, Any]) -> None:
 def check_same(stored: dict[str, Any], given: Config) -> None:
     """Compare the options of a checkpoint with those of the command that wants to resume it.
 
+    Options that did not exist when the checkpoint was written count as left at their defaults.
+
     Raises:
         ConfigError: Naming the first option that differs and may not, with both values.
     """
-    old, new = _flatten(stored), _flatten(json.loads(json.dumps(to_json(given))))
+    old, new = (_flatten(json.loads(json.dumps(to_json(config)))) for config in (from_json(stored), given))
     for name in {**old, **new}:
         if name.startswith(CHANGEABLE) or old.get(name) == new.get(name):
             continue

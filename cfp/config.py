@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from cfp.actor import ActorSpec
 from cfp.errors import ConfigError
+from cfp.losses import Precision
 from cfp.networks import RESOLUTIONS, Interpolation
 
 Preset = Literal["quick", "paper"]
@@ -73,6 +74,10 @@ class LearningConfig:
     """Momentum of the running reward mean and variance."""
     max_grad_norm: float = 10.0
     """Largest gradient norm of one parameter tensor."""
+    precision: Precision = "float32"
+    """Of the networks in updates: float32, bfloat16, or auto (bfloat16 on CPUs with instructions for it)."""
+    compile: bool = False
+    """Run the updates through torch.compile."""
 
 
 @dataclass(frozen=True)

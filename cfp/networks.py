@@ -7,12 +7,13 @@ and Appendix B; parameter totals are held by a test.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from cfp import joint
 from dittogym.action import bicubic
 
 Interpolation = Literal["half_pixel", "aligned"]
@@ -41,7 +42,8 @@ def upsample(action: Tensor, size: int, interpolation: Interpolation) -> Tensor:
     """
     if action.shape[-1] == size:
         return action
-    return bicubic(action, size, align_corners=interpolation == "aligned")
+    with torch.autocast(action.device.type, enabled=False):  # makes a part of the executed action, not only an input
+        return bicubic(action, size, align_corners=interpolation == "aligned")
 
 
 def normalise_image(observation: Tensor) -> Tensor:
@@ -51,6 +53,11 @@ def normalise_image(observation: Tensor) -> Tensor:
     return observation.float().mul_(2.0 / 255.0).sub_(1.0)
 
 
+def at_least_float32(output: Tensor) -> Tensor:
+    """The output of a network in the precision that densities, losses and statistics need."""
+    return output.to(torch.promote_types(output.dtype, torch.float32))
+
+
 def initialise(module: nn.Module) -> nn.Module:
     """Xavier-uniform linear layers with zero bias; convolutions keep PyTorch's default, as in the reference."""
     for layer in module.modules():
@@ -58,16 +65,6 @@ def initialise(module: nn.Module) -> nn.Module:
             nn.init.xavier_uniform_(layer.weight)
             nn.init.zeros_(layer.bias)
     return module
-
-
-def _folded_conv(image: Tensor, weight: Tensor, stride: int) -> Tensor:
-    """The same as ``conv2d`` with a kernel of twice the stride, written as a 2x2 kernel over stride x stride blocks.
-
-    A CPU computes its gradient with respect to a two-channel image five times faster.
-    """
-    out, channels = weight.shape[:2]
-    blocks = weight.view(out, channels, 2, stride, 2, stride).permute(0, 1, 3, 5, 2, 4)
-    return F.conv2d(F.pixel_unshuffle(image, stride), blocks.reshape(out, channels * stride**2, 2, 2))
 
 
 class Encoder(nn.Module):
@@ -81,7 +78,8 @@ class Encoder(nn.Module):
         width: Channels w of the first and last layer (the middle one has 2w).
     """
 
-    coordinates: Tensor
+    patches: Tensor
+    """What the first layer sees of the coordinates at its 15 x 15 places, (2 x 8 x 8, 225)."""
 
     def __init__(self, channels: int, width: int) -> None:
         """Create the layers."""
@@ -96,22 +94,11 @@ class Encoder(nn.Module):
         )
         line = (torch.arange(IMAGE_SIZE) - IMAGE_SIZE / 2) / (IMAGE_SIZE / 2)
         grid = torch.stack(torch.meshgrid(line, line, indexing="ij"))
-        self.register_buffer("coordinates", grid[None], persistent=False)
+        self.register_buffer("patches", F.unfold(grid[None], 8, stride=4)[0], persistent=False)
 
     def forward(self, *images: Tensor) -> Tensor:
-        """Encode images (B, c, 64, 64), stacked along their channels, with values about [-1, 1], to (B, w, 4, 4).
-
-        The first layer is linear in its channels: it is evaluated image by image and added up, which spares the
-        stacked copy, the batch of constant coordinates, and the gradient of images that need none.
-        """
-        sizes = [image.shape[1] for image in images]
-        *weights, position = self.first.weight.split([*sizes, 2], dim=1)
-        total = F.conv2d(self.coordinates, position, self.first.bias, stride=4)
-        for image, weight in zip(images, weights, strict=True):
-            convolve = _folded_conv if image.requires_grad else F.conv2d
-            total = total + convolve(image, weight, stride=4)
-        latent: Tensor = self.rest(total)
-        return latent
+        """Encode images (B, c, 64, 64), stacked along their channels, with values about [-1, 1], to (B, w, 4, 4)."""
+        return joint.encode([self], *images)
 
 
 class PairEncoder(nn.Module):
@@ -135,7 +122,7 @@ class PairEncoder(nn.Module):
         return torch.cat([self.encoders[0](image), self.encoders[1](patch)], dim=1)
 
 
-def make_head(resolution: int) -> nn.Module:
+def make_head(resolution: int) -> nn.Sequential:
     """Decoder from the latent (B, 32, 4, 4) to an action-shaped output (B, 2, R, R); no activation at the end."""
     if resolution == 4:
         return nn.Sequential(
@@ -199,7 +186,19 @@ class TwinCritic(nn.Module):
         image = normalise_image(observation)
         field = action.reshape(-1, 2, self.resolution, self.resolution)
         patch = upsample(field, IMAGE_SIZE, self.interpolation)
-        return tuple(critic(image, patch) for critic in self.critics)
+        return tuple(at_least_float32(self._judge(image, patch)))
+
+    def _judge(self, image: Tensor, patch: Tensor) -> Tensor:
+        """What `Critic.forward` gives for each critic, (2, B, 1), computed for both together."""
+        critics = cast(list[Critic], list(self.critics))
+        encoders = list(zip(*(critic.encoder.encoders for critic in critics), strict=True))
+        inputs = [(image, patch)] if len(encoders) == 1 else [(image,), (patch,)]
+        parts = [
+            joint.encode(alike, *images).unflatten(1, (len(alike), -1))
+            for alike, images in zip(encoders, inputs, strict=True)
+        ]
+        latents = torch.cat(parts, dim=2).transpose(0, 1)  # (2, B, 32, 4, 4)
+        return joint.perceive([critic.value for critic in critics], latents)
 
     def set_training_mode(self, mode: bool) -> None:
         """Switch between training and evaluation; without effect on these layers, asked for by stable-baselines3."""

@@ -145,6 +145,8 @@ class Runner:
             gate_penalty=stage.gate_penalty,
             reward_momentum=learning.reward_momentum,
             max_grad_norm=learning.max_grad_norm,
+            precision=learning.precision,
+            compile=learning.compile,
             policy_kwargs={"spec": self.config.actor_spec(level)},
             seed=self.config.seed,
             device=choose_device(self.config.device),

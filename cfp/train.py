@@ -110,6 +110,8 @@ def train(config: Config, folder: Path, resume: bool = False) -> None:
         runner = Runner(config, folder, resume, signals)
         if config.environment.backend == "compile":
             print("compiling the physics; the first time on a machine this takes half a minute ...")
+        if config.learning.compile:
+            print("compiling the updates; the first time on a machine this takes minutes ...", flush=True)
         runner.train()
     runner.finish()
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from fakes import FakeEnv
@@ -5,10 +7,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
 from cfp.algorithm import CFP
-from cfp.checkpoint import Checkpoint, Position, model_state
-from cfp.config import Config
-from cfp.errors import CheckpointError
+from cfp.checkpoint import Checkpoint, Position, check_same, model_state
+from cfp.config import Config, to_json
+from cfp.errors import CheckpointError, ConfigError
 from cfp.policy import CFPPolicy
+from cfp.presets import preset
 from cfp.vec_env import monitored
 
 CONFIG = Config(resolutions=(4, 8), gate_bias=(-1.0,))
@@ -19,6 +22,7 @@ def make_model(level=1):
     env = monitored(FakeEnv(num_envs=2, resolution=CONFIG.resolutions[level], horizon=7))
     spec = CONFIG.actor_spec(level)
     options = {"buffer_size": 40, "batch_size": 4, "update_start": 6, "random_steps": 10, "seed": 3, "device": "cpu"}
+    options |= {"precision": "bfloat16"}
     model = CFP(CFPPolicy, env, gate_penalty=0.1, policy_kwargs={"spec": spec}, **options)
     model.set_logger(Logger(None, []))
     return model
@@ -130,6 +134,15 @@ def test_damaged_state_is_refused_with_its_name(tmp_path, damage):
         torch.save({"version": 99}, path)
     with pytest.raises(CheckpointError, match=r"state\.pt"):
         Checkpoint(tmp_path).load()
+
+
+def test_checkpoint_from_before_an_option_existed_is_resumed():
+    stored, given = to_json(preset("shapematch")), preset("shapematch")
+    del stored["learning"]["precision"], stored["learning"]["compile"]
+    check_same(stored, given)
+    other = replace(given, learning=replace(given.learning, precision="bfloat16"))
+    with pytest.raises(ConfigError, match="precision: the run was started with 'float32', got 'bfloat16'"):
+        check_same(stored, other)
 
 
 def test_state_of_another_network_is_refused(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 import torch
 from cuda_kernels import DEVICE, cuda, interpreted
 from native_scenes import moving, solvers
-from scenes import assert_close, lively, normal, robot, robot_and_ball
+from scenes import lively, normal, robot, robot_and_ball
 from test_native_adjoint import assert_gradients_close, gradients, state_leaves
 from torch import Tensor
 

@@ -1,0 +1,156 @@
+"""What a training step costs and where its time goes: `python benchmarks/training.py`.
+
+Prints seconds an update (batches of the quick and the paper preset, float32 and bfloat16 in turn), training steps a
+second of the quick preset with the shares of simulation, updates and the rest, and environment steps a second alone.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+
+import gymnasium
+import numpy as np
+import torch
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+import dittogym  # noqa: F401  (registers the environments)
+from cfp import CFP, CFPPolicy, Config, preset
+from cfp.environments import make_env
+from cfp.process import keep_memory
+
+
+def make_model(config: Config, level: int, num_envs: int) -> CFP:
+    """The model of one level of a configuration, with updates from the first steps on."""
+    stage, learning = config.stage(level), config.learning
+    model = CFP(
+        CFPPolicy,
+        make_env(config, stage.resolution, num_envs),
+        buffer_size=2_000,
+        update_start=learning.batch_size,
+        random_steps=0,
+        batch_size=learning.batch_size,
+        gradient_steps=learning.gradient_steps,
+        gate_penalty=stage.gate_penalty,
+        precision=learning.precision,
+        compile=learning.compile,
+        policy_kwargs={"spec": config.actor_spec(level)},
+        seed=0,
+        device="cpu",
+    )
+    model.set_logger(Logger(None, []))
+    return model
+
+
+def make_batch(size: int, resolution: int) -> ReplayBufferSamples:
+    """Random transitions."""
+    generator = torch.Generator().manual_seed(0)
+    images = torch.randint(0, 256, (2, size, 3, 64, 64), dtype=torch.uint8, generator=generator)
+    actions = torch.rand(size, 2, resolution, resolution, generator=generator) * 2 - 1
+    rewards, dones = torch.randn(2, size, 1, generator=generator)
+    return ReplayBufferSamples(images[0], actions, images[1], (dones > 2).float(), rewards)
+
+
+def in_turn(cases: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+    """Least seconds of each case; the cases take turns, so that other programs disturb all of them alike."""
+    least = dict.fromkeys(cases, float("inf"))
+    for number in range(rounds + 2):  # the first two are thrown away
+        for name, run in cases.items():
+            start = time.perf_counter()
+            run()
+            if number > 1:
+                least[name] = min(least[name], time.perf_counter() - start)
+    return least
+
+
+def updates(config: Config, modes: list[str], rounds: int) -> None:
+    """Print seconds an update."""
+    print("| level | batch | " + " | ".join(modes) + f" | {modes[-1]} : {modes[0]} |")
+    print("| --- " * (3 + len(modes)) + "|")
+    for level in (0, 1):
+        for size in (64, 256):
+            batch, cases = make_batch(size, config.resolutions[level]), {}
+            for mode in modes:
+                precision, _, compiled = mode.partition("+")
+                learning = replace(config.learning, precision=precision, compile=bool(compiled))
+                model = make_model(replace(config, learning=learning), level, 1)
+                cases[mode] = partial(model.update, batch)
+            least = list(in_turn(cases, rounds).values())
+            numbers = " | ".join(f"{value:.4f}" for value in least)
+            print(f"| {level + 1} | {size} | {numbers} | {least[-1] / least[0]:.2f} |", flush=True)
+
+
+@contextmanager
+def timed(owner: object, name: str, clock: dict[str, float]) -> Iterator[None]:
+    """Add up the seconds spent in a method."""
+    method = getattr(owner, name)
+
+    def run(*arguments: object, **options: object) -> object:
+        start = time.perf_counter()
+        try:
+            return method(*arguments, **options)
+        finally:
+            clock[name] = clock.get(name, 0.0) + time.perf_counter() - start
+
+    setattr(owner, name, run)
+    yield
+    delattr(owner, name)
+
+
+def training(config: Config, steps: int) -> None:
+    """Print training steps a second and their shares."""
+    print("| level | robots | updates a step | precision | training steps/s | simulation | updates | rest |")
+    print("| --- " * 8 + "|")
+    for level in (0, 1):
+        for num_envs, gradient_steps in ((1, 1), (config.environment.num_envs, config.learning.gradient_steps)):
+            learning = replace(config.learning, gradient_steps=gradient_steps)
+            model, clock = make_model(replace(config, learning=learning), level, num_envs), dict[str, float]()
+            model.learn(config.learning.batch_size + 2 * num_envs)
+            with timed(model.env, "step", clock), timed(model, "train", clock):
+                start = time.perf_counter()
+                model.learn(steps * num_envs, reset_num_timesteps=False)
+                total = time.perf_counter() - start
+            simulation, update = clock["step"] / total, clock["train"] / total
+            shares = " | ".join(f"{100 * share:.0f} %" for share in (simulation, update, 1 - simulation - update))
+            precision = "bfloat16" if model.losses.bfloat16 else "float32"
+            head = f"| {level + 1} | {num_envs} | {gradient_steps} | {precision}"
+            print(f"{head} | {steps * num_envs / total:.1f} | {shares} |", flush=True)
+
+
+def environments(steps: int) -> None:
+    """Print environment steps a second of RUN under Gymnasium's vector interface."""
+    for count in (16, 64):
+        env = gymnasium.make_vec(
+            "dittogym/run-coarse-v0", num_envs=count, vectorization_mode="vector_entry_point", particles="lite"
+        )
+        env.reset(seed=0)
+        action = np.asarray(env.action_space.sample())
+        least = in_turn({"step": lambda env=env, action=action: env.step(action)}, steps)["step"]
+        print(f"make_vec, {count} x lite RUN: {count / least:.0f} environment steps/s")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--compile", action="store_true", help="also compiled updates")
+    parser.add_argument("--rounds", type=int, default=12, help="repeats of an update and of a step")
+    parser.add_argument("--steps", type=int, default=12, help="batched training steps")
+    parser.add_argument("--precision", default="auto", help="of the updates in training steps")
+    parser.add_argument("--skip", nargs="*", default=[], choices=("updates", "training", "environments"))
+    arguments = parser.parse_args()
+    keep_memory()
+    print(f"torch {torch.__version__}, {torch.get_num_threads()} threads")
+    config = preset("shapematch")
+    if "updates" not in arguments.skip:
+        modes = ["float32", "bfloat16"] + ["float32+compile", "bfloat16+compile"] * arguments.compile
+        updates(config, modes, arguments.rounds)
+    if "training" not in arguments.skip:
+        training(replace(config, learning=replace(config.learning, precision=arguments.precision)), arguments.steps)
+    if "environments" not in arguments.skip:
+        environments(arguments.steps)
+
+
+if __name__ == "__main__":
+    main()
