@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dittogym import observation as obs
 from dittogym.action import patch_field, place
-from dittogym.physics import Physics
+from dittogym.physics import Physics, part_of
 from dittogym.reward import action_cost, measure, split_penalty
 from dittogym.spec import FAILURE_REWARD, Measurement, Moment, Outcome, TaskSpec
 from dittogym.window import in_window, window_origin
@@ -83,6 +83,7 @@ class Model:
         substeps: Substeps of a control step.
         shares: By body, the full-size particles that one particle stands for.
         pixels: Whether observations use the reference's pixel raster.
+        segment: Substeps between checkpoints where gradients are enabled, see :meth:`torchmpm.Solver.step`.
     """
 
     spec: TaskSpec
@@ -90,6 +91,7 @@ class Model:
     substeps: int
     shares: tuple[float, ...]
     pixels: bool
+    segment: int | None = 10
 
     @property
     def robot(self) -> int:
@@ -145,13 +147,15 @@ def make_model(
 
 
 def _bodies(spec: TaskSpec, counts: tuple[int, ...], shares: tuple[float, ...], physics: Physics) -> tuple[Body, ...]:
-    mu, lam, yield_stress = (physics.get(name, getattr(spec, name)) for name in ("mu", "lam", "yield_stress"))
-    robot, elastic = VonMises(mu, lam, yield_stress), Elastic(mu, lam)
-    heavier = physics.get("mass", 1.0)
-    return tuple(
-        Body(n, robot if i == 0 else body.material or elastic, share * body.mass * heavier, share, muscle=i == 0)
-        for i, (body, n, share) in enumerate(zip(spec.bodies, counts, shares, strict=True))
-    )
+    values = {name: getattr(spec, name) for name in ("mu", "lam", "yield_stress")} | {"mass": 1.0} | dict(physics)
+    bodies: list[Body] = []
+    for body, count, share in zip(spec.bodies, counts, shares, strict=True):
+        first, robot = sum(earlier.count for earlier in bodies), not bodies
+        own = {name: part_of(value, slice(first, first + count)) for name, value in values.items()}
+        elastic = Elastic(own["mu"], own["lam"])
+        material = VonMises(own["mu"], own["lam"], own["yield_stress"]) if robot else body.material or elastic
+        bodies.append(Body(count, material, share * body.mass * own["mass"], share, muscle=robot))
+    return tuple(bodies)
 
 
 def initial(model: Model, positions: Tensor, physics: Physics | None = None) -> EnvState:
@@ -179,7 +183,9 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
     spec, solver = model.spec, model.solver_for(state.physics)
     field = patch_field(action, spec.patch, state.physics.get("max_actuation", spec.max_actuation))
     on_nodes = place(field, in_window(spec.reach, state.centre, state.origin), solver.grid.resolution)
-    particles = solver.step(state.particles, on_nodes, substeps=model.substeps, origin=state.origin)
+    particles = solver.step(
+        state.particles, on_nodes, substeps=model.substeps, origin=state.origin, segment=model.segment
+    )
     com = particles.x[:, : model.robot].mean(1)
     origin = state.origin if spec.window.follow is None else window_origin(spec, com)
     return replace(state, particles=particles, origin=origin, centre=com, steps=state.steps + 1), field

@@ -74,6 +74,7 @@ class TorchEnv:
         resample: Draw new particles at every reset, not only at a seeded one.
         deterministic: Accept only what repeats a trajectory bit by bit for one seed and number of threads: the CPU, and
             not the backend ``"compile"``.
+        segment: Substeps between checkpoints where gradients are enabled, see :func:`torchmpm.segment_for`.
         task_options: ``body``, ``obstacles``, and options of the task such as ``target`` of SHAPE MATCH; see
             :func:`dittogym.make_spec`.
 
@@ -105,6 +106,7 @@ class TorchEnv:
         parity: Parity = "clean",
         resample: bool = False,
         deterministic: bool = False,
+        segment: int | None = 10,
         **task_options: Any,
     ) -> None:
         self.spec = make_spec(task, **task_options)
@@ -133,6 +135,7 @@ class TorchEnv:
         self._counts = counts = particle_counts(self.spec, particles)
         full = counts == particle_counts(self.spec, "full")
         self.model = dynamics.make_model(self.spec, counts, substeps=substeps, backend=backend, unscaled=self._stale)
+        self.model = replace(self.model, segment=segment)
         self._layouts = Layouts(self.spec, counts, num_envs, spread=not (full or self._stale), resample=resample)
         self._like = torch.empty(num_envs, dtype=self.dtype, device=self.device)
         self._physics: Physics = {}
@@ -225,7 +228,7 @@ class TorchEnv:
             seed: Seeds element i with ``seed + i`` and draws its particles anew. Without it the last layout is used
                 again, unless ``resample`` was asked for.
             options: ``"positions"``: (N, 2) or (B, N, 2) world positions in m, robot first, used until the next seed;
-                ``"physics"``: constants of the matter, one value for all or one per element, see
+                ``"physics"``: constants of the matter, one value for all, one per element or one per particle, see
                 :func:`dittogym.physics.physics_values`; used until given again, ``{}`` goes back to the task's own;
                 ``"reset_mask"``: (B,) bool, reset only these elements.
 
@@ -245,7 +248,7 @@ class TorchEnv:
             raise ValueError("reset_mask must reset all elements the first time")
         physics = self._physics
         if options.get("physics") is not None:
-            given = physics_values(options["physics"], self.num_envs, self._like)
+            given = physics_values(options["physics"], self.num_envs, self.num_particles, self._like)
             physics = merged(self.spec, physics, given, mask, self._like)
         positions = self._layouts.draw(seed, mask.cpu().numpy(), options.get("positions"), self._like)
         fresh = dynamics.initial(self.model, positions, physics)
