@@ -12,7 +12,7 @@ from torch import Tensor
 from dittogym import native
 from dittogym import observation as obs
 from dittogym.action import patch_field, place
-from dittogym.physics import Physics
+from dittogym.physics import Physics, part_of
 from dittogym.reward import action_cost, measure, split_penalty
 from dittogym.spec import FAILURE_REWARD, Measurement, Moment, Outcome, TaskSpec
 from dittogym.window import in_window, window_origin
@@ -84,6 +84,7 @@ class Model:
         substeps: Substeps of a control step.
         shares: By body, the full-size particles that one particle stands for.
         pixels: Whether observations use the reference's pixel raster.
+        segment: Substeps between checkpoints where gradients are enabled, see :meth:`torchmpm.Solver.step`.
     """
 
     spec: TaskSpec
@@ -91,6 +92,7 @@ class Model:
     substeps: int
     shares: tuple[float, ...]
     pixels: bool
+    segment: int | None = 10
 
     @functools.cached_property
     def painter(self) -> native.Painter:
@@ -151,13 +153,15 @@ def make_model(
 
 
 def _bodies(spec: TaskSpec, counts: tuple[int, ...], shares: tuple[float, ...], physics: Physics) -> tuple[Body, ...]:
-    mu, lam, yield_stress = (physics.get(name, getattr(spec, name)) for name in ("mu", "lam", "yield_stress"))
-    robot, elastic = VonMises(mu, lam, yield_stress), Elastic(mu, lam)
-    heavier = physics.get("mass", 1.0)
-    return tuple(
-        Body(n, robot if i == 0 else body.material or elastic, share * body.mass * heavier, share, muscle=i == 0)
-        for i, (body, n, share) in enumerate(zip(spec.bodies, counts, shares, strict=True))
-    )
+    values = {name: getattr(spec, name) for name in ("mu", "lam", "yield_stress")} | {"mass": 1.0} | dict(physics)
+    bodies: list[Body] = []
+    for body, count, share in zip(spec.bodies, counts, shares, strict=True):
+        first, robot = sum(earlier.count for earlier in bodies), not bodies
+        own = {name: part_of(value, slice(first, first + count)) for name, value in values.items()}
+        elastic = Elastic(own["mu"], own["lam"])
+        material = VonMises(own["mu"], own["lam"], own["yield_stress"]) if robot else body.material or elastic
+        bodies.append(Body(count, material, share * body.mass * own["mass"], share, muscle=robot))
+    return tuple(bodies)
 
 
 def initial(model: Model, positions: Tensor, physics: Physics | None = None) -> EnvState:
@@ -185,7 +189,9 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
     spec, solver = model.spec, model.solver_for(state.physics)
     field = patch_field(action, spec.patch, state.physics.get("max_actuation", spec.max_actuation))
     on_nodes = place(field, in_window(spec.reach, state.centre, state.origin), solver.grid.resolution)
-    particles = solver.step(state.particles, on_nodes, substeps=model.substeps, origin=state.origin)
+    particles = solver.step(
+        state.particles, on_nodes, substeps=model.substeps, origin=state.origin, segment=model.segment
+    )
     com = particles.x[:, : model.robot].mean(1)
     origin = state.origin if spec.window.follow is None else window_origin(spec, com)
     return replace(state, particles=particles, origin=origin, centre=com, steps=state.steps + 1), field
@@ -197,24 +203,37 @@ def observe(model: Model, state: EnvState) -> Tensor:
         return model.painter.paint(state)
     spec = model.spec
     particles, origin = state.particles.detach(), state.origin.detach()
-    finite = torch.isfinite((particles.x + particles.v).sum(-1))
+    row, column = obs.crop_corner(in_window(spec.view, state.centre.detach(), origin))
+    background = _background(spec, origin, row, column)
+    sight = look(model, particles, origin, row, column, background)
+    if model.pixels:
+        return obs.quantise(obs.pixel_means(sight))
+    return obs.quantise(obs.splat_means(sight, model.per_particle(model.shares, origin)))
+
+
+def look(
+    model: Model,
+    particles: ParticleState,
+    origin: Tensor,
+    row: Tensor,
+    column: Tensor,
+    background: obs.Background | None = None,
+) -> obs.Sight:
+    """What an image of the window at ``origin`` (B, 2), m, with its corner in a fine ``row`` and ``column`` shows."""
+    finite = torch.isfinite((particles.x + particles.v).detach().sum(-1))
     seen = finite & model.solver.grid.contains(particles.x[..., 0], origin[:, 0:1])
-    visible = tuple(body.moves_visibly for body in spec.bodies)
+    visible = tuple(body.moves_visibly for body in model.spec.bodies)
     silent = None if all(visible) else ~model.per_particle(visible, origin)
     speaks = seen if silent is None else seen & ~silent
-    row, column = obs.crop_corner(in_window(spec.view, state.centre.detach(), origin))
-    sight = obs.Sight(
+    return obs.Sight(
         position=particles.x - origin[:, None],
         velocity=(2.0 * torch.where(speaks[..., None], particles.v, 0.0)).clamp(-obs.CLIP, obs.CLIP),
         seen=seen,
         silent=silent,
         row=row,
         column=column,
-        background=_background(spec, origin, row, column),
+        background=background,
     )
-    if model.pixels:
-        return obs.quantise(obs.pixel_means(sight))
-    return obs.quantise(obs.splat_means(sight, model.per_particle(model.shares, origin)))
 
 
 def _background(spec: TaskSpec, origin: Tensor, row: Tensor, column: Tensor) -> obs.Background | None:
@@ -225,11 +244,20 @@ def _background(spec: TaskSpec, origin: Tensor, row: Tensor, column: Tensor) -> 
     return obs.draw_boxes(boxes, origin, row, column)
 
 
-def judge(model: Model, state: EnvState, field: Tensor, observation: Tensor) -> tuple[EnvState, Outcome]:
+def judge(
+    model: Model, state: EnvState, field: Tensor, observation: Tensor, *, soft: bool = False
+) -> tuple[EnvState, Outcome]:
     """Reward terms, termination and success after a transition.
 
     Elements whose state is not finite, or whose robot has left the window, end with the single term ``failure`` =
     :data:`dittogym.spec.FAILURE_REWARD`; their neighbours are not touched.
+
+    Args:
+        model: The task.
+        state: After the transition.
+        field: (B, 2, P, P) actuation on the patch, Pa.
+        observation: (B, 3, 64, 64) uint8, or the soft one.
+        soft: Smooth terms, from the soft observation; then only the terms of the outcome mean anything.
 
     Raises:
         ValueError: The task returns a term under a name of :data:`RESERVED`.
@@ -241,14 +269,14 @@ def judge(model: Model, state: EnvState, field: Tensor, observation: Tensor) -> 
     spec = model.spec
     weights = spec.weights
     now = measure(state.particles, model.robot)
-    own = spec.judge(_moment(model, state, now, observation), weights)
+    own = spec.judge(_moment(model, state, now, observation, soft), weights)
     finite = intact(model, state)
     terms = dict(own.terms)
     if taken := RESERVED & terms.keys():
         raise ValueError(f"judge of task {spec.name!r} must not return the engine's own terms, got {sorted(taken)}")
     terminated = torch.zeros_like(finite) if own.terminated is None else own.terminated
     if spec.split_limit is not None:
-        penalty, torn = split_penalty(now.split, spec.split_limit)
+        penalty, torn = split_penalty(now.split, spec.split_limit, soft=soft)
         terms["split"] = weights.split * penalty
         terminated = terminated | torn
     if weights.action:
@@ -272,5 +300,5 @@ def intact(model: Model, state: EnvState) -> Tensor:
     return diagnostics.finite(state.particles) & present.any(1)
 
 
-def _moment(model: Model, state: EnvState, now: Measurement, observation: Tensor) -> Moment:
-    return Moment(state.particles, model.robot, now, state.start, observation, state.memory)
+def _moment(model: Model, state: EnvState, now: Measurement, observation: Tensor, soft: bool = False) -> Moment:
+    return Moment(state.particles, model.robot, now, state.start, observation, state.memory, soft)

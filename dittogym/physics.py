@@ -11,13 +11,15 @@ from torch import Tensor
 from dittogym.spec import TaskSpec
 from torchmpm.state import choose
 
-#: Values by name, (B,) each; ``gravity`` (B, 2).
+#: Values by name, (B,) or (B, N) each; ``gravity`` (B, 2).
 Physics: TypeAlias = Mapping[str, Tensor]
 
 #: What can be set: Lame parameters of the robot and of objects without a material of their own, Pa; yield stress and
 #: muscle limit of the robot, Pa; gravity, m/s^2; and a factor on the mass of all particles.
 NAMES = ("mu", "lam", "yield_stress", "max_actuation", "gravity", "mass")
 _POSITIVE = ("mu", "mass")
+#: Of these, what particles may have values of their own of.
+PER_PARTICLE = ("mu", "lam", "yield_stress", "mass")
 
 
 def defaults(spec: TaskSpec, like: Tensor) -> dict[str, Tensor]:
@@ -26,13 +28,15 @@ def defaults(spec: TaskSpec, like: Tensor) -> dict[str, Tensor]:
     return {name: _expanded(like.new_tensor(value), name, len(like)) for name, value in own.items()}
 
 
-def physics_values(given: Any, batch: int, like: Tensor) -> dict[str, Tensor]:
-    """Check what a user asks for and bring it to one value per simulation; gradients flow through.
+def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict[str, Tensor]:
+    """Check what a user asks for and bring it to one value per simulation or particle; gradients flow through.
 
     Args:
         given: Mapping from :data:`NAMES` to a number, or a tensor or array of shape () or (B,); for ``gravity`` of
-            shape (2,) or (B, 2).
+            shape (2,) or (B, 2); for those of :data:`PER_PARTICLE` also (B, N), robot first, of which a body without
+            such a constant ignores its part.
         batch: B.
+        particles: N.
         like: Gives dtype and device.
 
     Raises:
@@ -52,8 +56,10 @@ def physics_values(given: Any, batch: int, like: Tensor) -> dict[str, Tensor]:
             raise ValueError(f"physics[{name!r}] must be real, got {tensor.dtype}")
         tensor = tensor.to(like)
         own = (2,) if name == "gravity" else ()
-        if tuple(tensor.shape) not in (own, (batch, *own)):
-            raise ValueError(f"physics[{name!r}] must have shape {own} or {(batch, *own)}, got {tuple(tensor.shape)}")
+        allowed_shapes = [own, (batch, *own), *([(batch, particles)] if name in PER_PARTICLE else [])]
+        if tuple(tensor.shape) not in allowed_shapes:
+            shapes = " or ".join(map(str, allowed_shapes))
+            raise ValueError(f"physics[{name!r}] must have shape {shapes}, got {tuple(tensor.shape)}")
         low = -torch.inf if name == "gravity" else 0.0
         allowed = torch.isfinite(tensor) & ((tensor > low) if name in _POSITIVE else (tensor >= low))
         if not bool(allowed.all()):
@@ -69,8 +75,24 @@ def merged(spec: TaskSpec, old: Physics, new: Physics, mask: Tensor, like: Tenso
         return dict(new)
     own = defaults(spec, like)
     names = [name for name in NAMES if name in old or name in new]
-    return {name: choose(mask, new.get(name, own[name]), old.get(name, own[name])) for name in names}
+    pairs = {name: _alike(new.get(name, own[name]), old.get(name, own[name])) for name in names}
+    return {name: choose(mask, *pair) for name, pair in pairs.items()}
+
+
+def part_of(value: float | Tensor, particles: slice) -> float | Tensor:
+    """The part of a value that belongs to some of the particles."""
+    return value[:, particles] if isinstance(value, Tensor) and value.ndim == 2 else value
+
+
+def _alike(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+    """Values of one shape: where one has a value per particle, both have."""
+    if one.ndim == other.ndim:
+        return one, other
+    one, other = (value[:, None] if value.ndim == 1 else value for value in (one, other))
+    return one.expand_as(one + other), other.expand_as(one + other)
 
 
 def _expanded(value: Tensor, name: str, batch: int) -> Tensor:
+    if value.ndim == 2:
+        return value
     return value.expand(batch, 2) if name == "gravity" else value.expand(batch)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -16,6 +17,7 @@ from dittogym.layout import Layouts, Particles, particle_counts
 from dittogym.physics import Physics, merged, physics_values
 from dittogym.render import frame
 from dittogym.reward import measure
+from dittogym.soft import soft_observation
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
 from torchmpm import ParticleState
@@ -43,6 +45,10 @@ class Snapshot:
     observation: Tensor
 
 
+def _sum(terms: Mapping[str, Tensor]) -> Tensor:
+    return torch.stack(tuple(terms.values())).sum(0)
+
+
 class TorchEnv:
     """``num_envs`` independent simulations of one task, advanced together.
 
@@ -68,6 +74,7 @@ class TorchEnv:
         resample: Draw new particles at every reset, not only at a seeded one.
         deterministic: Accept only what repeats a trajectory bit by bit for one seed and number of threads: the CPU, and
             not the backend ``"compile"``.
+        segment: Substeps between checkpoints where gradients are enabled, see :func:`torchmpm.segment_for`.
         task_options: ``body``, ``obstacles``, and options of the task such as ``target`` of SHAPE MATCH; see
             :func:`dittogym.make_spec`.
 
@@ -99,6 +106,7 @@ class TorchEnv:
         parity: Parity = "clean",
         resample: bool = False,
         deterministic: bool = False,
+        segment: int | None = 10,
         **task_options: Any,
     ) -> None:
         self.spec = make_spec(task, **task_options)
@@ -127,6 +135,7 @@ class TorchEnv:
         self._counts = counts = particle_counts(self.spec, particles)
         full = counts == particle_counts(self.spec, "full")
         self.model = dynamics.make_model(self.spec, counts, substeps=substeps, backend=backend, unscaled=self._stale)
+        self.model = replace(self.model, segment=segment)
         self._layouts = Layouts(self.spec, counts, num_envs, spread=not (full or self._stale), resample=resample)
         self._like = torch.empty(num_envs, dtype=self.dtype, device=self.device)
         self._physics: Physics = {}
@@ -219,7 +228,7 @@ class TorchEnv:
             seed: Seeds element i with ``seed + i`` and draws its particles anew. Without it the last layout is used
                 again, unless ``resample`` was asked for.
             options: ``"positions"``: (N, 2) or (B, N, 2) world positions in m, robot first, used until the next seed;
-                ``"physics"``: constants of the matter, one value for all or one per element, see
+                ``"physics"``: constants of the matter, one value for all, one per element or one per particle, see
                 :func:`dittogym.physics.physics_values`; used until given again, ``{}`` goes back to the task's own;
                 ``"reset_mask"``: (B,) bool, reset only these elements.
 
@@ -239,7 +248,7 @@ class TorchEnv:
             raise ValueError("reset_mask must reset all elements the first time")
         physics = self._physics
         if options.get("physics") is not None:
-            given = physics_values(options["physics"], self.num_envs, self._like)
+            given = physics_values(options["physics"], self.num_envs, self.num_particles, self._like)
             physics = merged(self.spec, physics, given, mask, self._like)
         positions = self._layouts.draw(seed, mask.cpu().numpy(), options.get("positions"), self._like)
         fresh = dynamics.initial(self.model, positions, physics)
@@ -258,12 +267,14 @@ class TorchEnv:
         info = {"com": now.com, "split": now.split, "finite": dynamics.intact(self.model, fresh)}
         return self._observation, {name: value.detach() for name, value in info.items()}
 
-    def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+    def step(self, action: Tensor, *, soft: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Advance every simulation by one control step.
 
         Args:
             action: (B, 2, R, R), muscle actuation in units of the task's maximum; ``[:, 0]`` along material x. Values
                 beyond [-1, 1] saturate after the interpolation.
+            soft: For gradients: the observation is :meth:`soft_observation`, reward and its terms are the task's smooth
+                ones, and ``info["true_reward"]`` is the reward. All else is as without.
 
         Returns:
             observation (B, 3, 64, 64) uint8; reward (B,); terminated (B,) bool; truncated (B,) bool, at the horizon;
@@ -276,14 +287,26 @@ class TorchEnv:
         action = self._checked(action)
         state, field = dynamics.transition(self.model, self.env_state, to_grid_layout(action, self._layout))
         observation = dynamics.observe(self.model, state)
-        state, outcome = dynamics.judge(self.model, state, field, observation)
-        self._env_state, self._observation, self._field = state, observation, field.detach()
+        judged, outcome = dynamics.judge(self.model, state, field, observation)
+        self._env_state, self._observation, self._field = judged, observation, field.detach()
         info: dict[str, Any] = {"reward_terms": dict(outcome.terms), **outcome.info}
         if outcome.success is not None:
             info["is_success"] = outcome.success
-        reward = torch.stack(tuple(outcome.terms.values())).sum(0)
+        reward = _sum(outcome.terms)
+        if soft:
+            info["true_reward"], observation = reward, soft_observation(self.model, state)
+            terms = dynamics.judge(self.model, state, field, observation, soft=True)[1].terms
+            info["reward_terms"], reward = dict(terms), _sum(terms)
         assert outcome.terminated is not None
         return observation, reward, outcome.terminated, state.steps >= self.spec.horizon, info
+
+    def soft_observation(self) -> Tensor:
+        """The present image as a smooth function of the state, see :func:`dittogym.soft.soft_observation`.
+
+        Returns:
+            (B, 3, 64, 64) in the units of the uint8 observation, with the autograd graph of the state.
+        """
+        return soft_observation(self.model, self.env_state)
 
     def render(self, index: int = 0, *, muscles: bool = False, size: int = 512) -> np.ndarray:
         """Picture of one simulation, (size, size, 3) uint8 RGB.

@@ -8,6 +8,7 @@ from torchmpm import diagnostics, sampling
 from torchmpm.boundary import VelocityRule, fixed
 from torchmpm.grid import Grid
 from torchmpm.material import Elastic, Material, Soil, VonMises, lame
+from torchmpm.memory import estimate_memory, segment_for
 from torchmpm.rollout import repeated, trajectory
 from torchmpm.solver import Body, Solver
 from torchmpm.state import ParticleState
@@ -25,9 +26,11 @@ __all__ = [
     "VelocityRule",
     "VonMises",
     "diagnostics",
+    "estimate_memory",
     "fixed",
     "lame",
     "repeated",
     "sampling",
+    "segment_for",
     "trajectory",
 ]

@@ -20,6 +20,8 @@ Sym2: TypeAlias = tuple[Tensor, Tensor, Tensor]
 STRETCH_FLOOR = 0.05
 #: Constant under the square root of the norm of the deviatoric strain.
 NORM_EPSILON = 1e-8
+#: No difference of principal logarithmic strains reaches this: a yield limit beyond it never acts, but would overflow.
+LARGEST_DIFFERENCE = 40.0
 #: Jp of soil stays below this. A grain that is pulled apart for ever has lost all stiffness long before, at Jp = 1.23;
 #: its Jp would go on growing until it is no number any more, and spoil gradients.
 LARGEST_JP = 1e30
@@ -85,14 +87,12 @@ def _sqrt(value: Value) -> Value:
     return value.sqrt() if isinstance(value, Tensor) else math.sqrt(value)
 
 
-def _exp(value: Value) -> Value:
-    return value.exp() if isinstance(value, Tensor) else math.exp(value)
-
-
 def yield_ratio(limit: Value) -> Value:
     """Ratio of the principal stretches at yield, for a limit of :func:`von_mises_return`."""
     excess = 2.0 * (limit * limit - NORM_EPSILON)
-    return _exp(_sqrt(excess.clamp_min(NORM_EPSILON) if isinstance(excess, Tensor) else max(excess, NORM_EPSILON)))
+    if isinstance(excess, Tensor):
+        return excess.clamp(NORM_EPSILON, LARGEST_DIFFERENCE**2).sqrt().exp()
+    return math.exp(math.sqrt(min(max(excess, NORM_EPSILON), LARGEST_DIFFERENCE**2)))
 
 
 def von_mises_return(F: Mat2, limit: Value) -> Mat2:

@@ -1,17 +1,15 @@
 """Loops over steps and their checkpoints, on a step simple enough to know the answer."""
 
 import gc
-import weakref
 from typing import Any
 
 import pytest
 import torch
 from scenes import lively, normal, robot
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils.weak import WeakIdKeyDictionary
 
 from torchmpm import ParticleState, repeated, trajectory
+from torchmpm.memory import PeakMemory
 
 
 def double(x: Tensor) -> Tensor:
@@ -144,32 +142,6 @@ def test_checkpoints_do_not_change_gradients(checkpointed: bool, segment: int | 
     assert all(g.abs().max() > 0 for g in plain)
     for with_checkpoints, without in zip(rollout_gradients(checkpointed, segment), plain, strict=True):
         torch.testing.assert_close(with_checkpoints, without, rtol=0, atol=1e-12 * without.abs().max().item())
-
-
-class PeakMemory(TorchDispatchMode):
-    """Largest number of bytes alive at once among the storages that operators return."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.seen = WeakIdKeyDictionary()
-        self.now = self.peak = 0
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        result = func(*args, **(kwargs or {}))
-        for tensor in result if isinstance(result, (tuple, list)) else (result,):
-            if not isinstance(tensor, Tensor):
-                continue
-            storage = tensor.untyped_storage()
-            if storage not in self.seen:
-                size = storage.nbytes()
-                self.seen[storage] = size
-                self.now += size
-                self.peak = max(self.peak, self.now)
-                weakref.finalize(storage, self.release, size)
-        return result
-
-    def release(self, size: int) -> None:
-        self.now -= size
 
 
 def peak_memory(substeps: int, segment: int | None, checkpointed: bool | None = None) -> int:

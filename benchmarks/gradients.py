@@ -1,0 +1,68 @@
+"""Time and memory of a gradient through one step of RUN: the table in docs/concepts/gradients.md.
+
+Run `python benchmarks/gradients.py`; each size has a process of its own, so that memory can be read off it (Linux).
+"""
+
+import gc
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import torch
+
+import dittogym
+from torchmpm import estimate_memory
+
+SIZES = (22000, 2000)
+REPEATS = 7
+
+
+def resident(name: str) -> int:
+    """Bytes of memory that this process has (``"VmRSS"``) or had at most (``"VmHWM"``)."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(name))
+
+
+def step(env: dittogym.TorchEnv, gradients: bool) -> float:
+    """Seconds for one step, with a backward pass from the reward to the action if asked for."""
+    action = torch.zeros(1, *env.action_shape, requires_grad=gradients)
+    env.reset()
+    begin = time.perf_counter()
+    with torch.set_grad_enabled(gradients):
+        reward = env.step(action)[1]
+    if gradients:
+        reward.sum().backward()
+    env.detach()
+    return time.perf_counter() - begin
+
+
+def measure(count: int) -> None:
+    """Print a row of the table."""
+    env = dittogym.TorchEnv("run", particles=count, backend="native")
+    env.reset(seed=0)
+    substeps, solver = env.model.substeps, env.model.solver
+    step(env, False)
+    gc.collect()
+    before = resident("VmRSS")
+    step(env, True)
+    used = resident("VmHWM") - before
+    forward, both = (min(step(env, gradients) for _ in range(REPEATS)) for gradients in (False, True))
+    predicted = estimate_memory(solver, env.state, substeps=substeps)
+    times = f"{1e3 * forward / substeps:.3f} | {1e3 * both / substeps:.3f} | {both / forward:.1f}"
+    print(f"| {count:,} | {times} | {predicted / 2**20:.0f} | {used / 2**20:.0f} |", flush=True)
+
+
+def main() -> None:
+    """Print the table."""
+    if len(sys.argv) > 1:
+        measure(int(sys.argv[1]))
+        return
+    print("| particles | forward, ms a substep | with backward | ratio | MiB predicted | MiB measured |")
+    print("| --- | --- | --- | --- | --- | --- |", flush=True)
+    for count in SIZES:
+        subprocess.run([sys.executable, __file__, str(count)], check=True)
+
+
+if __name__ == "__main__":
+    main()

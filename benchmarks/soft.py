@@ -1,0 +1,61 @@
+"""How far the soft observation and the soft rewards are from the true ones: the tables in docs/concepts/gradients.md.
+
+Run `python benchmarks/soft.py`; `--tasks run,kick` for some tasks only.
+"""
+
+import argparse
+
+import torch
+from tiers import sine, zeros
+
+import dittogym
+from dittogym.soft import soft_silhouette
+from dittogym.tasks.shapematch import silhouette
+
+STEPS = 30
+
+
+@torch.no_grad()
+def gaps(task: str, tier: str, policy) -> list[float]:
+    """Averages over an episode of 30 steps (or until it ends) from seed 0; at full size beside a second layout."""
+    env, other = (dittogym.TorchEnv(task, particles=p, action_layout="grid") for p in (tier, "full"))
+    env.reset(seed=0)
+    other.reset(seed=1)
+    rows = []
+    for t in range(STEPS):
+        soft, reward, terminated, _, info = env.step(policy(env, t), soft=True)
+        image = env.save().observation
+        on, other_on = silhouette(image), silhouette(other.step(policy(other, t))[0])
+        difference = (soft - image.to(soft)).abs()
+        rows.append(
+            (
+                (on ^ (soft_silhouette(soft) > 0.5)).sum().item(),
+                (on ^ other_on).sum().item(),
+                difference[:, 0].mean().item(),
+                difference[:, 1:].mean().item(),
+                (reward - info["true_reward"]).item(),
+            )
+        )
+        if terminated:
+            break
+    means = torch.tensor(rows).mean(0).tolist()
+    return [*means, max(abs(row[-1]) for row in rows)]
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--tasks", default=",".join(dittogym.TASKS))
+    tasks = parser.parse_args().tasks.split(",")
+    print("| task | tier | actions | pixels wrong | (another layout) | occupancy | velocity | reward, mean | at most |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    for task in tasks:
+        for tier in ("full", "lite"):
+            for policy in (zeros, sine):
+                wrong, layout, occupancy, velocity, mean, most = gaps(task, tier, policy)
+                pixels = f"{wrong:.0f} | {layout:.0f} | {occupancy:.2f} | {velocity:.2f}"
+                print(f"| {task} | {tier} | {policy.__name__} | {pixels} | {mean:+.3f} | {most:.3f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""Gradients of losses on states, soft observations and rewards in everything an environment is differentiable in.
+
+Three witnesses in float64: central differences, plain automatic differentiation (eager, whole graph), and the ways that
+are used: eager with checkpoints, and the native adjoint. Random strains put some of the robot beyond yield, random
+velocities throw it against the floor.
+"""
+
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+from tiny import actions, tiny
+from torch import Tensor
+
+from dittogym import TorchEnv, make_spec
+from torchmpm import ParticleState
+from torchmpm.backends import compiler_found
+
+TASKS = ("shapematch", "run", "kick", "dig")
+STEPS, SUBSTEPS, B = 2, 6, 2
+COUNTS = {"shapematch": (50,), "run": (50,), "kick": (40, 12), "dig": (40, 20)}
+MATTER = ("mu", "lam", "yield_stress", "mass")
+INPUTS = ("action", "x", "v", "C", "F", *MATTER, "max_actuation", "gravity")
+LOSSES = ("state", "observation", "soft reward", "reward")
+Leaves = dict[str, Tensor]
+
+
+def normal(*shape: int, seed: int) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def environment(task: str, backend: str, segment: int | None = None) -> TorchEnv:
+    env = tiny(task, B, particles=COUNTS[task], substeps=SUBSTEPS, resolution=4, backend=backend)
+    env.model = replace(env.model, segment=segment)
+    return env
+
+
+@cache
+def inputs(task: str, per_particle: bool) -> Leaves:
+    """Everything that a loss may be differentiated in."""
+    env = environment(task, "eager")
+    env.reset(seed=3)
+    n, spec = env.num_particles, make_spec(task)
+    own = {name: getattr(spec, name) for name in MATTER if name != "mass"} | {"mass": 1.0}
+    shape = (B, n) if per_particle else (B,)
+    matter = {name: own[name] * (1.0 + 0.1 * normal(*shape, seed=k).abs()) for k, name in enumerate(MATTER)}
+    strain = 0.08 * normal(B, n, 2, 2, seed=10)
+    strain[:, env.model.robot :] *= 0.2
+    return {
+        "action": 0.6 * actions(env, STEPS),
+        "x": env.state.x.clone(),
+        "v": torch.tensor([0.6, -1.0]) + 0.3 * normal(B, n, 2, seed=11),
+        "C": 2.0 * normal(B, n, 2, 2, seed=12),
+        "F": torch.eye(2) + strain,
+        **matter,
+        "max_actuation": spec.max_actuation * torch.tensor([0.8, 1.1], dtype=torch.float64),
+        "gravity": torch.tensor(spec.gravity) + normal(B, 2, seed=13),
+    }
+
+
+def losses(env: TorchEnv, given: Leaves) -> tuple[Tensor, ...]:
+    """Random combinations of the final state and image, and the sums of soft and of true rewards."""
+    physics = {name: given[name] for name in (*MATTER, "max_actuation", "gravity")}
+    env.reset(seed=0, options={"positions": given["x"], "physics": physics})
+    state = env.env_state
+    particles = ParticleState(state.particles.x, given["v"], given["C"], given["F"], state.particles.Jp)
+    env.env_state = replace(state, particles=particles)
+    soft = true = torch.zeros(B, dtype=torch.float64)
+    for action in given["action"]:
+        image, reward, *_, info = env.step(action, soft=True)
+        soft, true = soft + reward, true + info["true_reward"]
+    final = env.state
+    fields = ((final.x, 1.0), (final.v, 0.2), (final.C, 0.01), (final.F, 1.0), (final.Jp, 1.0))
+    total = sum(size * (normal(*t.shape, seed=20 + k) * t).sum() for k, (t, size) in enumerate(fields))
+    share = torch.tensor([1.0, 0.7], dtype=torch.float64)
+    return total, 0.01 * (normal(*image.shape, seed=30) * image).sum(), (share * soft).sum(), (share * true).sum()
+
+
+def gradients(task: str, per_particle: bool, backend: str, segment: int | None = None) -> dict[str, Leaves]:
+    """By loss and input; zero where a loss does not depend on an input."""
+    leaves = {name: value.clone().requires_grad_() for name, value in inputs(task, per_particle).items()}
+    found = {}
+    for name, loss in zip(LOSSES, losses(environment(task, backend, segment), leaves), strict=True):
+        if not loss.requires_grad:  # SHAPE MATCH's true reward counts pixels
+            found[name] = {key: torch.zeros_like(leaf) for key, leaf in leaves.items()}
+            continue
+        by_input = torch.autograd.grad(loss, list(leaves.values()), retain_graph=True, materialize_grads=True)
+        found[name] = dict(zip(leaves, by_input, strict=True))
+    return found
+
+
+@cache
+def plain(task: str, per_particle: bool = False) -> dict[str, Leaves]:
+    return gradients(task, per_particle, "eager")
+
+
+def check_against_differences(task: str, name: str, per_particle: bool) -> None:
+    """In one random direction, all losses at once."""
+    given, direction = inputs(task, per_particle), normal(*inputs(task, per_particle)[name].shape, seed=40)
+    # Along positions and deformations a step must be short to cross no yield surface and no cell.
+    # Along gravity it may be long, and must be where SHAPE MATCH's free robot hardly feels it.
+    step = {"x": 1e-8, "F": 1e-8, "gravity": 1e-4}.get(name, 1e-6) * given[name].abs().max().item()
+    env = environment(task, "auto")
+    with torch.no_grad():
+        ahead, behind = (losses(env, given | {name: given[name] + side * step * direction}) for side in (1, -1))
+    for k, loss in enumerate(LOSSES):
+        slope = (plain(task, per_particle)[loss][name] * direction).sum().item()
+        difference = (ahead[k] - behind[k]).item() / (2 * step)
+        # What rounding leaves of a difference of two losses.
+        floor = 4e-16 * max(abs(ahead[k].item()), 1.0) / step
+        assert abs(slope - difference) <= 1e-5 * abs(difference) + 10 * floor, f"{loss}: {slope} {difference}"
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("name", INPUTS)
+def test_against_central_differences(task: str, name: str) -> None:
+    check_against_differences(task, name, False)
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("name", MATTER)
+def test_of_values_per_particle(task: str, name: str) -> None:
+    check_against_differences(task, name, True)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_input_matters(task: str) -> None:
+    """No comparison above is one of zeros, but for what the task does not have."""
+    for loss in LOSSES[:3]:
+        for name, value in plain(task)[loss].items():
+            assert value.isfinite().all()
+            assert value.abs().max() > 1e-13, f"{loss} {name}"
+
+
+def assert_near(found: dict[str, Leaves], expected: dict[str, Leaves], tolerance: float) -> None:
+    for loss, leaves in expected.items():
+        for name, value in leaves.items():
+            error = (found[loss][name] - value).abs().max().item()
+            # Forces within the robot hardly move its centre: rewards depend on F and C by differences of large numbers.
+            assert error <= tolerance * max(value.abs().max().item(), 1e-3), f"{loss} {name}: {error}"
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_checkpoints_make_no_difference(task: str) -> None:
+    assert_near(gradients(task, False, "eager", segment=4), plain(task), 1e-12)
+
+
+@pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+@pytest.mark.parametrize("per_particle", [False, True])
+@pytest.mark.parametrize("task", TASKS)
+def test_native_adjoint(task: str, per_particle: bool) -> None:
+    assert_near(gradients(task, per_particle, "native"), plain(task, per_particle), 1e-9)

@@ -1,0 +1,245 @@
+"""What a gradient costs in memory, before it is computed."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import weakref
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.weak import WeakIdKeyDictionary
+
+from torchmpm.backends import runs_native, substep_function
+from torchmpm.native import ops, pack
+from torchmpm.rollout import repeated
+from torchmpm.solver import MASS_EPSILON, Solver
+from torchmpm.state import ParticleState
+
+#: Component planes of a state.
+ROWS = 13
+
+
+class PeakMemory(TorchDispatchMode):
+    """Bytes alive among the storages that operators return while the mode is on.
+
+    Works on real tensors and on fake ones, which have sizes but no memory.
+
+    Attributes:
+        now: Bytes alive.
+        peak: The largest number so far.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._seen = WeakIdKeyDictionary()
+        self.now = self.peak = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run an operator and count what it returns."""
+        result = func(*args, **(kwargs or {}))
+        for tensor in result if isinstance(result, (tuple, list)) else (result,):
+            if isinstance(tensor, Tensor):
+                self._count(tensor.untyped_storage())
+        return result
+
+    def _count(self, storage: torch.UntypedStorage) -> None:
+        if storage in self._seen:
+            return
+        size = storage.nbytes()
+        self._seen[storage] = size
+        self.now += size
+        self.peak = max(self.peak, self.now)
+        weakref.finalize(storage, self._release, size)
+
+    def _release(self, size: int) -> None:
+        self.now -= size
+
+
+def estimate_memory(
+    solver: Solver,
+    state: ParticleState | tuple[int, int, torch.dtype],
+    *,
+    substeps: int,
+    segment: int | None = 10,
+    env_steps: int = 1,
+    backward: bool = True,
+) -> int:
+    """Bytes that :meth:`torchmpm.Solver.step`, and a backward pass through it, will need beyond their inputs.
+
+    Eagerly the operators of two substeps and of their backward passes run on tensors without memory; the rest is
+    proportion. A compiled substep keeps less than an eager one, so there this is an upper bound. The native backend
+    says how large its scratch memory is. Counted are the largest sizes alive at once, with gradients in state and
+    actuation; what an allocator rounds up, or keeps for later, comes on top.
+
+    Args:
+        solver: The solver; its backend is the one that the step would use.
+        state: Where the step starts; or (B, N, dtype) on the CPU, for which the native backend assumes matter all over
+            the window.
+        substeps: Substeps of a step.
+        segment: As in :meth:`torchmpm.Solver.step`.
+        env_steps: Steps in a row, through :func:`torchmpm.trajectory` with its checkpoints.
+        backward: With a gradient; else only what one step needs without.
+
+    Raises:
+        ValueError: A number is below 1, or the solver cannot run such a state.
+    """
+    for name, number in (("substeps", substeps), ("env_steps", env_steps)):
+        if number < 1:
+            raise ValueError(f"{name} must be at least 1, got {number}")
+    share = _occupied(solver, state)
+    state = _empty(solver, state)
+    if runs_native(solver, state):
+        return _native(solver, state, substeps, env_steps, backward, share)
+    if not backward:
+        return _rehearsed(solver, state, 2, False)
+    kept, grown = _eager_parts(solver, state)
+    return _eager(state, kept, grown, substeps, segment) + (env_steps - 1) * _step_bytes(solver, state)
+
+
+def segment_for(
+    solver: Solver,
+    state: ParticleState | tuple[int, int, torch.dtype],
+    *,
+    substeps: int,
+    budget: int,
+    env_steps: int = 1,
+) -> int | None:
+    """The ``segment`` for :meth:`torchmpm.Solver.step` with which gradients fit into a budget.
+
+    The whole graph (``None``) if that fits, which saves a second forward pass; else as few checkpoints as fit. The
+    native backend has no use for a segment: ``None`` if its needs fit.
+
+    Args:
+        solver: The solver.
+        state: Where the step starts, or (B, N, dtype) on the CPU.
+        substeps: Substeps of a step.
+        budget: Bytes.
+        env_steps: Steps in a row, see :func:`estimate_memory`.
+
+    Raises:
+        ValueError: The smallest need exceeds the budget, or a number is below 1.
+    """
+    least = estimate_memory(solver, state, substeps=substeps, segment=None, env_steps=env_steps)
+    state = _empty(solver, state)
+    if least <= budget:
+        return None
+    if not runs_native(solver, state):
+        kept, grown = _eager_parts(solver, state)
+        others = least - _eager(state, kept, grown, substeps, None)
+        needs = {n: others + _eager(state, kept, grown, substeps, n) for n in range(substeps - 1, 0, -1)}
+        least = min([least, *needs.values()])
+        for length, need in needs.items():
+            if need <= budget:
+                return length
+    raise ValueError(
+        f"budget must be at least {least:,} bytes for {env_steps} step(s) of {substeps} substeps, {state.batch_size} x "
+        f"{state.num_particles} particles in {state.dtype}, got {budget:,}: take fewer particles, simulations or "
+        "substeps a step"
+    )
+
+
+def _empty(solver: Solver, state: ParticleState | tuple[int, int, torch.dtype]) -> ParticleState:
+    """A state of that size; nothing is written to its memory, so it takes none."""
+    if isinstance(state, ParticleState):
+        return state
+    batch, count, dtype = state
+    if count != solver.num_particles:
+        raise ValueError(f"state has {count} particles, the solver's bodies {solver.num_particles}")
+    return ParticleState.from_stack(torch.empty(ROWS, batch, count, dtype=dtype))
+
+
+def _state_bytes(state: ParticleState) -> int:
+    return ROWS * state.batch_size * state.num_particles * state.x.element_size()
+
+
+def _field_bytes(solver: Solver, state: ParticleState) -> int:
+    return 2 * state.batch_size * solver.grid.resolution**2 * state.x.element_size()
+
+
+def _step_bytes(solver: Solver, state: ParticleState) -> int:
+    """What a further step of a trajectory adds: its start, and the derivative in its actuation."""
+    return _state_bytes(state) + _field_bytes(solver, state)
+
+
+def _eager(state: ParticleState, kept: int, grown: int, substeps: int, segment: int | None) -> int:
+    if segment is None or segment >= substeps:
+        return kept + grown * substeps
+    return kept + grown * segment + _state_bytes(state) * -(-substeps // segment)
+
+
+def _eager_parts(solver: Solver, state: ParticleState) -> tuple[int, int]:
+    """Bytes that do not depend on the number of substeps, and bytes that the graph of a further one takes."""
+    one, two = (_rehearsed(solver, state, times, True) for times in (1, 2))
+    return 2 * one - two, two - one
+
+
+def _rehearsed(solver: Solver, state: ParticleState, substeps: int, backward: bool) -> int:
+    """Peak bytes of some substeps without checkpoints, on tensors that have no memory."""
+    batch, count, nodes = state.batch_size, state.num_particles, solver.grid.resolution
+    empty = state.x.new_empty
+    scene = solver.scene(state, empty(batch, 2, nodes, nodes).zero_())
+    assert scene.actuation is not None
+    gc.collect()  # a collection in between would let go of memory that is counted
+    with FakeTensorMode(allow_non_fake_inputs=True), torch.set_grad_enabled(backward):
+        planes = tuple(empty((batch, count), requires_grad=backward) for _ in range(ROWS))
+        field = empty(scene.actuation.shape, requires_grad=backward)
+        run = substep_function(replace(solver, backend="eager"), replace(scene, actuation=field))
+        with PeakMemory() as memory:
+            final = ParticleState.from_planes(repeated(run, planes, substeps))
+            if backward:
+                torch.autograd.backward([final.x, final.v, final.C, final.F], [final.x, final.v, final.C, final.F])
+    return memory.peak
+
+
+def _occupied(solver: Solver, state: ParticleState | tuple[int, int, torch.dtype]) -> float:
+    """Share of the nodes that a state reaches, with a margin for a step's motion; all where only sizes are known."""
+    if not isinstance(state, ParticleState) or not bool(state.x.isfinite().all()):
+        return 1.0
+    extent = state.x.detach().amax(1) - state.x.detach().amin(1)
+    nodes = (extent / solver.grid.h + 5.0).clamp(max=solver.grid.width)
+    return float(nodes.prod(1).max() / solver.grid.width**2)
+
+
+def _native(solver: Solver, state: ParticleState, substeps: int, env_steps: int, backward: bool, share: float) -> int:
+    planes = state.x.new_empty(ROWS, state.batch_size, state.num_particles)
+    length = min(substeps, ops.tape_limit(planes, solver.grid.width)) if backward else substeps
+    scratch = _scratch_bytes(solver, state, length, backward)
+    if not backward:
+        return scratch + 2 * _state_bytes(state)
+    # The tape has room for all nodes, but memory that is never written to takes none.
+    teams = max(1, round(scratch / _scratch_bytes(solver, state[0], length, backward)))
+    scratch -= int((1.0 - share) * 3 * solver.grid.width**2 * state.x.element_size() * length * teams)
+    # Alive at once in a backward pass: every call's start, one result, and derivatives in both on their way.
+    calls = env_steps * -(-substeps // length)
+    values_bar = 8 * _state_bytes(state) // ROWS if _differentiates_values(solver) else 0
+    derivatives = 3 * _state_bytes(state) + values_bar
+    return scratch + (calls + 1) * _state_bytes(state) + derivatives + env_steps * _field_bytes(solver, state)
+
+
+def _differentiates_values(solver: Solver) -> bool:
+    """Whether a material value, mass or volume has a gradient."""
+    values = [v for body in solver.bodies for v in (body.mass, body.volume, *vars(body.material).values())]
+    return any(isinstance(value, Tensor) and value.requires_grad for value in values)
+
+
+def _scratch_bytes(solver: Solver, state: ParticleState, substeps: int, backward: bool) -> int:
+    """What the kernels ask for."""
+    batch, count, nodes = state.batch_size, state.num_particles, solver.grid.resolution
+    empty = state.x.new_empty
+    with torch.no_grad():
+        values, widths = pack.values(solver, state.Jp)
+    description = pack.description(solver, widths, MASS_EPSILON)
+    field, origin, shift = empty(batch, 2, nodes, nodes), empty(batch, 2), torch.empty(batch, 2, dtype=torch.int64)
+    planes = empty(ROWS, batch, count)
+    call = ops._call(planes, field, origin, origin, values, shift, description, substeps)
+    call.result = call.result_bar = call.planes_bar = call.field_bar = planes.data_ptr()
+    call.origin_bar = call.gravity_bar = origin.data_ptr()
+    call.values_bar = planes.data_ptr() if _differentiates_values(solver) else None
+    measure = ops.library_for(state.dtype)[f"torchmpm_{'backward' if backward else 'forward'}_bytes"]
+    measure.restype = ctypes.c_size_t
+    return int(measure(ctypes.byref(call)))
