@@ -67,6 +67,6 @@ if __name__ == "__main__":
         recording = film(env, 1, {name: torch.tensor(value) for name, value in TRUTH.items()})
     found = identify(env, recording, arguments.iterations)
     errors = {name: found[name] / TRUTH[name] - 1 for name in TRUTH}
-    for name in TRUTH:
-        print(f"{name}: true {TRUTH[name]:.1f} Pa, guess {GUESS[name]:.1f}, found {found[name]:.1f} ({errors[name]:+.1%})")
+    for name, true in TRUTH.items():
+        print(f"{name}: true {true:.1f} Pa, guess {GUESS[name]:.1f}, found {found[name]:.1f} ({errors[name]:+.1%})")
     assert all(abs(error) < TOLERANCE for error in errors.values()), errors
