@@ -7,11 +7,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
 from cfp.algorithm import CFP
-from cfp.checkpoint import Checkpoint, Position, check_same, model_state
+from cfp.checkpoint import Checkpoint, model_state
 from cfp.config import Config, to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.policy import CFPPolicy
 from cfp.presets import preset
+from cfp.state_file import Position, check_same
 from cfp.vec_env import monitored
 
 CONFIG = Config(resolutions=(4, 8), gate_bias=(-1.0,))
@@ -90,7 +91,7 @@ def test_checkpoint_survives_a_crash_while_the_next_is_written(tmp_path, monkeyp
         file.write(b"half a state")
         raise OSError("No space left on device")
 
-    monkeypatch.setattr("cfp.checkpoint.torch.save", crash)
+    monkeypatch.setattr("cfp.state_file.torch.save", crash)
     with pytest.raises(OSError, match="No space"):
         checkpoint.save(model, CONFIG, Position(1))
     monkeypatch.undo()
