@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchmpm import Body, ParticleState, Solver, VonMises, backends
 from torchmpm.backends import BACKENDS, compiler_found
-from torchmpm.native import pack, unsupported
+from torchmpm.native import library, pack, unsupported
 
 
 def run(solver: Solver) -> tuple[ParticleState, tuple[Tensor, ...]]:
@@ -40,9 +40,10 @@ def test_compiled_equals_eager() -> None:
 
 
 @pytest.fixture
-def fresh_warnings() -> None:
-    """A process that has not said anything yet."""
+def fresh_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a process that has not said or loaded anything yet."""
     backends._warn_once.cache_clear()
+    monkeypatch.setattr(library, "_loaded", {})
 
 
 def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -50,7 +51,7 @@ def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 
 @pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
-def test_auto_is_native_where_that_works(fresh_warnings: None, caplog: pytest.LogCaptureFixture) -> None:
+def test_auto_is_native_where_that_works(fresh_process: None, caplog: pytest.LogCaptureFixture) -> None:
     state = lively(30)
     results = [robot(30, backend=backend).step(state, substeps=5) for backend in ("auto", "native")]
     assert_identical(*results)
@@ -69,7 +70,7 @@ class Own(VonMises):
     ],
 )
 def test_auto_is_eager_where_it_does_not(
-    fresh_warnings: None, caplog: pytest.LogCaptureFixture, change: dict, dtype: torch.dtype, reason: str
+    fresh_process: None, caplog: pytest.LogCaptureFixture, change: dict, dtype: torch.dtype, reason: str
 ) -> None:
     """And says why, once."""
     state = lively(30).to(dtype)
@@ -80,7 +81,7 @@ def test_auto_is_eager_where_it_does_not(
 
 
 def test_auto_without_a_compiler(
-    fresh_warnings: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    fresh_process: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CXX", raising=False)
@@ -92,7 +93,7 @@ def test_auto_without_a_compiler(
 
 
 def test_auto_with_a_compiler_that_fails(
-    fresh_warnings: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+    fresh_process: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("CXX", "false")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
