@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dittogym import dynamics
-from dittogym.action import to_grid_layout
+from dittogym.action import Layout, to_grid_layout
 from dittogym.dynamics import EnvState, Model
 from torchmpm import trajectory
 
@@ -25,15 +25,22 @@ def true_reward(model: Model, state: EnvState, field: Tensor) -> tuple[EnvState,
 
 
 def rewards(
-    model: Model, start: EnvState, actions: Tensor, reward: Reward = true_reward, *, checkpointed: bool = True
+    model: Model,
+    start: EnvState,
+    actions: Tensor,
+    reward: Reward = true_reward,
+    *,
+    layout: Layout = "image",
+    checkpointed: bool = True,
 ) -> tuple[EnvState, Tensor, Tensor]:
     """Drive simulations through some control steps.
 
     Args:
         model: The task, such as ``TorchEnv.model``.
         start: Where all simulations start, B of them.
-        actions: (T, B, 2, R, R) in image layout, as :meth:`dittogym.TorchEnv.step` takes them.
+        actions: (T, B, 2, R, R), as :meth:`dittogym.TorchEnv.step` takes them.
         reward: What a step is worth.
+        layout: Of the actions.
         checkpointed: Keep only the states between the steps and replay each step in the backward pass.
 
     Returns:
@@ -44,7 +51,7 @@ def rewards(
 
     def step(carry: Carry, action: Tensor) -> Carry:
         state, _, over = carry
-        state, field = dynamics.transition(model, state, to_grid_layout(action, "image"))
+        state, field = dynamics.transition(model, state, to_grid_layout(action, layout))
         state, earned, ended = reward(model, state, field)
         return state, torch.where(over, 0.0, earned), over | ended
 

@@ -1,0 +1,160 @@
+"""Receding-horizon planning by gradients through the simulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from baselines.rollout import Reward, rewards, true_reward
+from dittogym import TorchEnv
+from dittogym.action import Layout
+from dittogym.dynamics import EnvState, Model
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """How a plan is made."""
+
+    horizon: int = 16
+    """Control steps that a plan looks ahead."""
+    commit: int = 8
+    """Control steps of a plan that are carried out before the next is made."""
+    iterations: int = 6
+    """Gradient steps on a plan."""
+    learning_rate: float = 0.3
+    """Adam's step size on actions, which lie in [-1, 1]."""
+    noise: float = 0.1
+    """Standard deviation of the actions with which a plan is extended."""
+    clip: float = 3.0
+    """Largest gradient of one control step, in medians over the steps of the plan."""
+    terminal: float = 0.0
+    """Additional weight on the reward of the last step, for what comes after the plan."""
+    margin: float = 100.0
+    """Cost of a spread beyond 85 % of the limit at which the robot counts as torn, per squared share of the limit."""
+
+
+class Planner:
+    """Plans for all simulations of an environment by Adam on their next actions.
+
+    The plan of a simulation is what it would do from its present state on; the gradient goes through the same
+    simulator that the environment is, so the planner sees everything: state, matter, obstacles. Between plans, the part
+    that was not carried out is kept and extended by noise. Of all plans met in the iterations, the one with the
+    highest true return is carried out.
+
+    Args:
+        env: The environment; only read, after its reset.
+        config: How to plan.
+        reward: What is climbed; what is chosen is judged by the task's own reward.
+        seed: Of the noise.
+        layout: The environment's action layout.
+
+    Attributes:
+        failed: Plans that were not finite so far, in their return or their gradient; they are never carried out.
+        plans: Plans evaluated so far.
+
+    Raises:
+        ValueError: An option is out of range.
+    """
+
+    def __init__(
+        self,
+        env: TorchEnv,
+        config: PlannerConfig | None = None,
+        *,
+        reward: Reward = true_reward,
+        seed: int = 0,
+        layout: Layout = "image",
+    ) -> None:
+        self.config = config = config or PlannerConfig()
+        if not 1 <= config.commit <= config.horizon:
+            raise ValueError(f"commit must be from 1 to the horizon, {config.horizon}, got {config.commit}")
+        for name in ("iterations", "learning_rate", "clip"):
+            if not getattr(config, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(config, name)}")
+        for name in ("noise", "terminal", "margin"):
+            if not getattr(config, name) >= 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(config, name)}")
+        self.env, self.reward, self.layout = env, reward, layout
+        self.generator = torch.Generator().manual_seed(seed)
+        self.failed = self.plans = 0
+        self._ahead = self._fresh(config.horizon)
+        self._position = config.commit
+
+    def _fresh(self, steps: int) -> Tensor:
+        shape = (steps, self.env.num_envs, *self.env.action_shape)
+        noise = torch.randn(shape, generator=self.generator, dtype=self.env.dtype).to(self.env.device)
+        return (self.config.noise * noise).clamp(-1.0, 1.0)
+
+    def act(self) -> Tensor:
+        """Next action of every simulation, (B, 2, R, R); plans anew where the last plan is used up."""
+        if self._position >= self.config.commit:
+            self.plan()
+        self._position += 1
+        return self._ahead[self._position - 1]
+
+    def forget(self) -> None:
+        """Drop the present plan, for a new episode."""
+        self._ahead, self._position = self._fresh(self.config.horizon), self.config.commit
+
+    def plan(self) -> Tensor:
+        """Make new plans from the environment's present state: actions (T, B, 2, R, R)."""
+        config, start = self.config, self.env.env_state.detach()
+        kept = self._ahead[self._position :] if self._position < config.horizon else self._ahead[:0]
+        plan = torch.cat((kept, self._fresh(config.horizon - len(kept)))).requires_grad_()
+        adam = torch.optim.Adam([plan], config.learning_rate, (0.9, 0.95))
+        best, chosen = torch.full_like(plan[0, :, 0, 0, 0], -torch.inf), torch.zeros_like(plan)
+        for iteration in range(config.iterations + 1):
+            learns = iteration < config.iterations
+            with torch.set_grad_enabled(learns):
+                climbed, value = self._judge(start, plan)
+            self.plans += len(value)
+            better = value.isfinite() & (value > best)
+            best = torch.where(better, value, best)
+            chosen = torch.where(_spread(better), plan.detach(), chosen)
+            if not learns:
+                self.failed += int((~value.isfinite()).sum())
+                break
+            (gradient,) = torch.autograd.grad(-climbed.sum(), plan)
+            broken = ~(value.isfinite() & gradient.isfinite().flatten(2).all(2).all(0))
+            self.failed += int(broken.sum())
+            plan.grad = torch.where(_spread(broken), 0.0, _clipped(gradient, config.clip))
+            adam.step()
+            with torch.no_grad():
+                plan.copy_(torch.where(_spread(broken), chosen, plan.clamp(-1.0, 1.0)))
+        self._ahead, self._position = chosen.detach(), 0
+        return self._ahead
+
+    def _judge(self, start: EnvState, plan: Tensor) -> tuple[Tensor, Tensor]:
+        """What is climbed, and the true return, of plans (T, B, 2, R, R): (B,) each."""
+        config = self.config
+
+        def both(model: Model, state: EnvState, field: Tensor) -> tuple[EnvState, Tensor, Tensor]:
+            after, earned, ended = true_reward(model, state, field)
+            smooth = earned if self.reward is true_reward else self.reward(model, state, field)[1]
+            limit = model.spec.split_limit
+            if limit is not None:
+                x = after.particles.x[:, : model.robot]
+                share = x.var(1, correction=0).sum(-1).sqrt() / limit
+                smooth = smooth - config.margin * (share - 0.85).clamp_min(0.0).square()
+            return after, torch.stack((smooth, earned.detach())), ended
+
+        _, earned, _ = rewards(self.env.model, start, plan, both, layout=self.layout, checkpointed=False)
+        weights = earned.new_ones(len(plan))
+        weights[-1] += config.terminal
+        climbed, value = (weights[:, None, None] * earned).sum(0)
+        return climbed, value
+
+
+def _spread(mask: Tensor) -> Tensor:
+    """A mask over simulations (B,) as one over plans (T, B, 2, R, R)."""
+    return mask[:, None, None, None]
+
+
+def _clipped(gradient: Tensor, limit: float) -> Tensor:
+    """Limit the norm of each control step of a gradient (T, B, 2, R, R) to ``limit`` medians over the steps."""
+    norm = gradient.flatten(2).norm(dim=2)
+    largest = limit * norm.median(0).values
+    scale = torch.where(norm > largest, largest / norm, 1.0)
+    return gradient * scale[:, :, None, None, None]
