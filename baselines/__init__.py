@@ -1,5 +1,8 @@
-"""Algorithms to compare the coarse-to-fine policy with.
+"""Algorithms to compare the coarse-to-fine policy with, behind the same command lines, folders and policies."""
 
-This package will hold modular policies (message passing, attention), ablations of CFP and gradient-based control
-behind the command line of :mod:`cfp`. Nothing public stands here yet.
-"""
+from baselines.algorithm import Algorithm, Entry
+from baselines.gradient import Gradient, GradientConfig
+from baselines.open_loop import OpenLoop
+from baselines.registry import ALGORITHMS, load
+
+__all__ = ["ALGORITHMS", "Algorithm", "Entry", "Gradient", "GradientConfig", "OpenLoop", "load"]

@@ -1,11 +1,9 @@
-"""Everything a run needs to go on after a stop or a crash: one state file and the replay chunks that it names."""
+"""Everything a run of CFP needs to go on after a stop or a crash: the state file and the replay chunks it names."""
 
 from __future__ import annotations
 
 import json
-import pickle
 from collections import deque
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,49 +12,25 @@ import torch
 from stable_baselines3.common.vec_env import VecMonitor
 
 from cfp.algorithm import CFP
-from cfp.config import Config, to_json
-from cfp.errors import CheckpointError, ConfigError
-from cfp.files import write_atomically
+from cfp.config import Config
 from cfp.replay import ReplayArchive, ReplayRing
+from cfp.state_file import Position, StateFile
 from cfp.vec_env import TorchVecEnv
 
-VERSION = 1
 
-CHANGEABLE = ("steps", "device", "report.", "environment.backend")
-"""Options that a resumed run may change (a dot at the end: the whole group)."""
+class Checkpoint(StateFile):
+    """The ``checkpoint`` folder of a run of CFP.
 
-
-@dataclass(frozen=True)
-class Position:
-    """Where in the ladder a run stands.
-
-    Attributes:
-        level: Index of the level in training, 0 is the coarsest.
-        offset: Environment steps that the levels before it took.
-    """
-
-    level: int = 0
-    offset: int = 0
-
-
-class Checkpoint:
-    """The ``checkpoint`` folder of a run.
-
-    The state file is replaced in one move and names its replay chunks, which are immutable: a crash at any moment
-    leaves the previous checkpoint whole.
+    The state file names its replay chunks, which are immutable: a crash at any moment leaves the previous checkpoint
+    whole.
 
     Args:
         folder: ``RUN/checkpoint``.
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.path = folder / "state.pt"
+        super().__init__(folder)
         self.archive = ReplayArchive(folder / "replay", 0)
-
-    def exists(self) -> bool:
-        """Whether a whole checkpoint is there."""
-        return self.path.exists()
 
     def save(self, model: CFP, config: Config, position: Position) -> None:
         """Write networks, optimisers, statistics, counters, random generators and new replay rows.
@@ -70,37 +44,9 @@ class Checkpoint:
             self.archive = ReplayArchive(self.archive.folder, position.level)
         assert model.replay_buffer is not None
         rows = model.num_timesteps // model.n_envs
-        state = {
-            "version": VERSION,
-            "config": json.dumps(to_json(config)),
-            "level": position.level,
-            "offset": position.offset,
-            "rows": rows,
-            "chunks": self.archive.save(model.replay_buffer, rows),
-            "model": model_state(model),
-        }
-        write_atomically(self.path, lambda file: torch.save(state, file))
+        chunks = self.archive.save(model.replay_buffer, rows)
+        self.write(config, position, {"rows": rows, "chunks": chunks, "model": model_state(model)})
         self.archive.prune()
-
-    def load(self) -> dict[str, Any]:
-        """Read the state file.
-
-        Raises:
-            CheckpointError: It is missing, damaged, or of another version.
-        """
-        try:
-            state = torch.load(self.path, map_location="cpu", weights_only=True)
-        except FileNotFoundError as error:
-            raise CheckpointError(f"{self.path}: there is no checkpoint") from error
-        except (OSError, RuntimeError, ValueError, KeyError, EOFError, pickle.UnpicklingError) as error:
-            raise CheckpointError(
-                f"{self.path}: the checkpoint is damaged ({type(error).__name__}) and cannot be resumed; "
-                "the policy.safetensors of the run may still be whole"
-            ) from error
-        if not isinstance(state, dict) or state.get("version") != VERSION:
-            found = state.get("version") if isinstance(state, dict) else type(state).__name__
-            raise CheckpointError(f"{self.path}: got checkpoint version {found}, allowed {VERSION}")
-        return state
 
     def restore(self, model: CFP, state: dict[str, Any]) -> None:
         """Put a state into a freshly made model of the same configuration.
@@ -114,7 +60,7 @@ class Checkpoint:
             self.archive.load(model.replay_buffer, state["rows"], state["chunks"])
             restore_model(model, state["model"])
         except (KeyError, RuntimeError, ValueError, TypeError) as error:
-            raise CheckpointError(f"{self.path}: the checkpoint does not fit this program ({error})") from error
+            raise self.misfit(error) from error
 
 
 def model_state(model: CFP) -> dict[str, Any]:
@@ -200,26 +146,3 @@ def restore_random(model: CFP, state: dict[str, Any]) -> None:
     model.action_space.np_random.bit_generator.state = json.loads(state["actions"])
     if "cuda" in state and model.device.type == "cuda":
         torch.cuda.set_rng_state(state["cuda"], model.device)
-
-
-def check_same(stored: dict[str, Any], given: Config) -> None:
-    """Compare the options of a checkpoint with those of the command that wants to resume it.
-
-    Raises:
-        ConfigError: Naming the first option that differs and may not, with both values.
-    """
-    old, new = _flatten(stored), _flatten(json.loads(json.dumps(to_json(given))))
-    for name in {**old, **new}:
-        if name.startswith(CHANGEABLE) or old.get(name) == new.get(name):
-            continue
-        raise ConfigError(
-            f"{name.split('.')[-1]}: the run was started with {old.get(name)!r}, got {new.get(name)!r}; "
-            "a resumed run may change only steps, device, backend and what is reported"
-        )
-
-
-def _flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in values.items():
-        flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
-    return flat

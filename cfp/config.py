@@ -6,13 +6,16 @@ import dataclasses
 import typing
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from cfp.actor import ActorSpec
 from cfp.errors import ConfigError
 from cfp.networks import RESOLUTIONS, Interpolation
 
 Preset = Literal["quick", "paper"]
+
+EVALUATION_SEED = 10_000
+"""Added to a run's seed for evaluations, so that they start from particle layouts not trained on."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,78 @@ class ReportConfig:
 
 
 @dataclass(frozen=True)
+class RunConfig:
+    """Options of a training run that every algorithm has.
+
+    Training goes through one or more stages; what an algorithm says about them here is what its runs are made of.
+    """
+
+    algo: str = "cfp"
+    """Which algorithm."""
+    task: str = "shapematch"
+    """Which task: see the presets."""
+    preset: Preset = "quick"
+    """Where defaults come from: quick (minutes on two cores) or paper (the published numbers)."""
+    seed: int = 0
+    """Controls everything that is random."""
+    device: str = "auto"
+    """cpu, cuda, or auto."""
+    environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
+    report: ReportConfig = field(default_factory=ReportConfig)
+
+    changeable: ClassVar[tuple[str, ...]] = ("device", "report.", "environment.backend")
+    """Options that a resumed run may change (a dot at the end: the whole group)."""
+
+    @property
+    def name(self) -> str:
+        """Of the run, for a folder."""
+        return f"{self.algo}-{self.task}-{self.preset}-{self.seed}"
+
+    def ends(self) -> tuple[int, ...]:
+        """Environment steps since the beginning of the run after which each stage ends."""
+        raise NotImplementedError
+
+    def resolution(self, level: int) -> int:
+        """Action grid R of a stage (0 is the first)."""
+        raise NotImplementedError
+
+    def evaluation_seed(self, level: int) -> int:
+        """Seed of the layouts on which a stage is evaluated while it trains."""
+        return self.seed + EVALUATION_SEED
+
+    def adapted(self, base: RunConfig) -> RunConfig:
+        """These options with what follows from those that differ from ``base``, unless it was changed too."""
+        return self
+
+    def check(self) -> None:
+        """Check what the types cannot.
+
+        Raises:
+            ConfigError: Naming the option, what was given and what is allowed.
+        """
+        at_least_one(
+            num_envs=self.environment.num_envs,
+            substeps=self.environment.substeps,
+            eval_episodes=self.report.eval_episodes,
+            checkpoint_every=self.report.checkpoint_every,
+            log_every=self.report.log_every,
+        )
+        if self.report.eval_every < 0:
+            raise ConfigError(f"eval_every: got {self.report.eval_every}, allowed 0 (never) or more")
+
+
+def at_least_one(**counts: int) -> None:
+    """Check counts by name.
+
+    Raises:
+        ConfigError: One is below 1.
+    """
+    for name, value in counts.items():
+        if value < 1:
+            raise ConfigError(f"{name}: got {value}, allowed 1 or more")
+
+
+@dataclass(frozen=True)
 class StageConfig:
     """One level of the ladder, as `Config.stage` cuts it out."""
 
@@ -105,17 +180,9 @@ class StageConfig:
 
 
 @dataclass(frozen=True)
-class Config:
-    """A training run. Levels are listed coarsest first; one value per level unless said otherwise."""
+class Config(RunConfig):
+    """A run of CFP. Levels are listed coarsest first; one value per level unless said otherwise."""
 
-    task: str = "shapematch"
-    """Which task: see the presets."""
-    preset: Preset = "quick"
-    """Where defaults come from: quick (minutes on two cores) or paper (the published numbers)."""
-    seed: int = 0
-    """Controls everything that is random."""
-    device: str = "auto"
-    """cpu, cuda, or auto."""
     steps: int = 20_000
     """Environment steps of all levels together."""
     handover: tuple[int, ...] = (10_000,)
@@ -130,10 +197,26 @@ class Config:
     """Bias of the gate's logit (one less than levels)."""
     gate_penalty: tuple[float, ...] = (0.01,)
     """Weight of the gate penalty (one less than levels)."""
-    environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     learning: LearningConfig = field(default_factory=LearningConfig)
-    report: ReportConfig = field(default_factory=ReportConfig)
+
+    changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
+
+    def ends(self) -> tuple[int, ...]:
+        """Environment steps since the beginning of the run after which each level ends."""
+        return (*self.handover, self.steps)
+
+    def resolution(self, level: int) -> int:
+        """Action grid R of a level."""
+        return self.resolutions[level]
+
+    def adapted(self, base: RunConfig) -> RunConfig:
+        """Other steps move the handovers in proportion."""
+        assert isinstance(base, Config)
+        if self.steps == base.steps or self.handover != base.handover:
+            return self
+        share = self.steps / base.steps
+        return replace(self, handover=tuple(round(step * share) for step in base.handover))
 
     def actor_spec(self, level: int) -> ActorSpec:
         """The networks of the actor at a level (0 is the coarsest), with all coarser ones."""
@@ -147,7 +230,7 @@ class Config:
 
     def stage(self, level: int) -> StageConfig:
         """What the training of one level needs."""
-        bounds = (0, *self.handover, self.steps)
+        bounds = (0, *self.ends())
         return StageConfig(
             self.resolutions[level],
             bounds[level + 1] - bounds[level],
@@ -172,37 +255,27 @@ class Config:
             given = len(getattr(self, name))
             if given != count:
                 raise ConfigError(f"{name}: got {given} values, allowed {count} for resolutions {self.resolutions}")
-        if any(late <= early for early, late in pairwise((0, *self.handover, self.steps))):
+        if any(late <= early for early, late in pairwise((0, *self.ends()))):
             raise ConfigError(f"handover: got {self.handover} of {self.steps} steps, allowed are growing steps between")
+        super().check()
         self._check_ranges()
 
     def _check_ranges(self) -> None:
-        counts = {
-            "num_envs": self.environment.num_envs,
-            "substeps": self.environment.substeps,
-            "batch_size": self.learning.batch_size,
-            "buffer_size": self.learning.buffer_size,
-            "gradient_steps": self.learning.gradient_steps,
-            "eval_episodes": self.report.eval_episodes,
-            "checkpoint_every": self.report.checkpoint_every,
-            "log_every": self.report.log_every,
-        }
-        for name, value in counts.items():
-            if value < 1:
-                raise ConfigError(f"{name}: got {value}, allowed 1 or more")
+        at_least_one(
+            batch_size=self.learning.batch_size,
+            buffer_size=self.learning.buffer_size,
+            gradient_steps=self.learning.gradient_steps,
+            update_start=self.learning.update_start,
+        )
         shares = {"gamma": self.learning.gamma, "tau": self.learning.tau, "momentum": self.learning.reward_momentum}
         for name, share in shares.items():
             if not 0 <= share <= 1:
                 raise ConfigError(f"{name}: got {share}, allowed 0 to 1")
-        if self.report.eval_every < 0:
-            raise ConfigError(f"eval_every: got {self.report.eval_every}, allowed 0 (never) or more")
         if self.learning.learning_rate <= 0:
             raise ConfigError(f"learning_rate: got {self.learning.learning_rate}, allowed more than 0")
-        if self.learning.update_start < 1:
-            raise ConfigError(f"update_start: got {self.learning.update_start}, allowed 1 or more")
 
 
-def to_json(config: Config) -> dict[str, Any]:
+def to_json(config: RunConfig) -> dict[str, Any]:
     """A configuration as plain JSON values."""
     return dataclasses.asdict(config)
 
@@ -220,7 +293,8 @@ def merge(base: Any, values: Any, path: str = "") -> Any:
     """
     if not isinstance(values, dict):
         raise ConfigError(f"{path or 'configuration'}: got {values!r}, allowed an object with named values")
-    kinds = typing.get_type_hints(type(base))
+    hints = typing.get_type_hints(type(base))
+    kinds = {option.name: hints[option.name] for option in dataclasses.fields(base)}
     changes: dict[str, Any] = {}
     for name, value in values.items():
         where = f"{path}.{name}" if path else name

@@ -7,13 +7,10 @@ import dataclasses
 import torch
 from stable_baselines3.common.vec_env import VecMonitor
 
-from cfp.config import Config
+from cfp.config import RunConfig
 from cfp.errors import ConfigError
 from cfp.vec_env import monitored
 from dittogym import TorchEnv
-
-EVALUATION_SEED = 10_000
-"""Added to a run's seed for evaluations, so that they start from particle layouts not trained on."""
 
 
 def choose_device(name: str) -> str:
@@ -33,7 +30,12 @@ def choose_device(name: str) -> str:
     return name
 
 
-def make_env(config: Config, resolution: int, num_envs: int | None = None) -> VecMonitor:
+def make_env(config: RunConfig, resolution: int, num_envs: int | None = None) -> VecMonitor:
+    """Build the environment of a run for stable-baselines3, see `make_torch_env`."""
+    return monitored(make_torch_env(config, resolution, num_envs))
+
+
+def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = None) -> TorchEnv:
     """Build the environment of a run.
 
     Args:
@@ -51,7 +53,6 @@ def make_env(config: Config, resolution: int, num_envs: int | None = None) -> Ve
         options["target"] = target
     device = choose_device(config.device)
     try:
-        env = TorchEnv(config.task, num_envs or own, resolution, device=device, **options)
+        return TorchEnv(config.task, num_envs or own, resolution, device=device, **options)
     except (ValueError, TypeError, OSError) as error:
         raise ConfigError(" ".join(str(error).split())) from error
-    return monitored(env)

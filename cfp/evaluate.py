@@ -10,11 +10,12 @@ from pathlib import Path
 
 import tyro
 
+from cfp.command import Program
 from cfp.errors import CFPError, CheckpointError, ConfigError
 from cfp.evaluation import compare, format_table, to_rows
 from cfp.process import keep_memory
-from cfp.runner import make_video, read_config, stage_files
-from cfp.weights import load
+from cfp.run import make_video, read_config, stage_files
+from cfp.train import PROGRAM
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Command:
     """Evaluate the policies in a run folder beside zero and random action, on the same particle layouts."""
 
     folder: tyro.conf.Positional[Path]
-    """A folder that cfp.train wrote or is writing."""
+    """A folder that a training wrote or is writing."""
     episodes: int = 5
     """Episodes of each policy."""
     seed: int | None = None
@@ -35,7 +36,7 @@ class Command:
     """Also film one episode of the newest policy into this MP4 file."""
 
 
-def run(command: Command) -> str:
+def run(program: Program, command: Command) -> str:
     """Do what a command says and return what it prints.
 
     Raises:
@@ -43,24 +44,24 @@ def run(command: Command) -> str:
     """
     if command.episodes < 1:
         raise ConfigError(f"episodes: got {command.episodes}, allowed 1 or more")
-    config = replace(read_config(command.folder), device=command.device)
+    config = replace(read_config(command.folder, program.configure), device=command.device)
     if command.seed is not None:
         config = replace(config, seed=command.seed)
-    files = stage_files(command.folder, len(config.resolutions))
+    files = stage_files(command.folder, len(config.ends()))
     if not files:
         raise CheckpointError(f"{command.folder}: no policy has been written yet")
-    policies = {name: load(path) for name, path in files.items()}
+    policies = {name: program.load(path) for name, path in files.items()}
     results = compare(config, policies, command.episodes)
     if command.video is not None:
         make_video(config, list(policies.values())[-1], command.video)
     return json.dumps(to_rows(results), indent=2) if command.json else format_table(config, results)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:
     """Command line entry; returns the exit code."""
     keep_memory()
     try:
-        print(run(tyro.cli(Command, prog="python -m cfp.evaluate", args=arguments)))
+        print(run(program, tyro.cli(Command, prog=f"python -m {program.package}.evaluate", args=arguments)))
     except CFPError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -12,9 +12,24 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
-from cfp.config import Config
-from cfp.environments import EVALUATION_SEED, make_env
-from cfp.policy import ActorPolicy
+from cfp.config import EVALUATION_SEED, RunConfig
+from cfp.environments import make_env
+
+
+class Policy(PolicyPredictor, Protocol):
+    """A trained policy of any kind, as it comes from its file."""
+
+    @property
+    def resolution(self) -> int:
+        """Action grid R."""
+
+    @property
+    def deterministic_by_default(self) -> bool:
+        """Whether the run that trained it evaluates it without noise."""
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """What it is and comes from; ``layout`` is the seed of the one particle layout it was made for, if so."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +106,7 @@ def evaluate(
     """Run episodes without learning.
 
     Neither the environments of a training run nor torch's generator are touched, and the same seed gives the same
-    episodes: element i of the batch starts from layout ``seed + EVALUATION_SEED + i``.
+    episodes: element i of the batch starts from layout ``seed + i``.
 
     Args:
         name: Of the policy, for the result.
@@ -99,7 +114,7 @@ def evaluate(
         env: Environments used for evaluation only.
         episodes: How many.
         deterministic: Act without noise.
-        seed: Of the run.
+        seed: Of the first element's layout and of the noise.
     """
     successes: list[bool] = []
 
@@ -107,10 +122,10 @@ def evaluate(
         if local["done"] and "is_success" in local["info"]:
             successes.append(bool(local["info"]["is_success"]))
 
-    env.seed(seed + EVALUATION_SEED)
+    env.seed(seed)
     cuda = list(range(torch.cuda.device_count()))
     with torch.random.fork_rng(devices=cuda):
-        torch.manual_seed(seed + EVALUATION_SEED)
+        torch.manual_seed(seed)
         returns, _ = evaluate_policy(
             policy, env, episodes, deterministic=deterministic, callback=note_success, return_episode_rewards=True
         )
@@ -121,27 +136,31 @@ def evaluate(
     return Result(name, action_space.shape[-1], tuple(float(value) for value in returns), success)
 
 
-def compare(config: Config, policies: Mapping[str, ActorPolicy], episodes: int) -> list[Result]:
+def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int) -> list[Result]:
     """Evaluate trained policies beside zero and random action, all on the same particle layouts.
+
+    A policy made for a single layout is evaluated there too, in a row of its own.
 
     Args:
         config: The run's options.
-        policies: By name, each with its own resolution. Zero and random action use the coarsest.
+        policies: By name, each with its own resolution. Zero and random action use the first stage's.
         episodes: Episodes of each.
     """
-    coarsest = config.resolutions[0]
-    seed = config.seed + EVALUATION_SEED  # layouts that neither trained a policy nor chose the best one
+    coarsest = config.resolution(0)
+    seed = config.seed + 2 * EVALUATION_SEED  # layouts that neither trained a policy nor chose the best one
     env = make_env(config, coarsest, episodes)
     untrained = {"zero action": ZeroPolicy(coarsest), "random action": RandomPolicy(coarsest, config.seed)}
     results = [
         evaluate(name, policy, env, episodes, deterministic=True, seed=seed) for name, policy in untrained.items()
     ]
     for name, trained in policies.items():
-        resolution = trained.spec.resolutions[-1]
-        if env.action_space.shape != (2, resolution, resolution):
-            env = make_env(config, resolution, episodes)
+        if env.action_space.shape != (2, trained.resolution, trained.resolution):
+            env = make_env(config, trained.resolution, episodes)
         deterministic = trained.deterministic_by_default
         results.append(evaluate(name, trained, env, episodes, deterministic=deterministic, seed=seed))
+        if "layout" in trained.description:
+            alone, own = make_env(config, trained.resolution, 1), trained.description["layout"]
+            results.append(evaluate("  own layout", trained, alone, 1, deterministic=deterministic, seed=own))
     return results
 
 
@@ -161,7 +180,7 @@ def to_rows(results: list[Result]) -> list[dict[str, Any]]:
     ]
 
 
-def format_table(config: Config, results: list[Result]) -> str:
+def format_table(config: RunConfig, results: list[Result]) -> str:
     """Results as a plain text table: mean and standard deviation of the return over the episodes."""
     counts = {len(result.returns) for result in results}
     title = f"{config.task}, return over {'/'.join(map(str, sorted(counts)))} episodes"

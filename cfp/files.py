@@ -34,6 +34,12 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], Any]) -> None:
     _sync_folder(path.parent)
 
 
+def copy_atomically(source: Path, target: Path) -> None:
+    """Copy a file, as `write_atomically` writes one."""
+    content = source.read_bytes()
+    write_atomically(target, lambda file: file.write(content))
+
+
 def _sync_folder(folder: Path) -> None:
     """Make a rename itself durable; some systems (Windows) cannot open a folder and need nothing here."""
     if os.name != "posix":

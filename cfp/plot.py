@@ -9,11 +9,11 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from cfp.config import Config
+from cfp.config import RunConfig
 from cfp.files import read_table, write_atomically
 
 
-def plot_curve(run: Path, config: Config, baselines: dict[str, float]) -> Path:
+def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Path:
     """Draw ``curve.png``: training and evaluation returns over environment steps, all levels after one another.
 
     Args:
@@ -29,7 +29,8 @@ def plot_curve(run: Path, config: Config, baselines: dict[str, float]) -> Path:
     training = read_table(run / "progress.csv")
     evaluations = read_table(run / "evaluations.csv")
     steps, values = _column(training, "rollout/return")
-    axes.plot(steps, values, color="tab:gray", alpha=0.8, label="training episodes (with noise)")
+    if steps:
+        axes.plot(steps, values, color="tab:gray", alpha=0.8, label="training episodes (with noise)")
     steps, means = _column(evaluations, "mean")
     _, stds = _column(evaluations, "std")
     how = "without noise" if config.report.eval_deterministic else "with noise"
@@ -40,12 +41,12 @@ def plot_curve(run: Path, config: Config, baselines: dict[str, float]) -> Path:
     for (name, value), style in zip(baselines.items(), ("--", ":", "-."), strict=False):
         axes.axhline(value, color="black", linestyle=style, linewidth=1, label=name)
     for level, step in enumerate(_handovers(training)):
-        before, after = config.resolutions[level], config.resolutions[level + 1]
+        before, after = config.resolution(level), config.resolution(level + 1)
         axes.axvline(step, color="tab:green", linewidth=1)
         label = f" {before}x{before} → {after}x{after}"
         axes.text(step, 0.01, label, color="tab:green", fontsize=8, transform=axes.get_xaxis_transform())
     axes.set(xlabel="environment steps", ylabel="return of an episode")
-    axes.set_title(f"CFP on {config.task}, seed {config.seed}")
+    axes.set_title(f"{config.algo} on {config.task}, seed {config.seed}")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     content = BytesIO()

@@ -116,6 +116,7 @@ class ActorPolicy(BasePolicy):
     """
 
     action_space: spaces.Box
+    deterministic_by_default: bool
 
     def __init__(self, spec: ActorSpec, deterministic_by_default: bool = False) -> None:
         """Build the actor; its weights are random until a state is loaded."""
@@ -125,6 +126,11 @@ class ActorPolicy(BasePolicy):
         self.deterministic_by_default = deterministic_by_default
         self.description: dict[str, Any] = {}
         self.actor = build_actor(spec).requires_grad_(False)
+
+    @property
+    def resolution(self) -> int:
+        """Action grid R."""
+        return self.spec.resolutions[-1]
 
     def forward(self, observation: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
         """Actions (B, 2, R, R) for uint8 observations (B, 3, 64, 64)."""

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.type_aliases import PolicyPredictor
 
-from cfp.config import Config
-from cfp.environments import EVALUATION_SEED, make_env
+from cfp.config import EVALUATION_SEED, RunConfig
+from cfp.environments import make_env
+from cfp.evaluation import Policy
 from cfp.vec_env import TorchVecEnv
 
 FRAMES_PER_SECOND = 10
@@ -23,26 +23,26 @@ class VideoUnavailable(RuntimeError):
     """The optional packages that write videos are not installed."""
 
 
-def film(config: Config, policy: PolicyPredictor, resolution: int, deterministic: bool) -> list[np.ndarray]:
+def film(config: RunConfig, policy: Policy) -> list[np.ndarray]:
     """Pictures of one episode, uint8 (512, 512, 3): the start, then one per environment step.
 
     Args:
         config: The run's options.
-        policy: Anything with stable-baselines3's ``predict``.
-        resolution: Its action grid R.
-        deterministic: Act without noise.
+        policy: Acts as it is evaluated; one made for a single layout is filmed there.
     """
-    venv = make_env(config, resolution, 1).venv
+    venv = make_env(config, policy.resolution, 1).venv
     assert isinstance(venv, TorchVecEnv)
-    venv.seed(config.seed + EVALUATION_SEED)
+    seed = policy.description.get("layout", config.seed + EVALUATION_SEED)
+    venv.seed(seed)
     observation = venv.reset()
     frames = [venv.torch_env.render(0)]
-    done = False
+    done, memory = False, None
     with torch.random.fork_rng(devices=list(range(torch.cuda.device_count()))), torch.no_grad():
-        torch.manual_seed(config.seed + EVALUATION_SEED)
+        torch.manual_seed(seed)
         while not done:
             assert isinstance(observation, np.ndarray)
-            action, _ = policy.predict(observation, deterministic=deterministic)
+            start = np.array([len(frames) == 1])
+            action, memory = policy.predict(observation, memory, start, policy.deterministic_by_default)
             tensors = venv.torch_env.step(torch.as_tensor(action, device=venv.torch_env.device))
             observation, _, terminated, truncated, _ = (_numpy(value) for value in tensors)
             frames.append(venv.torch_env.render(0))  # before a reset can replace the last picture

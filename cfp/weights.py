@@ -4,59 +4,129 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import safetensors
 import safetensors.torch
+from torch import Tensor
 
 from cfp.actor import Actor, ActorSpec
-from cfp.config import Config
+from cfp.config import Config, RunConfig
 from cfp.errors import CheckpointError
 from cfp.files import write_atomically, write_json
 from cfp.policy import ActorPolicy
 
 FORMAT = "cfp-policy"
 VERSION = 1
+KIND = "cfp"
 
 
-def describe(config: Config, level: int, steps: int) -> dict[str, Any]:
-    """What a policy is and comes from, as JSON values.
+def origin(config: RunConfig, kind: str, level: int, steps: int) -> dict[str, Any]:
+    """What a policy of any kind is and comes from, as JSON values.
 
     Args:
         config: The run that trained it.
-        level: Its level in the ladder, 0 is the coarsest.
+        kind: Says who can load it.
+        level: Its stage, 0 is the first.
         steps: Environment steps of the run so far.
     """
-    spec = config.actor_spec(level)
     return {
         "format": FORMAT,
         "version": VERSION,
+        "kind": kind,
         "task": config.task,
-        "resolution": spec.resolutions[-1],
+        "resolution": config.resolution(level),
         "stage": level + 1,
         "steps": steps,
         "seed": config.seed,
         "deterministic": config.report.eval_deterministic,
-        "network": dataclasses.asdict(spec),
         "environment": dataclasses.asdict(config.environment),
     }
 
 
-def save_policy(path: Path, actor: Actor, description: dict[str, Any]) -> None:
-    """Write an actor with its frozen levels.
+def describe(config: Config, level: int, steps: int) -> dict[str, Any]:
+    """What an actor is and comes from, see `origin`."""
+    return origin(config, KIND, level, steps) | {"network": dataclasses.asdict(config.actor_spec(level))}
+
+
+def write_policy(path: Path, tensors: Mapping[str, Tensor], description: dict[str, Any]) -> None:
+    """Write a policy of any kind.
 
     The description goes into the weights file too, so that the two can never disagree; the JSON file is for reading.
 
     Args:
         path: The ``.safetensors`` file; the ``.json`` file gets the same name.
+        tensors: By name.
+        description: From `origin`, and what else its kind needs.
+    """
+    plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    content = safetensors.torch.save(plain, {FORMAT: json.dumps(description)})
+    write_atomically(path, lambda file: file.write(content))
+    write_json(path.with_suffix(".json"), description)
+
+
+def policy_file(path: str | Path) -> Path:
+    """The ``.safetensors`` file that a run folder, that file itself or the ``.json`` beside it stands for.
+
+    Raises:
+        CheckpointError: There is none.
+    """
+    file = Path(path)
+    file = file / "policy.safetensors" if file.is_dir() else file.with_suffix(".safetensors")
+    if not file.exists():
+        raise CheckpointError(f"{file}: there is no policy")
+    return file
+
+
+def read_policy(path: str | Path, device: str = "cpu") -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read what `write_policy` wrote: tensors by name, and the description; nothing is unpickled.
+
+    Args:
+        path: A run folder, a ``.safetensors`` file, or the ``.json`` beside one.
+        device: Where the tensors go.
+
+    Raises:
+        CheckpointError: No such file, a damaged one, or one that is not such a policy.
+    """
+    file = policy_file(path)
+    try:
+        with safetensors.safe_open(file, framework="pt", device=device) as content:
+            metadata = content.metadata() or {}
+            tensors = {name: content.get_tensor(name) for name in content.keys()}
+    except (OSError, safetensors.SafetensorError) as error:
+        raise CheckpointError(f"{file}: the policy is damaged ({error})") from error
+    description = json.loads(metadata.get(FORMAT, "{}"))
+    if description.get("format") != FORMAT or description.get("version") != VERSION:
+        raise CheckpointError(f"{file}: got a file without a {FORMAT} description of version {VERSION}")
+    return tensors, {"kind": KIND, **description}  # files older than kinds are all of this one
+
+
+@contextmanager
+def fitting(path: str | Path) -> Iterator[None]:
+    """Turn what goes wrong while a policy is built from its file into an error that names the file.
+
+    Raises:
+        CheckpointError: Tensors and description do not fit.
+    """
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise CheckpointError(f"{policy_file(path)}: weights and description do not fit ({reason})") from error
+
+
+def save_policy(path: Path, actor: Actor, description: dict[str, Any]) -> None:
+    """Write an actor with its frozen levels, see `write_policy`.
+
+    Args:
+        path: The ``.safetensors`` file.
         actor: The network.
         description: From `describe`.
     """
-    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in actor.state_dict().items()}
-    content = safetensors.torch.save(tensors, {FORMAT: json.dumps(description)})
-    write_atomically(path, lambda file: file.write(content))
-    write_json(path.with_suffix(".json"), description)
+    write_policy(path, actor.state_dict(), description)
 
 
 def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
@@ -73,24 +143,12 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
     Raises:
         CheckpointError: No such file, a damaged one, or one that is not such a policy.
     """
-    file = Path(path)
-    file = file / "policy.safetensors" if file.is_dir() else file.with_suffix(".safetensors")
-    if not file.exists():
-        raise CheckpointError(f"{file}: there is no policy")
-    try:
-        with safetensors.safe_open(file, framework="pt", device=device) as content:
-            metadata = content.metadata() or {}
-            tensors = {name: content.get_tensor(name) for name in content.keys()}
-    except (OSError, safetensors.SafetensorError) as error:
-        raise CheckpointError(f"{file}: the policy is damaged ({error})") from error
-    description = json.loads(metadata.get(FORMAT, "{}"))
-    if description.get("format") != FORMAT or description.get("version") != VERSION:
-        raise CheckpointError(f"{file}: got a file without a {FORMAT} description of version {VERSION}")
-    try:
+    tensors, description = read_policy(path, device)
+    if description["kind"] != KIND:
+        raise CheckpointError(f"{policy_file(path)}: got a policy of kind {description['kind']!r}, allowed {KIND!r}")
+    with fitting(path):
         policy = ActorPolicy(ActorSpec.from_json(description["network"]), bool(description["deterministic"]))
         policy.actor.load_state_dict(tensors)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise CheckpointError(f"{file}: weights and description do not fit ({str(error).splitlines()[0]})") from error
     policy.description = description
     policy.to(device)
     policy.set_training_mode(False)

@@ -189,24 +189,37 @@ def observe(model: Model, state: EnvState) -> Tensor:
     """The image (B, 3, 64, 64) uint8; particles that are not finite are not drawn."""
     spec = model.spec
     particles, origin = state.particles.detach(), state.origin.detach()
-    finite = torch.isfinite((particles.x + particles.v).sum(-1))
+    row, column = obs.crop_corner(in_window(spec.view, state.centre.detach(), origin))
+    background = _background(spec, origin, row, column)
+    sight = look(model, particles, origin, row, column, background)
+    if model.pixels:
+        return obs.quantise(obs.pixel_means(sight))
+    return obs.quantise(obs.splat_means(sight, model.per_particle(model.shares, origin)))
+
+
+def look(
+    model: Model,
+    particles: ParticleState,
+    origin: Tensor,
+    row: Tensor,
+    column: Tensor,
+    background: obs.Background | None = None,
+) -> obs.Sight:
+    """What an image of the window at ``origin`` (B, 2), m, with its corner in a fine ``row`` and ``column`` shows."""
+    finite = torch.isfinite((particles.x + particles.v).detach().sum(-1))
     seen = finite & model.solver.grid.contains(particles.x[..., 0], origin[:, 0:1])
-    visible = tuple(body.moves_visibly for body in spec.bodies)
+    visible = tuple(body.moves_visibly for body in model.spec.bodies)
     silent = None if all(visible) else ~model.per_particle(visible, origin)
     speaks = seen if silent is None else seen & ~silent
-    row, column = obs.crop_corner(in_window(spec.view, state.centre.detach(), origin))
-    sight = obs.Sight(
+    return obs.Sight(
         position=particles.x - origin[:, None],
         velocity=(2.0 * torch.where(speaks[..., None], particles.v, 0.0)).clamp(-obs.CLIP, obs.CLIP),
         seen=seen,
         silent=silent,
         row=row,
         column=column,
-        background=_background(spec, origin, row, column),
+        background=background,
     )
-    if model.pixels:
-        return obs.quantise(obs.pixel_means(sight))
-    return obs.quantise(obs.splat_means(sight, model.per_particle(model.shares, origin)))
 
 
 def _background(spec: TaskSpec, origin: Tensor, row: Tensor, column: Tensor) -> obs.Background | None:

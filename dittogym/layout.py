@@ -142,7 +142,8 @@ class Layouts:
             return self._positions
         if self._positions is not None:
             positions = choose(torch.as_tensor(mask, device=like.device), positions, self._positions)
-        self._samplers, self._positions = samplers, positions
+        # Gradients in given positions reach back to this reset only, not to the one that uses them next.
+        self._samplers, self._positions = samplers, positions.detach()
         return positions
 
     def _given(self, given: Any, like: Tensor) -> Tensor:

@@ -166,14 +166,19 @@ def splat_means(sight: Sight, shares: Tensor) -> Tensor:
     sums = sums.view(-1, batch, width, width)[..., FRAME:-FRAME, FRAME:-FRAME]
     expected, heard = sums[0], sums[0 if silent is None else 3]
     free = 1.0 if drawn is None else 1.0 - drawn.share
-    hit = 1.0 - torch.exp(-heard / SATURATION)
+    hit = -torch.expm1(-heard / SATURATION)
     per_particle = torch.where(heard > 0, hit / torch.where(heard > 0, heard, 1.0), 0.0)
     occupancy = 1.0 - free * torch.exp(-expected / SATURATION)
     return torch.stack((occupancy, sums[1] * per_particle, sums[2] * per_particle), dim=1)
 
 
-def quantise(means: Tensor) -> Tensor:
-    """Code block means (B, 3, 64, 64) as uint8: occupancy 0..255, zero velocity at 132, truncated."""
+def coded(means: Tensor) -> Tensor:
+    """Bring block means (B, 3, 64, 64) to the units of the image: occupancy 0 to 255, zero velocity at 132."""
     occupancy = 255.0 * means[:, :1]
     velocity = 10.0 * (255.0 * (means[:, 1:] + CLIP) / (2 * CLIP) - 127.0) + 127.0
-    return torch.cat((occupancy, velocity), dim=1).clamp(0.0, 255.0).to(torch.uint8)
+    return torch.cat((occupancy, velocity), dim=1).clamp(0.0, 255.0)
+
+
+def quantise(means: Tensor) -> Tensor:
+    """Block means (B, 3, 64, 64) as the uint8 image: :func:`coded`, truncated."""
+    return coded(means).to(torch.uint8)

@@ -16,6 +16,7 @@ from dittogym.layout import Layouts, Particles, particle_counts
 from dittogym.physics import Physics, merged, physics_values
 from dittogym.render import frame
 from dittogym.reward import measure
+from dittogym.soft import soft_observation
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
 from torchmpm import ParticleState
@@ -284,6 +285,14 @@ class TorchEnv:
         reward = torch.stack(tuple(outcome.terms.values())).sum(0)
         assert outcome.terminated is not None
         return observation, reward, outcome.terminated, state.steps >= self.spec.horizon, info
+
+    def soft_observation(self) -> Tensor:
+        """The present image as a smooth function of the state, see :func:`dittogym.soft.soft_observation`.
+
+        Returns:
+            (B, 3, 64, 64) in the units of the uint8 observation, with the autograd graph of the state.
+        """
+        return soft_observation(self.model, self.env_state)
 
     def render(self, index: int = 0, *, muscles: bool = False, size: int = 512) -> np.ndarray:
         """Picture of one simulation, (size, size, 3) uint8 RGB.

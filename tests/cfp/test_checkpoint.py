@@ -5,10 +5,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
 from cfp.algorithm import CFP
-from cfp.checkpoint import Checkpoint, Position, model_state
+from cfp.checkpoint import Checkpoint, model_state
 from cfp.config import Config
 from cfp.errors import CheckpointError
 from cfp.policy import CFPPolicy
+from cfp.state_file import Position
 from cfp.vec_env import monitored
 
 CONFIG = Config(resolutions=(4, 8), gate_bias=(-1.0,))
@@ -86,7 +87,7 @@ def test_checkpoint_survives_a_crash_while_the_next_is_written(tmp_path, monkeyp
         file.write(b"half a state")
         raise OSError("No space left on device")
 
-    monkeypatch.setattr("cfp.checkpoint.torch.save", crash)
+    monkeypatch.setattr("cfp.state_file.torch.save", crash)
     with pytest.raises(OSError, match="No space"):
         checkpoint.save(model, CONFIG, Position(1))
     monkeypatch.undo()

@@ -3,11 +3,12 @@ from dataclasses import replace
 
 import pytest
 
-from cfp.checkpoint import check_same
+from cfp.command import parse
 from cfp.config import Config, merge, to_json
 from cfp.errors import ConfigError
 from cfp.presets import TASKS, from_json, preset
-from cfp.train import parse
+from cfp.state_file import check_same
+from cfp.train import PROGRAM
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -111,30 +112,32 @@ def test_json_values_take_the_types_of_their_fields():
 def test_command_line_beats_file_beats_preset(tmp_path):
     file = tmp_path / "options.json"
     file.write_text(json.dumps({"task": "run", "learning": {"gamma": 0.5, "tau": 0.25}, "report": {"video": True}}))
-    command = parse(["--config", str(file), "--gamma", "0.75", "--no-video", "--particles", "300", "--out", "x"])
+    command = parse(
+        PROGRAM, ["--config", str(file), "--gamma", "0.75", "--no-video", "--particles", "300", "--out", "x"]
+    )
     assert command.run.task == "run"
     assert (command.run.learning.gamma, command.run.learning.tau) == (0.75, 0.25)
     assert command.run.report.video is False
     assert command.run.environment.particles == 300
     assert command.run.learning.batch_size == preset("run").learning.batch_size
-    assert parse(["--video"]).run.report.video is True
-    assert parse(["--particles", "full"]).run.environment.particles == "full"
-    assert parse(["--particles", "500", "20"]).run.environment.particles == (500, 20)
+    assert parse(PROGRAM, ["--video"]).run.report.video is True
+    assert parse(PROGRAM, ["--particles", "full"]).run.environment.particles == "full"
+    assert parse(PROGRAM, ["--particles", "500", "20"]).run.environment.particles == (500, 20)
 
 
 def test_fewer_steps_shorten_every_level():
     config = preset("run")
-    half = parse(["--task", "run", "--steps", str(config.steps // 2)]).run
+    half = parse(PROGRAM, ["--task", "run", "--steps", str(config.steps // 2)]).run
     assert half.handover == (config.handover[0] // 2,)
-    explicit = parse(["--task", "run", "--steps", "1000", "--handover", "900"]).run
+    explicit = parse(PROGRAM, ["--task", "run", "--steps", "1000", "--handover", "900"]).run
     assert explicit.handover == (900,)
 
 
 def test_ladder_of_any_length_can_be_asked_for():
     arguments = "--resolutions 4 8 16 --handover 1000 2000 --alpha 0 0 0 --random-steps 9 9 9"
-    command = parse([*arguments.split(), "--gate-bias", "-1", "-2", "--gate-penalty", "0", "0.5"])
+    command = parse(PROGRAM, [*arguments.split(), "--gate-bias", "-1", "-2", "--gate-penalty", "0", "0.5"])
     assert command.run.actor_spec(2).gate_bias == (-1.0, -2.0)
-    one = parse("--resolutions 16 --handover --alpha 0 --random-steps 9 --gate-bias --gate-penalty".split())
+    one = parse(PROGRAM, "--resolutions 16 --handover --alpha 0 --random-steps 9 --gate-bias --gate-penalty".split())
     assert one.run.stage(0).steps == one.run.steps
 
 

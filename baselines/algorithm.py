@@ -1,0 +1,167 @@
+"""What an algorithm must offer to be trained, resumed, evaluated and compared like any other."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from typing_extensions import Self
+
+from cfp.books import Books
+from cfp.config import RunConfig
+from cfp.evaluation import Policy
+from cfp.process import StopSignals
+from cfp.run import Run
+from cfp.weights import origin
+
+Sees = Literal["image", "state", "simulator"]
+"""What a policy may look at: the observation; anything the simulation knows; the simulator itself, to plan with."""
+
+Callback = Callable[[Mapping[str, float | None]], None]
+"""Called by `Algorithm.learn` between two updates, with scalars to log by name; raises to stop the training."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An algorithm in the registry.
+
+    Attributes:
+        sees: What its policies look at, and what its training may use.
+        preset: From task and preset to options.
+        open: Opens a run: options, folder, whether to resume, stop signals.
+        load: Loads a policy file onto a device.
+    """
+
+    sees: Sees
+    preset: Callable[[str, str], RunConfig]
+    open: Callable[[RunConfig, Path, bool, StopSignals], Run]
+    load: Callable[[Path, str], Policy]
+
+
+class Algorithm(ABC):
+    """Trains a policy through one stage of a run; method names are those of stable-baselines3.
+
+    Args:
+        config: The run's options.
+        level: Index of the stage.
+        start: Policy of the stage before, None in the first.
+
+    Attributes:
+        num_timesteps: Environment steps taken in this stage.
+    """
+
+    name: ClassVar[str]
+    sees: ClassVar[Sees] = "image"
+    num_timesteps: int = 0
+
+    @abstractmethod
+    def __init__(self, config: Any, level: int = 0, start: Any = None) -> None: ...
+
+    @staticmethod
+    @abstractmethod
+    def preset(task: str, name: str) -> RunConfig:
+        """Defaults of a task.
+
+        Raises:
+            ConfigError: No such task or preset.
+        """
+
+    @abstractmethod
+    def learn(self, total_timesteps: int, callback: Callback) -> Self:
+        """Take some more environment steps and learn from them; call back between updates."""
+
+    @abstractmethod
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Actions (B, 2, R, R) for observations (B, 3, 64, 64), and the policy's memory for the next step."""
+
+    @abstractmethod
+    def save(self, path: Path, description: dict[str, Any]) -> None:
+        """Write the policy, see `cfp.weights.write_policy`."""
+
+    @classmethod
+    @abstractmethod
+    def load(cls, path: Path, device: str = "cpu") -> Policy:
+        """Load a policy that `save` wrote."""
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """All that learning needs to go on, as tensors and plain values."""
+
+    @abstractmethod
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Undo `state_dict` in an algorithm made with the same options."""
+
+    @classmethod
+    def entry(cls) -> Entry:
+        """For the registry."""
+        return Entry(cls.sees, cls.preset, partial(AlgorithmRun, cls), cls.load)
+
+
+class AlgorithmRun(Run):
+    """Trains an `Algorithm` in its folder, see `cfp.run.Run`.
+
+    Args:
+        kind: Class of the algorithm.
+        config: The run's options.
+        folder: Its folder.
+        resume: Go on from the folder's checkpoint.
+        signals: Whether the user wants to stop.
+    """
+
+    def __init__(
+        self, kind: type[Algorithm], config: RunConfig, folder: Path, resume: bool, signals: StopSignals
+    ) -> None:
+        super().__init__(config, folder, resume, signals)
+        self.kind = kind
+
+    def make_model(self, level: int) -> Algorithm:
+        """The algorithm at the beginning of a stage."""
+        start = self.load(self.folder / f"stage{level}.safetensors") if level else None
+        return self.kind(self.config, level, start)
+
+    def restore(self, model: Algorithm, state: dict[str, Any]) -> None:
+        """Put the state of a checkpoint into an algorithm that has just been made."""
+        try:
+            model.load_state_dict(state["model"])
+        except (KeyError, RuntimeError, ValueError, TypeError) as error:
+            raise self.checkpoint.misfit(error) from error
+        model.num_timesteps = state["model"]["num_timesteps"]
+
+    def save(self, model: Algorithm) -> None:
+        """Write a checkpoint of the algorithm."""
+        state = {**model.state_dict(), "num_timesteps": model.num_timesteps}
+        self.checkpoint.write(self.config, self.position, {"model": state})
+
+    def keep(self, model: Algorithm, level: int, step: int) -> None:
+        """Write the policy as ``policy.safetensors``."""
+        model.save(self.folder / "policy.safetensors", origin(self.config, self.kind.name, level, step))
+
+    def learn(self, model: Algorithm, steps: int, books: Books) -> None:
+        """Train for some more steps, with the books kept between updates."""
+        offset, last, latest = self.position.offset, model.num_timesteps, {}
+
+        def turn(scalars: Mapping[str, float | None]) -> None:
+            nonlocal last, latest
+            latest = dict(scalars)
+            books.advance(model.num_timesteps - last)
+            last = model.num_timesteps
+            books.turn(offset + last, lambda: latest)
+
+        books.open(offset + last)
+        model.learn(steps, turn)
+        books.close(offset + last, lambda: latest)
+
+    def load(self, path: Path) -> Policy:
+        """Load a policy of the run."""
+        return self.kind.load(path)

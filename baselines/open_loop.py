@@ -1,0 +1,76 @@
+"""A policy that does not look: the same sequence of actions in every episode."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from cfp.weights import fitting, read_policy, write_policy
+
+
+class OpenLoop:
+    """Plays a sequence of actions from the beginning of an episode; afterwards muscles are slack.
+
+    Args:
+        actions: (T, 2, R, R), in [-1, 1].
+        description: What it is and comes from.
+    """
+
+    deterministic_by_default = True
+
+    def __init__(self, actions: Tensor, description: dict[str, Any] | None = None) -> None:
+        if actions.ndim != 4 or actions.shape[1] != 2 or actions.shape[2] != actions.shape[3]:
+            raise ValueError(f"actions: got shape {tuple(actions.shape)}, allowed (T, 2, R, R)")
+        self.actions = actions.detach().float().cpu()
+        self.description = description or {}
+
+    @property
+    def resolution(self) -> int:
+        """Action grid R."""
+        return self.actions.shape[-1]
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Actions for the next step, as stable-baselines3's ``predict`` of a policy with memory.
+
+        Args:
+            observation: (B, 3, 64, 64) or (3, 64, 64); only the number of images matters.
+            state: What the last call returned, None at the beginning: the number of the step, (B,).
+            episode_start: (B,) bool, which elements begin anew.
+            deterministic: Changes nothing.
+
+        Returns:
+            Actions (B, 2, R, R), or (2, R, R) for one image, and the memory for the next step.
+        """
+        single = isinstance(observation, np.ndarray) and observation.ndim == 3
+        count = 1 if single else len(observation)
+        step = np.zeros(count, np.int64) if state is None else state[0]
+        if episode_start is not None:
+            step = np.where(episode_start, 0, step)
+        actions = np.zeros((count, *self.actions.shape[1:]), np.float32)
+        playing = step < len(self.actions)
+        actions[playing] = self.actions.numpy()[step[playing]]
+        return actions[0] if single else actions, (step + 1,)
+
+    def save(self, path: Path) -> None:
+        """Write ``path`` (``.safetensors``) and the ``.json`` beside it."""
+        write_policy(path, {"actions": self.actions}, self.description)
+
+    @classmethod
+    def load(cls, path: Path) -> OpenLoop:
+        """Load what `save` wrote.
+
+        Raises:
+            CheckpointError: No such file, a damaged one, or one that is not such a policy.
+        """
+        tensors, description = read_policy(path)
+        with fitting(path):
+            return cls(tensors["actions"], description)

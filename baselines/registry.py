@@ -1,0 +1,67 @@
+"""All algorithms by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cfp
+from baselines.algorithm import Entry
+from baselines.gradient import Gradient
+from cfp.config import RunConfig, merge
+from cfp.errors import ConfigError
+from cfp.evaluation import Policy
+from cfp.process import StopSignals
+from cfp.run import Run
+from cfp.runner import Runner
+from cfp.weights import read_policy
+
+ALGORITHMS: dict[str, Entry] = {
+    "cfp": Entry("image", cfp.preset, Runner, cfp.load),
+    "gradient": Gradient.entry(),
+}
+
+
+def find(name: str) -> Entry:
+    """An algorithm.
+
+    Raises:
+        ConfigError: There is none of that name.
+    """
+    if name not in ALGORITHMS:
+        raise ConfigError(f"algo: got {name!r}, allowed {', '.join(ALGORITHMS)}")
+    return ALGORITHMS[name]
+
+
+def configure(values: dict[str, Any]) -> RunConfig:
+    """Options from JSON values; what they leave out comes from the preset they name.
+
+    Raises:
+        ConfigError: An unknown name or a value of the wrong type.
+    """
+    entry = find(values.get("algo", "cfp"))
+    config: RunConfig = merge(entry.preset(values.get("task", "shapematch"), values.get("preset", "quick")), values)
+    return config
+
+
+def open_run(config: RunConfig, folder: Path, resume: bool, signals: StopSignals) -> Run:
+    """Open a run of any algorithm, see `cfp.run.Run`."""
+    return find(config.algo).open(config, folder, resume, signals)
+
+
+def load(path: str | Path, device: str = "cpu") -> Policy:
+    """Load a trained policy of any algorithm; nothing is unpickled.
+
+    Args:
+        path: A run folder, a ``.safetensors`` file, or the ``.json`` beside one.
+        device: Where its tensors go.
+
+    Returns:
+        A policy with stable-baselines3's ``predict``. Some remember: hand the second result back as ``state``. Its
+        ``description`` tells task and origin.
+
+    Raises:
+        CheckpointError: No such file, a damaged one, or one that is not such a policy.
+        ConfigError: It is of an algorithm that is not known here.
+    """
+    return find(read_policy(path)[1]["kind"]).load(Path(path), device)

@@ -1,0 +1,26 @@
+"""``python -m baselines.train --algo NAME``: train any algorithm, watch it, stop it, resume it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from baselines.registry import ALGORITHMS, configure, load, open_run
+from cfp import command
+
+PROGRAM = command.Program(
+    "baselines",
+    f"Train an algorithm (--algo {'|'.join(ALGORITHMS)}) on a DittoGym task; name it to see its options here.",
+    configure,
+    open_run,
+    load,
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line entry; returns the exit code."""
+    return command.main(PROGRAM, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,146 @@
+"""The command line that trains: options from preset, file and command line, stop signals, errors, exit codes."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from cfp.config import RunConfig
+from cfp.errors import CFPError, ConfigError, NonFiniteError
+from cfp.evaluation import Policy
+from cfp.process import Stopped, StopSignals, keep_memory
+from cfp.run import Run, holds_run, read_config
+
+
+@dataclass(frozen=True)
+class Program:
+    """What the command lines of a package are made of.
+
+    Attributes:
+        package: ``python -m PACKAGE.train``.
+        about: First words of the help.
+        configure: From JSON values to options; what the values leave out comes from the preset they name.
+        run: Opens a run: options, folder, whether to resume, stop signals.
+        load: Loads a policy file.
+    """
+
+    package: str
+    about: str
+    configure: Callable[[dict[str, Any]], RunConfig]
+    run: Callable[[RunConfig, Path, bool, StopSignals], Run]
+    load: Callable[[Path], Policy]
+
+
+@dataclass(frozen=True)
+class Command:
+    """Defaults come from the preset of the task; a --config file goes over them, the command line over both.
+
+    Ctrl-C writes a checkpoint and stops; --resume goes on.
+    """
+
+    run: RunConfig = field(default_factory=RunConfig)
+    out: Path | None = None
+    """Folder of the run; in runs/, named by algorithm, task, preset and seed, if not given."""
+    resume: bool = False
+    """Go on with the run in the folder; an empty or missing folder starts afresh."""
+    config: Path | None = None
+    """JSON file with options, in the form of a run's config.json; it may hold only some of them."""
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """What must be known before the defaults are: the same options, read first."""
+
+    algo: str | None = None
+    task: str | None = None
+    preset: str | None = None
+    seed: int | None = None
+    out: Path | None = None
+    resume: bool = False
+    config: Path | None = None
+
+
+def parse(program: Program, arguments: Sequence[str]) -> Command:
+    """Read a command line.
+
+    Raises:
+        ConfigError: An option is wrong.
+        SystemExit: ``--help``, or an option that does not exist or cannot be read (exit code 2).
+    """
+    choice, _ = tyro.cli(_Choice, args=list(arguments), return_unknown_args=True, add_help=False, console_outputs=False)
+    fresh, base = True, program.configure(_values(choice))
+    folder = choice.out or _default_folder(base if choice.seed is None else replace(base, seed=choice.seed))
+    if choice.resume and (folder / "config.json").exists():
+        fresh, base = False, read_config(folder, program.configure)
+    command: Command = tyro.cli(
+        Command,
+        prog=f"python -m {program.package}.train",
+        description=f"{program.about}\n\n{inspect.getdoc(Command)}",
+        args=list(arguments),
+        default=Command(base),
+        config=(tyro.conf.OmitArgPrefixes,),
+    )
+    run = command.run.adapted(base) if fresh else command.run
+    run.check()
+    return replace(command, run=run, out=command.out or _default_folder(run))
+
+
+def _values(choice: _Choice) -> dict[str, Any]:
+    """What a file and the choice on the command line say about the defaults."""
+    values: dict[str, Any] = {}
+    if choice.config is not None:
+        try:
+            values = json.loads(choice.config.read_text())
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"config: {choice.config} cannot be read as JSON ({error})") from error
+        if not isinstance(values, dict):
+            raise ConfigError(f"config: {choice.config} holds {type(values).__name__}, allowed an object of options")
+    chosen = {"algo": choice.algo, "task": choice.task, "preset": choice.preset}
+    return values | {name: value for name, value in chosen.items() if value is not None}
+
+
+def _default_folder(config: RunConfig) -> Path:
+    return Path("runs") / config.name
+
+
+def main(program: Program, arguments: Sequence[str] | None = None) -> int:
+    """Do what a command line says; returns the exit code."""
+    try:
+        command = parse(program, sys.argv[1:] if arguments is None else arguments)
+        assert command.out is not None
+        folder = command.out
+        if folder.exists() and not folder.is_dir():
+            raise ConfigError(f"out: {folder} is a file, allowed is a folder")
+        if command.resume and not holds_run(folder):
+            print(f"{folder} holds no run yet: starting afresh")
+        config = command.run
+        print(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed} -> {folder}")
+        keep_memory()
+        _train(program, config, folder, command.resume)
+    except Stopped as stopped:
+        print(f"{stopped}; go on with: python -m {program.package}.train --resume --out {folder}")
+        return 128 + stopped.number
+    except CFPError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1 if isinstance(error, NonFiniteError) else 2
+    except OSError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _train(program: Program, config: RunConfig, folder: Path, resume: bool) -> None:
+    """Train, evaluate, draw and film."""
+    with StopSignals() as signals:
+        run = program.run(config, folder, resume, signals)
+        if config.environment.backend == "compile":
+            print("compiling the physics; the first time on a machine this takes half a minute ...")
+        run.train()
+    run.finish()

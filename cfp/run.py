@@ -1,0 +1,210 @@
+"""A whole training run of any algorithm: stage after stage, all it leaves in its folder, going on after a stop."""
+
+from __future__ import annotations
+
+import json
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.type_aliases import PolicyPredictor
+
+from cfp.books import Books
+from cfp.config import RunConfig, to_json
+from cfp.environments import choose_device, make_env
+from cfp.errors import CheckpointError, ConfigError
+from cfp.evaluation import Policy, Result, compare, evaluate, format_table, to_rows
+from cfp.files import EventFile, ProgressTable, Table, copy_atomically, read_table, write_json
+from cfp.plot import plot_curve
+from cfp.process import StopSignals
+from cfp.state_file import Position, StateFile, check_same
+from cfp.video import VideoUnavailable, film, write_video
+from cfp.weights import read_policy
+
+MARKS = ("config.json", "checkpoint", "progress.csv", "evaluations.csv", "policy.safetensors")
+"""Any of these in a folder means that it holds a run."""
+
+
+def holds_run(folder: Path) -> bool:
+    """Whether a folder holds a run, whole or begun."""
+    return any((folder / name).exists() for name in MARKS)
+
+
+def read_config(folder: Path, configure: Callable[[dict[str, Any]], RunConfig]) -> RunConfig:
+    """Options of the run in a folder.
+
+    Args:
+        folder: Of the run.
+        configure: From JSON values to options.
+
+    Raises:
+        CheckpointError: There is no run, or its ``config.json`` cannot be read.
+    """
+    path = folder / "config.json"
+    try:
+        config = configure(json.loads(path.read_text()))
+        config.check()
+        return config
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{folder}: there is no run (no config.json)") from error
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path}: cannot be read ({error})") from error
+
+
+def stage_files(folder: Path, stages: int) -> dict[str, Path]:
+    """Policies of a run so far by name: finished stages, then the one in training or trained last."""
+    done = {f"stage {stage}": folder / f"stage{stage}.safetensors" for stage in range(1, stages)}
+    files = {name: path for name, path in done.items() if path.exists()}
+    newest = folder / "policy.safetensors"
+    if newest.exists():
+        files[f"stage {read_policy(newest)[1]['stage']}"] = newest
+    return files
+
+
+class Run(ABC):
+    """Trains all stages of a run in its folder.
+
+    ``policy.safetensors`` is the policy with the best evaluation of its stage so far (without evaluations: the newest);
+    it is what the next stage starts from and what the final table judges, on layouts of its own.
+
+    What is called a model here has stable-baselines3's ``predict`` and counts the steps of its stage in
+    ``num_timesteps``.
+
+    Args:
+        config: The run's options.
+        folder: Its folder.
+        resume: Go on from the folder's checkpoint; without one, start from the beginning.
+        signals: Whether the user wants to stop.
+
+    Raises:
+        ConfigError: The folder already holds a run and ``resume`` is not set (nothing in it is touched), or the options
+            do not fit its checkpoint.
+        CheckpointError: The checkpoint is damaged.
+    """
+
+    checkpoint_type: type[StateFile] = StateFile
+
+    def __init__(self, config: RunConfig, folder: Path, resume: bool, signals: StopSignals) -> None:
+        config.check()
+        choose_device(config.device)
+        for level in range(len(config.ends())):
+            make_env(config, config.resolution(level), 1)  # refuses bad options before anything is written
+        self.config, self.folder, self.signals = config, folder, signals
+        if holds_run(folder) and not resume:
+            raise ConfigError(f"out: {folder} already holds a run, allowed with --resume; or name another folder")
+        self.checkpoint = self.checkpoint_type(folder / "checkpoint")
+        self.state: dict[str, Any] | None = None
+        self.position = Position()
+        step = 0
+        if resume and self.checkpoint.exists():
+            self.state = self.checkpoint.load()
+            check_same(json.loads(self.state["config"]), config)
+            self.position = Position(self.state["level"], self.state["offset"])
+            step = self.position.offset + self.state["model"]["num_timesteps"]
+            print(f"resuming {folder} at step {step} of {config.ends()[-1]} (stage {self.position.level + 1})")
+        elif resume:
+            print(f"{folder} holds no checkpoint: starting from the beginning")
+        write_json(folder / "config.json", to_json(config))
+        self.evaluations = Table(folder / "evaluations.csv", step)
+        progress = ProgressTable(Table(folder / "progress.csv", step))
+        self.logger = Logger(str(folder), [progress, EventFile(folder / "tensorboard", step)])
+
+    @abstractmethod
+    def make_model(self, level: int) -> Any:
+        """The model of a stage as it begins; the policy of the one before is in the folder."""
+
+    @abstractmethod
+    def restore(self, model: Any, state: dict[str, Any]) -> None:
+        """Put the state of a checkpoint into a model that has just been made."""
+
+    @abstractmethod
+    def save(self, model: Any) -> None:
+        """Write a checkpoint of the model at `position`."""
+
+    @abstractmethod
+    def keep(self, model: Any, level: int, step: int) -> None:
+        """Write the model's policy of a step of the run as ``policy.safetensors``."""
+
+    @abstractmethod
+    def learn(self, model: Any, steps: int, books: Books) -> None:
+        """Train the model for some more steps and keep the books."""
+
+    @abstractmethod
+    def load(self, path: Path) -> Policy:
+        """Load a policy that `keep` wrote."""
+
+    def train(self) -> None:
+        """Train the stages that are left."""
+        ends = self.config.ends()
+        for level in range(self.position.level, len(ends)):
+            model = self.make_model(level)
+            if self.state is not None:
+                self.restore(model, self.state)
+                self.state = None
+            left = ends[level] - self.position.offset - model.num_timesteps
+            if left > 0:
+                self.learn(model, left, self._books(level, model))
+            if level + 1 < len(ends):
+                copy_policy(self.folder / "policy.safetensors", self.folder / f"stage{level + 1}.safetensors")
+                self.position = Position(level + 1, self.position.offset + model.num_timesteps)
+        self.logger.close()
+
+    def _books(self, level: int, model: PolicyPredictor) -> Books:
+        config = self.config
+        episodes = config.report.eval_episodes
+        env = make_env(config, config.resolution(level), episodes)
+        rows = read_table(self.folder / "evaluations.csv")
+        best = max((float(row["mean"]) for row in rows if int(row["stage"]) == level + 1), default=-math.inf)
+
+        def measure(step: int) -> Result:
+            nonlocal best
+            deterministic, seed = config.report.eval_deterministic, config.evaluation_seed(level)
+            result = evaluate("", model, env, episodes, deterministic=deterministic, seed=seed)
+            row: dict[str, Any] = {"step": step, "stage": level + 1, "episodes": episodes}
+            row |= {"mean": result.mean, "std": result.std}
+            row |= {"lowest": min(result.returns), "highest": max(result.returns), "success": result.success}
+            if result.mean > best:  # before the row: a crash between the two repeats the evaluation
+                best = result.mean
+                self.keep(model, level, step)
+            self.evaluations.add(row)
+            return result
+
+        def save(step: int) -> None:
+            if best == -math.inf:  # not evaluated yet, or never
+                self.keep(model, level, step)
+            self.save(model)
+
+        # A stage begins with what the one before has reached: it must do better than that.
+        first = level > 0 and config.report.eval_every > 0 and best == -math.inf
+        return Books(level, config.ends()[-1], config.report, self.signals, self.logger, measure, save, first)
+
+    def finish(self) -> list[Result]:
+        """After training: the final table, ``results.json``, the curve and the video. Returns the table's rows."""
+        policies = {name: self.load(path) for name, path in stage_files(self.folder, len(self.config.ends())).items()}
+        results = compare(self.config, policies, self.config.report.eval_episodes)
+        write_json(self.folder / "results.json", to_rows(results))
+        untrained = {result.name: result.mean for result in results[:2]}
+        print(f"learning curve: {plot_curve(self.folder, self.config, untrained)}")
+        if self.config.report.video:
+            make_video(self.config, list(policies.values())[-1], self.folder / "video.mp4")
+        print(format_table(self.config, results))
+        return results
+
+
+def copy_policy(source: Path, target: Path) -> None:
+    """Copy a ``.safetensors`` file and the ``.json`` beside it."""
+    for suffix in (".safetensors", ".json"):
+        copy_atomically(source.with_suffix(suffix), target.with_suffix(suffix))
+
+
+def make_video(config: RunConfig, policy: Policy, path: Path) -> None:
+    """Film one episode of a policy; without the optional packages, say how to get them and go on."""
+    try:
+        write_video(path, film(config, policy))
+    except VideoUnavailable as error:
+        print(error)
+    else:
+        print(f"video: {path}")

@@ -1,0 +1,105 @@
+"""The command lines with every algorithm, on a robot of a hundred particles that moves one substep at a time."""
+
+import json
+import signal
+
+import numpy as np
+import pytest
+
+import baselines
+import cfp.evaluate
+from baselines import evaluate, train
+from cfp.books import Books
+from cfp.files import read_table
+
+COMMON = "--particles 100 --substeps 1 --eval-episodes 2 --no-video --device cpu".split()
+# A tiny run of each algorithm: options, a step at which it is stopped, its policies.
+TINY = {
+    "cfp": (
+        "--num-envs 2 --resolutions 4 8 --steps 60 --handover 30 --random-steps 10 4 --batch-size 4 --buffer-size 60 "
+        "--update-start 8 --gradient-steps 1 --eval-every 20 --checkpoint-every 10 --log-every 10 --backend eager",
+        44,
+        ["stage 1", "stage 2"],
+    ),
+    "gradient": (
+        "--task kick --iterations 2 --grid 4 --tier 100 --window 5 --polish 2 --polish-grid 8 "
+        "--eval-every 500 --checkpoint-every 500 --log-every 500",
+        1500,
+        ["stage 1", "stage 2", "  own layout"],
+    ),
+}
+
+
+def run(algo, folder, *more):
+    return train.main([*COMMON, "--algo", algo, *TINY[algo][0].split(), "--out", str(folder), *more])
+
+
+def test_every_algorithm_is_tried_here():
+    assert set(TINY) == set(baselines.ALGORITHMS)
+
+
+@pytest.fixture(scope="module", params=TINY)
+def finished(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp(request.param) / "whole"
+    assert run(request.param, folder) == 0
+    return request.param, folder
+
+
+def test_run_leaves_its_files(finished):
+    algo, folder = finished
+    for name in ("results.json", "curve.png", "policy.safetensors", "policy.json", "stage1.json"):
+        assert (folder / name).stat().st_size > 0, name
+    assert json.loads((folder / "config.json").read_text())["algo"] == algo
+    assert json.loads((folder / "policy.json").read_text())["kind"] == algo
+    assert list((folder / "tensorboard").glob("events*"))
+    assert {row["stage"] for row in read_table(folder / "progress.csv")} == {"1", "2"}
+    assert {row["stage"] for row in read_table(folder / "evaluations.csv")} == {"1", "2"}
+    rows = json.loads((folder / "results.json").read_text())
+    assert [row["policy"] for row in rows] == ["zero action", "random action", *TINY[algo][2]]
+
+
+def test_policy_is_loaded_by_its_kind(finished):
+    _, folder = finished
+    images = np.zeros((3, 3, 64, 64), np.uint8)
+    policy = baselines.load(folder)
+    start = np.ones(3, bool)
+    actions, _ = policy.predict(images, None, start, True)
+    assert actions.shape == (3, 2, 8, 8) and policy.resolution == 8
+    assert policy.description["task"] == json.loads((folder / "config.json").read_text())["task"]
+
+
+def test_folder_is_evaluated_whatever_trained_it(finished, capsys):
+    algo, folder = finished
+    capsys.readouterr()
+    assert evaluate.main([str(folder), "--episodes", "2", "--json", "--device", "cpu"]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads((folder / "results.json").read_text())
+    assert cfp.evaluate.main([str(folder), "--episodes", "1", "--device", "cpu"]) == (0 if algo == "cfp" else 2)
+    if algo != "cfp":
+        assert "python -m baselines" in capsys.readouterr().err
+
+
+def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monkeypatch, capsys):
+    algo, whole = finished
+    folder, turn = tmp_path / "stopped", Books.turn
+
+    def interrupt(books, step, scalars):
+        if step == TINY[algo][1]:
+            signal.raise_signal(signal.SIGINT)
+        turn(books, step, scalars)
+
+    monkeypatch.setattr(Books, "turn", interrupt)
+    assert run(algo, folder) == 128 + signal.SIGINT
+    assert "python -m baselines.train --resume" in capsys.readouterr().out
+    monkeypatch.undo()
+    assert train.main(["--out", str(folder), "--resume"]) == 0
+    for name in ("results.json", "evaluations.csv"):
+        assert (folder / name).read_bytes() == (whole / name).read_bytes(), name
+    steps = [[row["step"] for row in read_table(place / "progress.csv")] for place in (folder, whole)]
+    assert steps[0] == steps[1]
+
+
+def test_wrong_algorithm_is_named(tmp_path, capsys):
+    assert train.main(["--algo", "alchemy", "--out", str(tmp_path / "a")]) == 2
+    assert "algo: got 'alchemy', allowed cfp, gradient" in capsys.readouterr().err
+    assert cfp.train.main(["--algo", "gradient", "--out", str(tmp_path / "a")]) == 2
+    assert "algo: got 'gradient', allowed 'cfp'" in capsys.readouterr().err

@@ -1,0 +1,165 @@
+"""The soft observation: its gradient, and how near it is to the image."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+from tiny import TASKS, actions, stir, tiny
+from torch import Tensor
+
+from dittogym import TorchEnv
+from dittogym import observation as obs
+from dittogym.dynamics import EnvState, observe
+from dittogym.geometry import Box
+from dittogym.reward import measure
+from dittogym.soft import ON_COUNT, ON_WIDTH, soft_observation, soft_share, soft_silhouette
+from dittogym.tasks.shapematch import silhouette
+from dittogym.window import window_origin
+from torchmpm import ParticleState
+
+
+def stirred(task: str, **options: object) -> TorchEnv:
+    """Two simulations in motion, a step after the start."""
+    env = tiny(task, 2, **options)
+    env.reset(seed=0)
+    stir(env)
+    with torch.no_grad():
+        env.step(actions(env, 1)[0])
+    return env
+
+
+def moment(env: TorchEnv, x: Tensor, v: Tensor) -> EnvState:
+    """The present moment with particles at ``x`` (B, N, 2), window and centre along with them."""
+    state = env.env_state
+    particles = ParticleState(x, v, state.particles.C, state.particles.F, state.particles.Jp)
+    com = measure(particles, env.model.robot).com
+    origin = window_origin(env.spec, com)
+    return replace(state, particles=particles, centre=com, origin=origin)
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("name", ["x", "v"])
+def test_gradient_against_central_differences(task: str, name: str) -> None:
+    """Of pixels and of the silhouette, while the crop follows the robot and obstacles pass by."""
+    env = stirred(task)
+    draw = torch.Generator().manual_seed(1)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=draw, dtype=torch.float64)
+
+    given = {"x": env.state.x.detach().clone(), "v": 0.3 * env.state.v.detach().clone()}
+    weights, others, direction = normal(2, 3, 64, 64), normal(2, 64, 64), normal(*given[name].shape)
+    direction = direction + 2.0  # also along with the window
+
+    def loss(value: Tensor) -> Tensor:
+        image = soft_observation(env.model, moment(env, **(given | {name: value})))
+        return (weights * image).sum() + 100.0 * (others * soft_silhouette(image)).sum()
+
+    leaf = given[name].requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(leaf), leaf)
+    step = 1e-8 if name == "x" else 1e-6
+    with torch.no_grad():
+        ahead, behind = (loss(leaf + side * step * direction) for side in (1, -1))
+    slope = (gradient * direction).sum().item()
+    assert slope == pytest.approx((ahead - behind).item() / (2 * step), rel=1e-5)
+    assert abs(slope) > 1.0
+
+
+@pytest.mark.parametrize("task", TASKS)
+@torch.no_grad()
+def test_is_the_image_at_the_lite_tier(task: str) -> None:
+    """But for truncation to integers, and half a fine pixel where crop or background move."""
+    env = stirred(task)
+    image, soft = env.save().observation.double(), env.soft_observation()
+    assert soft.shape == image.shape and soft.dtype == env.dtype
+    difference = (soft - image).abs()
+    assert difference.mean() < 0.45
+    assert soft.min() >= 0 and soft.max() <= 255
+
+
+@pytest.mark.parametrize("task", ["shapematch", "run"])
+@torch.no_grad()
+def test_silhouette_at_full_size(task: str) -> None:
+    """Nearer to the reference's raster of a random layout than that of another layout is."""
+    env = TorchEnv(task, 2)
+    env.reset(seed=0)
+    image = env.save().observation
+    on, soft = silhouette(image), soft_silhouette(env.soft_observation())
+    wrong = (on ^ (soft > 0.5)).sum((1, 2))
+    assert wrong.max() <= 26
+    if task == "shapematch":
+        assert wrong.max() < (on[0] ^ on[1]).sum()
+    assert (soft.sum((1, 2)) / on.sum((1, 2))).tolist() == pytest.approx([1.0, 1.0], abs=0.05)
+
+
+def test_silhouette_is_a_sigmoid_in_the_expected_count() -> None:
+    count = torch.tensor([0.0, 10.0, ON_COUNT, 30.0, 100.0, 1e6], dtype=torch.float64)
+    image = torch.zeros(1, 3, 1, 6, dtype=torch.float64)
+    image[0, 0, 0] = 255.0 * (1.0 - torch.exp(-count / obs.SATURATION))
+    image.requires_grad_()
+    result = soft_silhouette(image)
+    assert result[0, 0].tolist() == pytest.approx(torch.sigmoid((count - ON_COUNT) / ON_WIDTH).tolist(), rel=1e-9)
+    (gradient,) = torch.autograd.grad(result.sum(), image)
+    assert gradient.isfinite().all() and gradient[0, 0, 0, 2] > 0
+
+
+def test_crop_follows_without_steps() -> None:
+    """SHAPE MATCH's image does not change when the whole robot moves."""
+    env = stirred("shapematch")
+    x, v = env.state.x.detach(), env.state.v.detach()
+    here, there = (soft_observation(env.model, moment(env, x + shift, v)) for shift in (0.0, 0.00037))
+    assert torch.allclose(here, there, atol=1e-8)
+
+
+def test_background_moves_without_steps() -> None:
+    """A drawn box, as the window follows the robot: linear between edges of pixels, and near the true picture."""
+    env = stirred("obstacle")
+    x, v = env.state.x.detach(), env.state.v.detach()
+    values = []
+    for shift in (0.0, 0.0005, 0.001):
+        state = moment(env, x + torch.tensor([shift, 0.0]), v)
+        soft = soft_observation(env.model, state)[:, 0]
+        image = observe(env.model, state)[:, 0].double()
+        values.append(soft)
+        assert (soft - image).abs().max() <= 255 / 8 + 1
+    changed = [(b - a).abs().sum() for a, b in pairwise(values)]
+    assert all(change > 100 for change in changed)
+
+
+def test_soil_has_no_velocity_and_broken_particles_are_not_seen() -> None:
+    env = stirred("dig")
+    robot = env.model.robot
+    x, v = (t.detach().clone().requires_grad_() for t in (env.state.x, env.state.v))
+    with torch.no_grad():
+        x[0, 3], v[1, 5] = torch.nan, torch.inf
+    state = moment(env, x, v)
+    state = replace(state, centre=env.env_state.centre, origin=env.env_state.origin)
+    image = soft_observation(env.model, state)
+    of_x, of_v = torch.autograd.grad(image.square().sum(), (x, v))
+    assert image.isfinite().all() and of_x.isfinite().all() and of_v.isfinite().all()
+    assert (of_v[:, robot:] == 0).all() and of_v[:, :robot].abs().max() > 0
+    assert (of_x[0, 3] == 0).all() and (of_v[1, 5] == 0).all()
+
+
+def test_through_steps_of_the_environment() -> None:
+    """The method keeps the graph of actions, and of positions given to a reset, for this episode only."""
+    env = tiny("shapematch", 2)
+    env.reset(seed=0)
+    x = env.state.x.clone().requires_grad_()
+    env.reset(options={"positions": x})
+    action = torch.zeros(2, *env.action_shape, dtype=env.dtype, requires_grad=True)
+    env.step(action)
+    for gradient in torch.autograd.grad(env.soft_observation()[:, 0].square().sum(), (x, action)):
+        assert gradient.isfinite().all() and gradient.abs().max() > 0
+    env.reset()
+    assert not env.state.x.requires_grad
+
+
+def test_boxes_that_touch() -> None:
+    """In the same pixel, and at the upper end of the picture; their rule is by left and upper edges of fine pixels."""
+    zero, half = torch.zeros(1, 1, dtype=torch.float64), 0.5 / obs.RASTER
+    boxes = [Box(-half, 2.25 / 128), Box(2.25 / 128, 4 / 128 - half), Box(bottom=1.0 - 1 / 128 + half)]
+    share = soft_share(boxes, torch.zeros(1, 2, dtype=torch.float64), zero, zero)[0]
+    assert share[0].tolist() == pytest.approx([1.0] * 64)
+    assert share[1:].tolist() == [pytest.approx([1.0] * 4 + [0.0] * 60)] * 63
