@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from baselines.rollout import Reward, rewards, true_reward
+from cfp.errors import ConfigError
 from dittogym import TorchEnv
 from dittogym.action import Layout
 from dittogym.dynamics import EnvState, Model
@@ -29,10 +31,25 @@ class PlannerConfig:
     """Standard deviation of the actions with which a plan is extended."""
     clip: float = 3.0
     """Largest gradient of one control step, in medians over the steps of the plan."""
-    terminal: float = 0.0
-    """Additional weight on the reward of the last step, for what comes after the plan."""
+    terminal: float = 32.0
+    """Control steps after the plan that are counted with the mean reward of its second half, if it has not ended."""
     margin: float = 100.0
     """Cost of a spread beyond 85 % of the limit at which the robot counts as torn, per squared share of the limit."""
+
+    def check(self) -> None:
+        """Check what the types cannot.
+
+        Raises:
+            ConfigError: Naming the option, what was given and what is allowed.
+        """
+        if not 1 <= self.commit <= self.horizon:
+            raise ConfigError(f"commit: got {self.commit}, allowed 1 to the horizon, {self.horizon}")
+        for name in ("iterations", "learning_rate", "clip"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed more than 0")
+        for name in ("noise", "terminal", "margin"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed 0 or more")
 
 
 class Planner:
@@ -41,7 +58,7 @@ class Planner:
     The plan of a simulation is what it would do from its present state on; the gradient goes through the same
     simulator that the environment is, so the planner sees everything: state, matter, obstacles. Between plans, the part
     that was not carried out is kept and extended by noise. Of all plans met in the iterations, the one with the
-    highest true return is carried out.
+    highest true return is carried out; a plan that ends the episode forgoes what would come after it.
 
     Args:
         env: The environment; only read, after its reset.
@@ -55,7 +72,7 @@ class Planner:
         plans: Plans evaluated so far.
 
     Raises:
-        ValueError: An option is out of range.
+        ConfigError: An option is out of range.
     """
 
     def __init__(
@@ -68,14 +85,7 @@ class Planner:
         layout: Layout = "image",
     ) -> None:
         self.config = config = config or PlannerConfig()
-        if not 1 <= config.commit <= config.horizon:
-            raise ValueError(f"commit must be from 1 to the horizon, {config.horizon}, got {config.commit}")
-        for name in ("iterations", "learning_rate", "clip"):
-            if not getattr(config, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(config, name)}")
-        for name in ("noise", "terminal", "margin"):
-            if not getattr(config, name) >= 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(config, name)}")
+        config.check()
         self.env, self.reward, self.layout = env, reward, layout
         self.generator = torch.Generator().manual_seed(seed)
         self.failed = self.plans = 0
@@ -97,6 +107,20 @@ class Planner:
     def forget(self) -> None:
         """Drop the present plan, for a new episode."""
         self._ahead, self._position = self._fresh(self.config.horizon), self.config.commit
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that the next action depends on beside the environment."""
+        return {
+            "ahead": self._ahead.cpu(),
+            "counts": [self._position, self.failed, self.plans],
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Undo `state_dict` in a planner made with the same options."""
+        self._ahead = state["ahead"].to(self._ahead)
+        self._position, self.failed, self.plans = state["counts"]
+        self.generator.set_state(state["generator"])
 
     def plan(self) -> Tensor:
         """Make new plans from the environment's present state: actions (T, B, 2, R, R)."""
@@ -127,7 +151,7 @@ class Planner:
         return self._ahead
 
     def _judge(self, start: EnvState, plan: Tensor) -> tuple[Tensor, Tensor]:
-        """What is climbed, and the true return, of plans (T, B, 2, R, R): (B,) each."""
+        """What is climbed, and the true return with what comes after, of plans (T, B, 2, R, R): (B,) each."""
         config = self.config
 
         def both(model: Model, state: EnvState, field: Tensor) -> tuple[EnvState, Tensor, Tensor]:
@@ -142,7 +166,8 @@ class Planner:
 
         _, earned, _ = rewards(self.env.model, start, plan, both, layout=self.layout, checkpointed=False)
         weights = earned.new_ones(len(plan))
-        weights[-1] += config.terminal
+        late = weights[len(plan) // 2 :]
+        late += config.terminal / len(late)
         climbed, value = (weights[:, None, None] * earned).sum(0)
         return climbed, value
 

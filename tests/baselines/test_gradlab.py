@@ -24,7 +24,7 @@ def normal(*shape: int, seed: int = 0) -> torch.Tensor:
 class Known(Probe):
     """Rewards ``c_t . a_t + curvature / 2 |a_t|^2`` in place of a simulation."""
 
-    slope: torch.Tensor = torch.zeros(())
+    slope: torch.Tensor | None = None
     curvature: float = 0.0
 
     def to(self, dtype):

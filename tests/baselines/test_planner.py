@@ -1,0 +1,159 @@
+"""The gradient planner on tiny robots, and on rewards whose best plan is known."""
+
+import pytest
+import torch
+
+from baselines.planner import Planner, PlannerConfig, _clipped
+from baselines.rollout import true_reward
+from cfp.errors import ConfigError
+from dittogym import TorchEnv
+
+
+def small(task: str = "run", num_envs: int = 1, **options) -> TorchEnv:
+    env = TorchEnv(task, num_envs, **{"particles": 200, "substeps": 20, "resolution": 4, **options})
+    env.reset(seed=0)
+    return env
+
+
+def drive(env: TorchEnv, planner: Planner | None, steps: int) -> torch.Tensor:
+    total = torch.zeros(env.num_envs)
+    for _ in range(steps):
+        action = planner.act() if planner else torch.zeros(env.num_envs, *env.action_shape)
+        with torch.no_grad():
+            total += env.step(action)[1]
+    return total
+
+
+@pytest.mark.parametrize(("task", "more"), [("kick", 0.5), ("grow", 0.5)])
+def test_planned_episode_beats_rest(task: str, more: float) -> None:
+    env = small(task, substeps=60)
+    planned = drive(env, Planner(env, PlannerConfig(horizon=8, commit=4, iterations=4)), 12)
+    assert float(planned) > float(drive(small(task, substeps=60), None, 12)) + more
+
+
+def test_simulations_of_a_batch_are_planned_apart() -> None:
+    config = PlannerConfig(horizon=3, commit=2, iterations=2, noise=0.0)
+    pair = small("kick", 2)
+    together = Planner(pair, config)
+    drive(pair, together, 4)
+    for i in range(2):
+        alone = small("kick")
+        alone.reset(seed=i)
+        drive(alone, Planner(alone, config), 4)
+        assert torch.allclose(pair.state.x[i], alone.state.x[0], atol=1e-5)
+    assert not torch.allclose(pair.state.x[0], pair.state.x[1], atol=1e-4)
+    assert together.plans == 2 * 2 * 3 and together.failed == 0
+
+
+def test_planning_leaves_the_environment_alone_and_repeats_by_seed() -> None:
+    plans = []
+    for seed in (0, 0, 1):
+        env = small()
+        before = env.state
+        plans.append(Planner(env, PlannerConfig(horizon=3, commit=1, iterations=1), seed=seed).plan())
+        assert env.state is before
+    assert torch.equal(plans[0], plans[1]) and not torch.equal(plans[0], plans[2])
+    assert plans[0].abs().max() <= 1.0 and not plans[0].requires_grad
+
+
+def test_plan_goes_on_from_the_last() -> None:
+    config = PlannerConfig(horizon=4, commit=1, iterations=1, learning_rate=1e-9, noise=0.5)
+    env = small()
+    planner = Planner(env, config)
+    first = planner.plan()
+    planner.act()
+    second = planner.plan()
+    assert torch.allclose(second[:3], first[1:], atol=1e-6) and second[3].abs().max() > 0
+    planner.forget()
+    assert not torch.allclose(planner.plan()[:2], second[1:3], atol=1e-3)
+
+
+def test_state_of_a_planner_goes_on_the_same() -> None:
+    config = PlannerConfig(horizon=4, commit=3, iterations=1)
+    env = small()
+    planner = Planner(env, config)
+    planner.act()
+    state, moment = planner.state_dict(), env.save()
+    wanted = [planner.act() for _ in range(4)]
+    env.load(moment)
+    other = Planner(env, config, seed=7)
+    other.load_state_dict(state)
+    assert all(torch.equal(other.act(), action) for action in wanted)
+    assert (other.failed, other.plans) == (planner.failed, planner.plans)
+
+
+def test_action_layout_is_the_environments() -> None:
+    def upper_left(model, state, field):
+        state, _, ended = true_reward(model, state, field)
+        return state, field[:, :, :10, -10:].mean((1, 2, 3)), ended  # small x, large y
+
+    config = PlannerConfig(horizon=1, commit=1, iterations=1, noise=0.0, margin=0.0)
+    for layout, place in (("image", (0, 0)), ("grid", (0, 3))):
+        env = small(action_layout=layout)
+        planner = Planner(env, config, reward=upper_left, layout=layout)
+        planner._judge = _climbed_is_value(planner)
+        plan = planner.plan()[0, 0, 0]
+        assert (plan == plan.max()).nonzero().tolist() == [list(place)] or plan[place] == plan.max() > 0
+
+
+def _climbed_is_value(planner: Planner):
+    judge = Planner._judge
+
+    def both(start, plan):
+        climbed, _ = judge(planner, start, plan)
+        return climbed, climbed.detach()
+
+    return both
+
+
+def test_plans_that_are_not_finite_are_counted_and_not_carried_out(monkeypatch) -> None:
+    env = small("run", 2)
+    planner = Planner(env, PlannerConfig(horizon=2, commit=1, iterations=2, noise=0.0, learning_rate=0.01))
+    judge, calls = planner._judge, []
+
+    def breaks(start, plan):
+        climbed, value = judge(start, plan)
+        calls.append(plan.detach().clone())
+        spoilt = torch.tensor([0.0, torch.nan if len(calls) > 1 else 0.0])
+        return climbed + spoilt, value + spoilt
+
+    monkeypatch.setattr(planner, "_judge", breaks)
+    plan = planner.plan()
+    assert planner.failed == 2 and planner.plans == 6
+    assert torch.equal(plan[:, 1], calls[0][:, 1])  # the only one whose value was finite
+    assert torch.equal(calls[2][:, 1], calls[0][:, 1])  # the search went on from there
+    assert plan.isfinite().all() and not torch.equal(plan[:, 0], calls[0][:, 0])
+
+
+def test_spread_near_the_limit_costs() -> None:
+    env = small("run")
+    plan = torch.zeros(1, 1, *env.action_shape)
+    planner = Planner(env, PlannerConfig(horizon=1, commit=1, margin=300.0, terminal=0.0))
+    for stretch, spread in ((1.0, 0.067), (1.4, 0.094)):
+        env.state.x[:] = 0.3 + stretch * (env.state.x - env.state.x.mean(1))
+        with torch.no_grad():
+            climbed, value = planner._judge(env.env_state, plan)
+        assert float(value) > 0
+        assert float(value - climbed) == pytest.approx(300.0 * max(0.0, spread / 0.1 - 0.85) ** 2, rel=0.15)
+
+
+def test_clipping_limits_steps_to_medians() -> None:
+    gradient = torch.zeros(5, 2, 2, 1, 1)
+    gradient[:, 0, 0, 0, 0] = torch.tensor([1.0, 2.0, 3.0, 4.0, 100.0])
+    clipped = _clipped(gradient, 3.0)
+    assert clipped[:, 0, 0, 0, 0].tolist() == pytest.approx([1.0, 2.0, 3.0, 4.0, 9.0])
+    assert (clipped[:, 1] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"commit": 17}, "commit: got 17, allowed 1 to the horizon, 16"),
+        ({"iterations": 0}, "iterations: got 0, allowed more than 0"),
+        ({"noise": -0.1}, "noise: got -0.1, allowed 0 or more"),
+        ({"margin": float("nan")}, "margin: got nan"),
+    ],
+)
+def test_bad_options(options: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        Planner(small(), PlannerConfig(**options))
