@@ -206,7 +206,7 @@ class Gradient(Algorithm):
             _, reward, terminated, _, info = env.step(actions[step].expand(env.num_envs, -1, -1, -1))
             if not bool(info["finite"].all()):
                 return math.nan, math.nan, actions
-            part = part + (self.objective(env.env_state, reward, progress) * running).mean() / self.horizon
+            part = part + (self.objective(env, reward, progress) * running).mean() / self.horizon
             total += float((reward.detach() * running).mean())
             running = running & ~terminated
             ends = not bool(running.any())

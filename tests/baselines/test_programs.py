@@ -22,9 +22,9 @@ TINY = {
         ["stage 1", "stage 2"],
     ),
     "gradient": (
-        "--task kick --iterations 2 --grid 4 --tier 100 --window 5 --polish 2 --polish-grid 8 "
-        "--eval-every 500 --checkpoint-every 500 --log-every 500",
-        1500,
+        "--iterations 5 --grid 4 --tier 100 --polish 3 --polish-grid 8 "
+        "--eval-every 90 --checkpoint-every 30 --log-every 30",
+        180,
         ["stage 1", "stage 2", "  own layout"],
     ),
     "mpc": (
