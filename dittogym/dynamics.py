@@ -230,11 +230,20 @@ def _background(spec: TaskSpec, origin: Tensor, row: Tensor, column: Tensor) -> 
     return obs.draw_boxes(boxes, origin, row, column)
 
 
-def judge(model: Model, state: EnvState, field: Tensor, observation: Tensor) -> tuple[EnvState, Outcome]:
+def judge(
+    model: Model, state: EnvState, field: Tensor, observation: Tensor, *, soft: bool = False
+) -> tuple[EnvState, Outcome]:
     """Reward terms, termination and success after a transition.
 
     Elements whose state is not finite, or whose robot has left the window, end with the single term ``failure`` =
     :data:`dittogym.spec.FAILURE_REWARD`; their neighbours are not touched.
+
+    Args:
+        model: The task.
+        state: After the transition.
+        field: (B, 2, P, P) actuation on the patch, Pa.
+        observation: (B, 3, 64, 64) uint8, or the soft one.
+        soft: Smooth terms, from the soft observation; then only the terms of the outcome mean anything.
 
     Raises:
         ValueError: The task returns a term under a name of :data:`RESERVED`.
@@ -246,14 +255,14 @@ def judge(model: Model, state: EnvState, field: Tensor, observation: Tensor) -> 
     spec = model.spec
     weights = spec.weights
     now = measure(state.particles, model.robot)
-    own = spec.judge(_moment(model, state, now, observation), weights)
+    own = spec.judge(_moment(model, state, now, observation, soft), weights)
     finite = intact(model, state)
     terms = dict(own.terms)
     if taken := RESERVED & terms.keys():
         raise ValueError(f"judge of task {spec.name!r} must not return the engine's own terms, got {sorted(taken)}")
     terminated = torch.zeros_like(finite) if own.terminated is None else own.terminated
     if spec.split_limit is not None:
-        penalty, torn = split_penalty(now.split, spec.split_limit)
+        penalty, torn = split_penalty(now.split, spec.split_limit, soft=soft)
         terms["split"] = weights.split * penalty
         terminated = terminated | torn
     if weights.action:
@@ -277,5 +286,5 @@ def intact(model: Model, state: EnvState) -> Tensor:
     return diagnostics.finite(state.particles) & present.any(1)
 
 
-def _moment(model: Model, state: EnvState, now: Measurement, observation: Tensor) -> Moment:
-    return Moment(state.particles, model.robot, now, state.start, observation, state.memory)
+def _moment(model: Model, state: EnvState, now: Measurement, observation: Tensor, soft: bool = False) -> Moment:
+    return Moment(state.particles, model.robot, now, state.start, observation, state.memory, soft)

@@ -4,17 +4,70 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn.functional import softplus
 
 from dittogym.spec import Measurement
 from torchmpm import ParticleState
 
 #: The spread of a robot is not counted beyond this, m.
 SPLIT_CAP = 0.2
+#: Soft limits set in over this share of their value.
+SOFTNESS = 0.05
+#: The nearest particles fade out over this distance where the choice is soft, m.
+FADE = 0.005
 
 
 def signed_quadratic(z: Tensor, k: float) -> Tensor:
     """``sign(z) (2 z)^2 + k z``: linear for small, quadratic for large deviations."""
     return 4.0 * z * z.abs() + k * z
+
+
+def limited(z: Tensor, low: float | None = None, high: float | None = None, *, soft: bool = False) -> Tensor:
+    """Bring ``z`` into [low, high]; ``None`` leaves an end open.
+
+    Soft, a limit l sets in over the width w = |l| / 20: ``w ln(1 + exp((z - l) / w))`` is taken off. The result differs
+    by at most w ln 2, at the limit, where its slope is 1/2.
+    """
+    if not soft:
+        return z.clamp(low, high)
+    if high is not None:
+        width = SOFTNESS * abs(high)
+        z = z - width * softplus((z - high) / width)
+    if low is not None:
+        width = SOFTNESS * abs(low)
+        z = z + width * softplus((low - z) / width)
+    return z
+
+
+def beyond(z: Tensor, width: float, *, soft: bool = False) -> Tensor:
+    """1 where ``z`` is positive, else 0; soft, a sigmoid that reaches 0.98 and 0.02 at four times the ``width``."""
+    return torch.sigmoid(z / width) if soft else (z > 0).to(z.dtype)
+
+
+def mean_over_nearest(values: Tensor, x: Tensor, point: Tensor, share: float, *, soft: bool = False) -> Tensor:
+    """Mean of ``values`` over the particles that :func:`nearest` chooses.
+
+    Soft, particles fade out around the distance within which there are as many, over :data:`FADE`, and the choice is
+    differentiated too; the widest particle is not left out.
+
+    Args:
+        values: (B, N, K).
+        x: (B, N, 2) positions of the particles, m.
+        point: (B, 2), m.
+        share: How many, as a share of all.
+        soft: For gradients.
+
+    Returns:
+        (B, K).
+    """
+    if not soft:
+        index = nearest(x.detach(), point.detach(), share)
+        return values.gather(1, index[..., None].expand(-1, -1, values.shape[2])).mean(1)
+    distance = (x - point[:, None]).square().sum(-1)
+    edge = distance.topk(share_of(share, x), largest=False).values[:, -1:]
+    width = 2.0 * FADE * edge.clamp_min(FADE**2).sqrt()
+    weight = torch.sigmoid((edge - distance) / width)[..., None]
+    return (weight * values).sum(1) / weight.sum(1)
 
 
 def nearest(x: Tensor, point: Tensor, share: float) -> Tensor:
@@ -58,11 +111,13 @@ def measure(particles: ParticleState, robot: int) -> Measurement:
     return Measurement(*bodies)
 
 
-def split_penalty(split: Tensor, limit: float) -> tuple[Tensor, Tensor]:
+def split_penalty(split: Tensor, limit: float, *, soft: bool = False) -> tuple[Tensor, Tensor]:
     """Penalty ``-(20 s)^2`` and end of the episode once the spread s (B,) exceeds ``limit``.
+
+    Soft, the penalty sets in over a width of ``limit / 20``, and goes on growing beyond :data:`SPLIT_CAP`.
 
     Returns:
         Penalty (B,) and termination (B,) bool.
     """
-    torn = split > limit
-    return -(20.0 * split.clamp_max(SPLIT_CAP)).square() * torn, torn
+    counted = split if soft else split.clamp_max(SPLIT_CAP)
+    return -(20.0 * counted).square() * beyond(split - limit, SOFTNESS * limit, soft=soft), split > limit

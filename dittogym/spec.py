@@ -70,8 +70,9 @@ class Moment(NamedTuple):
         robot: Number of robot particles; they come first.
         now: Averages after the step.
         start: Averages right after the reset.
-        observation: (B, 3, 64, 64) uint8.
+        observation: (B, 3, 64, 64) uint8; floating point from :func:`dittogym.soft.soft_observation` if ``soft``.
         memory: What the task remembers, tensors with a leading B.
+        soft: Whether smooth terms are wanted, for gradients; then nothing but the terms is used of the outcome.
     """
 
     particles: ParticleState
@@ -80,6 +81,7 @@ class Moment(NamedTuple):
     start: Measurement
     observation: Tensor
     memory: Mapping[str, Tensor]
+    soft: bool = False
 
 
 class Outcome(NamedTuple):
@@ -141,7 +143,8 @@ class TaskSpec:
         lam: First Lame parameter, Pa.
         yield_stress: Of the robot, Pa.
         max_actuation: Muscle stress at action 1, Pa.
-        judge: The task's own reward terms, termination and success.
+        judge: The task's own reward terms, termination and success. Asked for soft terms it should return smooth ones,
+            see :class:`Moment` and the helpers in :mod:`dittogym.reward`; a smooth reward needs nothing.
         weights: Weights of the terms that all tasks share, and of the task's own.
         objects: Bodies beside the robot, at most one.
         gravity: (x, y), m/s^2.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -42,6 +43,10 @@ class Snapshot:
     counts: tuple[int, ...]
     state: EnvState
     observation: Tensor
+
+
+def _sum(terms: Mapping[str, Tensor]) -> Tensor:
+    return torch.stack(tuple(terms.values())).sum(0)
 
 
 class TorchEnv:
@@ -259,12 +264,14 @@ class TorchEnv:
         info = {"com": now.com, "split": now.split, "finite": dynamics.intact(self.model, fresh)}
         return self._observation, {name: value.detach() for name, value in info.items()}
 
-    def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+    def step(self, action: Tensor, *, soft: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Advance every simulation by one control step.
 
         Args:
             action: (B, 2, R, R), muscle actuation in units of the task's maximum; ``[:, 0]`` along material x. Values
                 beyond [-1, 1] saturate after the interpolation.
+            soft: For gradients: the observation is :meth:`soft_observation`, reward and its terms are the task's smooth
+                ones, and ``info["true_reward"]`` is the reward. All else is as without.
 
         Returns:
             observation (B, 3, 64, 64) uint8; reward (B,); terminated (B,) bool; truncated (B,) bool, at the horizon;
@@ -277,12 +284,16 @@ class TorchEnv:
         action = self._checked(action)
         state, field = dynamics.transition(self.model, self.env_state, to_grid_layout(action, self._layout))
         observation = dynamics.observe(self.model, state)
-        state, outcome = dynamics.judge(self.model, state, field, observation)
-        self._env_state, self._observation, self._field = state, observation, field.detach()
+        judged, outcome = dynamics.judge(self.model, state, field, observation)
+        self._env_state, self._observation, self._field = judged, observation, field.detach()
         info: dict[str, Any] = {"reward_terms": dict(outcome.terms), **outcome.info}
         if outcome.success is not None:
             info["is_success"] = outcome.success
-        reward = torch.stack(tuple(outcome.terms.values())).sum(0)
+        reward = _sum(outcome.terms)
+        if soft:
+            info["true_reward"], observation = reward, soft_observation(self.model, state)
+            terms = dynamics.judge(self.model, state, field, observation, soft=True)[1].terms
+            info["reward_terms"], reward = dict(terms), _sum(terms)
         assert outcome.terminated is not None
         return observation, reward, outcome.terminated, state.steps >= self.spec.horizon, info
 

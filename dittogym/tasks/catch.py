@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from torch import Tensor
 
 from dittogym.geometry import Obstacle, ceiling, floor, nodes, side_walls
-from dittogym.reward import nearest, pick
+from dittogym.reward import limited, mean_over_nearest
 from dittogym.shapes import Disc, Rectangle
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
 from torchmpm import VelocityRule
@@ -61,12 +61,12 @@ def judge(moment: Moment, weights: Weights) -> Outcome:
     cube = moment.now.object_com
     assert cube is not None
     x = moment.particles.x[:, : moment.robot]
-    hand = pick(x, nearest(x.detach(), moment.memory["object_com"].detach(), HAND)).mean(1)
+    hand = mean_over_nearest(x, x, moment.memory["object_com"], HAND, soft=moment.soft)
     to_goal, to_cube = (offset.abs().sum(-1) for offset in (cube - cube.new_tensor(GOAL), hand - cube))
     return Outcome(
         terms={
-            "object_distance": -weights.location * OBJECT_COST * to_goal.clamp_max(CAP),
-            "hand_distance": -weights.location * HAND_COST * to_cube.clamp_max(CAP),
+            "object_distance": -weights.location * OBJECT_COST * limited(to_goal, high=CAP, soft=moment.soft),
+            "hand_distance": -weights.location * HAND_COST * limited(to_cube, high=CAP, soft=moment.soft),
         },
         success=to_goal < CAUGHT,
         info={"object_distance": to_goal, "hand_distance": to_cube},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dittogym.geometry import ceiling, floor, side_walls
-from dittogym.reward import signed_quadratic
+from dittogym.reward import limited, signed_quadratic
 from dittogym.shapes import Disc, Rectangle
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
 from torchmpm import Soil, lame
@@ -19,7 +19,8 @@ def judge(moment: Moment, weights: Weights) -> Outcome:
     x = moment.particles.x[:, : moment.robot]
     distance = (x - x.new_tensor(GOAL)).abs().sum(-1).mean(1)
     rightwards, upwards = moment.now.velocity.unbind(1)
-    along, down = (signed_quadratic(v, 5.0).clamp(-20.0, 20.0) for v in (rightwards, -upwards))
+    speeds = (rightwards, -upwards)
+    along, down = (limited(signed_quadratic(v, 5.0), -20.0, 20.0, soft=moment.soft) for v in speeds)
     return Outcome(
         terms={"distance": -weights.location * distance.sqrt(), "velocity": weights.velocity * (along + down)},
         success=distance < REACHED,

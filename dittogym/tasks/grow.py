@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import torch
 from torch import Tensor
 
 from dittogym.geometry import Obstacle, ceiling, floor, nodes, side_walls
-from dittogym.reward import drop_widest, pick, share_of
+from dittogym.reward import beyond, drop_widest, pick, share_of
 from dittogym.shapes import Lattice
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
 from torchmpm import VelocityRule
@@ -19,6 +18,8 @@ REACHED = 0.04
 #: It ends, in failure, with the tip this far away, m.
 LOST = 0.28
 BONUS = 200.0
+#: Where the reward is soft, the bonus sets in over this distance, m.
+BONUS_WIDTH = 0.005
 #: Share of the robot's particles that are its tip: 2,000 of 19,600.
 TIP = 2000 / 19600
 
@@ -61,8 +62,9 @@ def judge(moment: Moment, weights: Weights) -> Outcome:
     tip = pick(moment.particles.x, moment.memory["tip"])
     distance = (tip - tip.new_tensor(GOAL)).norm(dim=-1).mean(1)
     reached = distance < REACHED
+    bonus = BONUS * beyond(REACHED - distance, BONUS_WIDTH, soft=moment.soft)
     return Outcome(
-        terms={"distance": -weights.location * distance.sqrt(), "success": torch.where(reached, BONUS, 0.0)},
+        terms={"distance": -weights.location * distance.sqrt(), "success": bonus},
         terminated=reached | (distance > LOST),
         success=reached,
         info={"distance": distance},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dittogym.geometry import ceiling, floor
-from dittogym.reward import signed_quadratic
+from dittogym.reward import limited, signed_quadratic
 from dittogym.shapes import Disc, Rectangle
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
 
@@ -21,15 +21,16 @@ def judge(moment: Moment, weights: Weights) -> Outcome:
     assert now.object_com is not None and now.object_velocity is not None and start.object_com is not None
     kicked = now.object_com[:, 0] - start.object_com[:, 0]
     travelled = now.com[:, 0] - start.com[:, 0]
-    ahead, along = (signed_quadratic(z, 4.0).clamp(-20.0, 30.0) for z in (kicked, travelled))
+    soft = moment.soft
+    ahead, along = (limited(signed_quadratic(z, 4.0), -20.0, 30.0, soft=soft) for z in (kicked, travelled))
     speeds = (now.velocity[:, 0], now.object_velocity[:, 0])
-    velocity, object_velocity = (signed_quadratic(v, 5.0).clamp(-20.0, 20.0) for v in speeds)
+    velocity, object_velocity = (limited(signed_quadratic(v, 5.0), -20.0, 20.0, soft=soft) for v in speeds)
     gap = (now.com[:, 0] - now.object_com[:, 0]).abs()
     return Outcome(
         terms={
             "object_location": weights.location * ahead,
             "location": weights.location * along,
-            "gap": -weights.location * GAP_COST * gap.clamp_max(GAP_CAP),
+            "gap": -weights.location * GAP_COST * limited(gap, high=GAP_CAP, soft=soft),
             "velocity": weights.velocity * velocity,
             "object_velocity": weights.velocity * object_velocity,
         },

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dittogym.geometry import Obstacle, ceiling, floor, nodes
-from dittogym.reward import signed_quadratic
+from dittogym.reward import limited, signed_quadratic
 from dittogym.shapes import Disc
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
 from torchmpm import VelocityRule
@@ -40,8 +40,8 @@ class Forward:
     def __call__(self, moment: Moment, weights: Weights) -> Outcome:
         """Judge a step."""
         travelled = moment.now.com[:, 0] - moment.start.com[:, 0]
-        location = signed_quadratic(travelled, 5.0).clamp(-20.0, 20.0)
-        velocity = signed_quadratic(moment.now.velocity[:, 0], 5.0).clamp(-20.0, 20.0)
+        values = (travelled, moment.now.velocity[:, 0])
+        location, velocity = (limited(signed_quadratic(z, 5.0), -20.0, 20.0, soft=moment.soft) for z in values)
         return Outcome(
             terms={"location": weights.location * location, "velocity": weights.velocity * velocity},
             terminated=moment.now.com[:, 0] < REAR_LIMIT,

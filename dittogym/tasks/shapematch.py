@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dittogym.geometry import ceiling, floor
 from dittogym.shapes import Disc
+from dittogym.soft import soft_silhouette
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights
 from dittogym.targets import TargetLike, load_target
 
@@ -27,9 +28,12 @@ def silhouette(observation: Tensor) -> Tensor:
 
 
 def judge(moment: Moment, weights: Weights, *, target: np.ndarray) -> Outcome:
-    """Count the pixels in which silhouette and target differ."""
+    """Count the pixels in which silhouette and target differ; softly, those to expect."""
+    wanted = torch.as_tensor(target, device=moment.observation.device)
+    if moment.soft:
+        expected = (soft_silhouette(moment.observation) - wanted.to(moment.observation)).abs().sum((1, 2))
+        return Outcome(terms={"mismatch": -PIXEL_COST * expected})
     robot = silhouette(moment.observation)
-    wanted = torch.as_tensor(target, device=robot.device)
     differing = (robot ^ wanted).sum((1, 2)).to(moment.now.com.dtype)
     union = (robot | wanted).sum((1, 2))
     iou = (robot & wanted).sum((1, 2)) / union

@@ -6,11 +6,10 @@ import math
 from collections.abc import Mapping
 from typing import Literal
 
-import torch
 from torch import Tensor
 
 from dittogym.geometry import NODES, Box, Obstacle, ceiling, floor, nodes
-from dittogym.reward import nearest, pick, signed_quadratic
+from dittogym.reward import beyond, limited, mean_over_nearest, signed_quadratic
 from dittogym.shapes import Disc, Rectangle
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
 from torchmpm import VelocityRule, fixed
@@ -19,6 +18,8 @@ from torchmpm import VelocityRule, fixed
 FALLEN = 0.24
 #: Right of this it fell on the far side, which is success, m.
 FAR_SIDE = 0.67
+#: Where the reward is soft, falling and reaching the far side set in over this distance, m.
+FALL_WIDTH = 0.01
 #: Where the cap rests at the start, m.
 CAP_START = 0.585
 #: The episode ends when the robot's centre gets behind this, m.
@@ -72,8 +73,8 @@ def front_distance(moment: Moment) -> Tensor:
     """Mean distance of the robot's front from the cap's centre, (B,), m."""
     x, cap = moment.particles.x[:, : moment.robot], moment.now.object_com
     assert cap is not None
-    front = pick(x, nearest(x.detach(), cap.detach(), FRONT))
-    return (front - cap[:, None]).norm(dim=-1).mean(1)
+    distance = (x - cap[:, None]).norm(dim=-1, keepdim=True)
+    return mean_over_nearest(distance, x, cap, FRONT, soft=moment.soft)[:, 0]
 
 
 def remember(moment: Moment) -> Mapping[str, Tensor]:
@@ -86,14 +87,17 @@ def judge(moment: Moment, weights: Weights) -> Outcome:
     cap, distance = moment.now.object_com, front_distance(moment)
     assert cap is not None
     z = 2.0 * (moment.memory["front_distance"] - distance)
-    approach = (16.0 * z * z.abs() + 10.0 * z).clamp(-20.0, 50.0)
+    soft = moment.soft
+    approach = limited(16.0 * z * z.abs() + 10.0 * z, -20.0, 50.0, soft=soft)
     fallen, far = cap[:, 1] < FALLEN, cap[:, 0] >= FAR_SIDE
-    velocity = signed_quadratic(moment.now.velocity, 10.0).clamp(-20.0, 20.0).sum(1)
+    where = 2.0 * beyond(cap[:, 0] - FAR_SIDE, FALL_WIDTH, soft=soft) - 1.0
+    fall = 100.0 * where * beyond(FALLEN - cap[:, 1], FALL_WIDTH, soft=soft)
+    velocity = limited(signed_quadratic(moment.now.velocity, 10.0), -20.0, 20.0, soft=soft).sum(1)
     return Outcome(
         terms={
             "approach": weights.location * approach,
             "object_location": weights.location * 200.0 * (cap[:, 0] - CAP_START),
-            "fall": weights.location * torch.where(fallen, torch.where(far, 100.0, -100.0), 0.0),
+            "fall": weights.location * fall,
             "velocity": weights.velocity * velocity,
         },
         terminated=fallen | (moment.now.com[:, 0] < REAR_LIMIT),

@@ -1,0 +1,201 @@
+"""Smooth counterparts of the rewards: their gradients, where they set in, and how far they are from the true ones."""
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+from tiny import TASKS, actions, assert_same_bits, everything, stir, tiny
+from torch import Tensor
+
+from dittogym import Outcome, TorchEnv, make_spec
+from dittogym.dynamics import EnvState, judge, observe
+from dittogym.reward import FADE, beyond, limited, mean_over_nearest, nearest, split_penalty
+from dittogym.soft import soft_observation
+from dittogym.tasks.grow import GOAL
+from dittogym.tasks.slot import FALLEN, FAR_SIDE
+from torchmpm import ParticleState
+
+
+def normal(*shape: int, seed: int = 1) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def soft_reward(env: TorchEnv, state: EnvState) -> Tensor:
+    """The task's soft reward (B,) of a state, under a full actuation."""
+    field = torch.ones(env.num_envs, 2, env.spec.patch, env.spec.patch, dtype=env.dtype)
+    terms = judge(env.model, state, field, soft_observation(env.model, state), soft=True)[1].terms
+    return sum(terms.values())
+
+
+def reward(env: TorchEnv, state: EnvState) -> Tensor:
+    """The true one."""
+    field = torch.ones(env.num_envs, 2, env.spec.patch, env.spec.patch, dtype=env.dtype)
+    return sum(judge(env.model, state, field, observe(env.model, state))[1].terms.values())
+
+
+def placed(env: TorchEnv, x: Tensor, v: Tensor | None = None) -> EnvState:
+    """The present moment of the environment with other positions and velocities."""
+    state = env.env_state
+    old = state.particles
+    return replace(state, particles=ParticleState(x, old.v if v is None else v, old.C, old.F, old.Jp))
+
+
+def at_threshold(task: str) -> tuple[TorchEnv, Tensor, Tensor]:
+    """A task with the first simulation where its reward jumps or bends, and random velocities."""
+    env = tiny(task, 2)
+    env.reset(seed=0)
+    stir(env)
+    x, v, robot = env.state.x.clone(), env.state.v.clone(), env.model.robot
+    if task == "grow":
+        x[0] += torch.tensor(GOAL) + 0.02 - x[0][env.env_state.memory["tip"][0]].mean(0)
+    elif task == "slot":
+        x[0, robot:] += torch.tensor([FAR_SIDE, FALLEN]) - x[0, robot:].mean(0)
+        v[0, :, 0] += 1.45
+    elif task == "catch":
+        x[0, robot:] += torch.tensor([0.4, -0.0])
+    else:
+        v[0, :, 0] += 1.7
+    if env.spec.split_limit is not None:
+        centre, split = x[:, :robot].mean(1, keepdim=True), env.env_state.start.split[:, None, None]
+        x[1, :robot] = (centre + (x[:, :robot] - centre) * env.spec.split_limit / split)[1]
+    return env, x, v
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("name", ["x", "v"])
+def test_gradient_at_thresholds_against_central_differences(task: str, name: str) -> None:
+    env, *given = at_threshold(task)
+    if name == "v" and task in ("shapematch", "grow", "catch"):
+        pytest.skip("the reward does not look at velocities")
+    which = ("x", "v").index(name)
+    leaf, direction = given[which].requires_grad_(), normal(*given[which].shape) + 1.0
+
+    def total(value: Tensor) -> Tensor:
+        values = [value if i == which else t for i, t in enumerate(given)]
+        return (soft_reward(env, placed(env, *values)) * torch.tensor([1.0, 0.7])).sum()
+
+    slope = (torch.autograd.grad(total(leaf), leaf)[0] * direction).sum().item()
+    with torch.no_grad():
+        step = 1e-7
+        ahead, behind = (total(leaf + side * step * direction).item() for side in (1, -1))
+    assert slope == pytest.approx((ahead - behind) / (2 * step), rel=1e-5)
+    assert abs(slope) > 0.1
+
+
+def jumps(values: list[float]) -> float:
+    """Largest change from one to the next as a share of the whole range."""
+    steps = [abs(b - a) for a, b in pairwise(values)]
+    return max(steps) / (max(values) - min(values))
+
+
+@pytest.mark.parametrize("task", ["run", "grow", "slot"])
+@torch.no_grad()
+def test_soft_rewards_pass_thresholds_without_a_jump(task: str) -> None:
+    """Tearing the robot, reaching GROW's goal, SLOT's cap falling, in 50 small steps."""
+    env, x, _ = at_threshold(task)
+    robot = env.model.robot
+    soft, true = [], []
+    for k in range(50):
+        z = x.clone()
+        if task == "run":
+            centre = z[:, :robot].mean(1, keepdim=True)
+            z[:, :robot] = centre + (z[:, :robot] - centre) * (0.8 + 0.008 * k)
+        elif task == "grow":
+            z[0] += 0.05 - 0.0016 * k
+        else:
+            z[0, robot:, 1] += 0.05 - 0.002 * k
+            z[0, robot:, 0] += 0.03
+        element = 1 if task == "run" else 0
+        state = placed(env, z)
+        soft.append(soft_reward(env, state)[element].item())
+        true.append(reward(env, state)[element].item())
+    assert jumps(soft) < 0.12
+    assert jumps(true) > 0.3
+
+
+@pytest.mark.parametrize("task", TASKS)
+@torch.no_grad()
+def test_gap_from_rest(task: str) -> None:
+    """Away from thresholds the soft reward is the true one; SHAPE MATCH counts pixels, and CATCH and SLOT particles."""
+    env = tiny(task, 2, particles=2000)
+    env.reset(seed=0)
+    gap = (soft_reward(env, env.env_state) - reward(env, env.env_state)).abs().max()
+    bounds = {"shapematch": 2.5, "catch": 0.15, "slot": 0.6}
+    assert gap <= bounds.get(task, 0.01)
+
+
+@pytest.mark.parametrize("task", ["shapematch", "slot", "run"])
+def test_step_with_soft_rewards(task: str) -> None:
+    """The same simulation, judged twice; the gradient reaches back through several steps."""
+    env, plain = tiny(task, 2, resolution=8), tiny(task, 2, resolution=8)
+    env.reset(seed=0), plain.reset(seed=0)
+    drive = (0.5 * actions(env, 2)).requires_grad_()
+    total = torch.zeros(2, dtype=env.dtype)
+    for action in drive:
+        image, soft, terminated, truncated, info = env.step(action, soft=True)
+        seen, true, their_end, their_limit, theirs = plain.step(action)
+        total = total + soft
+    assert torch.equal(info["true_reward"], true) and torch.equal(terminated, their_end)
+    assert torch.equal(truncated, their_limit) and torch.equal(env.save().observation, seen)
+    assert info["reward_terms"].keys() == theirs["reward_terms"].keys()
+    assert torch.allclose(sum(info["reward_terms"].values()), soft)
+    assert torch.equal(image, env.soft_observation())
+    assert_same_bits(everything(env), everything(plain))
+    (gradient,) = torch.autograd.grad(total.sum() + 1e-3 * image.sum(), drive)
+    assert gradient.isfinite().all() and all(g.abs().max() > 0 for g in gradient)
+
+
+def test_a_task_of_ones_own() -> None:
+    """One that is smooth already needs nothing; one that asks gets the soft image."""
+
+    def judged(moment, weights):
+        if moment.soft:
+            return Outcome({"brightness": moment.observation[:, 0].mean((1, 2))})
+        return Outcome({"brightness": moment.observation[:, 0].to(torch.float64).mean((1, 2))})
+
+    action = torch.zeros(1, 2, 8, 8, dtype=torch.float64, requires_grad=True)
+    env = tiny(replace(make_spec("shapematch"), judge=judged), resolution=8)
+    env.reset(seed=0)
+    _, soft, *_, info = env.step(action, soft=True)
+    assert soft.item() == pytest.approx(info["true_reward"].item(), abs=0.5) and soft.requires_grad
+    height = replace(make_spec("run"), judge=lambda moment, weights: Outcome({"height": moment.now.com[:, 1]}))
+    env = tiny(height)
+    env.reset(seed=0)
+    _, soft, *_, info = env.step(action, soft=True)
+    assert soft.item() == pytest.approx(info["true_reward"].item(), abs=1e-2)
+
+
+def test_soft_limits() -> None:
+    z = torch.linspace(-40.0, 60.0, 101, dtype=torch.float64)
+    hard, soft = limited(z, -20.0, 30.0), limited(z, -20.0, 30.0, soft=True)
+    assert torch.equal(hard, z.clamp(-20.0, 30.0))
+    assert (soft - hard).abs().max().item() == pytest.approx(1.5 * math.log(2))
+    assert soft[40].item() == pytest.approx(0.0, abs=1e-7)
+    assert (soft.diff() > 0).all()
+    assert torch.equal(limited(z, high=30.0), z.clamp_max(30.0))
+    assert beyond(torch.tensor([-1.0, 0.0, 1.0]), 0.1).tolist() == [0.0, 0.0, 1.0]
+    near = beyond(torch.tensor([-0.4, 0.0, 0.4]), 0.1, soft=True).tolist()
+    assert near == pytest.approx([0.018, 0.5, 0.982], abs=1e-3)
+
+
+def test_soft_split() -> None:
+    split = torch.tensor([0.05, 0.1 - 1e-9, 0.1 + 1e-9, 0.15, 0.3], dtype=torch.float64)
+    soft, torn = split_penalty(split, 0.1, soft=True)
+    hard, _ = split_penalty(split, 0.1)
+    assert hard.tolist() == pytest.approx([0.0, 0.0, -4.0, -9.0, -16.0])
+    assert soft.tolist() == pytest.approx([0.0, -2.0, -2.0, -9.0, -36.0], abs=1e-3)
+    assert torn.tolist() == [False, False, True, True, True]
+
+
+def test_soft_choice_of_the_nearest() -> None:
+    """Near the mean over the chosen; a particle fades in while it passes the edge."""
+    x = torch.rand(2, 500, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    point = torch.full((2, 2), 0.3, dtype=torch.float64)
+    hard = mean_over_nearest(x, x, point, 0.2)
+    assert torch.equal(hard, x.gather(1, nearest(x, point, 0.2)[..., None].expand(-1, -1, 2)).mean(1))
+    soft = mean_over_nearest(x, x, point, 0.2, soft=True)
+    assert (soft - hard).abs().max() < FADE
+    alone = mean_over_nearest(x[:, :1], x[:, :1], x[:, 0], 0.2, soft=True)
+    assert torch.allclose(alone, x[:, 0])
