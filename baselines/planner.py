@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from baselines.rollout import Reward, rewards, true_reward
+from baselines.rollout import Judge, judge, rollout
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
 from dittogym.action import Layout
-from dittogym.dynamics import EnvState, Model
+from dittogym.dynamics import EnvState
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class PlannerConfig:
     """Control steps of a plan that are carried out before the next is made."""
     iterations: int = 6
     """Gradient steps on a plan."""
-    learning_rate: float = 0.3
+    learning_rate: float = 0.6
     """Adam's step size on actions, which lie in [-1, 1]."""
     noise: float = 0.1
     """Standard deviation of the actions with which a plan is extended."""
@@ -33,8 +33,6 @@ class PlannerConfig:
     """Largest gradient of one control step, in medians over the steps of the plan."""
     terminal: float = 32.0
     """Control steps after the plan that are counted with the mean reward of its second half, if it has not ended."""
-    margin: float = 100.0
-    """Cost of a spread beyond 85 % of the limit at which the robot counts as torn, per squared share of the limit."""
 
     def check(self) -> None:
         """Check what the types cannot.
@@ -47,7 +45,7 @@ class PlannerConfig:
         for name in ("iterations", "learning_rate", "clip"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, allowed more than 0")
-        for name in ("noise", "terminal", "margin"):
+        for name in ("noise", "terminal"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, allowed 0 or more")
 
@@ -63,7 +61,7 @@ class Planner:
     Args:
         env: The environment; only read, after its reset.
         config: How to plan.
-        reward: What is climbed; what is chosen is judged by the task's own reward.
+        judge: What a step is worth: the smooth reward is climbed, the true one chooses.
         seed: Of the noise.
         layout: The environment's action layout.
 
@@ -80,13 +78,13 @@ class Planner:
         env: TorchEnv,
         config: PlannerConfig | None = None,
         *,
-        reward: Reward = true_reward,
+        judge: Judge = judge,
         seed: int = 0,
         layout: Layout = "image",
     ) -> None:
         self.config = config = config or PlannerConfig()
         config.check()
-        self.env, self.reward, self.layout = env, reward, layout
+        self.env, self.judge, self.layout = env, judge, layout
         self.generator = torch.Generator().manual_seed(seed)
         self.failed = self.plans = 0
         self._ahead = self._fresh(config.horizon)
@@ -99,7 +97,7 @@ class Planner:
 
     def act(self) -> Tensor:
         """Next action of every simulation, (B, 2, R, R); plans anew where the last plan is used up."""
-        if self._position >= self.config.commit:
+        if self._position >= min(self.config.commit, len(self._ahead)):
             self.plan()
         self._position += 1
         return self._ahead[self._position - 1]
@@ -125,8 +123,10 @@ class Planner:
     def plan(self) -> Tensor:
         """Make new plans from the environment's present state: actions (T, B, 2, R, R)."""
         config, start = self.config, self.env.env_state.detach()
-        kept = self._ahead[self._position :] if self._position < config.horizon else self._ahead[:0]
-        plan = torch.cat((kept, self._fresh(config.horizon - len(kept)))).requires_grad_()
+        left = self._left(start)
+        length = min(config.horizon, left) if left else config.horizon
+        kept = self._ahead[self._position :][:length]
+        plan = torch.cat((kept, self._fresh(length - len(kept)))).requires_grad_()
         adam = torch.optim.Adam([plan], config.learning_rate, (0.9, 0.95))
         best, chosen = torch.full_like(plan[0, :, 0, 0, 0], -torch.inf), torch.zeros_like(plan)
         for iteration in range(config.iterations + 1):
@@ -150,26 +150,17 @@ class Planner:
         self._ahead, self._position = chosen.detach(), 0
         return self._ahead
 
+    def _left(self, start: EnvState) -> int:
+        """Control steps to the end of the youngest episode."""
+        return max(self.env.spec.horizon - int(start.steps.min()), 0)
+
     def _judge(self, start: EnvState, plan: Tensor) -> tuple[Tensor, Tensor]:
-        """What is climbed, and the true return with what comes after, of plans (T, B, 2, R, R): (B,) each."""
-        config = self.config
-
-        def both(model: Model, state: EnvState, field: Tensor) -> tuple[EnvState, Tensor, Tensor]:
-            after, earned, ended = true_reward(model, state, field)
-            smooth = earned if self.reward is true_reward else self.reward(model, state, field)[1]
-            limit = model.spec.split_limit
-            if limit is not None:
-                x = after.particles.x[:, : model.robot]
-                share = x.var(1, correction=0).sum(-1).sqrt() / limit
-                smooth = smooth - config.margin * (share - 0.85).clamp_min(0.0).square()
-            return after, torch.stack((smooth, earned.detach())), ended
-
-        _, earned, _ = rewards(self.env.model, start, plan, both, layout=self.layout, checkpointed=False)
-        weights = earned.new_ones(len(plan))
-        late = weights[len(plan) // 2 :]
-        late += config.terminal / len(late)
-        climbed, value = (weights[:, None, None] * earned).sum(0)
-        return climbed, value
+        """Smooth return, and true return with what may come after, of plans (T, B, 2, R, R): (B,) each."""
+        steps = rollout(self.env.model, start, plan, self.judge, layout=self.layout, checkpointed=False)
+        late = steps.true_rewards[len(plan) // 2 :].mean(0)
+        after = min(self.config.terminal, max(self._left(start) - len(plan), 0))
+        beyond = torch.where(steps.ended, 0.0, after * late)
+        return steps.rewards.sum(0), steps.true_rewards.sum(0) + beyond
 
 
 def _spread(mask: Tensor) -> Tensor:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeAlias
+from collections.abc import Callable, Mapping
+from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -11,55 +11,94 @@ from torch import Tensor
 from dittogym import dynamics
 from dittogym.action import Layout, to_grid_layout
 from dittogym.dynamics import EnvState, Model
+from dittogym.soft import soft_observation
 from torchmpm import trajectory
 
-#: (model, state after a transition, actuation on the patch) -> state, reward (B,), and whether the episode ends (B,).
-Reward: TypeAlias = Callable[[Model, EnvState, Tensor], tuple[EnvState, Tensor, Tensor]]
+
+class Judgement(NamedTuple):
+    """What a control step was worth.
+
+    Attributes:
+        state: After the step, with the task's memory brought up to date.
+        reward: (B,) to differentiate.
+        true_reward: (B,) the task's own.
+        ended: (B,) bool, whether the episode ends.
+    """
+
+    state: EnvState
+    reward: Tensor
+    true_reward: Tensor
+    ended: Tensor
 
 
-def true_reward(model: Model, state: EnvState, field: Tensor) -> tuple[EnvState, Tensor, Tensor]:
-    """The task's own reward; what it counts or thresholds has no gradient."""
-    state, outcome = dynamics.judge(model, state, field, dynamics.observe(model, state))
+#: From the task, the state after a transition and the actuation on the patch.
+Judge: TypeAlias = Callable[[Model, EnvState, Tensor], Judgement]
+
+
+def judge(model: Model, state: EnvState, field: Tensor) -> Judgement:
+    """The task's smooth reward beside its true one, see :meth:`dittogym.TorchEnv.step` with ``soft``."""
+    judged, outcome = dynamics.judge(model, state, field, dynamics.observe(model, state))
+    soft = dynamics.judge(model, state, field, soft_observation(model, state), soft=True)[1]
     assert outcome.terminated is not None
-    return state, torch.stack(tuple(outcome.terms.values())).sum(0), outcome.terminated
+    return Judgement(judged, _sum(soft.terms), _sum(outcome.terms).detach(), outcome.terminated)
 
 
-def rewards(
+def _sum(terms: Mapping[str, Tensor]) -> Tensor:
+    return torch.stack(tuple(terms.values())).sum(0)
+
+
+class Rollout(NamedTuple):
+    """Some control steps of B simulations. After its end a simulation earns nothing more, as in an episode.
+
+    Attributes:
+        state: After the last step.
+        rewards: (T, B) to differentiate.
+        true_rewards: (T, B) the task's own.
+        ended: (B,) bool, whether the episode has ended.
+    """
+
+    state: EnvState
+    rewards: Tensor
+    true_rewards: Tensor
+    ended: Tensor
+
+
+def rollout(
     model: Model,
     start: EnvState,
     actions: Tensor,
-    reward: Reward = true_reward,
+    judge: Judge = judge,
     *,
     layout: Layout = "image",
     checkpointed: bool = True,
-) -> tuple[EnvState, Tensor, Tensor]:
+) -> Rollout:
     """Drive simulations through some control steps.
 
     Args:
         model: The task, such as ``TorchEnv.model``.
-        start: Where all simulations start, B of them.
+        start: Where the simulations start, B of them.
         actions: (T, B, 2, R, R), as :meth:`dittogym.TorchEnv.step` takes them.
-        reward: What a step is worth.
+        judge: What a step is worth.
         layout: Of the actions.
         checkpointed: Keep only the states between the steps and replay each step in the backward pass.
-
-    Returns:
-        The final state, the rewards (T, B), and which simulations have ended (B,). After its end a simulation
-        earns nothing more, as in an episode.
     """
-    Carry: TypeAlias = tuple[EnvState, Tensor, Tensor]
 
-    def step(carry: Carry, action: Tensor) -> Carry:
-        state, _, over = carry
-        state, field = dynamics.transition(model, state, to_grid_layout(action, layout))
-        state, earned, ended = reward(model, state, field)
-        return state, torch.where(over, 0.0, earned), over | ended
+    def step(before: Judgement, action: Tensor) -> Judgement:
+        state, field = dynamics.transition(model, before.state, to_grid_layout(action, layout))
+        after, over = judge(model, state, field), before.ended
+        earned, true = (torch.where(over, 0.0, reward) for reward in (after.reward, after.true_reward))
+        return Judgement(after.state, earned, true, over | after.ended)
 
     nothing = actions.new_zeros(actions.shape[1])
-    (state, _, over), earned = trajectory(
-        step, (start, nothing, nothing.bool()), actions, observe=lambda carry: carry[1], checkpointed=checkpointed
+    last, steps = trajectory(
+        step,
+        Judgement(start, nothing, nothing, nothing.bool()),
+        actions,
+        observe=lambda judgement: (judgement.reward, judgement.true_reward),
+        checkpointed=checkpointed,
     )
-    return state, torch.stack(earned), over
+    rewards, true_rewards = (torch.stack(values) for values in zip(*steps, strict=True))
+    return Rollout(last.state, rewards, true_rewards, last.ended)
 
 
 def repeat(state: EnvState, copies: int) -> EnvState:

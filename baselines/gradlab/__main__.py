@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from baselines.gradlab.measure import NoGradientError, Probe, Smoothing, measure
 from baselines.gradlab.report import format_table, write
-from baselines.rollout import true_reward
+from baselines.rollout import judge
 from cfp.environments import choose_device
 from cfp.errors import CFPError, ConfigError
 from dittogym import TorchEnv
@@ -25,7 +25,7 @@ from dittogym import TorchEnv
 
 @dataclass(frozen=True)
 class Lab:
-    """Measure the gradient of a task's return in the actions, by horizon, and write a table and a picture.
+    """Measure the gradient of a task's smooth return in the actions, by horizon, and write a table and a picture.
 
     Finite differences against step width, norm, float32 against float64, first against zeroth order.
     """
@@ -159,7 +159,7 @@ def run(lab: Lab) -> str:
         for action in drive[: lab.warmup]:
             env.step(action[None])
     with tqdm(total=total_steps(lab, horizons), unit=" steps", disable=None) as bar:
-        probe = Probe(env.model, env.env_state, true_reward, lab.chunk, bar.update)
+        probe = Probe(env.model, env.env_state, judge, lab.chunk, bar.update)
         directions, smoothing = normal(lab.directions), Smoothing(normal(lab.samples), lab.sigma)
         rows, errors = measure(probe, drive[lab.warmup :], horizons, lab.widths, directions, smoothing)
     config = dataclasses.asdict(lab) | {"out": str(lab.out)}

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from baselines.rollout import Reward, repeat, rewards, to_dtype
+from baselines.rollout import Judge, repeat, rollout, to_dtype
 from dittogym.dynamics import EnvState, Model
 
 
@@ -21,19 +21,19 @@ class NoGradientError(ValueError):
 class Probe:
     """Returns and gradients of many plans from one state.
 
-    A plan is a sequence of actions (T, 2, R, R); its return at horizon h is the sum of its first h rewards.
+    A plan is a sequence of actions (T, 2, R, R); its return at horizon h is the sum of its first h smooth rewards.
 
     Attributes:
         model: The task.
         start: A state of one simulation; its dtype is that of the computation.
-        reward: What a step is worth.
+        judge: What a step is worth.
         chunk: Simulations at once; this and the horizon bound the memory.
         advance: Called with the number of control steps simulated; a gradient counts as three.
     """
 
     model: Model
     start: EnvState
-    reward: Reward
+    judge: Judge
     chunk: int
     advance: Callable[[int], object]
 
@@ -46,8 +46,8 @@ class Probe:
         """Returns of plans (S, T, 2, R, R) at every horizon, (S, T)."""
         parts = []
         for part in self._parts(plans):
-            _, earned, _ = rewards(self.model, repeat(self.start, part.shape[1]), part, self.reward)
-            parts.append(earned.T.cumsum(1))
+            rewards = rollout(self.model, repeat(self.start, part.shape[1]), part, self.judge).rewards
+            parts.append(rewards.T.cumsum(1))
             self.advance(part.shape[0] * part.shape[1])
         return torch.cat(parts)
 
@@ -60,12 +60,12 @@ class Probe:
         parts = []
         for part in self._parts(plans):
             part = part.requires_grad_()
-            _, earned, _ = rewards(self.model, repeat(self.start, part.shape[1]), part, self.reward)
-            if not earned.requires_grad:
+            rewards = rollout(self.model, repeat(self.start, part.shape[1]), part, self.judge).rewards
+            if not rewards.requires_grad:
                 raise NoGradientError(
                     f"the reward of task {self.model.spec.name!r} has no gradient in the actions: it only counts"
                 )
-            parts.append(torch.autograd.grad(earned.sum(), part)[0].transpose(0, 1))
+            parts.append(torch.autograd.grad(rewards.sum(), part)[0].transpose(0, 1))
             self.advance(3 * part.shape[0] * part.shape[1])
         return torch.cat(parts)
 

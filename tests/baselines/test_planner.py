@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from baselines.planner import Planner, PlannerConfig, _clipped
-from baselines.rollout import true_reward
+from baselines.rollout import judge
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
 
@@ -82,28 +82,41 @@ def test_state_of_a_planner_goes_on_the_same() -> None:
     assert (other.failed, other.plans) == (planner.failed, planner.plans)
 
 
-def test_action_layout_is_the_environments() -> None:
+@pytest.mark.parametrize(("layout", "place"), [("image", (0, 0)), ("grid", (0, 3))])
+def test_action_layout_is_the_environments(layout: str, place: tuple[int, int]) -> None:
     def upper_left(model, state, field):
-        state, _, ended = true_reward(model, state, field)
-        return state, field[:, :, :10, -10:].mean((1, 2, 3)), ended  # small x, large y
+        value = field[:, 0, :8, -8:].mean((1, 2))  # small x, large y
+        return judge(model, state, field)._replace(reward=value, true_reward=value.detach())
 
-    config = PlannerConfig(horizon=1, commit=1, iterations=1, noise=0.0, margin=0.0)
-    for layout, place in (("image", (0, 0)), ("grid", (0, 3))):
-        env = small(action_layout=layout)
-        planner = Planner(env, config, reward=upper_left, layout=layout)
-        planner._judge = _climbed_is_value(planner)
-        plan = planner.plan()[0, 0, 0]
-        assert (plan == plan.max()).nonzero().tolist() == [list(place)] or plan[place] == plan.max() > 0
+    env = small(action_layout=layout)
+    config = PlannerConfig(horizon=1, commit=1, iterations=1, noise=0.0)
+    plan = Planner(env, config, judge=upper_left, layout=layout).plan()[0, 0, 0]
+    assert float(plan[place]) == pytest.approx(0.6, rel=1e-3) and plan[3, 0] == plan[3, 3] == 0
 
 
-def _climbed_is_value(planner: Planner):
-    judge = Planner._judge
+def test_ending_the_episode_forgoes_what_comes_after() -> None:
+    def ends_if_contracted(model, state, field):
+        value = field[:, 0].mean((1, 2)) / 45.0
+        return judge(model, state, field)._replace(reward=value, true_reward=1.0 + value.detach(), ended=value > 0.3)
 
-    def both(start, plan):
-        climbed, _ = judge(planner, start, plan)
-        return climbed, climbed.detach()
+    chosen = {}
+    for terminal in (0.0, 5.0):
+        env = small()
+        config = PlannerConfig(horizon=1, commit=1, iterations=2, noise=0.0, learning_rate=0.25, terminal=terminal)
+        chosen[terminal] = float(Planner(env, config, judge=ends_if_contracted).plan()[0, 0, 0].mean())
+    assert chosen[0.0] == pytest.approx(0.5, abs=0.02) and chosen[5.0] == pytest.approx(0.25, abs=0.02)
 
-    return both
+
+def test_plans_end_with_the_episode() -> None:
+    env = small("shapematch", substeps=1)
+    planner = Planner(env, PlannerConfig(horizon=16, commit=8, iterations=1))
+    lengths = []
+    for step in range(32):
+        env.step(planner.act())
+        env.detach()
+        if step % 8 == 0:
+            lengths.append(len(planner._ahead))
+    assert lengths == [16, 16, 14, 6] and env.env_state.steps.item() == 32
 
 
 def test_plans_that_are_not_finite_are_counted_and_not_carried_out(monkeypatch) -> None:
@@ -122,19 +135,7 @@ def test_plans_that_are_not_finite_are_counted_and_not_carried_out(monkeypatch) 
     assert planner.failed == 2 and planner.plans == 6
     assert torch.equal(plan[:, 1], calls[0][:, 1])  # the only one whose value was finite
     assert torch.equal(calls[2][:, 1], calls[0][:, 1])  # the search went on from there
-    assert plan.isfinite().all() and not torch.equal(plan[:, 0], calls[0][:, 0])
-
-
-def test_spread_near_the_limit_costs() -> None:
-    env = small("run")
-    plan = torch.zeros(1, 1, *env.action_shape)
-    planner = Planner(env, PlannerConfig(horizon=1, commit=1, margin=300.0, terminal=0.0))
-    for stretch, spread in ((1.0, 0.067), (1.4, 0.094)):
-        env.state.x[:] = 0.3 + stretch * (env.state.x - env.state.x.mean(1))
-        with torch.no_grad():
-            climbed, value = planner._judge(env.env_state, plan)
-        assert float(value) > 0
-        assert float(value - climbed) == pytest.approx(300.0 * max(0.0, spread / 0.1 - 0.85) ** 2, rel=0.15)
+    assert plan.isfinite().all() and not torch.equal(calls[2][:, 0], calls[0][:, 0])
 
 
 def test_clipping_limits_steps_to_medians() -> None:
@@ -151,7 +152,7 @@ def test_clipping_limits_steps_to_medians() -> None:
         ({"commit": 17}, "commit: got 17, allowed 1 to the horizon, 16"),
         ({"iterations": 0}, "iterations: got 0, allowed more than 0"),
         ({"noise": -0.1}, "noise: got -0.1, allowed 0 or more"),
-        ({"margin": float("nan")}, "margin: got nan"),
+        ({"terminal": float("nan")}, "terminal: got nan"),
     ],
 )
 def test_bad_options(options: dict, message: str) -> None:
