@@ -8,11 +8,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from baselines.rollout import Judge, judge, rollout
+from baselines.rollout import Judge, Judgement, judge, rollout
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
 from dittogym.action import Layout
-from dittogym.dynamics import EnvState
+from dittogym.dynamics import EnvState, Model
+from dittogym.reward import measure
+
+SAFE_SPREAD = 0.8
+"""Share of the limit of its spread up to which a robot is not in danger of being torn."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,8 @@ class PlannerConfig:
     """Largest gradient of one control step, in medians over the steps of the plan."""
     terminal: float = 32.0
     """Control steps after the plan that are counted with the mean reward of its second half, if it has not ended."""
+    margin: float = 1000.0
+    """Cost of a spread beyond 80 % of the limit at which the robot counts as torn, per squared share of the limit."""
 
     def check(self) -> None:
         """Check what the types cannot.
@@ -45,7 +51,7 @@ class PlannerConfig:
         for name in ("iterations", "learning_rate", "clip"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, allowed more than 0")
-        for name in ("noise", "terminal"):
+        for name in ("noise", "terminal", "margin"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, allowed 0 or more")
 
@@ -154,9 +160,19 @@ class Planner:
         """Control steps to the end of the youngest episode."""
         return max(self.env.spec.horizon - int(start.steps.min()), 0)
 
+    def _careful(self, model: Model, state: EnvState, field: Tensor) -> Judgement:
+        """What a step is worth, less the cost of being nearly torn: the true penalty comes when it is too late."""
+        judgement, limit = self.judge(model, state, field), model.spec.split_limit
+        if limit is None:
+            return judgement
+        excess = measure(judgement.state.particles, model.robot).split / limit - SAFE_SPREAD
+        cost = self.config.margin * excess.clamp_min(0.0).square()
+        reward, true_reward = judgement.reward - cost, judgement.true_reward - cost.detach()
+        return judgement._replace(reward=reward, true_reward=true_reward)
+
     def _judge(self, start: EnvState, plan: Tensor) -> tuple[Tensor, Tensor]:
         """Smooth return, and true return with what may come after, of plans (T, B, 2, R, R): (B,) each."""
-        steps = rollout(self.env.model, start, plan, self.judge, layout=self.layout, checkpointed=False)
+        steps = rollout(self.env.model, start, plan, self._careful, layout=self.layout, checkpointed=False)
         late = steps.true_rewards[len(plan) // 2 :].mean(0)
         after = min(self.config.terminal, max(self._left(start) - len(plan), 0))
         beyond = torch.where(steps.ended, 0.0, after * late)

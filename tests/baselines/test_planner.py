@@ -138,6 +138,20 @@ def test_plans_that_are_not_finite_are_counted_and_not_carried_out(monkeypatch) 
     assert plan.isfinite().all() and not torch.equal(calls[2][:, 0], calls[0][:, 0])
 
 
+def test_spread_near_the_limit_costs() -> None:
+    env = small("run")
+    plan = torch.zeros(1, 1, *env.action_shape)
+    spread = float(env.env_state.start.split)
+    for stretch in (1.0, 0.094 / spread):
+        env.state.x[:] = 0.3 + stretch * (env.state.x - env.state.x.mean(1))
+        values = []
+        for margin in (0.0, 300.0):
+            planner = Planner(env, PlannerConfig(horizon=1, commit=1, margin=margin, terminal=0.0))
+            values.append(torch.stack(planner._judge(env.env_state, plan)))
+        cost = 300.0 * max(0.0, stretch * spread / 0.1 - 0.8) ** 2
+        assert (values[0] - values[1]).flatten().tolist() == pytest.approx([cost, cost], rel=0.05, abs=1e-6)
+
+
 def test_clipping_limits_steps_to_medians() -> None:
     gradient = torch.zeros(5, 2, 2, 1, 1)
     gradient[:, 0, 0, 0, 0] = torch.tensor([1.0, 2.0, 3.0, 4.0, 100.0])
