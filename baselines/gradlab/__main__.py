@@ -143,9 +143,11 @@ def run(lab: Lab) -> str:
     Raises:
         ConfigError: See `make_env`.
         NoGradientError: The task's reward has no gradient.
+        OSError: The folder cannot be made.
     """
     assert lab.out is not None
     env = make_env(lab)
+    lab.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
     horizons = [horizon for horizon in lab.horizons if horizon <= env.spec.horizon - lab.warmup]
     generator = torch.Generator().manual_seed(lab.seed)
     shape = (horizons[-1], *env.action_shape)

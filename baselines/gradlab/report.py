@@ -137,7 +137,7 @@ def draw(rows: Sequence[Row], widths: Sequence[float], errors: Sequence[Sequence
 
     for index, (row, error) in enumerate(zip(rows, errors, strict=True)):
         shade = str(0.8 * (1.0 - (index + 1) / len(rows)))
-        panels[0, 0].plot(widths, error, "o-", color=shade, markersize=3, label=f"{row.horizon} steps")
+        panels[0, 0].plot(widths, error, "o-", color=shade, markersize=3, label=f"horizon {row.horizon}")
     panels[0, 0].set(xlabel="step width (action units)", title="finite differences against gradient, float64")
     panels[0, 0].set_ylabel("relative error")
     line(panels[0, 1], "norm", "in all actions")

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
+import dittogym
 from baselines.gradlab import __main__ as command
 from baselines.gradlab.measure import Probe, Row, Smoothing, finite_differences, measure
 from baselines.gradlab.report import conclude, objections
@@ -135,6 +136,23 @@ def test_command_writes_the_same_twice(tmp_path, capsys) -> None:
 def test_command_rejects(arguments: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         command.run(command.parse(["--quick", *arguments.split()]))
+
+
+def test_folder_is_made_before_the_work(tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(command, "measure", lambda *_: pytest.fail("worked for nothing"))
+    (tmp_path / "file").touch()
+    assert command.main(["--quick", "--out", str(tmp_path / "file")]) == 2
+    assert "file" in capsys.readouterr().err
+
+
+def test_task_without_a_gradient_is_named(tmp_path, capsys, monkeypatch) -> None:
+    spec = dittogym.make_spec("shapematch")
+    counts = replace(
+        spec, name="count", judge=lambda moment, weights: dittogym.Outcome({"n": moment.now.split.detach()})
+    )
+    monkeypatch.setitem(dittogym.TASKS, "count", lambda: counts)
+    assert command.main(["--quick", "--task", "count", "--out", str(tmp_path)]) == 2
+    assert "reward of task 'count' has no gradient" in capsys.readouterr().err
 
 
 def test_horizons_end_with_the_episode(tmp_path) -> None:
