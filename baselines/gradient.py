@@ -54,7 +54,7 @@ class GradientConfig(RunConfig):
     """Updates in the first stage."""
     grid: int | Literal["coarse", "fine"] = 16
     """Action grid R: coarse, fine (the task's), or a number."""
-    learning_rate: float = 0.05
+    learning_rate: float = 0.1
     """Adam's step size at the beginning; a cosine takes it to a tenth."""
     window: int = 0
     """Control steps that a gradient reaches back; 0: the whole episode."""
@@ -66,10 +66,10 @@ class GradientConfig(RunConfig):
     """Updates in a second stage, on the particles and the one layout of this seed that judge it."""
     polish_grid: int | Literal["coarse", "fine"] = "fine"
     """Its action grid."""
-    polish_rate: float = 0.02
+    polish_rate: float = 0.05
     """Its learning rate."""
 
-    changeable: ClassVar[tuple[str, ...]] = ("polish", *RunConfig.changeable)
+    changeable: ClassVar[tuple[str, ...]] = ("polish", "polish_grid", "polish_rate", *RunConfig.changeable)
 
     def ends(self) -> tuple[int, ...]:
         """Environment steps after which each stage ends."""
@@ -83,9 +83,9 @@ class GradientConfig(RunConfig):
         spec = make_spec(self.task)
         return {"coarse": spec.coarse, "fine": spec.fine}[grid] if isinstance(grid, str) else grid
 
-    def evaluation_seed(self, level: int) -> int:
+    def evaluation(self, level: int) -> tuple[int, int]:
         """A polished policy is judged on its own layout while it is polished."""
-        return self.seed if level else super().evaluation_seed(level)
+        return (self.seed, 1) if level else super().evaluation(level)
 
     def check(self) -> None:
         """Check what the types cannot, see `RunConfig.check`."""

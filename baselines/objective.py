@@ -63,6 +63,7 @@ def gaussian(sigma: float, size: int) -> Tensor:
     """
     if sigma == 0:
         return torch.eye(size, dtype=torch.float64)
-    place = torch.arange(size, dtype=torch.float64)
-    weight = torch.exp(-0.5 * ((place[:, None] - place) / sigma) ** 2)
-    return weight / torch.exp(-0.5 * (torch.arange(-4 * size, 4 * size + 1) / sigma) ** 2).sum()
+    place = torch.arange(-4 * size, 4 * size + 1, dtype=torch.float64)
+    weight = torch.exp(-0.5 * (place / sigma) ** 2)
+    distance = torch.arange(size)[:, None] - torch.arange(size)
+    return weight[4 * size + distance] / weight.sum()

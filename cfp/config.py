@@ -132,9 +132,9 @@ class RunConfig:
         """Action grid R of a stage (0 is the first)."""
         raise NotImplementedError
 
-    def evaluation_seed(self, level: int) -> int:
-        """Seed of the layouts on which a stage is evaluated while it trains."""
-        return self.seed + EVALUATION_SEED
+    def evaluation(self, level: int) -> tuple[int, int]:
+        """Seed of the first layout, and episodes, by which a stage is evaluated while it trains."""
+        return self.seed + EVALUATION_SEED, self.report.eval_episodes
 
     def adapted(self, base: RunConfig) -> RunConfig:
         """These options with what follows from those that differ from ``base``, unless it was changed too."""

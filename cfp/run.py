@@ -154,14 +154,14 @@ class Run(ABC):
 
     def _books(self, level: int, model: PolicyPredictor) -> Books:
         config = self.config
-        episodes = config.report.eval_episodes
+        seed, episodes = config.evaluation(level)
         env = make_env(config, config.resolution(level), episodes)
         rows = read_table(self.folder / "evaluations.csv")
         best = max((float(row["mean"]) for row in rows if int(row["stage"]) == level + 1), default=-math.inf)
 
         def measure(step: int) -> Result:
             nonlocal best
-            deterministic, seed = config.report.eval_deterministic, config.evaluation_seed(level)
+            deterministic = config.report.eval_deterministic
             result = evaluate("", model, env, episodes, deterministic=deterministic, seed=seed)
             row: dict[str, Any] = {"step": step, "stage": level + 1, "episodes": episodes}
             row |= {"mean": result.mean, "std": result.std}

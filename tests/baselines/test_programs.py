@@ -105,6 +105,16 @@ def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monk
     assert steps[0] == steps[1]
 
 
+def test_polish_is_judged_on_the_layout_it_is_made_for(finished):
+    algo, folder = finished
+    rows = [row for row in read_table(folder / "evaluations.csv") if row["stage"] == "2"]
+    assert {row["episodes"] for row in rows} == {"2" if algo == "cfp" else "1"}
+    if algo == "gradient":
+        own = json.loads((folder / "results.json").read_text())[-1]
+        assert own["returns"] == [pytest.approx(max(float(row["mean"]) for row in rows), abs=1e-3)]
+        assert baselines.load(folder).description["layout"] == 0
+
+
 def test_wrong_algorithm_is_named(tmp_path, capsys):
     assert train.main(["--algo", "alchemy", "--out", str(tmp_path / "a")]) == 2
     assert "algo: got 'alchemy', allowed cfp, gradient, mpc" in capsys.readouterr().err

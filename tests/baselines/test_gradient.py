@@ -1,0 +1,152 @@
+"""Open-loop gradient descent, on robots of a few hundred particles."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from baselines import Gradient, OpenLoop
+from baselines.registry import configure
+from cfp.config import EnvironmentConfig, to_json
+from cfp.errors import ConfigError, NonFiniteError
+from dittogym import make_spec
+
+TASKS = ("shapematch", "run", "grow", "kick", "dig", "obstacle", "catch", "slot")
+
+
+def make(task="shapematch", **changes):
+    environment = EnvironmentConfig(1, changes.pop("particles", 300), changes.pop("substeps", 4))
+    defaults = {"environment": environment, "tier": 300, "grid": 4, "device": "cpu", "iterations": 12}
+    return replace(Gradient.preset(task, "quick"), **defaults | changes)
+
+
+def shorten(algorithm, horizon):
+    algorithm.horizon = horizon
+    algorithm.theta = algorithm.theta.detach()[:horizon].clone().requires_grad_()
+    return algorithm
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("preset", ["quick", "paper"])
+def test_every_preset_is_valid_and_survives_json(task, preset):
+    config = Gradient.preset(task, preset)
+    config.check()
+    assert configure(json.loads(json.dumps(to_json(config)))) == config
+    assert config.ends() == (config.iterations * make_spec(task).horizon,)
+    assert replace(config, polish=2).ends()[1] - config.ends()[0] == 2 * make_spec(task).horizon
+    assert [config.resolution(level) for level in (0, 1)] == [config.resolution(0), make_spec(task).fine]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"iterations": 0}, "iterations: got 0"),
+        ({"window": -1}, "window: got -1"),
+        ({"polish_rate": 0.0}, "polish_rate"),
+        ({"blur": ()}, "blur"),
+    ],
+)
+def test_impossible_options_are_named(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        make(**changes).check()
+
+
+def test_descent_improves_the_true_return():
+    algorithm, returns = Gradient(make(substeps=30, tier=500, learning_rate=0.2, blur=(1.0,), iterations=6)), []
+    algorithm.learn(6 * 30, lambda scalars: returns.append(scalars["train/return"]))
+    assert len(returns) == 6 and algorithm.num_timesteps == 180
+    assert returns[-1] > returns[0] + 40
+    assert algorithm.policy.actions.abs().max() < 1
+
+
+def numerical(algorithm, index, width):
+    """Central difference of the loss in one entry of theta."""
+    losses = []
+    for sign in (1, -1):
+        algorithm.theta.data[index] += sign * width
+        losses.append(algorithm._episode(0.9)[0])
+        algorithm.theta.data[index] -= sign * width
+    return (losses[0] - losses[1]) / (2 * width)
+
+
+@pytest.mark.parametrize("task", ["shapematch", "run"])
+def test_gradient_is_that_of_the_loss(task):
+    environment = EnvironmentConfig(1, 300, 4, dtype="float64")
+    algorithm = shorten(Gradient(make(task, environment=environment, window=0)), 4)
+    with torch.no_grad():
+        algorithm.theta += 0.3
+    algorithm.theta = algorithm.theta.detach().double().requires_grad_()
+    _, _, gradient = algorithm._episode(0.9)
+    index = (1, 0, 2, 2)
+    assert gradient[index].item() == pytest.approx(numerical(algorithm, index, 1e-5), rel=1e-4)
+
+
+def test_windows_cut_the_gradient_but_not_the_loss():
+    whole = shorten(Gradient(make(window=0)), 6)._episode(0.9)
+    halves = shorten(Gradient(make(window=3)), 6)._episode(0.9)
+    assert halves[0] == pytest.approx(whole[0], rel=1e-6)
+    assert torch.allclose(halves[2][3:], whole[2][3:], rtol=1e-4, atol=1e-9)
+    assert not torch.allclose(halves[2][:3], whole[2][:3], rtol=0.1, atol=1e-9)
+
+
+def test_steps_after_the_end_of_an_episode_do_not_count(monkeypatch):
+    algorithm = shorten(Gradient(make("run", window=2)), 6)
+    step, calls = algorithm.env.step, []
+
+    def end_at_third(action):
+        calls.append(action)
+        observation, reward, terminated, truncated, info = step(action)
+        return observation, reward, terminated | (len(calls) == 3), truncated, info
+
+    monkeypatch.setattr(algorithm.env, "step", end_at_third)
+    _, _, gradient = algorithm._episode(0.0)
+    assert len(calls) == 3
+    assert gradient[:3].abs().amax((1, 2, 3)).gt(0).all() and not gradient[3:].any()
+
+
+def test_unusual_gradients_are_clipped():
+    algorithm = Gradient(make())
+    gradient = torch.ones(30, 2, 4, 4)
+    clipped, share = algorithm._clip(gradient)
+    assert torch.equal(clipped, gradient) and share == 0
+    spiky = gradient.clone()
+    spiky[7] *= 100
+    clipped, share = algorithm._clip(spiky)
+    assert torch.allclose(clipped[7], 3 * gradient[7]) and torch.equal(clipped[8], gradient[8])
+    assert share == pytest.approx(1 / 30)
+
+
+def test_iteration_that_is_not_finite_is_undone(monkeypatch):
+    algorithm = Gradient(make(substeps=1))
+    algorithm.learn(30, lambda _: None)
+    good, before = algorithm._episode, algorithm.theta.detach().clone()
+    algorithm.learn(30, lambda _: None)
+    assert not torch.equal(algorithm.theta, before)
+    fail = lambda progress: (float("nan"), 0.0, torch.zeros_like(algorithm.theta))  # noqa: E731
+    monkeypatch.setattr(algorithm, "_episode", fail)
+    scalars = algorithm._iterate()
+    assert torch.equal(algorithm.theta, before) and scalars["train/failed"] == 1
+    monkeypatch.setattr(algorithm, "_episode", good)
+    assert algorithm._iterate()["train/learning_rate"] == pytest.approx(scalars["train/learning_rate"] / 2)
+    monkeypatch.setattr(algorithm, "_episode", fail)
+    with pytest.raises(NonFiniteError, match="10 iterations in a row"):
+        algorithm.learn(30 * 20, lambda _: None)
+    assert algorithm.theta.isfinite().all()
+
+
+def test_polish_starts_from_the_actions_of_the_first_stage():
+    actions = 0.5 * torch.rand(30, 2, 4, 4, generator=torch.Generator().manual_seed(0)) - 0.25
+    algorithm = Gradient(make(polish=1, polish_grid=4, particles=200), 1, OpenLoop(actions))
+    assert torch.allclose(algorithm.policy.actions, actions, atol=1e-6)
+    assert algorithm.env.num_particles == 200
+    finer = Gradient(make(polish=1, polish_grid=8, particles=200), 1, OpenLoop(actions)).policy.actions
+    assert finer.shape == (30, 2, 8, 8)
+    assert torch.allclose(finer.mean((2, 3)), actions.mean((2, 3)), atol=0.05)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_has_a_gradient(task):
+    algorithm = shorten(Gradient(make(task, substeps=20, particles=100, tier=100)), 3)
+    loss, _, gradient = algorithm._episode(0.0)
+    assert gradient.isfinite().all() and gradient.abs().sum() > 0 and loss == loss
