@@ -35,8 +35,8 @@ class PlannerConfig:
     """Standard deviation of the actions with which a plan is extended."""
     clip: float = 3.0
     """Largest gradient of one control step, in medians over the steps of the plan."""
-    terminal: float = 32.0
-    """Control steps after the plan that are counted with the mean reward of its second half, if it has not ended."""
+    forgone: float = 32.0
+    """Control steps at its mean reward that a plan is charged for ending the episode before its time."""
     margin: float = 1000.0
     """Cost of a spread beyond 80 % of the limit at which the robot counts as torn, per squared share of the limit."""
 
@@ -51,7 +51,7 @@ class PlannerConfig:
         for name in ("iterations", "learning_rate", "clip"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, allowed more than 0")
-        for name in ("noise", "terminal", "margin"):
+        for name in ("noise", "forgone", "margin"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, allowed 0 or more")
 
@@ -171,12 +171,12 @@ class Planner:
         return judgement._replace(reward=reward, true_reward=true_reward)
 
     def _judge(self, start: EnvState, plan: Tensor) -> tuple[Tensor, Tensor]:
-        """Smooth return, and true return with what may come after, of plans (T, B, 2, R, R): (B,) each."""
+        """Smooth return, and true return less what ending forgoes, of plans (T, B, 2, R, R): (B,) each."""
         steps = rollout(self.env.model, start, plan, self._careful, layout=self.layout, checkpointed=False)
-        late = steps.true_rewards[len(plan) // 2 :].mean(0)
-        after = min(self.config.terminal, max(self._left(start) - len(plan), 0))
-        beyond = torch.where(steps.ended, 0.0, after * late)
-        return steps.rewards.sum(0), steps.true_rewards.sum(0) + beyond
+        total = steps.true_rewards.sum(0)
+        after = min(self.config.forgone, max(self._left(start) - len(plan), 0))
+        charge = torch.where(steps.ended, after / len(plan) * total.clamp_min(0.0), 0.0)
+        return steps.rewards.sum(0), total - charge
 
 
 def _spread(mask: Tensor) -> Tensor:

@@ -100,10 +100,10 @@ def test_ending_the_episode_forgoes_what_comes_after() -> None:
         return judge(model, state, field)._replace(reward=value, true_reward=1.0 + value.detach(), ended=value > 0.3)
 
     chosen = {}
-    for terminal in (0.0, 5.0):
+    for forgone in (0.0, 5.0):
         env = small()
-        config = PlannerConfig(horizon=1, commit=1, iterations=2, noise=0.0, learning_rate=0.25, terminal=terminal)
-        chosen[terminal] = float(Planner(env, config, judge=ends_if_contracted).plan()[0, 0, 0].mean())
+        config = PlannerConfig(horizon=1, commit=1, iterations=2, noise=0.0, learning_rate=0.25, forgone=forgone)
+        chosen[forgone] = float(Planner(env, config, judge=ends_if_contracted).plan()[0, 0, 0].mean())
     assert chosen[0.0] == pytest.approx(0.5, abs=0.02) and chosen[5.0] == pytest.approx(0.25, abs=0.02)
 
 
@@ -146,7 +146,7 @@ def test_spread_near_the_limit_costs() -> None:
         env.state.x[:] = 0.3 + stretch * (env.state.x - env.state.x.mean(1))
         values = []
         for margin in (0.0, 300.0):
-            planner = Planner(env, PlannerConfig(horizon=1, commit=1, margin=margin, terminal=0.0))
+            planner = Planner(env, PlannerConfig(horizon=1, commit=1, margin=margin))
             values.append(torch.stack(planner._judge(env.env_state, plan)))
         cost = 300.0 * max(0.0, stretch * spread / 0.1 - 0.8) ** 2
         assert (values[0] - values[1]).flatten().tolist() == pytest.approx([cost, cost], rel=0.05, abs=1e-6)
@@ -166,7 +166,7 @@ def test_clipping_limits_steps_to_medians() -> None:
         ({"commit": 17}, "commit: got 17, allowed 1 to the horizon, 16"),
         ({"iterations": 0}, "iterations: got 0, allowed more than 0"),
         ({"noise": -0.1}, "noise: got -0.1, allowed 0 or more"),
-        ({"terminal": float("nan")}, "terminal: got nan"),
+        ({"forgone": float("nan")}, "forgone: got nan"),
     ],
 )
 def test_bad_options(options: dict, message: str) -> None:
