@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from typing_extensions import Self
+from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from cfp.books import Books
 from cfp.config import RunConfig
@@ -72,10 +72,14 @@ class Algorithm(ABC):
         """
 
     @abstractmethod
-    def learn(self, total_timesteps: int, callback: Callback) -> Self:
+    def learn(self, total_timesteps: int, callback: Callback) -> Algorithm:
         """Take some more environment steps and learn from them; call back between updates."""
 
+    @property
     @abstractmethod
+    def policy(self) -> PolicyPredictor:
+        """What has been learned so far."""
+
     def predict(
         self,
         observation: np.ndarray | dict[str, np.ndarray],
@@ -84,6 +88,7 @@ class Algorithm(ABC):
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Actions (B, 2, R, R) for observations (B, 3, 64, 64), and the policy's memory for the next step."""
+        return self.policy.predict(observation, state, episode_start, deterministic)
 
     @abstractmethod
     def save(self, path: Path, description: dict[str, Any]) -> None:

@@ -7,11 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
-from typing_extensions import Self
 
 import cfp
 from baselines.algorithm import Algorithm, Callback, Sees
@@ -115,8 +113,8 @@ class Gradient(Algorithm):
     def __init__(self, config: GradientConfig, level: int = 0, start: OpenLoop | None = None) -> None:
         self.config, self.level = config, level
         particles = config.environment.particles if level else config.tier
-        judged = replace(config, environment=replace(config.environment, particles=particles))
-        self.env = make_torch_env(judged, config.resolution(level), 1 if level else None)
+        own = replace(config, environment=replace(config.environment, particles=particles))
+        self.env = make_torch_env(own, config.resolution(level), 1 if level else None)
         self.horizon = self.env.spec.horizon
         self.theta = torch.zeros(self.horizon, *self.env.action_shape, device=self.env.device)
         if start is not None:
@@ -157,7 +155,7 @@ class Gradient(Algorithm):
         """The present actions."""
         return OpenLoop(self.theta.tanh())
 
-    def learn(self, total_timesteps: int, callback: Callback) -> Self:
+    def learn(self, total_timesteps: int, callback: Callback) -> Gradient:
         """Do as many iterations as cover the steps.
 
         Raises:
@@ -244,16 +242,6 @@ class Gradient(Algorithm):
                 self.theta.copy_(self.before)
         for state in self.adam.state.values():
             state["exp_avg"].zero_()
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """See `OpenLoop.predict`."""
-        return self.policy.predict(observation, state, episode_start, deterministic)
 
     def save(self, path: Path, description: dict[str, Any]) -> None:
         """Write the actions; a polished policy names its layout."""

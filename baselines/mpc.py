@@ -6,10 +6,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
-from typing_extensions import Self
 
 import cfp
 from baselines.algorithm import Algorithm, Callback, Sees
@@ -110,7 +108,7 @@ class MPC(Algorithm):
         """The record so far."""
         return OpenLoop(self.actions)
 
-    def learn(self, total_timesteps: int, callback: Callback) -> Self:
+    def learn(self, total_timesteps: int, callback: Callback) -> MPC:
         """Carry out some more steps, fewer if the episode ends."""
         end = self.num_timesteps + total_timesteps
         while self.num_timesteps < end and not self.over:
@@ -134,16 +132,6 @@ class MPC(Algorithm):
         self.reward = float(reward)
         self.total += self.reward
         self.over = bool(terminated)
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """See `OpenLoop.predict`."""
-        return self.policy.predict(observation, state, episode_start, deterministic)
 
     def save(self, path: Path, description: dict[str, Any]) -> None:
         """Write the record, with its layout."""

@@ -36,15 +36,16 @@ napoleon_use_ivar = True
 
 
 class CommandHelp(SphinxDirective):
-    """Show what ``python -m MODULE --help`` prints, so that the page cannot fall behind the program."""
+    """Show what ``python -m MODULE OPTIONS --help`` prints, so that the page cannot fall behind the program."""
 
     required_arguments = 1
+    final_argument_whitespace = True
 
     def run(self) -> list[nodes.Node]:
         """Run the command and keep its output as a literal block."""
         self.env.note_reread()  # the program may have changed though the page has not
         environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
-        command = [sys.executable, "-m", self.arguments[0], "--help"]
+        command = [sys.executable, "-m", *self.arguments[0].split(), "--help"]
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
         if done.returncode != 0:
             raise self.error(f"python -m {self.arguments[0]} --help failed:\n{done.stderr}")

@@ -1,5 +1,7 @@
 """Settings shared by all tests."""
 
+from collections.abc import Iterator
+
 import pytest
 import torch
 from hypothesis import settings
@@ -15,3 +17,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("cuda"):
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Batches of four images are too small to share: waiting for a second thread costs more than it brings."""
+    before = torch.get_num_threads()
+    if request.path.parent.name in ("cfp", "baselines"):
+        torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)

@@ -28,8 +28,8 @@ TINY = {
         ["stage 1", "stage 2", "  own layout"],
     ),
     "mpc": (
-        "--task kick --grid 8 --horizon 3 --commit 2 --iterations 1 --eval-every 200 --checkpoint-every 100",
-        221,
+        "--grid 8 --horizon 3 --commit 2 --iterations 1 --eval-every 12 --checkpoint-every 5 --log-every 5",
+        17,
         ["stage 1", "  own layout"],
     ),
 }
