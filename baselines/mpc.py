@@ -46,9 +46,9 @@ class MPCConfig(RunConfig):
         spec = make_spec(self.task)
         return {"coarse": spec.coarse, "fine": spec.fine}[self.grid] if isinstance(self.grid, str) else self.grid
 
-    def evaluation_seed(self, level: int) -> int:
+    def evaluation(self, level: int) -> tuple[int, int]:
         """The episode is evaluated on the layout that it was planned on."""
-        return self.seed
+        return self.seed, 1
 
     def check(self) -> None:
         """Check what the types cannot, see `RunConfig.check`."""

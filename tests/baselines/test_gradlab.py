@@ -156,7 +156,7 @@ def test_task_without_a_gradient_is_named(tmp_path, capsys, monkeypatch) -> None
 
 
 def test_horizons_end_with_the_episode(tmp_path) -> None:
-    arguments = ["--quick", "--task", "run", "--warmup", "797", "--substeps", "1", "--particles", "20"]
+    arguments = ["--quick", "--task", "shapematch", "--resolution", "4", "--warmup", "27"]
     command.run(command.parse([*arguments, "--out", str(tmp_path)]))
     report = json.loads((tmp_path / "report.json").read_text())
     assert [row["horizon"] for row in report["horizons"]] == [1, 2]
