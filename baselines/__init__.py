@@ -2,7 +2,21 @@
 
 from baselines.algorithm import Algorithm, Entry
 from baselines.gradient import Gradient, GradientConfig
+from baselines.mpc import MPC, MPCConfig
 from baselines.open_loop import OpenLoop
+from baselines.planner import Planner, PlannerConfig
 from baselines.registry import ALGORITHMS, load
 
-__all__ = ["ALGORITHMS", "Algorithm", "Entry", "Gradient", "GradientConfig", "OpenLoop", "load"]
+__all__ = [
+    "ALGORITHMS",
+    "MPC",
+    "Algorithm",
+    "Entry",
+    "Gradient",
+    "GradientConfig",
+    "MPCConfig",
+    "OpenLoop",
+    "Planner",
+    "PlannerConfig",
+    "load",
+]

@@ -25,6 +25,8 @@ FINAL_RATE = 0.1
 """Share of the learning rate that is left at the end of its cosine."""
 SPIKE, MEMORY = 3.0, 0.9
 """A step's gradient is clipped to this many times its usual norm, which is averaged with this momentum."""
+RISE, SLOWER = 1.1, 0.7
+"""An iteration whose loss is this many times the best one is undone, and the learning rate falls by this factor."""
 PATIENCE = 10
 """Failed iterations in a row after which training gives up."""
 
@@ -34,7 +36,7 @@ METRICS: dict[str, str] = {
     "train/gradient_norm": "norm of the gradient before it is clipped",
     "train/clipped": "share of control steps whose gradient was clipped",
     "train/learning_rate": "Adam's step size in the next iteration",
-    "train/failed": "iterations of this stage that were not finite and were undone",
+    "train/failed": "iterations of this stage that were undone",
 }
 """Every scalar that `Gradient.learn` logs, and what it means."""
 
@@ -52,7 +54,7 @@ class GradientConfig(RunConfig):
     """Updates in the first stage."""
     grid: int | Literal["coarse", "fine"] = 16
     """Action grid R: coarse, fine (the task's), or a number."""
-    learning_rate: float = 0.1
+    learning_rate: float = 0.05
     """Adam's step size at the beginning; a cosine takes it to a tenth."""
     window: int = 0
     """Control steps that a gradient reaches back; 0: the whole episode."""
@@ -103,8 +105,9 @@ class Gradient(Algorithm):
     """Adam on the actions of a whole episode, through the simulation.
 
     Actions are ``tanh(theta)``, theta (T, 2, R, R) begins at zero. Steps after the end of an episode do not count. An
-    iteration whose loss, gradient or state is not finite is undone: theta goes back to where it was, Adam's momentum is
-    forgotten, and the learning rate is halved for good.
+    iteration whose loss, gradient or state is not finite, or whose loss is far above the best one (a robot that breaks
+    into pieces has no way back), is undone: theta returns to the best point under the present blur, Adam's momentum is
+    forgotten, and the learning rate falls for good.
     """
 
     name: ClassVar[str] = "gradient"
@@ -125,7 +128,7 @@ class Gradient(Algorithm):
         self.objective = make_objective(self.env, config.blur[-1:] if level else config.blur)
         self.usual = torch.zeros(self.horizon, device=self.env.device)
         self.slower, self.failed, self.failed_in_a_row = 1.0, 0, 0
-        self.before: Tensor | None = None
+        self.best_loss, self.best, self.phase = math.inf, self.theta.detach().clone(), 0
 
     @staticmethod
     def preset(task: str, name: str) -> GradientConfig:
@@ -178,14 +181,17 @@ class Gradient(Algorithm):
         cosine = 0.5 * (1.0 + math.cos(math.pi * progress))
         rate = self.slower * self.rate * (FINAL_RATE + (1.0 - FINAL_RATE) * cosine)
         self.adam.param_groups[0]["lr"] = rate
+        if self.phase != (phase := int(progress * len(self.config.blur))):
+            self._return_to_best()
+            self.best_loss, self.phase = math.inf, phase
         loss, total, gradient = self._episode(progress)
         scalars: dict[str, float | None] = {"train/learning_rate": rate, "train/loss": loss, "train/return": total}
-        if math.isfinite(loss) and bool(torch.isfinite(gradient).all()):
+        finite = math.isfinite(loss) and bool(torch.isfinite(gradient).all())
+        if finite and loss <= RISE * self.best_loss:
+            if loss < self.best_loss:
+                self.best_loss, self.best = loss, self.theta.detach().clone()
             scalars["train/gradient_norm"] = float(gradient.norm())
-            gradient, clipped = self._clip(gradient)
-            scalars["train/clipped"] = clipped
-            self.before = self.theta.detach().clone()
-            self.theta.grad = gradient
+            self.theta.grad, scalars["train/clipped"] = self._clip(gradient)
             self.adam.step()
             self.failed_in_a_row = 0
         else:
@@ -233,13 +239,15 @@ class Gradient(Algorithm):
         self.failed_in_a_row += 1
         if self.failed_in_a_row >= PATIENCE:
             raise NonFiniteError(
-                f"{PATIENCE} iterations in a row were not finite after {self.num_timesteps} environment steps of the "
+                f"{PATIENCE} iterations in a row came to nothing after {self.num_timesteps} environment steps of the "
                 "stage; the last checkpoint is untouched"
             )
-        self.slower *= 0.5
-        if self.before is not None:
-            with torch.no_grad():
-                self.theta.copy_(self.before)
+        self.slower *= SLOWER
+        self._return_to_best()
+
+    def _return_to_best(self) -> None:
+        with torch.no_grad():
+            self.theta.copy_(self.best)
         for state in self.adam.state.values():
             state["exp_avg"].zero_()
 
@@ -257,20 +265,20 @@ class Gradient(Algorithm):
         """Everything that the next iteration depends on."""
         return {
             "theta": self.theta.detach().cpu(),
-            "before": None if self.before is None else self.before.cpu(),
+            "best": self.best.cpu(),
             "adam": self.adam.state_dict(),
             "usual": self.usual.cpu(),
-            "counts": [self.slower, self.failed, self.failed_in_a_row],
+            "counts": [self.best_loss, self.phase, self.slower, self.failed, self.failed_in_a_row],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Undo `state_dict`."""
         with torch.no_grad():
             self.theta.copy_(state["theta"])
-        self.before = None if state["before"] is None else state["before"].to(self.theta)
+        self.best = state["best"].to(self.theta)
         self.adam.load_state_dict(state["adam"])
         self.usual = state["usual"].to(self.theta)
-        self.slower, self.failed, self.failed_in_a_row = state["counts"]
+        self.best_loss, self.phase, self.slower, self.failed, self.failed_in_a_row = state["counts"]
 
 
 def _theta(actions: Tensor, resolution: int) -> Tensor:

@@ -1,0 +1,1 @@
+"""How far gradients through a task reach: ``python -m baselines.gradlab``."""

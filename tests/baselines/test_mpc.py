@@ -1,0 +1,80 @@
+"""The planner as an algorithm."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from baselines import MPC, OpenLoop, PlannerConfig, train
+from baselines.mpc import MPCConfig
+from cfp.config import EnvironmentConfig
+from cfp.errors import ConfigError
+from cfp.files import read_table
+
+ENVIRONMENT = EnvironmentConfig(num_envs=1, particles=100, substeps=2)
+CONFIG = MPCConfig(
+    task="kick", device="cpu", grid=4, environment=ENVIRONMENT, planner=PlannerConfig(horizon=3, commit=2, iterations=1)
+)
+
+
+def test_record_repeats_the_episode(tmp_path) -> None:
+    options = "--task shapematch --particles 60 --substeps 1 --grid 4 --horizon 2 --commit 2 --iterations 1"
+    arguments = ["--algo", "mpc", *options.split(), "--no-video", "--device", "cpu", "--log-every", "1"]
+    assert train.main([*arguments, "--out", str(tmp_path)]) == 0
+    planned = [float(row["train/return"]) for row in read_table(tmp_path / "progress.csv")]
+    evaluated = [float(row["mean"]) for row in read_table(tmp_path / "evaluations.csv")]
+    assert len(planned) == 30 and evaluated[-1] == pytest.approx(planned[-1], abs=1e-3)
+    rows = {row["policy"].strip(): row for row in json.loads((tmp_path / "results.json").read_text())}
+    assert rows["own layout"]["mean"] == pytest.approx(max(evaluated), abs=1e-3)
+    record = OpenLoop.load(tmp_path)
+    assert 0 < len(record.actions) <= 30 and record.resolution == 4 and record.description["layout"] == 0
+
+
+def test_learning_stops_with_the_episode() -> None:
+    mpc = MPC(CONFIG)
+    seen = []
+
+    def behind_the_limit(scalars) -> None:
+        seen.append(scalars)
+        if len(seen) == 3:
+            mpc.env.state.x[..., 0] -= 1.0
+
+    mpc.learn(10, behind_the_limit)
+    assert mpc.over and mpc.num_timesteps == 4 == len(mpc.actions) == len(seen)
+    assert seen[-1]["train/return"] == mpc.total and seen[-1]["train/plans"] == 4
+    mpc.learn(5, behind_the_limit)
+    assert len(seen) == 4
+
+
+def test_layout_of_the_reference_is_kept() -> None:
+    for environment, layout in (
+        (ENVIRONMENT, "image"),
+        (replace(ENVIRONMENT, action_layout="grid"), "grid"),
+        (replace(ENVIRONMENT, parity="reference"), "grid"),
+        (replace(ENVIRONMENT, parity="reference", action_layout="image"), "image"),
+    ):
+        assert MPC(replace(CONFIG, environment=environment)).planner.layout == layout
+
+
+def test_state_goes_on_the_same() -> None:
+    first, second = MPC(CONFIG), MPC(CONFIG)
+    first.learn(3, lambda scalars: None)
+    second.load_state_dict(first.state_dict())
+    second.num_timesteps = first.num_timesteps
+    for mpc in (first, second):
+        mpc.learn(4, lambda scalars: None)
+    assert torch.equal(first.actions, second.actions) and first.total == second.total
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"environment": replace(ENVIRONMENT, num_envs=2)}, "num_envs: got 2, allowed 1"),
+        ({"environment": replace(ENVIRONMENT, resample=True)}, "resample: got True, allowed False"),
+        ({"planner": PlannerConfig(horizon=4, commit=5)}, "commit: got 5, allowed 1 to the horizon, 4"),
+    ],
+)
+def test_bad_options(change: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        replace(CONFIG, **change).check()
