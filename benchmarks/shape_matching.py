@@ -59,7 +59,8 @@ def measure(target: str, out: Path, polish: int) -> dict:
     if kept.exists():
         return json.loads(kept.read_text())
     if len(target) == 1 and target not in "IMT":
-        cv2.imwrite(target := str(out / f"{target}.png"), letter(target))
+        picture_of_letter = letter(target)
+        cv2.imwrite(target := str(out / f"{target}.png"), picture_of_letter)
     start = time.process_time()
     options = ["--algo", "gradient", "--task", "shapematch", "--target", target, "--polish", str(polish), "--no-video"]
     if train([*options, "--out", str(out / name), "--resume"]) != 0:
