@@ -17,6 +17,7 @@ from dittogym.reward import action_cost, measure, split_penalty
 from dittogym.spec import FAILURE_REWARD, Measurement, Moment, Outcome, TaskSpec
 from dittogym.window import in_window, window_origin
 from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VonMises, diagnostics
+from torchmpm.rollout import Segment
 from torchmpm.state import choose
 
 #: Terms that the engine adds to those of a task.
@@ -92,7 +93,7 @@ class Model:
     substeps: int
     shares: tuple[float, ...]
     pixels: bool
-    segment: int | None = 10
+    segment: Segment = "auto"
 
     @functools.cached_property
     def painter(self) -> native.Painter:

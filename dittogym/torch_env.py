@@ -21,6 +21,7 @@ from dittogym.soft import soft_observation
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
 from torchmpm import ParticleState
+from torchmpm.rollout import Segment
 from torchmpm.state import choose
 
 Parity = Literal["clean", "reference"]
@@ -106,7 +107,7 @@ class TorchEnv:
         parity: Parity = "clean",
         resample: bool = False,
         deterministic: bool = False,
-        segment: int | None = 10,
+        segment: Segment = "auto",
         **task_options: Any,
     ) -> None:
         self.spec = make_spec(task, **task_options)

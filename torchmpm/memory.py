@@ -16,7 +16,7 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from torchmpm.backends import runs_native, substep_function
 from torchmpm.native import ops, pack
-from torchmpm.rollout import repeated
+from torchmpm.rollout import SEGMENT, Segment, repeated
 from torchmpm.solver import MASS_EPSILON, Solver
 from torchmpm.state import ParticleState
 
@@ -65,7 +65,7 @@ def estimate_memory(
     state: ParticleState | tuple[int, int, torch.dtype],
     *,
     substeps: int,
-    segment: int | None = 10,
+    segment: Segment = "auto",
     env_steps: int = 1,
     backward: bool = True,
 ) -> int:
@@ -94,7 +94,7 @@ def estimate_memory(
     share = _occupied(solver, state)
     state = _empty(solver, state)
     if runs_native(solver, state):
-        return _native(solver, state, substeps, env_steps, backward, share)
+        return _native(solver, state, substeps, segment, env_steps, backward, share)
     if not backward:
         return _rehearsed(solver, state, 2, False)
     kept, grown = _eager_parts(solver, state)
@@ -111,8 +111,7 @@ def segment_for(
 ) -> int | None:
     """The ``segment`` for :meth:`torchmpm.Solver.step` with which gradients fit into a budget.
 
-    The whole graph (``None``) if that fits, which saves a second forward pass; else as few checkpoints as fit. The
-    native backend has no use for a segment: ``None`` if its needs fit.
+    The whole graph (``None``) if that fits, which saves a second forward pass eagerly; else as few checkpoints as fit.
 
     Args:
         solver: The solver.
@@ -125,17 +124,20 @@ def segment_for(
         ValueError: The smallest need exceeds the budget, or a number is below 1.
     """
     least = estimate_memory(solver, state, substeps=substeps, segment=None, env_steps=env_steps)
-    state = _empty(solver, state)
     if least <= budget:
         return None
-    if not runs_native(solver, state):
+    share, state = _occupied(solver, state), _empty(solver, state)
+    lengths = range(substeps - 1, 0, -1)
+    if runs_native(solver, state):
+        needs = {n: _native(solver, state, substeps, n, env_steps, True, share) for n in lengths}
+    else:
         kept, grown = _eager_parts(solver, state)
         others = least - _eager(state, kept, grown, substeps, None)
-        needs = {n: others + _eager(state, kept, grown, substeps, n) for n in range(substeps - 1, 0, -1)}
-        least = min([least, *needs.values()])
-        for length, need in needs.items():
-            if need <= budget:
-                return length
+        needs = {n: others + _eager(state, kept, grown, substeps, n) for n in lengths}
+    for length, need in needs.items():
+        if need <= budget:
+            return length
+    least = min([least, *needs.values()])
     raise ValueError(
         f"budget must be at least {least:,} bytes for {env_steps} step(s) of {substeps} substeps, {state.batch_size} x "
         f"{state.num_particles} particles in {state.dtype}, got {budget:,}: take fewer particles, simulations or "
@@ -166,7 +168,8 @@ def _step_bytes(solver: Solver, state: ParticleState) -> int:
     return _state_bytes(state) + _field_bytes(solver, state)
 
 
-def _eager(state: ParticleState, kept: int, grown: int, substeps: int, segment: int | None) -> int:
+def _eager(state: ParticleState, kept: int, grown: int, substeps: int, segment: Segment) -> int:
+    segment = SEGMENT if segment == "auto" else segment
     if segment is None or segment >= substeps:
         return kept + grown * substeps
     return kept + grown * segment + _state_bytes(state) * -(-substeps // segment)
@@ -205,9 +208,17 @@ def _occupied(solver: Solver, state: ParticleState | tuple[int, int, torch.dtype
     return float(nodes.prod(1).max() / solver.grid.width**2)
 
 
-def _native(solver: Solver, state: ParticleState, substeps: int, env_steps: int, backward: bool, share: float) -> int:
+def _native(
+    solver: Solver,
+    state: ParticleState,
+    substeps: int,
+    segment: Segment,
+    env_steps: int,
+    backward: bool,
+    share: float,
+) -> int:
     planes = state.x.new_empty(ROWS, state.batch_size, state.num_particles)
-    length = min(substeps, ops.tape_limit(planes, solver.grid.width)) if backward else substeps
+    length = min(substeps, ops.tape_limit(planes, solver.grid.width, segment)) if backward else substeps
     scratch = _scratch_bytes(solver, state, length, backward)
     if not backward:
         return scratch + 2 * _state_bytes(state)

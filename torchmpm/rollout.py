@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import TypeVar
+from typing import Literal, TypeAlias, TypeVar
 
 import torch
 from torch.utils.checkpoint import checkpoint
@@ -25,15 +25,21 @@ def _apply(step: Callable[[State, Input], State], value: Input, state: State) ->
     return step(state, value)
 
 
-def check_repetition(times: int, segment: int | None) -> None:
+#: Substeps between checkpoints; ``None`` for none, ``"auto"`` to leave it to the backend.
+Segment: TypeAlias = "int | Literal['auto'] | None"
+#: What ``"auto"`` is where nothing but checkpoints bounds the memory.
+SEGMENT = 10
+
+
+def check_repetition(times: int, segment: Segment) -> None:
     """Raise the errors of :func:`repeated`."""
     if times < 0:
         raise ValueError(f"times must not be negative, got {times}")
-    if segment is not None and segment < 1:
-        raise ValueError(f"segment must be at least 1 or None, got {segment}")
+    if segment not in (None, "auto") and not (isinstance(segment, int) and segment >= 1):
+        raise ValueError(f"segment must be at least 1, None or 'auto', got {segment!r}")
 
 
-def repeated(step: Callable[[State], State], state: State, times: int, *, segment: int | None = None) -> State:
+def repeated(step: Callable[[State], State], state: State, times: int, *, segment: Segment = None) -> State:
     """Apply ``step`` to ``state`` again and again.
 
     Args:
@@ -42,12 +48,13 @@ def repeated(step: Callable[[State], State], state: State, times: int, *, segmen
         times: How often.
         segment: With gradients enabled, keep the state only every ``segment`` steps and replay the steps between in
             the backward pass: memory for ``times / segment`` states and the graph of ``segment`` steps, for one more
-            forward pass. ``None`` keeps the whole graph.
+            forward pass. ``None`` keeps the whole graph, ``"auto"`` is 10.
 
     Raises:
         ValueError: ``times`` is negative or ``segment`` is below 1.
     """
     check_repetition(times, segment)
+    segment = SEGMENT if segment == "auto" else segment
     if segment is None or segment >= times or not torch.is_grad_enabled():
         for _ in range(times):
             state = step(state)

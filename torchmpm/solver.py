@@ -18,7 +18,7 @@ from torchmpm.grid import PAD, Grid
 from torchmpm.linalg import Mat2, matmul
 from torchmpm.material import Material, Sym2, Value, column
 from torchmpm.native.library import NO_COMPILER
-from torchmpm.rollout import check_repetition, repeated
+from torchmpm.rollout import Segment, check_repetition, repeated
 from torchmpm.spline import Stencil, stencil
 from torchmpm.state import ParticleState
 
@@ -151,7 +151,7 @@ class Solver:
         *,
         substeps: int = 1,
         origin: Float[Tensor, "B 2"] | None = None,
-        segment: int | None = 10,
+        segment: Segment = "auto",
     ) -> ParticleState:
         """Advance all simulations by ``substeps * dt`` seconds.
 
@@ -163,8 +163,9 @@ class Solver:
                 indices (i, j) rightwards and upwards; constant during the step. ``None`` for none.
             substeps: Number of substeps.
             origin: (B, 2) lower left corner of the window in the world, m; ``None`` for (0, 0).
-            segment: Substeps between checkpoints when gradients are enabled, see :func:`torchmpm.repeated`. The native
-                backend has no use for it: it keeps the start of the step and replays the substeps.
+            segment: Substeps between checkpoints when gradients are enabled, see :func:`torchmpm.repeated` and
+                :func:`torchmpm.segment_for`. The native backend keeps the start of a segment and replays its substeps
+                onto a tape; ``"auto"`` and ``None`` make its segments as long as the memory that it keeps for tapes.
 
         Returns:
             The new state, differentiable in state, actuation, origin, material values, masses, volumes and gravity.
@@ -176,7 +177,7 @@ class Solver:
         check_repetition(substeps, segment)
         if runs_native(self, state):
             origin = self.check(state, actuation, origin)
-            return native.step(self, state, actuation, origin, substeps, mass_epsilon=MASS_EPSILON)
+            return native.step(self, state, actuation, origin, substeps, segment, mass_epsilon=MASS_EPSILON)
         substep = substep_function(self, self.scene(state, actuation, origin))
         return ParticleState.from_planes(repeated(substep, state.planes(), substeps, segment=segment))
 

@@ -132,6 +132,29 @@ def test_the_segment_follows_the_budget() -> None:
     assert segment_for(solver, state, substeps=20, budget=budget, env_steps=30) < segment
 
 
+@needs_compiler
+def test_the_native_tape_follows_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorter tapes of more starts, of the scratch that kernels ask for; the gradient stays the same."""
+    solver, state = robot(300, backend="native"), lively(300)
+    whole = estimate_memory(solver, state, substeps=40)
+    segment = segment_for(solver, state, substeps=40, budget=whole // 2)
+    assert segment is not None and 1 < segment < 40
+    assert estimate_memory(solver, state, substeps=40, segment=segment) <= whole // 2
+    sizes: list[int] = []
+    scratch = ops._scratch
+    monkeypatch.setattr(ops, "_scratch", lambda size: (sizes.append(size), scratch(size))[1])
+
+    def gradient(segment: int | None) -> tuple[torch.Tensor, int]:
+        sizes.clear()
+        v = state.v.clone().requires_grad_()
+        final = solver.step(replace(state, v=v), substeps=40, segment=segment)
+        return torch.autograd.grad(final.x.square().sum(), v)[0], max(sizes)
+
+    (expected, most), (shorter, less) = gradient(None), gradient(segment)
+    assert less < 0.6 * most
+    torch.testing.assert_close(shorter, expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
+
+
 @pytest.mark.parametrize("backend", ["eager", pytest.param("native", marks=needs_compiler)])
 def test_a_budget_that_nothing_fits_into(backend: str) -> None:
     with pytest.raises(

@@ -68,7 +68,7 @@ def test_repeated_rejects() -> None:
     with pytest.raises(ValueError, match="times must not be negative, got -1"):
         repeated(double, torch.ones(1), -1)
     for segment in (0, -3):
-        with pytest.raises(ValueError, match=f"segment must be at least 1 or None, got {segment}"):
+        with pytest.raises(ValueError, match=f"segment must be at least 1, None or .auto., got {segment}"):
             repeated(double, torch.ones(1), 3, segment=segment)
 
 

@@ -22,6 +22,7 @@ from torch import Tensor
 from torchmpm.boundary import node_shift
 from torchmpm.native import ops, pack
 from torchmpm.native.pack import unsupported
+from torchmpm.rollout import Segment
 from torchmpm.state import ParticleState
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ def step(
     actuation: Tensor | None,
     origin: Tensor,
     substeps: int,
+    segment: Segment = "auto",
     *,
     mass_epsilon: float,
 ) -> ParticleState:
@@ -57,6 +59,7 @@ def step(
         actuation: (B, 2, G, G) or ``None``.
         origin: (B, 2).
         substeps: Number of substeps, not negative.
+        segment: With gradients, at most so many substeps are taped at once.
         mass_epsilon: Added to the mass of a node before the division, kg.
 
     Raises:
@@ -72,7 +75,7 @@ def step(
     shift, description = node_shift(solver.grid, origin), pack.description(solver, widths, mass_epsilon)
     planes = state.stack()
     # With gradients a call keeps its start and needs a tape of all its substeps later, which must not grow endlessly.
-    limit = ops.tape_limit(planes, solver.grid.width) if torch.is_grad_enabled() else substeps
+    limit = ops.tape_limit(planes, solver.grid.width, segment) if torch.is_grad_enabled() else substeps
     for start in range(0, substeps, limit):
         length = min(limit, substeps - start)
         planes = ops.native_step(planes, field, origin, gravity, table, shift, description, length)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchmpm.native.library import Call, load, thread_pool
 from torchmpm.native.pack import ROWS, body_widths
+from torchmpm.rollout import Segment
 
 _REAL = {torch.float32: "float", torch.float64: "double"}
 #: Scratch memory up to this size, bytes, is kept for the next call: fresh pages cost a third of a backward pass. It is
@@ -37,18 +38,21 @@ def _scratch(size: int) -> Iterator[int]:
         _kept.append(buffer)
 
 
-def tape_limit(planes: Tensor, width: int) -> int:
+def tape_limit(planes: Tensor, width: int, segment: Segment = "auto") -> int:
     """How many substeps the adjoint can replay at once within :data:`KEPT_BYTES`, or :data:`CUDA_TAPE_BYTES`.
 
     Args:
         planes: (13, B, N).
         width: Nodes per axis with their padding.
+        segment: Not more than so many, if it is a number.
     """
     rows, batch, particles = planes.shape
     if planes.is_cuda:
-        return max(1, CUDA_TAPE_BYTES // (planes.element_size() * rows * particles * batch))
-    substep = planes.element_size() * (rows * particles + 3 * width**2) * min(batch, torch.get_num_threads())
-    return max(1, KEPT_BYTES // substep)
+        limit = CUDA_TAPE_BYTES // (planes.element_size() * rows * particles * batch)
+    else:
+        substep = planes.element_size() * (rows * particles + 3 * width**2) * min(batch, torch.get_num_threads())
+        limit = KEPT_BYTES // substep
+    return max(1, min(limit, segment) if isinstance(segment, int) else limit)
 
 
 def library_for(dtype: torch.dtype) -> ctypes.CDLL:
