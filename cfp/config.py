@@ -42,6 +42,10 @@ class EnvironmentConfig:
     target: str | None = None
     """SHAPE MATCH: star, I, M, T or the path of an image; None: the task's default."""
 
+    def task_options(self) -> dict[str, Any]:
+        """What of it belongs to the task, for `dittogym.make_spec`."""
+        return {} if self.target is None else {"target": self.target}
+
 
 @dataclass(frozen=True)
 class NetworkConfig:

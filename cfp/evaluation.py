@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -57,6 +58,30 @@ class Result:
     def std(self) -> float:
         """Standard deviation of the returns over the episodes (of this sample, not of its mean)."""
         return float(np.std(self.returns))
+
+    @property
+    def interval(self) -> float | None:
+        """Half the width of the 95 % confidence interval of the mean (Student's t); None for one episode."""
+        count = len(self.returns)
+        if count < 2:
+            return None
+        return student(count - 1) * float(np.std(self.returns, ddof=1)) / math.sqrt(count)
+
+
+def student(degrees: int, level: float = 0.95) -> float:
+    """The t within which a share ``level`` of Student's distribution lies on both sides of 0.
+
+    With ``t = sqrt(degrees) tan(angle)`` the density in the angle is proportional to ``cos(angle)^(degrees - 1)``.
+    """
+    angle = np.linspace(0.0, np.pi / 2, 20_001)
+    density = np.cos(angle) ** (degrees - 1)
+    share = np.concatenate([[0.0], np.cumsum(density[1:] + density[:-1])])
+    return float(math.sqrt(degrees) * np.tan(np.interp(level, share / share[-1], angle)))
+
+
+def judging_seed(config: RunConfig) -> int:
+    """Of layouts that neither trained a policy nor chose the best one."""
+    return config.seed + 2 * EVALUATION_SEED
 
 
 class ZeroPolicy:
@@ -147,7 +172,7 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int) ->
         episodes: Episodes of each.
     """
     coarsest = config.resolution(0)
-    seed = config.seed + 2 * EVALUATION_SEED  # layouts that neither trained a policy nor chose the best one
+    seed = judging_seed(config)
     env = make_env(config, coarsest, episodes)
     untrained = {"zero action": ZeroPolicy(coarsest), "random action": RandomPolicy(coarsest, config.seed)}
     results = [
