@@ -16,6 +16,7 @@ from cfp.books import Books
 from cfp.config import RunConfig, to_json
 from cfp.environments import choose_device, make_env
 from cfp.errors import CheckpointError, ConfigError
+from cfp.estimate import Cost
 from cfp.evaluation import Policy, Result, compare, evaluate, format_table, to_rows
 from cfp.files import EventFile, ProgressTable, Table, copy_atomically, read_table, write_json
 from cfp.plot import plot_curve
@@ -135,6 +136,21 @@ class Run(ABC):
     @abstractmethod
     def load(self, path: Path) -> Policy:
         """Load a policy that `keep` wrote."""
+
+    @abstractmethod
+    def measure(self, model: Any) -> Cost:
+        """Time a few steps and updates of a model that has just been made; what it has learned is spoiled."""
+
+    def measure_all(self) -> list[Cost]:
+        """`measure` every stage, each over the untrained policy of the one before."""
+        costs = []
+        for level in range(len(self.config.ends())):
+            model = self.make_model(level)
+            self.keep(model, level, 0)
+            copy_policy(self.folder / "policy.safetensors", self.folder / f"stage{level + 1}.safetensors")
+            costs.append(self.measure(model))
+        self.logger.close()
+        return costs
 
     def train(self) -> None:
         """Train the stages that are left."""

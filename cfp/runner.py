@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.vec_env import VecMonitor
 
 from cfp.algorithm import CFP
@@ -13,7 +14,9 @@ from cfp.callbacks import StageCallback
 from cfp.checkpoint import Checkpoint
 from cfp.config import Config
 from cfp.environments import choose_device, make_env
+from cfp.estimate import Cost, seconds
 from cfp.policy import ActorPolicy, CFPPolicy
+from cfp.replay import FIELDS
 from cfp.run import Run
 from cfp.weights import describe, load, save_policy
 
@@ -78,6 +81,20 @@ class Runner(Run):
         """Train for some more steps in stable-baselines3's loop."""
         callback = StageCallback(books, self.position.offset)
         model.learn(steps, callback, log_interval=1 << 62, reset_num_timesteps=False)
+
+    def measure(self, model: CFP) -> Cost:
+        """Time a few steps and updates of a model that has just been made."""
+        env, buffer = model.get_env(), model.replay_buffer
+        assert env is not None and buffer is not None
+        observation, count = env.reset(), env.num_envs
+        assert isinstance(observation, np.ndarray)
+        actions = np.stack([env.action_space.sample() for _ in range(count)])
+        for _ in range(-(-model.batch_size // count)):
+            buffer.add(observation, observation, actions, np.zeros(count), np.zeros(count), [{}] * count)
+        acting = seconds(lambda: env.step(model.predict(observation)[0]))
+        updating = seconds(lambda: model.train(1, model.batch_size)) * self.config.learning.gradient_steps
+        arrays = (getattr(buffer, name) for name in FIELDS)
+        return Cost((acting + updating) / count, sum(array.nbytes for array in arrays))
 
     def load(self, path: Path) -> ActorPolicy:
         """Load a policy of the run."""
