@@ -12,6 +12,7 @@ from cfp.actor import ActorSpec
 from cfp.errors import ConfigError
 from cfp.losses import Precision
 from cfp.networks import RESOLUTIONS, Interpolation
+from dittogym import TASKS, make_spec
 
 Preset = Literal["quick", "paper"]
 
@@ -52,7 +53,7 @@ class NetworkConfig:
     """Choices inside the networks."""
 
     interpolation: Interpolation = "half_pixel"
-    """Bicubic upsampling: half_pixel (as the environment does) or aligned (aligned corners, the reference's)."""
+    """Bicubic upsampling: half_pixel (the environment's rule, blended on its patch) or aligned (the reference's)."""
     split: bool = False
     """Separate narrow encoders for observation and action (DIG)."""
     gate_scale: float = 1.0
@@ -141,6 +142,10 @@ class RunConfig:
         """Action grid R of a stage (0 is the first)."""
         raise NotImplementedError
 
+    def action_size(self, level: int) -> int:
+        """Rows and columns of the actions that the environment of a stage takes."""
+        return self.resolution(level)
+
     def evaluation(self, level: int) -> tuple[int, int]:
         """Seed of the first layout, and episodes, by which a stage is evaluated while it trains."""
         return self.seed + EVALUATION_SEED, self.report.eval_episodes
@@ -219,6 +224,10 @@ class Config(RunConfig):
         """Action grid R of a level."""
         return self.resolutions[level]
 
+    def action_size(self, level: int) -> int:
+        """Rows and columns of the actions that the environment of a level takes, see `ActorSpec.patch`."""
+        return self.actor_spec(level).action_size
+
     def adapted(self, base: RunConfig) -> RunConfig:
         """Other steps move the handovers in proportion."""
         assert isinstance(base, Config)
@@ -235,6 +244,7 @@ class Config(RunConfig):
             self.network.split,
             self.network.gate_scale,
             self.network.interpolation,
+            None if self.network.interpolation == "aligned" else make_spec(self.task).patch,
         )
 
     def stage(self, level: int) -> StageConfig:
@@ -264,6 +274,8 @@ class Config(RunConfig):
             given = len(getattr(self, name))
             if given != count:
                 raise ConfigError(f"{name}: got {given} values, allowed {count} for resolutions {self.resolutions}")
+        if self.task in TASKS and self.resolutions[-1] > (patch := make_spec(self.task).patch):
+            raise ConfigError(f"resolutions: got {self.resolutions}, allowed in {self.task} is at most {patch}")
         if any(late <= early for early, late in pairwise((0, *self.ends()))):
             raise ConfigError(f"handover: got {self.handover} of {self.steps} steps, allowed are growing steps between")
         super().check()

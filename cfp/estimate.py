@@ -75,7 +75,7 @@ def estimate(program: Program, config: RunConfig) -> str:
 
 def _evaluation_step(config: RunConfig, level: int) -> float:
     """Seconds of one step of an evaluation's environments."""
-    env = make_env(config, config.resolution(level), config.report.eval_episodes)
+    env = make_env(config, config.action_size(level), config.report.eval_episodes)
     env.reset()
     actions = np.stack([env.action_space.sample() for _ in range(env.num_envs)])
     return seconds(lambda: env.step(actions))

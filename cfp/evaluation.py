@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -22,7 +22,7 @@ class Policy(PolicyPredictor, Protocol):
 
     @property
     def resolution(self) -> int:
-        """Action grid R."""
+        """Rows and columns of its actions."""
 
     @property
     def deterministic_by_default(self) -> bool:
@@ -182,7 +182,9 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int) ->
         if env.action_space.shape != (2, trained.resolution, trained.resolution):
             env = make_env(config, trained.resolution, episodes)
         deterministic = trained.deterministic_by_default
-        results.append(evaluate(name, trained, env, episodes, deterministic=deterministic, seed=seed))
+        grid = trained.description.get("resolution", trained.resolution)
+        result = evaluate(name, trained, env, episodes, deterministic=deterministic, seed=seed)
+        results.append(replace(result, resolution=grid))
         if "layout" in trained.description:
             alone, own = make_env(config, trained.resolution, 1), trained.description["layout"]
             results.append(evaluate("  own layout", trained, alone, 1, deterministic=deterministic, seed=own))

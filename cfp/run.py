@@ -92,7 +92,7 @@ class Run(ABC):
         config.check()
         choose_device(config.device)
         for level in range(len(config.ends())):
-            make_env(config, config.resolution(level), 1)  # refuses bad options before anything is written
+            make_env(config, config.action_size(level), 1)  # refuses bad options before anything is written
         self.config, self.folder, self.signals = config, folder, signals
         if holds_run(folder) and not resume:
             raise ConfigError(f"out: {folder} already holds a run, allowed with --resume; or name another folder")
@@ -171,7 +171,7 @@ class Run(ABC):
     def _books(self, level: int, model: PolicyPredictor) -> Books:
         config = self.config
         seed, episodes = config.evaluation(level)
-        env = make_env(config, config.resolution(level), episodes)
+        env = make_env(config, config.action_size(level), episodes)
         rows = read_table(self.folder / "evaluations.csv")
         best = max((float(row["mean"]) for row in rows if int(row["stage"]) == level + 1), default=-math.inf)
 

@@ -30,7 +30,7 @@ class Runner(Run):
 
     def make_model(self, level: int) -> CFP:
         """Networks, replay memory and environment of a level, over the frozen policy of the coarser one."""
-        model = self._make_model(level, make_env(self.config, self.config.resolution(level)))
+        model = self._make_model(level, make_env(self.config, self.config.action_size(level)))
         if level > 0:
             coarse = load(self.folder / f"stage{level}.safetensors", str(model.device)).actor
             model.networks()[0].get_submodule("coarse").load_state_dict(coarse.state_dict())

@@ -64,7 +64,8 @@ def test_policy_is_loaded_by_its_kind(finished):
     policy = baselines.load(folder)
     start = np.ones(3, bool)
     actions, _ = policy.predict(images, None, start, True)
-    assert actions.shape == (3, 2, 8, 8) and policy.resolution == 8
+    assert actions.shape == (3, 2, policy.resolution, policy.resolution) == policy.predict(images)[0].shape
+    assert policy.description["resolution"] == 8
     assert policy.description["task"] == json.loads((folder / "config.json").read_text())["task"]
 
 
