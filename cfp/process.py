@@ -48,6 +48,10 @@ class Stopped(Exception):
         self.number = number
 
 
+class Plateau(Exception):
+    """A stage is over because its evaluations no longer improve; its checkpoint is written."""
+
+
 class StopSignals:
     """Turn Ctrl-C and SIGTERM into a request that training grants between two steps.
 

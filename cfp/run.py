@@ -6,6 +6,7 @@ import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from cfp.estimate import Cost
 from cfp.evaluation import Policy, Result, compare, evaluate, format_table, to_rows
 from cfp.files import EventFile, ProgressTable, Table, copy_atomically, read_table, write_json
 from cfp.plot import plot_curve
-from cfp.process import StopSignals
+from cfp.process import Plateau, StopSignals
 from cfp.state_file import Position, StateFile, check_same
 from cfp.video import VideoUnavailable, film, write_video
 from cfp.weights import read_policy
@@ -99,7 +100,6 @@ class Run(ABC):
         self.checkpoint = self.checkpoint_type(folder / "checkpoint")
         self.state: dict[str, Any] | None = None
         self.position = Position()
-        step = 0
         if resume and self.checkpoint.exists():
             self.state = self.checkpoint.load()
             check_same(json.loads(self.state["config"]), config)
@@ -108,10 +108,20 @@ class Run(ABC):
             print(f"resuming {folder} at step {step} of {config.ends()[-1]} (stage {self.position.level + 1})")
         elif resume:
             print(f"{folder} holds no checkpoint: starting from the beginning")
+        if self.state is None:
+            self.position = self.begin()
+            step = self.position.offset
         write_json(folder / "config.json", to_json(config))
         self.evaluations = Table(folder / "evaluations.csv", step)
         progress = ProgressTable(Table(folder / "progress.csv", step))
         self.logger = Logger(str(folder), [progress, EventFile(folder / "tensorboard", step)])
+
+    def begin(self) -> Position:
+        """Where a run begins that has no checkpoint; puts what the first stage needs into the folder."""
+        return Position()
+
+    def inherit(self, model: Any, previous: Any) -> None:  # noqa: B027  (most algorithms hand over a policy only)
+        """Give a model that has just been made what it shall have of the stage before, besides its policy."""
 
     @abstractmethod
     def make_model(self, level: int) -> Any:
@@ -154,19 +164,31 @@ class Run(ABC):
 
     def train(self) -> None:
         """Train the stages that are left."""
-        ends = self.config.ends()
+        ends, previous = self.config.ends(), None
         for level in range(self.position.level, len(ends)):
             model = self.make_model(level)
+            if previous is not None:
+                self.inherit(model, previous)
             if self.state is not None:
                 self.restore(model, self.state)
                 self.state = None
             left = ends[level] - self.position.offset - model.num_timesteps
-            if left > 0:
-                self.learn(model, left, self._books(level, model))
+            if left > 0 and not self._plateau(level):
+                try:
+                    self.learn(model, left, self._books(level, model))
+                except Plateau:
+                    print(f"stage {level + 1} ends early: {self.config.report.patience} evaluations without a new best")
+            previous = model
             if level + 1 < len(ends):
                 copy_policy(self.folder / "policy.safetensors", self.folder / f"stage{level + 1}.safetensors")
                 self.position = Position(level + 1, self.position.offset + model.num_timesteps)
         self.logger.close()
+
+    def _plateau(self, level: int) -> bool:
+        """Whether the best evaluation of a stage is as many evaluations ago as the run is patient."""
+        means = [float(row["mean"]) for row in self.evaluations.rows if int(row["stage"]) == level + 1]
+        patience = self.config.report.patience
+        return bool(patience and means) and len(means) - 1 - means.index(max(means)) >= patience
 
     def _books(self, level: int, model: PolicyPredictor) -> Books:
         config = self.config
@@ -195,7 +217,8 @@ class Run(ABC):
 
         # A stage begins with what the one before has reached: it must do better than that.
         first = level > 0 and config.report.eval_every > 0 and best == -math.inf
-        return Books(level, config.ends()[-1], config.report, self.signals, self.logger, measure, save, first)
+        total, over = config.ends()[-1], partial(self._plateau, level)
+        return Books(level, total, config.report, self.signals, self.logger, measure, save, first, over)
 
     def finish(self) -> list[Result]:
         """After training: the final table, ``results.json``, the curve and the video. Returns the table's rows."""

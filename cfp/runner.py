@@ -14,11 +14,13 @@ from cfp.callbacks import StageCallback
 from cfp.checkpoint import Checkpoint
 from cfp.config import Config
 from cfp.environments import choose_device, make_env
+from cfp.errors import ConfigError
 from cfp.estimate import Cost, seconds
 from cfp.policy import ActorPolicy, CFPPolicy
 from cfp.replay import FIELDS
 from cfp.run import Run
-from cfp.weights import describe, load, save_policy
+from cfp.state_file import Position
+from cfp.weights import describe, load, read_policy, save_policy, write_policy
 
 
 class Runner(Run):
@@ -27,6 +29,37 @@ class Runner(Run):
     checkpoint_type = Checkpoint
     config: Config
     checkpoint: Checkpoint
+
+    def begin(self) -> Position:
+        """Take the first levels from a policy if the options say so; its steps count as those before its handover.
+
+        Raises:
+            ConfigError: It is not the first levels of this ladder.
+            CheckpointError: It is missing, damaged, or of another kind.
+        """
+        if self.config.start_from is None:
+            return Position()
+        policy = load(self.config.start_from)
+        levels = len(policy.spec.resolutions)
+        if policy.description["task"] != self.config.task:
+            raise ConfigError(f"start_from: got a policy for {policy.description['task']}, allowed {self.config.task}")
+        if levels >= len(self.config.resolutions) or policy.spec.resolutions != self.config.resolutions[:levels]:
+            raise ConfigError(
+                f"start_from: got a policy of levels {policy.spec.resolutions}, allowed the first of "
+                f"{self.config.resolutions} but the last"
+            )
+        if levels > 1 and policy.spec != (wanted := self.config.actor_spec(levels - 1)):
+            raise ConfigError(f"start_from: got networks {policy.spec}, allowed {wanted}")
+        write_policy(self.folder / f"stage{levels}.safetensors", *read_policy(self.config.start_from))
+        return Position(levels, self.config.handover[levels - 1])
+
+    def inherit(self, model: CFP, previous: CFP) -> None:
+        """Warm critics: those of the level before, with the reward statistics in whose units they judge."""
+        if not self.config.learning.warm_critic:
+            return
+        for mine, theirs in zip(model.networks()[1:], previous.networks()[1:], strict=True):
+            mine.load_state_dict(theirs.state_dict())
+        model.reward_statistics.load_state_dict(previous.reward_statistics.state_dict())
 
     def make_model(self, level: int) -> CFP:
         """Networks, replay memory and environment of a level, over the frozen policy of the coarser one."""
