@@ -13,7 +13,7 @@ import tyro
 from cfp.command import Program
 from cfp.config import RunConfig
 from cfp.errors import CFPError, CheckpointError, ConfigError
-from cfp.evaluation import Policy, compare, format_table, to_rows
+from cfp.evaluation import Noise, Policy, compare, format_table, to_rows
 from cfp.process import keep_memory
 from cfp.run import make_video, read_config, stage_files
 from cfp.train import PROGRAM
@@ -27,6 +27,8 @@ class Command:
     """A folder that a training wrote or is writing."""
     episodes: int = 5
     """Episodes of each policy."""
+    noise: Noise = "default"
+    """Action noise of the trained policies: with, without, both in rows of their own, or default, as trained."""
     seed: int | None = None
     """Seed of layouts and noise; the run's own if not given."""
     device: str = "auto"
@@ -69,7 +71,7 @@ def run(program: Program, command: Command) -> str:
     if command.episodes < 1:
         raise ConfigError(f"episodes: got {command.episodes}, allowed 1 or more")
     config, policies = open_run(program, command.folder, command.device, command.seed)
-    results = compare(config, policies, command.episodes)
+    results = compare(config, policies, command.episodes, command.noise)
     if command.video is not None:
         make_video(config, list(policies.values())[-1], command.video)
     return json.dumps(to_rows(results), indent=2) if command.json else format_table(config, results)

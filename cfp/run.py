@@ -20,6 +20,7 @@ from cfp.errors import CheckpointError, ConfigError
 from cfp.estimate import Cost
 from cfp.evaluation import Policy, Result, compare, evaluate, format_table, to_rows
 from cfp.files import EventFile, ProgressTable, Table, copy_atomically, read_table, write_json
+from cfp.page import write_page
 from cfp.plot import plot_curve
 from cfp.process import Plateau, StopSignals
 from cfp.state_file import Position, StateFile, check_same
@@ -221,7 +222,7 @@ class Run(ABC):
         return Books(level, total, config.report, self.signals, self.logger, measure, save, first, over)
 
     def finish(self) -> list[Result]:
-        """After training: the final table, ``results.json``, the curve and the video. Returns the table's rows."""
+        """After training: the final table, ``results.json``, curve, video and page. Returns the table's rows."""
         policies = {name: self.load(path) for name, path in stage_files(self.folder, len(self.config.ends())).items()}
         results = compare(self.config, policies, self.config.report.eval_episodes)
         write_json(self.folder / "results.json", to_rows(results))
@@ -229,6 +230,7 @@ class Run(ABC):
         print(f"learning curve: {plot_curve(self.folder, self.config, untrained)}")
         if self.config.report.video:
             make_video(self.config, list(policies.values())[-1], self.folder / "video.mp4")
+        print(f"all of it on one page: {write_page(self.folder, self.config, results)}")
         print(format_table(self.config, results))
         return results
 
