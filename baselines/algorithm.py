@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from cfp.books import Books
 from cfp.config import RunConfig
+from cfp.estimate import Cost
 from cfp.evaluation import Policy
 from cfp.process import StopSignals
 from cfp.run import Run
@@ -166,6 +168,22 @@ class AlgorithmRun(Run):
         books.open(offset + last)
         model.learn(steps, turn)
         books.close(offset + last, lambda: latest)
+
+    def measure(self, model: Algorithm) -> Cost:
+        """Time what the algorithm does between two calls back; the first time counts as well."""
+
+        class Enough(Exception):
+            """The first call back has come."""
+
+        def stop(_: Mapping[str, float | None]) -> None:
+            raise Enough
+
+        start = time.perf_counter()
+        try:
+            model.learn(1, stop)
+        except Enough:
+            pass
+        return Cost((time.perf_counter() - start) / max(1, model.num_timesteps))
 
     def load(self, path: Path) -> Policy:
         """Load a policy of the run."""

@@ -28,7 +28,7 @@ def make_model(config: Config, level: int, num_envs: int) -> CFP:
     stage, learning = config.stage(level), config.learning
     model = CFP(
         CFPPolicy,
-        make_env(config, stage.resolution, num_envs),
+        make_env(config, config.action_size(level), num_envs),
         buffer_size=2_000,
         update_start=learning.batch_size,
         random_steps=0,

@@ -4,6 +4,7 @@ from cfp.actor import ActorSpec
 from cfp.algorithm import CFP
 from cfp.config import Config
 from cfp.errors import CFPError, CheckpointError, ConfigError, NonFiniteError
+from cfp.features import ImageFeatures
 from cfp.policy import ActorPolicy, CFPPolicy
 from cfp.presets import preset
 from cfp.vec_env import TorchVecEnv
@@ -18,6 +19,7 @@ __all__ = [
     "CheckpointError",
     "Config",
     "ConfigError",
+    "ImageFeatures",
     "NonFiniteError",
     "TorchVecEnv",
     "load",

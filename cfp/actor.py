@@ -39,6 +39,9 @@ class ActorSpec:
         gate_scale: Largest gate value; the reference uses 0.25 with split encoders and 1 otherwise.
         interpolation: Bicubic upsampling inside the networks: ``"half_pixel"`` is what the environment uses on
             actions, ``"aligned"`` (aligned corners) is what the reference implementation uses here.
+        patch: Size of the images on which a residual actor blends; None: the grid of its own level, as the reference
+            does. Two cubic enlargements are not one, so only images of the size of the environment's patch (then not
+            enlarged any more) make a closed gate leave the field of the coarser level as it was.
     """
 
     resolutions: tuple[int, ...]
@@ -46,6 +49,12 @@ class ActorSpec:
     split: bool = False
     gate_scale: float = 1.0
     interpolation: Interpolation = "half_pixel"
+    patch: int | None = None
+
+    @property
+    def action_size(self) -> int:
+        """Rows and columns of the executed action: a plain actor's own grid, else what is blended."""
+        return self.patch if self.patch and len(self.resolutions) > 1 else self.resolutions[-1]
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> ActorSpec:
@@ -69,13 +78,16 @@ class ActorSpec:
                 f"gate_bias: got {len(self.gate_bias)} values for resolutions {self.resolutions}, "
                 f"allowed is one per residual level ({len(self.resolutions) - 1})"
             )
+        if self.patch is not None and self.patch < self.resolutions[-1]:
+            raise ValueError(f"patch: got {self.patch}, allowed {self.resolutions[-1]} (the finest level) or more")
 
 
 class Sample(NamedTuple):
     """One draw from an actor.
 
     Attributes:
-        action: What is executed, (B, 2, R, R). A composed action may leave [-1, 1] a little and is not clipped.
+        action: What is executed, (B, 2, A, A) with A from `ActorSpec.action_size`. A composed action may leave [-1, 1]
+            a little and is not clipped.
         log_prob: Log-density of the sampled part (a residual actor's own action only), (B,).
         gate: Weight of the residual action, (B, 2, R, R), or None for a plain actor.
     """
@@ -134,7 +146,7 @@ class Actor(nn.Module):
         return Sample(action, log_prob, None)
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> Tensor:
-        """The action (B, 2, R, R) for uint8 observations (B, 3, 64, 64)."""
+        """The action (B, 2, A, A) for uint8 observations (B, 3, 64, 64)."""
         return self.sample(observation, deterministic).action
 
     def action_log_prob(self, observation: Tensor) -> tuple[Tensor, Tensor]:
@@ -150,14 +162,16 @@ class Actor(nn.Module):
 class ResidualActor(Actor):
     """Stage-2 actor: refines the action of a frozen coarser actor through a gate (paper, Section 4.2).
 
-    ``a = g * a_res + (1 - g) * up(a_coarse)`` with ``g = gate_scale * sigmoid(z_g + gate_bias)``, one gate value per
-    cell and muscle. The coarser actor is drawn anew at every call, may itself be residual, and is never trained.
+    ``a = up(g) * up(a_res) + (1 - up(g)) * up(a_coarse)`` with ``g = gate_scale * sigmoid(z_g + gate_bias)``, one gate
+    value per cell and muscle; ``up`` enlarges to `ActorSpec.action_size`. The coarser actor is drawn anew at every
+    call, may itself be residual, and is never trained.
     """
 
     def __init__(self, coarse: Actor, resolution: int, gate_bias: float, spec: ActorSpec) -> None:
         """Wrap and freeze ``coarse``; the spec says how images are merged and interpolated."""
         super().__init__(resolution)
         self.interpolation = spec.interpolation
+        self.action_size = spec.patch or resolution
         self.gate_bias, self.gate_scale = gate_bias, spec.gate_scale
         self.encoder = PairEncoder(spec.split)
         self.gate = make_head(resolution)
@@ -167,12 +181,16 @@ class ResidualActor(Actor):
     def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
         """Draw a composed action; log_prob belongs to the residual part alone, as in the reference."""
         with torch.no_grad():
-            coarse = upsample(self.coarse(observation, deterministic), self.resolution, self.interpolation)
+            coarse = self._enlarge(self.coarse(observation, deterministic))
         patch = upsample(coarse, IMAGE_SIZE, self.interpolation)
         latent = self.encoder(normalise_image(observation), patch)
         residual, log_prob, logit = self.own_action(latent, deterministic, self.gate)
         gate = self.gate_scale * torch.sigmoid(logit + self.gate_bias)
-        return Sample(gate * residual + (1 - gate) * coarse, log_prob, gate)
+        weight = self._enlarge(gate)
+        return Sample(weight * self._enlarge(residual) + (1 - weight) * coarse, log_prob, gate)
+
+    def _enlarge(self, image: Tensor) -> Tensor:
+        return upsample(image, self.action_size, self.interpolation)
 
 
 def build_actor(spec: ActorSpec) -> Actor:

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from cfp.actor import Actor
 from cfp.errors import NonFiniteError
 from cfp.losses import Losses, Precision
-from cfp.networks import TwinCritic
+from cfp.networks import TwinCritic, upsample
 from cfp.policy import CFPPolicy
 from cfp.replay import ReplayRing
 
@@ -222,7 +222,13 @@ class CFP(SAC):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         # stable-baselines3 ties the random phase to the start of the updates; here they are two settings.
-        return super()._sample_action(self.random_steps, action_noise, n_envs)
+        actions, stored = super()._sample_action(self.random_steps, action_noise, n_envs)
+        grid = self.networks()[0].resolution
+        if self.num_timesteps < self.random_steps and grid < self.action_resolution:
+            # As coarse as the level acts: of independent pixels little would be left in the field.
+            corner = torch.as_tensor(stored[..., :grid, :grid], dtype=torch.float32)
+            actions = stored = upsample(corner, self.action_resolution, "half_pixel").numpy()
+        return actions, stored
 
     def _store_transition(
         self,
@@ -251,6 +257,6 @@ class CFP(SAC):
 
     @property
     def action_resolution(self) -> int:
-        """Action grid R."""
+        """Rows and columns of an action."""
         assert isinstance(self.action_space, spaces.Box)
         return int(self.action_space.shape[-1])

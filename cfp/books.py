@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from cfp.config import ReportConfig
 from cfp.evaluation import Result
-from cfp.process import Stopped, StopSignals
+from cfp.process import Plateau, Stopped, StopSignals
 
 BOOK_METRICS: dict[str, str] = {
     "stage": "stage in training, 1 is the first",
@@ -36,6 +36,7 @@ class Books:
         evaluate: Called with the step; returns the result, which it has written down.
         save: Called with the step; writes policy and checkpoint.
         evaluate_first: Evaluate before the first step.
+        over: Asked after an evaluation: whether the stage should end now.
     """
 
     def __init__(
@@ -48,10 +49,12 @@ class Books:
         evaluate: Callable[[int], Result],
         save: Callable[[int], None],
         evaluate_first: bool = False,
+        over: Callable[[], bool] = lambda: False,
     ) -> None:
         self.level, self.total = level, total
         self.report, self.signals, self.logger = report, signals, logger
         self.evaluate, self.save, self.evaluate_first = evaluate, save, evaluate_first
+        self.over = over
         self.last_result: Result | None = None
         self._return: float | None = None
         self._last = self._logged = self._saved = self._evaluated = 0
@@ -80,6 +83,7 @@ class Books:
 
         Raises:
             Stopped: The user wants to stop; the checkpoint is written.
+            Plateau: The stage is over; the checkpoint is written.
         """
         due = {
             name: every > 0 and step // every > self._last // every
@@ -99,6 +103,9 @@ class Books:
         if self.signals.number:
             self.bar.close()
             raise Stopped(self.signals.number)
+        if due["evaluate"] and self.over():
+            self.bar.close()
+            raise Plateau
 
     def close(self, step: int, scalars: Scalars) -> None:
         """End the stage: a last row, evaluation and checkpoint, unless they were just made."""

@@ -12,8 +12,9 @@ from typing import Any
 
 import tyro
 
-from cfp.config import RunConfig
+from cfp.config import RunConfig, to_json
 from cfp.errors import CFPError, ConfigError, NonFiniteError
+from cfp.estimate import estimate
 from cfp.evaluation import Policy
 from cfp.process import Stopped, StopSignals, keep_memory
 from cfp.run import Run, holds_run, read_config
@@ -52,6 +53,8 @@ class Command:
     """Go on with the run in the folder; an empty or missing folder starts afresh."""
     config: Path | None = None
     """JSON file with options, in the form of a run's config.json; it may hold only some of them."""
+    dry_run: bool = False
+    """Only print the options and an estimate of time and memory; write nothing."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +124,9 @@ def main(program: Program, arguments: Sequence[str] | None = None) -> int:
         if command.resume and not holds_run(folder):
             print(f"{folder} holds no run yet: starting afresh")
         config = command.run
+        if command.dry_run:
+            print(json.dumps(to_json(config), indent=2), estimate(program, config), sep="\n")
+            return 0
         print(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed} -> {folder}")
         keep_memory()
         _train(program, config, folder, command.resume)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import typing
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
@@ -11,7 +10,9 @@ from typing import Any, ClassVar, Literal
 from cfp.actor import ActorSpec
 from cfp.errors import ConfigError
 from cfp.losses import Precision
+from cfp.merging import merge as merge
 from cfp.networks import RESOLUTIONS, Interpolation
+from dittogym import TASKS, make_spec
 
 Preset = Literal["quick", "paper"]
 
@@ -42,13 +43,17 @@ class EnvironmentConfig:
     target: str | None = None
     """SHAPE MATCH: star, I, M, T or the path of an image; None: the task's default."""
 
+    def task_options(self) -> dict[str, Any]:
+        """What of it belongs to the task, for `dittogym.make_spec`."""
+        return {} if self.target is None else {"target": self.target}
+
 
 @dataclass(frozen=True)
 class NetworkConfig:
     """Choices inside the networks."""
 
     interpolation: Interpolation = "half_pixel"
-    """Bicubic upsampling: half_pixel (as the environment does) or aligned (aligned corners, the reference's)."""
+    """Bicubic upsampling: half_pixel (the environment's rule, blended on its patch) or aligned (the reference's)."""
     split: bool = False
     """Separate narrow encoders for observation and action (DIG)."""
     gate_scale: float = 1.0
@@ -81,6 +86,8 @@ class LearningConfig:
     """Of the networks in updates: float32, bfloat16, or auto (bfloat16 on CPUs with instructions for it)."""
     compile: bool = False
     """Run the updates through torch.compile."""
+    warm_critic: bool = False
+    """Each level begins with critics and reward statistics of the one before (the reference: anew)."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +100,8 @@ class ReportConfig:
     """Episodes of an evaluation and of the final table."""
     eval_deterministic: bool = False
     """Evaluate without action noise (the reference does so in SHAPE MATCH only)."""
+    patience: int = 0
+    """Evaluations in a row without a new best that end a stage early (the last: the run); 0: only steps count."""
     checkpoint_every: int = 1_000
     """Environment steps between checkpoints."""
     log_every: int = 500
@@ -137,6 +146,10 @@ class RunConfig:
         """Action grid R of a stage (0 is the first)."""
         raise NotImplementedError
 
+    def action_size(self, level: int) -> int:
+        """Rows and columns of the actions that the environment of a stage takes."""
+        return self.resolution(level)
+
     def evaluation(self, level: int) -> tuple[int, int]:
         """Seed of the first layout, and episodes, by which a stage is evaluated while it trains."""
         return self.seed + EVALUATION_SEED, self.report.eval_episodes
@@ -160,6 +173,8 @@ class RunConfig:
         )
         if self.report.eval_every < 0:
             raise ConfigError(f"eval_every: got {self.report.eval_every}, allowed 0 (never) or more")
+        if self.report.patience < 0 or (self.report.patience and not self.report.eval_every):
+            raise ConfigError(f"patience: got {self.report.patience}, allowed 0, or more with evaluations (eval_every)")
 
 
 def at_least_one(**counts: int) -> None:
@@ -202,6 +217,8 @@ class Config(RunConfig):
     """Bias of the gate's logit (one less than levels)."""
     gate_penalty: tuple[float, ...] = (0.01,)
     """Weight of the gate penalty (one less than levels)."""
+    start_from: str | None = None
+    """Policy of the first levels, a run folder or policy.safetensors: training begins with the level after it."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     learning: LearningConfig = field(default_factory=LearningConfig)
 
@@ -214,6 +231,10 @@ class Config(RunConfig):
     def resolution(self, level: int) -> int:
         """Action grid R of a level."""
         return self.resolutions[level]
+
+    def action_size(self, level: int) -> int:
+        """Rows and columns of the actions that the environment of a level takes, see `ActorSpec.patch`."""
+        return self.actor_spec(level).action_size
 
     def adapted(self, base: RunConfig) -> RunConfig:
         """Other steps move the handovers in proportion."""
@@ -231,6 +252,7 @@ class Config(RunConfig):
             self.network.split,
             self.network.gate_scale,
             self.network.interpolation,
+            None if self.network.interpolation == "aligned" else make_spec(self.task).patch,
         )
 
     def stage(self, level: int) -> StageConfig:
@@ -260,12 +282,16 @@ class Config(RunConfig):
             given = len(getattr(self, name))
             if given != count:
                 raise ConfigError(f"{name}: got {given} values, allowed {count} for resolutions {self.resolutions}")
+        if self.task in TASKS and self.resolutions[-1] > (patch := make_spec(self.task).patch):
+            raise ConfigError(f"resolutions: got {self.resolutions}, allowed in {self.task} is at most {patch}")
         if any(late <= early for early, late in pairwise((0, *self.ends()))):
             raise ConfigError(f"handover: got {self.handover} of {self.steps} steps, allowed are growing steps between")
         super().check()
         self._check_ranges()
 
     def _check_ranges(self) -> None:
+        if self.learning.warm_critic and self.start_from is not None:
+            raise ConfigError("warm_critic: got True, allowed without start_from (a policy brings no critics)")
         at_least_one(
             batch_size=self.learning.batch_size,
             buffer_size=self.learning.buffer_size,
@@ -283,57 +309,3 @@ class Config(RunConfig):
 def to_json(config: RunConfig) -> dict[str, Any]:
     """A configuration as plain JSON values."""
     return dataclasses.asdict(config)
-
-
-def merge(base: Any, values: Any, path: str = "") -> Any:
-    """Put JSON values over a dataclass, recursively.
-
-    Args:
-        base: What the values leave out is taken from here.
-        values: An object with named values.
-        path: Where in the whole configuration this is, for the messages.
-
-    Raises:
-        ConfigError: An unknown name or a value of the wrong type.
-    """
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path or 'configuration'}: got {values!r}, allowed an object with named values")
-    hints = typing.get_type_hints(type(base))
-    kinds = {option.name: hints[option.name] for option in dataclasses.fields(base)}
-    changes: dict[str, Any] = {}
-    for name, value in values.items():
-        where = f"{path}.{name}" if path else name
-        if name not in kinds:
-            raise ConfigError(f"{where}: no such option, allowed {', '.join(kinds)}")
-        old = getattr(base, name)
-        changes[name] = (
-            merge(old, value, where) if dataclasses.is_dataclass(old) else _convert(value, kinds[name], where)
-        )
-    return replace(base, **changes)
-
-
-def _convert(value: Any, kind: Any, where: str) -> Any:
-    """Check a JSON value against a field's type and make lists tuples and integers floats where asked for."""
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is Literal:
-        if value in arguments:
-            return value
-    elif origin is tuple:
-        if isinstance(value, list | tuple):
-            item = arguments[0]
-            fixed = arguments[-1] is not Ellipsis
-            if not fixed or len(value) == len(arguments):
-                return tuple(_convert(each, item, where) for each in value)
-    elif arguments:  # a union: the first kind that fits
-        for choice in arguments:
-            if choice is type(None) and value is None:
-                return None
-            try:
-                return _convert(value, choice, where)
-            except ConfigError:
-                continue
-    elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
-    elif isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
-        return value
-    raise ConfigError(f"{where}: got {value!r}, allowed {kind.__name__ if isinstance(kind, type) else kind}")

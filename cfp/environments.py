@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import torch
 from stable_baselines3.common.vec_env import VecMonitor
@@ -35,22 +36,22 @@ def make_env(config: RunConfig, resolution: int, num_envs: int | None = None) ->
     return monitored(make_torch_env(config, resolution, num_envs))
 
 
-def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = None) -> TorchEnv:
+def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = None, **changes: Any) -> TorchEnv:
     """Build the environment of a run.
 
     Args:
         config: The run's options.
         resolution: Action grid R.
         num_envs: Robots side by side; the run's own number if None.
+        changes: Options of `dittogym.TorchEnv` that are not the run's, such as ``obstacles``.
 
     Raises:
         ConfigError: The environment refuses an option; the message is its own.
     """
     options = dataclasses.asdict(config.environment)
     own = options.pop("num_envs")
-    target = options.pop("target")
-    if target is not None:
-        options["target"] = target
+    options.pop("target")
+    options |= config.environment.task_options() | changes
     device = choose_device(config.device)
     try:
         return TorchEnv(config.task, num_envs or own, resolution, device=device, **options)

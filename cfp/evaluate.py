@@ -11,8 +11,9 @@ from pathlib import Path
 import tyro
 
 from cfp.command import Program
+from cfp.config import RunConfig
 from cfp.errors import CFPError, CheckpointError, ConfigError
-from cfp.evaluation import compare, format_table, to_rows
+from cfp.evaluation import Noise, Policy, compare, format_table, to_rows
 from cfp.process import keep_memory
 from cfp.run import make_video, read_config, stage_files
 from cfp.train import PROGRAM
@@ -26,6 +27,8 @@ class Command:
     """A folder that a training wrote or is writing."""
     episodes: int = 5
     """Episodes of each policy."""
+    noise: Noise = "default"
+    """Action noise of the trained policies: with, without, both in rows of their own, or default, as trained."""
     seed: int | None = None
     """Seed of layouts and noise; the run's own if not given."""
     device: str = "auto"
@@ -36,6 +39,29 @@ class Command:
     """Also film one episode of the newest policy into this MP4 file."""
 
 
+def open_run(
+    program: Program, folder: Path, device: str, seed: int | None = None
+) -> tuple[RunConfig, dict[str, Policy]]:
+    """Options of the run in a folder, for evaluation, and its policies by stage, the newest last.
+
+    Args:
+        program: Knows how to read them.
+        folder: Of the run.
+        device: Where environments go.
+        seed: In place of the run's own.
+
+    Raises:
+        CFPError: There is no run, it has no policy yet, or a file is damaged.
+    """
+    config = replace(read_config(folder, program.configure), device=device)
+    if seed is not None:
+        config = replace(config, seed=seed)
+    files = stage_files(folder, len(config.ends()))
+    if not files:
+        raise CheckpointError(f"{folder}: no policy has been written yet")
+    return config, {name: program.load(path) for name, path in files.items()}
+
+
 def run(program: Program, command: Command) -> str:
     """Do what a command says and return what it prints.
 
@@ -44,14 +70,8 @@ def run(program: Program, command: Command) -> str:
     """
     if command.episodes < 1:
         raise ConfigError(f"episodes: got {command.episodes}, allowed 1 or more")
-    config = replace(read_config(command.folder, program.configure), device=command.device)
-    if command.seed is not None:
-        config = replace(config, seed=command.seed)
-    files = stage_files(command.folder, len(config.ends()))
-    if not files:
-        raise CheckpointError(f"{command.folder}: no policy has been written yet")
-    policies = {name: program.load(path) for name, path in files.items()}
-    results = compare(config, policies, command.episodes)
+    config, policies = open_run(program, command.folder, command.device, command.seed)
+    results = compare(config, policies, command.episodes, command.noise)
     if command.video is not None:
         make_video(config, list(policies.values())[-1], command.video)
     return json.dumps(to_rows(results), indent=2) if command.json else format_table(config, results)

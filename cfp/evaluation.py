@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -15,13 +16,16 @@ from stable_baselines3.common.vec_env import VecEnv
 from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.environments import make_env
 
+Noise = Literal["default", "with", "without", "both"]
+"""With action noise or without; default: as the run that trained a policy evaluates it."""
+
 
 class Policy(PolicyPredictor, Protocol):
     """A trained policy of any kind, as it comes from its file."""
 
     @property
     def resolution(self) -> int:
-        """Action grid R."""
+        """Rows and columns of its actions."""
 
     @property
     def deterministic_by_default(self) -> bool:
@@ -57,6 +61,30 @@ class Result:
     def std(self) -> float:
         """Standard deviation of the returns over the episodes (of this sample, not of its mean)."""
         return float(np.std(self.returns))
+
+    @property
+    def interval(self) -> float | None:
+        """Half the width of the 95 % confidence interval of the mean (Student's t); None for one episode."""
+        count = len(self.returns)
+        if count < 2:
+            return None
+        return student(count - 1) * float(np.std(self.returns, ddof=1)) / math.sqrt(count)
+
+
+def student(degrees: int, level: float = 0.95) -> float:
+    """The t within which a share ``level`` of Student's distribution lies on both sides of 0.
+
+    With ``t = sqrt(degrees) tan(angle)`` the density in the angle is proportional to ``cos(angle)^(degrees - 1)``.
+    """
+    angle = np.linspace(0.0, np.pi / 2, 20_001)
+    density = np.cos(angle) ** (degrees - 1)
+    share = np.concatenate([[0.0], np.cumsum(density[1:] + density[:-1])])
+    return float(math.sqrt(degrees) * np.tan(np.interp(level, share / share[-1], angle)))
+
+
+def judging_seed(config: RunConfig) -> int:
+    """Of layouts that neither trained a policy nor chose the best one."""
+    return config.seed + 2 * EVALUATION_SEED
 
 
 class ZeroPolicy:
@@ -136,7 +164,7 @@ def evaluate(
     return Result(name, action_space.shape[-1], tuple(float(value) for value in returns), success)
 
 
-def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int) -> list[Result]:
+def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, noise: Noise = "default") -> list[Result]:
     """Evaluate trained policies beside zero and random action, all on the same particle layouts.
 
     A policy made for a single layout is evaluated there too, in a row of its own.
@@ -145,9 +173,10 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int) ->
         config: The run's options.
         policies: By name, each with its own resolution. Zero and random action use the first stage's.
         episodes: Episodes of each.
+        noise: Whether trained policies act with their noise; ``"both"`` gives each a row with and one without.
     """
     coarsest = config.resolution(0)
-    seed = config.seed + 2 * EVALUATION_SEED  # layouts that neither trained a policy nor chose the best one
+    seed = judging_seed(config)
     env = make_env(config, coarsest, episodes)
     untrained = {"zero action": ZeroPolicy(coarsest), "random action": RandomPolicy(coarsest, config.seed)}
     results = [
@@ -156,8 +185,12 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int) ->
     for name, trained in policies.items():
         if env.action_space.shape != (2, trained.resolution, trained.resolution):
             env = make_env(config, trained.resolution, episodes)
-        deterministic = trained.deterministic_by_default
-        results.append(evaluate(name, trained, env, episodes, deterministic=deterministic, seed=seed))
+        deterministic = trained.deterministic_by_default if noise == "default" else noise == "without"
+        grid = trained.description.get("resolution", trained.resolution)
+        for quiet in (False, True) if noise == "both" else (deterministic,):
+            label = f"{name}, {'mean' if quiet else 'noisy'}" if noise == "both" else name
+            result = evaluate(label, trained, env, episodes, deterministic=quiet, seed=seed)
+            results.append(replace(result, resolution=grid))
         if "layout" in trained.description:
             alone, own = make_env(config, trained.resolution, 1), trained.description["layout"]
             results.append(evaluate("  own layout", trained, alone, 1, deterministic=deterministic, seed=own))
@@ -173,6 +206,7 @@ def to_rows(results: list[Result]) -> list[dict[str, Any]]:
             "episodes": len(result.returns),
             "mean": round(result.mean, 3),
             "std": round(result.std, 3),
+            "interval": None if result.interval is None else round(result.interval, 3),
             "returns": [round(value, 3) for value in result.returns],
             "success": result.success,
         }
@@ -181,13 +215,15 @@ def to_rows(results: list[Result]) -> list[dict[str, Any]]:
 
 
 def format_table(config: RunConfig, results: list[Result]) -> str:
-    """Results as a plain text table: mean and standard deviation of the return over the episodes."""
+    """Results as a plain text table: mean return, its 95 % confidence interval, and the spread of the episodes."""
     counts = {len(result.returns) for result in results}
     title = f"{config.task}, return over {'/'.join(map(str, sorted(counts)))} episodes"
-    lines = [title, f"{'policy':<16}{'action':>8}{'mean':>10}{'± std':>9}{'lowest':>10}{'highest':>10}"]
+    lines = [title, f"{'policy':<16}{'action':>8}{'mean':>10}{'± 95 %':>9}{'± std':>9}{'lowest':>10}{'highest':>10}"]
     for result in results:
         grid = f"{result.resolution}x{result.resolution}"
-        spread = f"{result.mean:>10.1f}{result.std:>9.1f}{min(result.returns):>10.1f}{max(result.returns):>10.1f}"
+        interval = "–" if result.interval is None else f"{result.interval:.1f}"
+        spread = f"{result.mean:>10.1f}{interval:>9}{result.std:>9.1f}"
+        spread += f"{min(result.returns):>10.1f}{max(result.returns):>10.1f}"
         success = "" if result.success is None else f"   success {result.success:.0%}"
         lines.append(f"{result.name:<16}{grid:>8}{spread}{success}")
     return "\n".join(lines)

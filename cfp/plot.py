@@ -49,11 +49,16 @@ def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Pat
     axes.set_title(f"{config.algo} on {config.task}, seed {config.seed}")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
+    path = run / "curve.png"
+    write_figure(path, figure)
+    return path
+
+
+def write_figure(path: Path, figure: Figure) -> None:
+    """Write a figure as PNG, atomically."""
     content = BytesIO()
     FigureCanvasAgg(figure).print_png(content)
-    path = run / "curve.png"
     write_atomically(path, lambda file: file.write(content.getvalue()))
-    return path
 
 
 def _column(rows: Sequence[dict[str, str]], name: str) -> tuple[list[float], list[float]]:

@@ -42,7 +42,7 @@ class CFPPolicy(sac_policies.SACPolicy):
         optimizer_kwargs: Its options except the learning rate; a fused Adam if None.
 
     Raises:
-        ValueError: The spec's finest resolution is not the action space's, or ``use_sde`` is set.
+        ValueError: The size of the spec's actions is not the action space's, or ``use_sde`` is set.
     """
 
     def __init__(
@@ -60,10 +60,11 @@ class CFPPolicy(sac_policies.SACPolicy):
             raise ValueError("use_sde: got True, allowed False (the policy has its own exploration noise)")
         resolution = action_space.shape[-1]
         self.spec = spec or ActorSpec((resolution,))
-        if action_space.shape != (2, self.spec.resolutions[-1], self.spec.resolutions[-1]):
+        size = self.spec.action_size
+        if action_space.shape != (2, size, size):
             raise ValueError(
                 f"action space: got shape {action_space.shape}, allowed for a ladder {self.spec.resolutions} is "
-                f"{(2, self.spec.resolutions[-1], self.spec.resolutions[-1])}"
+                f"{(2, size, size)}"
             )
         super().__init__(
             observation_space,
@@ -90,7 +91,7 @@ class CFPPolicy(sac_policies.SACPolicy):
         self.critic_target = cast(ContinuousCritic, target)
 
     def _new_critic(self) -> TwinCritic:
-        return TwinCritic(self.spec.resolutions[-1], self.spec.split, self.spec.interpolation)
+        return TwinCritic(self.spec.action_size, self.spec.split, self.spec.interpolation)
 
     def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
         """Actor, critics and target critics with their own types."""
@@ -120,7 +121,7 @@ class ActorPolicy(BasePolicy):
 
     def __init__(self, spec: ActorSpec, deterministic_by_default: bool = False) -> None:
         """Build the actor; its weights are random until a state is loaded."""
-        space = action_space(spec.resolutions[-1])
+        space = action_space(spec.action_size)
         super().__init__(observation_space(), space, normalize_images=False, squash_output=True)
         self.spec = spec
         self.deterministic_by_default = deterministic_by_default
@@ -129,8 +130,8 @@ class ActorPolicy(BasePolicy):
 
     @property
     def resolution(self) -> int:
-        """Action grid R."""
-        return self.spec.resolutions[-1]
+        """Rows and columns of its actions: what the environment must take."""
+        return self.spec.action_size
 
     def forward(self, observation: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
         """Actions (B, 2, R, R) for uint8 observations (B, 3, 64, 64)."""

@@ -26,6 +26,16 @@ def keep_memory() -> None:
         library.mallopt(_M_TRIM_THRESHOLD, (1 << 31) - 1)
 
 
+def peak_memory() -> int | None:
+    """Most bytes of memory that this process has held so far; None where the system does not tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return largest if sys.platform == "darwin" else 1024 * largest
+
+
 class Stopped(Exception):
     """Training was asked to stop and has written its checkpoint.
 
@@ -36,6 +46,10 @@ class Stopped(Exception):
     def __init__(self, number: int) -> None:
         super().__init__(f"stopped by {signal.Signals(number).name}")
         self.number = number
+
+
+class Plateau(Exception):
+    """A stage is over because its evaluations no longer improve; its checkpoint is written."""
 
 
 class StopSignals:

@@ -6,6 +6,7 @@ import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,12 @@ from cfp.books import Books
 from cfp.config import RunConfig, to_json
 from cfp.environments import choose_device, make_env
 from cfp.errors import CheckpointError, ConfigError
+from cfp.estimate import Cost
 from cfp.evaluation import Policy, Result, compare, evaluate, format_table, to_rows
 from cfp.files import EventFile, ProgressTable, Table, copy_atomically, read_table, write_json
+from cfp.page import write_page
 from cfp.plot import plot_curve
-from cfp.process import StopSignals
+from cfp.process import Plateau, StopSignals
 from cfp.state_file import Position, StateFile, check_same
 from cfp.video import VideoUnavailable, film, write_video
 from cfp.weights import read_policy
@@ -91,14 +94,13 @@ class Run(ABC):
         config.check()
         choose_device(config.device)
         for level in range(len(config.ends())):
-            make_env(config, config.resolution(level), 1)  # refuses bad options before anything is written
+            make_env(config, config.action_size(level), 1)  # refuses bad options before anything is written
         self.config, self.folder, self.signals = config, folder, signals
         if holds_run(folder) and not resume:
             raise ConfigError(f"out: {folder} already holds a run, allowed with --resume; or name another folder")
         self.checkpoint = self.checkpoint_type(folder / "checkpoint")
         self.state: dict[str, Any] | None = None
         self.position = Position()
-        step = 0
         if resume and self.checkpoint.exists():
             self.state = self.checkpoint.load()
             check_same(json.loads(self.state["config"]), config)
@@ -107,10 +109,20 @@ class Run(ABC):
             print(f"resuming {folder} at step {step} of {config.ends()[-1]} (stage {self.position.level + 1})")
         elif resume:
             print(f"{folder} holds no checkpoint: starting from the beginning")
+        if self.state is None:
+            self.position = self.begin()
+            step = self.position.offset
         write_json(folder / "config.json", to_json(config))
         self.evaluations = Table(folder / "evaluations.csv", step)
         progress = ProgressTable(Table(folder / "progress.csv", step))
         self.logger = Logger(str(folder), [progress, EventFile(folder / "tensorboard", step)])
+
+    def begin(self) -> Position:
+        """Where a run begins that has no checkpoint; puts what the first stage needs into the folder."""
+        return Position()
+
+    def inherit(self, model: Any, previous: Any) -> None:  # noqa: B027  (most algorithms hand over a policy only)
+        """Give a model that has just been made what it shall have of the stage before, besides its policy."""
 
     @abstractmethod
     def make_model(self, level: int) -> Any:
@@ -136,26 +148,53 @@ class Run(ABC):
     def load(self, path: Path) -> Policy:
         """Load a policy that `keep` wrote."""
 
+    @abstractmethod
+    def measure(self, model: Any) -> Cost:
+        """Time a few steps and updates of a model that has just been made; what it has learned is spoiled."""
+
+    def measure_all(self) -> list[Cost]:
+        """`measure` every stage, each over the untrained policy of the one before."""
+        costs = []
+        for level in range(len(self.config.ends())):
+            model = self.make_model(level)
+            self.keep(model, level, 0)
+            copy_policy(self.folder / "policy.safetensors", self.folder / f"stage{level + 1}.safetensors")
+            costs.append(self.measure(model))
+        self.logger.close()
+        return costs
+
     def train(self) -> None:
         """Train the stages that are left."""
-        ends = self.config.ends()
+        ends, previous = self.config.ends(), None
         for level in range(self.position.level, len(ends)):
             model = self.make_model(level)
+            if previous is not None:
+                self.inherit(model, previous)
             if self.state is not None:
                 self.restore(model, self.state)
                 self.state = None
             left = ends[level] - self.position.offset - model.num_timesteps
-            if left > 0:
-                self.learn(model, left, self._books(level, model))
+            if left > 0 and not self._plateau(level):
+                try:
+                    self.learn(model, left, self._books(level, model))
+                except Plateau:
+                    print(f"stage {level + 1} ends early: {self.config.report.patience} evaluations without a new best")
+            previous = model
             if level + 1 < len(ends):
                 copy_policy(self.folder / "policy.safetensors", self.folder / f"stage{level + 1}.safetensors")
                 self.position = Position(level + 1, self.position.offset + model.num_timesteps)
         self.logger.close()
 
+    def _plateau(self, level: int) -> bool:
+        """Whether the best evaluation of a stage is as many evaluations ago as the run is patient."""
+        means = [float(row["mean"]) for row in self.evaluations.rows if int(row["stage"]) == level + 1]
+        patience = self.config.report.patience
+        return bool(patience and means) and len(means) - 1 - means.index(max(means)) >= patience
+
     def _books(self, level: int, model: PolicyPredictor) -> Books:
         config = self.config
         seed, episodes = config.evaluation(level)
-        env = make_env(config, config.resolution(level), episodes)
+        env = make_env(config, config.action_size(level), episodes)
         rows = read_table(self.folder / "evaluations.csv")
         best = max((float(row["mean"]) for row in rows if int(row["stage"]) == level + 1), default=-math.inf)
 
@@ -179,10 +218,11 @@ class Run(ABC):
 
         # A stage begins with what the one before has reached: it must do better than that.
         first = level > 0 and config.report.eval_every > 0 and best == -math.inf
-        return Books(level, config.ends()[-1], config.report, self.signals, self.logger, measure, save, first)
+        total, over = config.ends()[-1], partial(self._plateau, level)
+        return Books(level, total, config.report, self.signals, self.logger, measure, save, first, over)
 
     def finish(self) -> list[Result]:
-        """After training: the final table, ``results.json``, the curve and the video. Returns the table's rows."""
+        """After training: the final table, ``results.json``, curve, video and page. Returns the table's rows."""
         policies = {name: self.load(path) for name, path in stage_files(self.folder, len(self.config.ends())).items()}
         results = compare(self.config, policies, self.config.report.eval_episodes)
         write_json(self.folder / "results.json", to_rows(results))
@@ -190,6 +230,7 @@ class Run(ABC):
         print(f"learning curve: {plot_curve(self.folder, self.config, untrained)}")
         if self.config.report.video:
             make_video(self.config, list(policies.values())[-1], self.folder / "video.mp4")
+        print(f"all of it on one page: {write_page(self.folder, self.config, results)}")
         print(format_table(self.config, results))
         return results
 

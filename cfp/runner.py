@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.vec_env import VecMonitor
 
 from cfp.algorithm import CFP
@@ -13,9 +14,13 @@ from cfp.callbacks import StageCallback
 from cfp.checkpoint import Checkpoint
 from cfp.config import Config
 from cfp.environments import choose_device, make_env
+from cfp.errors import ConfigError
+from cfp.estimate import Cost, seconds
 from cfp.policy import ActorPolicy, CFPPolicy
+from cfp.replay import FIELDS
 from cfp.run import Run
-from cfp.weights import describe, load, save_policy
+from cfp.state_file import Position
+from cfp.weights import describe, load, read_policy, save_policy, write_policy
 
 
 class Runner(Run):
@@ -25,9 +30,40 @@ class Runner(Run):
     config: Config
     checkpoint: Checkpoint
 
+    def begin(self) -> Position:
+        """Take the first levels from a policy if the options say so; its steps count as those before its handover.
+
+        Raises:
+            ConfigError: It is not the first levels of this ladder.
+            CheckpointError: It is missing, damaged, or of another kind.
+        """
+        if self.config.start_from is None:
+            return Position()
+        policy = load(self.config.start_from)
+        levels = len(policy.spec.resolutions)
+        if policy.description["task"] != self.config.task:
+            raise ConfigError(f"start_from: got a policy for {policy.description['task']}, allowed {self.config.task}")
+        if levels >= len(self.config.resolutions) or policy.spec.resolutions != self.config.resolutions[:levels]:
+            raise ConfigError(
+                f"start_from: got a policy of levels {policy.spec.resolutions}, allowed the first of "
+                f"{self.config.resolutions} but the last"
+            )
+        if levels > 1 and policy.spec != (wanted := self.config.actor_spec(levels - 1)):
+            raise ConfigError(f"start_from: got networks {policy.spec}, allowed {wanted}")
+        write_policy(self.folder / f"stage{levels}.safetensors", *read_policy(self.config.start_from))
+        return Position(levels, self.config.handover[levels - 1])
+
+    def inherit(self, model: CFP, previous: CFP) -> None:
+        """Warm critics: those of the level before, with the reward statistics in whose units they judge."""
+        if not self.config.learning.warm_critic:
+            return
+        for mine, theirs in zip(model.networks()[1:], previous.networks()[1:], strict=True):
+            mine.load_state_dict(theirs.state_dict())
+        model.reward_statistics.load_state_dict(previous.reward_statistics.state_dict())
+
     def make_model(self, level: int) -> CFP:
         """Networks, replay memory and environment of a level, over the frozen policy of the coarser one."""
-        model = self._make_model(level, make_env(self.config, self.config.resolution(level)))
+        model = self._make_model(level, make_env(self.config, self.config.action_size(level)))
         if level > 0:
             coarse = load(self.folder / f"stage{level}.safetensors", str(model.device)).actor
             model.networks()[0].get_submodule("coarse").load_state_dict(coarse.state_dict())
@@ -78,6 +114,20 @@ class Runner(Run):
         """Train for some more steps in stable-baselines3's loop."""
         callback = StageCallback(books, self.position.offset)
         model.learn(steps, callback, log_interval=1 << 62, reset_num_timesteps=False)
+
+    def measure(self, model: CFP) -> Cost:
+        """Time a few steps and updates of a model that has just been made."""
+        env, buffer = model.get_env(), model.replay_buffer
+        assert env is not None and buffer is not None
+        observation, count = env.reset(), env.num_envs
+        assert isinstance(observation, np.ndarray)
+        actions = np.stack([env.action_space.sample() for _ in range(count)])
+        for _ in range(-(-model.batch_size // count)):
+            buffer.add(observation, observation, actions, np.zeros(count), np.zeros(count), [{}] * count)
+        acting = seconds(lambda: env.step(model.predict(observation)[0]))
+        updating = seconds(lambda: model.train(1, model.batch_size)) * self.config.learning.gradient_steps
+        arrays = (getattr(buffer, name) for name in FIELDS)
+        return Cost((acting + updating) / count, sum(array.nbytes for array in arrays))
 
     def load(self, path: Path) -> ActorPolicy:
         """Load a policy of the run."""

@@ -8,7 +8,7 @@ import pytest
 
 import baselines
 import cfp.evaluate
-from baselines import evaluate, train
+from baselines import evaluate, robustness, train
 from cfp.books import Books
 from cfp.files import read_table
 
@@ -71,7 +71,8 @@ def test_policy_is_loaded_by_its_kind(finished):
     policy = baselines.load(folder)
     start = np.ones(3, bool)
     actions, _ = policy.predict(images, None, start, True)
-    assert actions.shape == (3, 2, 8, 8) and policy.resolution == 8
+    assert actions.shape == (3, 2, policy.resolution, policy.resolution) == policy.predict(images)[0].shape
+    assert policy.description["resolution"] == 8
     assert policy.description["task"] == json.loads((folder / "config.json").read_text())["task"]
 
 
@@ -120,3 +121,11 @@ def test_wrong_algorithm_is_named(tmp_path, capsys):
     assert "algo: got 'alchemy', allowed cfp, gradient, mpc" in capsys.readouterr().err
     assert cfp.train.main(["--algo", "gradient", "--out", str(tmp_path / "a")]) == 2
     assert "algo: got 'gradient', allowed 'cfp'" in capsys.readouterr().err
+
+
+def test_robustness_is_reported_whatever_trained_it(finished):
+    _, folder = finished
+    assert robustness.main([str(folder), "--episodes", "1", "--device", "cpu"]) == 0
+    rows = json.loads((folder / "robustness.json").read_text())
+    assert rows[0]["case"] == "unperturbed" and rows[0]["ratio"] in (1, None)
+    assert {row["episodes"] for row in rows} == {1}

@@ -1,10 +1,15 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import distributions
 from torch.nn import functional as F
 
-from cfp.actor import ActorSpec, build_actor
+from cfp.actor import ActorSpec, Sample, build_actor
+from cfp.environments import make_torch_env
 from cfp.networks import normalise_image, upsample
+from cfp.presets import preset
+from dittogym import TASKS, make_spec
 
 
 def images(count=3, seed=0):
@@ -97,6 +102,43 @@ def test_closed_gates_leave_the_coarsest_action(resolutions):
     for resolution in resolutions[1:]:
         expected = upsample(expected, resolution, "half_pixel")
     torch.testing.assert_close(actor(image, deterministic=True), expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_closed_gates_leave_the_coarsest_field(task):
+    config = preset(task, "quick")
+    config = replace(config, environment=replace(config.environment, particles=100, substeps=1, num_envs=2))
+    ladders = {config.resolutions, tuple(size for size in (4, 8, 16, 32, 64) if size <= make_spec(task).patch)}
+    for ladder in ladders:
+        shut = replace(config, resolutions=ladder, gate_bias=(-100.0,) * (len(ladder) - 1))
+        torch.manual_seed(0)
+        finest, fields = build_actor(shut.actor_spec(len(ladder) - 1)), []
+        levels = [finest]
+        while hasattr(levels[0], "coarse"):
+            levels.insert(0, levels[0].coarse)
+        drawn = Sample(3 * torch.rand(2, 2, ladder[0], ladder[0]) - 1.5, torch.zeros(2), None)
+        levels[0].sample = lambda observation, deterministic, drawn=drawn: drawn  # some of the field is clipped
+        with torch.no_grad():
+            for level, actor in enumerate(levels):
+                env = make_torch_env(shut, shut.action_size(level))
+                observation, _ = env.reset(seed=0)
+                env.step(actor(observation, deterministic=True))
+                fields.append(env._field)
+        share = (fields[0].abs() == fields[0].abs().max()).float().mean()
+        assert 0 < share < 0.9
+        for field in fields[1:]:
+            torch.testing.assert_close(field, fields[0], rtol=0, atol=1e-5 * float(fields[0].abs().max()))
+
+
+def test_open_gate_leaves_the_residual_field():
+    torch.manual_seed(0)
+    actor = build_actor(ActorSpec((8, 16), (100.0,), patch=64))
+    image = images()
+    action, _, gate = actor.sample(image, deterministic=True)
+    latent = actor.encoder(normalise_image(image), upsample(actor.coarse(image, True), 64, "half_pixel"))
+    torch.testing.assert_close(gate, torch.ones_like(gate))
+    expected = upsample(torch.tanh(actor.mean(latent)), 64, "half_pixel")
+    torch.testing.assert_close(action, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_composed_action_is_not_clipped():

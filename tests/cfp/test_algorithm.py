@@ -224,6 +224,17 @@ def test_stage_two_starts_with_uniform_fine_actions():
     assert abs(neighbours) < 0.05  # no upsampled coarse action in them
 
 
+def test_uniform_actions_on_the_patch_are_as_coarse_as_the_level():
+    env = FakeEnv(num_envs=2, resolution=64)
+    model = make_model(ActorSpec((8, 16), (-100.0,), patch=64), env, random_steps=4)
+    model.learn(4)
+    actions = torch.stack(env.actions).flatten(0, 1)
+    small = F.interpolate(actions, scale_factor=0.25, mode="area")
+    assert small.std() > 0.8 * actions.std() > 0.3
+    stored = model.replay_buffer.actions[:2].reshape(-1, 2, 64, 64)
+    np.testing.assert_allclose(stored, actions.numpy())
+
+
 @pytest.mark.parametrize("fault", ["reward"])
 def test_reward_that_is_not_finite_is_never_stored(fault):
     model = make_model(ActorSpec((8,)), FakeEnv(num_envs=2, horizon=9, faults={3: fault}))

@@ -20,7 +20,7 @@ CONFIG = Config(resolutions=(4, 8), gate_bias=(-1.0,))
 
 def make_model(level=1):
     # The ring (20 rows) wraps around, and 7 does not divide anything: episodes are in progress at every checkpoint.
-    env = monitored(FakeEnv(num_envs=2, resolution=CONFIG.resolutions[level], horizon=7))
+    env = monitored(FakeEnv(num_envs=2, resolution=CONFIG.action_size(level), horizon=7))
     spec = CONFIG.actor_spec(level)
     options = {"buffer_size": 40, "batch_size": 4, "update_start": 6, "random_steps": 10, "seed": 3, "device": "cpu"}
     options |= {"precision": "bfloat16"}

@@ -1,5 +1,6 @@
 """The command lines, on a robot of a hundred particles that moves one substep at a time."""
 
+import html
 import json
 import signal
 
@@ -171,6 +172,28 @@ def test_evaluation_of_a_folder(finished, capsys):
     assert evaluate.main([str(finished), "--episodes", "1"]) == 0
     table = capsys.readouterr().out
     assert "stage 2" in table and "± std" in table
+
+
+def test_evaluation_with_and_without_noise(finished, capsys):
+    rows = {}
+    for noise in ("with", "without", "both"):
+        arguments = [str(finished), "--episodes", "2", "--json", "--device", "cpu", "--noise", noise]
+        assert evaluate.main(arguments) == 0
+        rows[noise] = {row.pop("policy"): row for row in json.loads(capsys.readouterr().out)[2:]}
+    assert list(rows["both"]) == [f"stage {stage}, {how}" for stage in (1, 2) for how in ("noisy", "mean")]
+    for stage in ("stage 1", "stage 2"):
+        assert rows["both"][f"{stage}, noisy"] == rows["with"][stage]
+        assert rows["both"][f"{stage}, mean"] == rows["without"][stage]
+    assert rows["with"] != rows["without"]
+    assert rows["with"]["stage 1"]["interval"] > 0
+
+
+def test_page_shows_the_run_and_opens_from_disk(finished):
+    page = (finished / "index.html").read_text()
+    assert 'src="curve.png"' in page and "http" not in page and "<video" not in page  # filmed nothing
+    for row in json.loads((finished / "results.json").read_text()):
+        assert f"<td>{row['policy']}</td>" in page and f"<td>{row['mean']:.1f}</td>" in page
+    assert html.escape((finished / "config.json").read_text().strip()) in page
 
 
 def test_evaluation_without_a_run_is_an_error(tmp_path, capsys):

@@ -28,7 +28,7 @@ def test_loaded_policy_acts_as_the_saved_one(saved, name):
     actions, state = policy.predict(images, deterministic=True)
     expected = actor(normalise_image(torch.from_numpy(images)), deterministic=True).detach().numpy()
     np.testing.assert_allclose(actions, expected, atol=1e-6)
-    assert actions.shape == (3, 2, 16, 16)
+    assert actions.shape == (3, 2, 64, 64) and policy.resolution == 64  # blended on the patch
     assert state is None
     single, _ = policy.predict(images[1], deterministic=True)
     np.testing.assert_allclose(single, actions[1], atol=1e-5)

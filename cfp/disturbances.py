@@ -1,0 +1,163 @@
+"""Faults and changed constants under which a policy is tried, without learning."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+from cfp.config import RunConfig
+from cfp.environments import make_torch_env
+from cfp.vec_env import monitored
+from dittogym import make_spec
+from dittogym.geometry import Obstacle, floor
+from dittogym.spec import TaskSpec
+
+FLOOR = floor().name
+
+
+@dataclass(frozen=True)
+class Case:
+    """One way to disturb a policy.
+
+    Attributes:
+        name: For tables and plots.
+        action_dropout: Share of the 2 R R action entries that become 0, drawn anew in every step.
+        observation_dropout: Share of the 3 x 64 x 64 raw pixels that become 0, drawn anew in every step. A velocity
+            pixel of 0 means fast motion, not rest, which is 132.
+        action_noise: Standard deviation of Gaussian noise on every action entry; 1 is the full actuation.
+        latency: Control steps by which actions come late; the first ones of an episode are 0.
+        physics: Factors on the task's own ``mu``, ``yield_stress`` and ``gravity``.
+        friction: Coulomb coefficient of the floor; ``math.inf`` sticks. ``None``: the task's own.
+    """
+
+    name: str
+    action_dropout: float = 0.0
+    observation_dropout: float = 0.0
+    action_noise: float = 0.0
+    latency: int = 0
+    physics: Mapping[str, float] = field(default_factory=dict)
+    friction: float | None = None
+
+
+def applies(case: Case, spec: TaskSpec) -> bool:
+    """Whether a case changes anything in a task: not gravity where there is none, not the friction it has already."""
+    if case.friction is not None:
+        return any(item.name == FLOOR and _friction(item) != case.friction for item in spec.obstacles)
+    return "gravity" not in case.physics or any(spec.gravity)
+
+
+def _friction(item: Obstacle) -> float:
+    return item.rules[0].friction
+
+
+def disturbed_env(config: RunConfig, resolution: int, num_envs: int, case: Case, seed: int) -> VecEnv:
+    """The environment of a run under a case.
+
+    Args:
+        config: The run's options.
+        resolution: Action grid R.
+        num_envs: Robots side by side.
+        case: What is disturbed.
+        seed: Of the disturbances, and of a first reset that sets the constants.
+    """
+    spec = make_spec(config.task, **config.environment.task_options())
+    options = {} if case.friction is None else {"obstacles": _with_friction(spec, case.friction)}
+    env = make_torch_env(config, resolution, num_envs, **options)
+    own = {name: np.asarray(getattr(spec, name), np.float64) for name in case.physics}
+    env.reset(seed=seed, options={"physics": {name: own[name] * factor for name, factor in case.physics.items()}})
+    return Disturbed(monitored(env), case, seed)
+
+
+def _with_friction(spec: TaskSpec, friction: float) -> tuple[Obstacle, ...]:
+    return tuple(
+        replace(item, rules=tuple(replace(rule, friction=friction) for rule in item.rules))
+        if item.name == FLOOR
+        else item
+        for item in spec.obstacles
+    )
+
+
+class Disturbed(VecEnvWrapper):
+    """Disturbs actions and observations of a vectorised environment; the same from every ``reset`` on.
+
+    Args:
+        venv: The environment, with actions (B, 2, R, R) and observations uint8 (B, 3, 64, 64).
+        case: What is disturbed; its constants of the matter are not applied here.
+        seed: Of the generator, which every ``reset`` starts anew.
+    """
+
+    def __init__(self, venv: VecEnv, case: Case, seed: int) -> None:
+        super().__init__(venv)
+        self.case, self.seed_of_noise = case, seed
+        self._begin()
+
+    def _begin(self) -> None:
+        self.generator = np.random.default_rng(self.seed_of_noise)
+        assert self.action_space.shape is not None
+        nothing = np.zeros((self.num_envs, *self.action_space.shape), np.float32)
+        self._late = deque(nothing.copy() for _ in range(self.case.latency))
+
+    def reset(self) -> VecEnvObs:
+        """Start new episodes, with the disturbances of the first time."""
+        self._begin()
+        return self._seen(self.venv.reset())
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Hand on what becomes of the actions (B, 2, R, R)."""
+        self._late.append(np.array(actions, np.float32))
+        actions = self._late.popleft()
+        if self.case.action_noise:
+            noise = self.generator.standard_normal(actions.shape, np.float32)
+            actions = actions + self.case.action_noise * noise
+        if self.case.action_dropout:
+            actions = np.where(self.generator.random(actions.shape) < self.case.action_dropout, 0, actions)
+        self.venv.step_async(actions.astype(np.float32))
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step; a new episode does not get the late actions of the one before."""
+        observation, reward, done, infos = self.venv.step_wait()
+        for actions in self._late:
+            actions[done] = 0
+        return self._seen(observation), reward, done, infos
+
+    def _seen(self, observation: VecEnvObs) -> VecEnvObs:
+        assert isinstance(observation, np.ndarray)
+        if not self.case.observation_dropout:
+            return observation
+        lost = self.generator.random(observation.shape) < self.case.observation_dropout
+        return np.where(lost, 0, observation).astype(observation.dtype)
+
+
+def make_cases(
+    dropout: float = 0.2,
+    noise: float = 0.2,
+    latency: int = 1,
+    shift: float = 0.2,
+    friction: tuple[float, ...] = (0.0, 0.5, math.inf),
+) -> list[Case]:
+    """The cases of a report, the unperturbed one first.
+
+    Args:
+        dropout: Share of lost action and of lost observation entries.
+        noise: Standard deviation of the action noise.
+        latency: Control steps.
+        shift: Constants of the matter are tried at 1 - shift and 1 + shift times their own value.
+        friction: Coefficients of the floor.
+    """
+    cases = [
+        Case("unperturbed"),
+        Case(f"action dropout {dropout:.0%}", action_dropout=dropout),
+        Case(f"observation dropout {dropout:.0%}", observation_dropout=dropout),
+        Case(f"action noise {noise:g}", action_noise=noise),
+        Case(f"latency {latency} step{'s' if latency > 1 else ''}", latency=latency),
+    ]
+    for name, symbol in (("mu", "mu"), ("yield_stress", "yield stress"), ("gravity", "gravity")):
+        cases += [Case(f"{symbol} x {factor:g}", physics={name: factor}) for factor in (1 - shift, 1 + shift)]
+    named = [("sticky" if math.isinf(value) else f"{value:g}", value) for value in friction]
+    return cases + [Case(f"floor friction {name}", friction=value) for name, value in named]

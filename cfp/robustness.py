@@ -1,0 +1,187 @@
+"""``python -m cfp.robustness RUN_FOLDER``: how much of its return a policy keeps under faults and other constants."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from matplotlib.figure import Figure
+
+from cfp.command import Program
+from cfp.config import RunConfig
+from cfp.disturbances import Case, applies, disturbed_env, make_cases
+from cfp.errors import CFPError, ConfigError
+from cfp.evaluate import open_run
+from cfp.evaluation import Policy, Result, evaluate, judging_seed
+from cfp.files import write_json, write_text
+from cfp.plot import write_figure
+from cfp.process import keep_memory
+from cfp.train import PROGRAM
+from dittogym import make_spec
+
+COLUMNS = ("case", "episodes", "mean", "std", "interval", "ratio", "success")
+
+
+@dataclass(frozen=True)
+class Command:
+    """Evaluate the newest policy of a run under faults and changed constants, on the same particle layouts.
+
+    Writes robustness.md, .csv, .json and .png into the run folder.
+    """
+
+    folder: tyro.conf.Positional[Path]
+    """A folder that a training wrote or is writing."""
+    episodes: int = 5
+    """Episodes of each case."""
+    dropout: float = 0.2
+    """Share of action entries, and of observation entries, set to zero in every step."""
+    noise: float = 0.2
+    """Standard deviation of Gaussian noise on every action entry."""
+    latency: int = 1
+    """Control steps by which actions come late."""
+    shift: float = 0.2
+    """mu, yield stress and gravity are tried at 1 - shift and 1 + shift times their value."""
+    friction: tuple[float, ...] = (0.0, 0.5, math.inf)
+    """Coulomb coefficients of the floor; inf sticks. The task's own is left out."""
+    seed: int | None = None
+    """Seed of layouts and noise; the run's own if not given."""
+    device: str = "auto"
+    """cpu, cuda, or auto."""
+
+    def check(self) -> None:
+        """Check what the types cannot.
+
+        Raises:
+            ConfigError: Naming the option, what was given and what is allowed.
+        """
+        for name in ("episodes", "latency"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed 1 or more")
+        for name in ("dropout", "shift"):
+            if not 0 < getattr(self, name) < 1:
+                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed between 0 and 1")
+        if not 0 < self.noise < math.inf:
+            raise ConfigError(f"noise: got {self.noise}, allowed more than 0")
+        if not all(value >= 0 for value in self.friction):
+            raise ConfigError(f"friction: got {self.friction}, allowed 0 or more, inf sticks")
+
+
+def report(config: RunConfig, policy: Policy, cases: Sequence[Case], episodes: int) -> list[Result]:
+    """Evaluate a policy in every case that changes something in its task, on the same layouts with the same noise.
+
+    Args:
+        config: Options of the run that trained it.
+        policy: Acts as it is evaluated.
+        cases: The unperturbed one first.
+        episodes: Of each case.
+    """
+    spec, seed = make_spec(config.task, **config.environment.task_options()), judging_seed(config)
+    results = []
+    for case in (case for case in cases if applies(case, spec)):
+        env = disturbed_env(config, policy.resolution, episodes, case, seed)
+        deterministic = policy.deterministic_by_default
+        results.append(evaluate(case.name, policy, env, episodes, deterministic=deterministic, seed=seed))
+    return results
+
+
+def to_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
+    """Results as JSON values, ``ratio`` to the first one's mean; None where that is not positive."""
+    base = results[0].mean
+    return [
+        {
+            "case": result.name,
+            "episodes": len(result.returns),
+            "mean": round(result.mean, 3),
+            "std": round(result.std, 3),
+            "interval": None if result.interval is None else round(result.interval, 3),
+            "ratio": round(result.mean / base, 4) if base > 0 else None,
+            "success": result.success,
+            "returns": [round(value, 3) for value in result.returns],
+        }
+        for result in results
+    ]
+
+
+def to_csv(rows: Sequence[dict[str, Any]]) -> str:
+    """The table as CSV."""
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def to_markdown(config: RunConfig, rows: Sequence[dict[str, Any]]) -> str:
+    """The table as Markdown."""
+    lines = [
+        f"Robustness of {config.name}: mean return of {rows[0]['episodes']} episodes and ratio to the unperturbed.",
+        "",
+        "| case | return | 95 % interval | ratio | success |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
+    for row in rows:
+        interval = "–" if row["interval"] is None else f"± {row['interval']:.1f}"
+        ratio = "–" if row["ratio"] is None else f"{row['ratio']:.3f}"
+        success = "–" if row["success"] is None else f"{row['success']:.0%}"
+        lines.append(f"| {row['case']} | {row['mean']:.1f} | {interval} | {ratio} | {success} |")
+    if rows[0]["ratio"] is None:
+        lines += ["", "The unperturbed return is not positive, so that there are no ratios to it."]
+    return "\n".join(lines) + "\n"
+
+
+def draw(config: RunConfig, results: Sequence[Result]) -> Figure:
+    """A bar for every case: its ratio to the unperturbed return, or its return where that is not positive."""
+    base = results[0].mean
+    unit = base if base > 0 else 1.0
+    figure = Figure(figsize=(8, 0.8 + 0.3 * len(results)), dpi=150, layout="constrained")
+    axes = figure.add_subplot()
+    names, values = [result.name for result in results], [result.mean / unit for result in results]
+    errors = [(result.interval or 0.0) / unit for result in results]
+    axes.barh(names, values, xerr=errors, color=["tab:gray"] + ["tab:blue"] * (len(results) - 1), ecolor="black")
+    axes.axvline(base / unit, color="black", linewidth=1, linestyle="--")
+    axes.invert_yaxis()
+    axes.set_xlabel("ratio to the unperturbed return" if base > 0 else "return (unperturbed: not positive)")
+    axes.set_title(f"{config.algo} on {config.task}, {len(results[0].returns)} episodes, 95 % intervals", fontsize=10)
+    axes.grid(alpha=0.3, axis="x")
+    return figure
+
+
+def run(program: Program, command: Command) -> str:
+    """Do what a command says and return what it prints.
+
+    Raises:
+        CFPError: An option is wrong, there is no run, it has no policy yet, or a file is damaged.
+    """
+    command.check()
+    config, policies = open_run(program, command.folder, command.device, command.seed)
+    cases = make_cases(command.dropout, command.noise, command.latency, command.shift, command.friction)
+    results = report(config, list(policies.values())[-1], cases, command.episodes)
+    rows, path = to_rows(results), command.folder / "robustness"
+    table = to_markdown(config, rows)
+    write_json(path.with_suffix(".json"), rows)
+    write_text(path.with_suffix(".csv"), to_csv(rows))
+    write_text(path.with_suffix(".md"), table)
+    write_figure(path.with_suffix(".png"), draw(config, results))
+    return f"{table}\nbar plot: {path.with_suffix('.png')}"
+
+
+def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:
+    """Command line entry; returns the exit code."""
+    keep_memory()
+    try:
+        print(run(program, tyro.cli(Command, prog=f"python -m {program.package}.robustness", args=arguments)))
+    except (CFPError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2 if isinstance(error, CFPError) else 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

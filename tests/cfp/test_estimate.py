@@ -1,0 +1,51 @@
+"""``--dry-run``: options and costs, and nothing written."""
+
+import json
+
+import pytest
+
+from baselines import train as baselines_train
+from cfp import train
+from cfp.config import Config, merge
+from cfp.estimate import seconds
+from cfp.presets import preset
+
+TINY = "--particles 100 --substeps 1 --num-envs 2 --device cpu --steps 150".split()
+
+
+def test_dry_run_tells_options_and_costs_and_writes_nothing(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments = [*TINY, "--handover", "70", "--batch-size", "4", "--buffer-size", "60", "--dry-run"]
+    assert train.main(arguments) == 0
+    assert not list(tmp_path.iterdir())
+    options, end = json.JSONDecoder().raw_decode(printed := capsys.readouterr().out)
+    config: Config = merge(preset("shapematch"), options)
+    assert (config.steps, config.handover, config.environment.particles) == (150, (70,), 100)
+    header, first, second, time, memory = printed[end:].strip().splitlines()
+    assert header.split()[:3] == ["stage", "action", "steps"]
+    assert first.split()[:3] == ["1", "32x32", "70"] and second.split()[:3] == ["2", "64x64", "80"]
+    rows = 60 * (2 * 3 * 64 * 64 + 2 * 64 * 64 * 4 + 3 * 4)  # two images, an action, three numbers each
+    assert f"{rows / 2**20:.0f} MiB" in second
+    assert time.startswith("time: about") and memory.startswith("memory: about")
+
+
+def test_dry_run_of_another_algorithm(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert baselines_train.main([*TINY[:-2], "--algo", "gradient", "--tier", "100", "--grid", "4", "--dry-run"]) == 0
+    assert "4x4" in capsys.readouterr().out and not list(tmp_path.iterdir())
+
+
+def test_dry_run_names_wrong_options(capsys):
+    assert train.main(["--particles", "0", "--dry-run"]) == 2
+    assert "particles" in capsys.readouterr().err
+
+
+def test_the_first_time_is_not_timed(monkeypatch):
+    now, calls = [0.0], []
+    monkeypatch.setattr("cfp.estimate.time.perf_counter", lambda: now[0])
+
+    def action():
+        now[0] += 100.0 if not calls else 2.0
+        calls.append(1)
+
+    assert seconds(action, 4) == pytest.approx(2.0)

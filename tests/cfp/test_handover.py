@@ -1,0 +1,105 @@
+"""From one level to the next: by plateau, from another run's policy, with warm critics."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from test_train import run
+
+from cfp.command import parse
+from cfp.files import read_table
+from cfp.process import StopSignals
+from cfp.runner import Runner
+from cfp.train import PROGRAM
+
+MEANS = [1.0, 3.0, 2.0, 2.5, 9.0, 1.0, 5.0, 4.0, 3.0, 2.0]
+
+
+@pytest.fixture
+def scripted(monkeypatch):
+    """Evaluations that return given means, whatever the policy."""
+    left = list(MEANS)
+    evaluate = __import__("cfp.run", fromlist=["evaluate"]).evaluate
+
+    def pretend(name, *arguments, **options):
+        result = evaluate(name, *arguments, **options)
+        return replace(result, returns=(left.pop(0),) * 2) if name == "" else result
+
+    monkeypatch.setattr("cfp.run.evaluate", pretend)
+
+
+def test_plateau_hands_over_and_ends_the_run(scripted, tmp_path, capsys):
+    folder = tmp_path / "run"
+    assert run(folder, "--eval-every", "10", "--patience", "2") == 0
+    rows = [(int(row["step"]), int(row["stage"])) for row in read_table(folder / "evaluations.csv")]
+    # The second of four evaluations is stage 1's best; stage 2 begins with one at 40, which stays its best.
+    assert rows == [(10, 1), (20, 1), (30, 1), (40, 1), (40, 2), (50, 2), (60, 2)]
+    assert capsys.readouterr().out.count("ends early: 2 evaluations without a new best") == 2
+    stages = [json.loads((folder / name).read_text()) for name in ("stage1.json", "policy.json")]
+    assert [(stage["stage"], stage["steps"]) for stage in stages] == [(1, 20), (2, 40)]
+    assert run(folder, "--eval-every", "10", "--patience", "2", "--resume") == 0
+    assert rows == [(int(row["step"]), int(row["stage"])) for row in read_table(folder / "evaluations.csv")]
+
+
+def test_patience_needs_evaluations(tmp_path, capsys):
+    assert run(tmp_path / "a", "--patience", "2", "--eval-every", "0") == 2
+    assert "patience: got 2" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def coarse(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "coarse"
+    options = "--resolutions 4 --handover --steps 30 --random-steps 10 --alpha 0.01 --gate-bias --gate-penalty"
+    assert run(folder, *options.split()) == 0
+    return folder
+
+
+@pytest.mark.parametrize("name", ["", "policy.safetensors"])
+def test_second_level_starts_from_a_policy(coarse, tmp_path, name):
+    folder = tmp_path / "fine"
+    assert run(folder, "--start-from", str(coarse / name), "--steps", "100") == 0
+    assert json.loads((folder / "stage1.json").read_text()) == json.loads((coarse / "policy.json").read_text())
+    assert {row["stage"] for row in read_table(folder / "progress.csv")} == {"2"}
+    assert read_table(folder / "progress.csv")[0]["step"] == "80"  # its steps go on from the handover
+    actor, frozen = (PROGRAM.load(place).actor.state_dict() for place in (folder, coarse))
+    assert all(torch.equal(actor[f"coarse.{key}"], value) for key, value in frozen.items())
+    results = json.loads((folder / "results.json").read_text())
+    assert [row["policy"] for row in results][2:] == ["stage 1", "stage 2"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--task", "run"], "start_from: got a policy for shapematch, allowed run"),
+        (["--resolutions", "8", "16"], "start_from: got a policy of levels (4,), allowed the first of (8, 16)"),
+        (["--warm-critic"], "warm_critic: got True, allowed without start_from"),
+        (["--start-from", "no/such"], "there is no policy"),
+    ],
+)
+def test_policy_that_does_not_fit_is_refused(coarse, tmp_path, capsys, options, message):
+    assert run(tmp_path / "a", "--start-from", str(coarse), *options) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("warm", [False, True])
+def test_critics_of_a_level_begin_with_those_before_if_asked_to(tmp_path, monkeypatch, warm):
+    options = "--particles 100 --substeps 1 --num-envs 2 --resolutions 4 8 --device cpu --backend eager".split()
+    config = parse(PROGRAM, [*options, "--warm-critic" if warm else "--no-warm-critic"]).run
+    runner, seen = Runner(config, tmp_path / "run", False, StopSignals()), []
+
+    def learn(model, steps, books):
+        seen.append({key: value.clone() for key, value in model.policy.critic.state_dict().items()})
+        assert (model.reward_statistics.mean.item() == 7) == (warm and len(seen) == 2)
+        with torch.no_grad():
+            for network in model.networks()[1:]:
+                for parameter in network.parameters():
+                    parameter.fill_(0.125)
+        model.reward_statistics.mean.fill_(7)
+        runner.keep(model, len(seen) - 1, 0)
+
+    monkeypatch.setattr(runner, "learn", learn)
+    runner.train()
+    kept = all((value == 0.125).all() for key, value in seen[1].items() if value.requires_grad or "patches" not in key)
+    assert kept == warm

@@ -1,0 +1,162 @@
+"""The robustness report: what each disturbance does, that it is repeatable, and the command line."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fakes import FakeEnv
+from scipy import stats
+
+from cfp import robustness
+from cfp.actor import build_actor
+from cfp.config import to_json
+from cfp.disturbances import Case, Disturbed, applies, disturbed_env, make_cases
+from cfp.evaluate import open_run
+from cfp.evaluation import Result, student
+from cfp.files import write_json
+from cfp.presets import preset
+from cfp.train import PROGRAM
+from cfp.vec_env import monitored
+from cfp.weights import describe, save_policy
+from dittogym import make_spec
+from dittogym.tasks import TASKS
+
+
+def disturbed(**disturbance):
+    return Disturbed(monitored(FakeEnv(num_envs=2, horizon=3)), Case("case", **disturbance), seed=0)
+
+
+def play(env, actions):
+    """What reached the physics for actions (T, B, 2, R, R), and the first observation."""
+    inner = env.unwrapped.torch_env
+    inner.actions.clear()
+    first = env.reset()
+    for action in actions:
+        env.step(action)
+    return np.stack([action.numpy() for action in inner.actions]), first
+
+
+def test_dropout_zeroes_its_share_of_the_entries_anew_in_every_step():
+    actions = np.full((4, 2, 2, 8, 8), 0.5, np.float32)
+    arrived, _ = play(disturbed(action_dropout=0.2), actions)
+    assert set(np.unique(arrived)) == {0.0, 0.5}
+    assert (arrived == 0).mean() == pytest.approx(0.2, abs=0.04)
+    assert not np.array_equal(arrived[0], arrived[1])
+    env = disturbed(observation_dropout=0.2)
+    _, seen = play(env, actions)
+    whole = play(disturbed(), actions)[1]
+    assert seen.dtype == np.uint8 and (whole[:, 0] > 0).all()
+    assert (seen[:, 0] == 0).mean() == pytest.approx(0.2, abs=0.02)
+    assert (seen[:, 0] == whole[:, 0]).mean() == pytest.approx(0.8, abs=0.02)
+
+
+def test_noise_has_its_deviation_and_every_reset_repeats_it():
+    env = disturbed(action_noise=0.3)
+    actions = np.zeros((4, 2, 2, 8, 8), np.float32)
+    first, _ = play(env, actions)
+    assert first.std() == pytest.approx(0.3, abs=0.02) and first.mean() == pytest.approx(0, abs=0.03)
+    np.testing.assert_array_equal(play(env, actions)[0], first)
+
+
+def test_late_actions_stay_in_their_episode():
+    actions = np.arange(1, 6, dtype=np.float32)[:, None, None, None, None] * np.ones((1, 2, 2, 8, 8), np.float32)
+    arrived, _ = play(disturbed(latency=2), actions)  # an episode lasts three steps
+    assert arrived[:, 0, 0, 0, 0].tolist() == [0, 0, 1, 0, 0]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_constants_reach_the_physics_of_every_task(task):
+    spec, config = make_spec(task), preset(task)
+    config = replace(config, environment=replace(config.environment, particles=100, substeps=1))
+    env = disturbed_env(config, 8, 2, Case("soft", physics={"mu": 0.5, "yield_stress": 0.5, "gravity": 2.0}), 3)
+    env.seed(5)
+    env.reset()
+    physics = env.unwrapped.torch_env.env_state.physics
+    assert physics["mu"].tolist() == [0.5 * spec.mu] * 2
+    assert physics["yield_stress"].tolist() == [0.5 * spec.yield_stress] * 2
+    assert physics["gravity"].tolist() == [[2 * value for value in spec.gravity]] * 2
+    env = disturbed_env(config, 8, 2, Case("ice", friction=0.25), 3)
+    floors = [item for item in env.unwrapped.torch_env.spec.obstacles if item.name == "floor"]
+    assert [rule.friction for item in floors for rule in item.rules] == [0.25]
+    others = [item for item in spec.obstacles if item.name != "floor"]
+    assert [item for item in env.unwrapped.torch_env.spec.obstacles if item.name != "floor"] == others
+
+
+def test_cases_that_change_nothing_in_a_task_are_left_out():
+    cases = make_cases()
+    names = {task: [case.name for case in cases if applies(case, make_spec(task))] for task in TASKS}
+    assert "gravity x 0.8" in names["run"] and "gravity x 0.8" not in names["shapematch"]
+    assert "floor friction sticky" in names["dig"] and "floor friction 0" not in names["dig"]
+    assert "floor friction sticky" not in names["run"] and "floor friction 0" in names["run"]
+
+
+@pytest.mark.parametrize("degrees", [1, 2, 4, 30])
+def test_interval_is_student_s(degrees):
+    assert student(degrees) == pytest.approx(stats.t.ppf(0.975, degrees), rel=1e-5)
+    returns = np.random.default_rng(0).normal(size=degrees + 1)
+    low, high = stats.t.interval(0.95, degrees, returns.mean(), stats.sem(returns))
+    assert Result("", 8, tuple(returns)).interval == pytest.approx((high - low) / 2, rel=1e-5)
+    assert Result("", 8, (1.0,)).interval is None
+
+
+@pytest.fixture
+def folder(tmp_path):
+    config = preset("shapematch")
+    environment = replace(config.environment, particles=1000, substeps=10)
+    config = replace(config, environment=environment)
+    write_json(tmp_path / "config.json", to_json(config))
+    save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(1)), describe(config, 1, 0))
+    return tmp_path
+
+
+def test_command_writes_table_and_plot(folder, capsys):
+    arguments = [str(folder), "--episodes", "2", "--device", "cpu"]
+    assert robustness.main(arguments) == 0
+    printed = capsys.readouterr().out
+    rows = json.loads((folder / "robustness.json").read_text())
+    assert [row["case"] for row in rows] == [
+        case.name for case in make_cases() if applies(case, make_spec("shapematch"))
+    ]
+    assert rows[0]["ratio"] == 1
+    for row in rows:
+        assert row["mean"] == pytest.approx(np.mean(row["returns"]), abs=1e-2)
+        assert row["ratio"] == pytest.approx(row["mean"] / rows[0]["mean"], abs=1e-4)
+    assert len({tuple(row["returns"]) for row in rows}) > len(rows) / 2
+    with open(folder / "robustness.csv", newline="") as file:
+        assert [float(row["mean"]) for row in csv.DictReader(file)] == [row["mean"] for row in rows]
+    table = (folder / "robustness.md").read_text()
+    assert table in printed and all(f"| {row['case']} |" in table for row in rows)
+    assert (folder / "robustness.png").read_bytes().startswith(b"\x89PNG")
+    config, policies = open_run(PROGRAM, folder, "cpu")
+    again = robustness.report(config, policies["stage 2"], make_cases()[:4], 2)  # alone, with the same seed
+    assert robustness.to_rows(again) == rows[:4]
+
+
+def test_ratios_need_a_positive_return():
+    rows = robustness.to_rows([Result("unperturbed", 8, (-2.0, -1.0)), Result("noise", 8, (-4.0, -3.0))])
+    assert [row["ratio"] for row in rows] == [None, None]
+    config = preset("dig")
+    assert "not positive" in robustness.to_markdown(config, rows)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--dropout", "1.5"], "dropout: got 1.5, allowed between 0 and 1"),
+        (["--latency", "0"], "latency: got 0, allowed 1 or more"),
+        (["--noise", "nan"], "noise: got nan"),
+        (["--friction", "-1"], "friction: got (-1.0,), allowed 0 or more"),
+        (["--device", "abacus"], "device: got 'abacus'"),
+    ],
+)
+def test_wrong_option_is_one_line_and_exit_code_two(folder, capsys, arguments, message):
+    assert robustness.main([str(folder), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and message in error
+
+
+def test_folder_without_a_run_is_an_error(tmp_path, capsys):
+    assert robustness.main([str(tmp_path)]) == 2
+    assert "there is no run" in capsys.readouterr().err
