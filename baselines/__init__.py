@@ -1,8 +1,21 @@
 """Algorithms to compare the coarse-to-fine policy with, behind the same command lines, folders and policies."""
 
+from baselines.actor_critic import StatePolicy
 from baselines.algorithm import Algorithm, Entry
 from baselines.gradient import Gradient, GradientConfig
 from baselines.open_loop import OpenLoop
 from baselines.registry import ALGORITHMS, load
+from baselines.shac import Shac, ShacConfig
 
-__all__ = ["ALGORITHMS", "Algorithm", "Entry", "Gradient", "GradientConfig", "OpenLoop", "load"]
+__all__ = [
+    "ALGORITHMS",
+    "Algorithm",
+    "Entry",
+    "Gradient",
+    "GradientConfig",
+    "OpenLoop",
+    "Shac",
+    "ShacConfig",
+    "StatePolicy",
+    "load",
+]

@@ -8,6 +8,7 @@ from typing import Any
 import cfp
 from baselines.algorithm import Entry
 from baselines.gradient import Gradient
+from baselines.shac import Shac
 from cfp.config import RunConfig, merge
 from cfp.errors import ConfigError
 from cfp.evaluation import Policy
@@ -19,6 +20,7 @@ from cfp.weights import read_policy
 ALGORITHMS: dict[str, Entry] = {
     "cfp": Entry("image", cfp.preset, Runner, cfp.load),
     "gradient": Gradient.entry(),
+    "shac": Shac.entry(),
 }
 
 

@@ -8,6 +8,7 @@ import pytest
 
 import baselines
 import cfp.evaluate
+import dittogym
 from baselines import evaluate, train
 from cfp.books import Books
 from cfp.files import read_table
@@ -26,6 +27,12 @@ TINY = {
         "--eval-every 90 --checkpoint-every 30 --log-every 30",
         180,
         ["stage 1", "stage 2", "  own layout"],
+    ),
+    "shac": (
+        "--tier 100 --num-envs 2 --steps 96 --window 6 --grid 8 --age 20 --critic-updates 2 "
+        "--eval-every 48 --checkpoint-every 12 --log-every 24",
+        60,
+        ["stage 1"],
     ),
 }
 
@@ -47,13 +54,15 @@ def finished(request, tmp_path_factory):
 
 def test_run_leaves_its_files(finished):
     algo, folder = finished
-    for name in ("results.json", "curve.png", "policy.safetensors", "policy.json", "stage1.json"):
+    for name in ("results.json", "curve.png", "policy.safetensors", "policy.json"):
         assert (folder / name).stat().st_size > 0, name
     assert json.loads((folder / "config.json").read_text())["algo"] == algo
     assert json.loads((folder / "policy.json").read_text())["kind"] == algo
     assert list((folder / "tensorboard").glob("events*"))
-    assert {row["stage"] for row in read_table(folder / "progress.csv")} == {"1", "2"}
-    assert {row["stage"] for row in read_table(folder / "evaluations.csv")} == {"1", "2"}
+    stages = {name[-1] for name in TINY[algo][2] if name.startswith("stage")}
+    assert {row["stage"] for row in read_table(folder / "progress.csv")} == stages
+    assert {row["stage"] for row in read_table(folder / "evaluations.csv")} == stages
+    assert all((folder / f"stage{stage}.json").exists() for stage in sorted(stages)[:-1])
     rows = json.loads((folder / "results.json").read_text())
     assert [row["policy"] for row in rows] == ["zero action", "random action", *TINY[algo][2]]
 
@@ -62,6 +71,10 @@ def test_policy_is_loaded_by_its_kind(finished):
     _, folder = finished
     images = np.zeros((3, 3, 64, 64), np.uint8)
     policy = baselines.load(folder)
+    if isinstance(policy, baselines.StatePolicy):
+        env = dittogym.TorchEnv("shapematch", 3, 8, particles=100)
+        env.reset(seed=0)
+        policy = policy.attached(env)
     start = np.ones(3, bool)
     actions, _ = policy.predict(images, None, start, True)
     assert actions.shape == (3, 2, 8, 8) and policy.resolution == 8
@@ -101,7 +114,7 @@ def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monk
 def test_polish_is_judged_on_the_layout_it_is_made_for(finished):
     algo, folder = finished
     rows = [row for row in read_table(folder / "evaluations.csv") if row["stage"] == "2"]
-    assert {row["episodes"] for row in rows} == {"2" if algo == "cfp" else "1"}
+    assert {row["episodes"] for row in rows} == {"cfp": {"2"}, "gradient": {"1"}, "shac": set()}[algo]
     if algo == "gradient":
         own = json.loads((folder / "results.json").read_text())[-1]
         assert own["returns"] == [pytest.approx(max(float(row["mean"]) for row in rows), abs=1e-3)]
@@ -110,6 +123,6 @@ def test_polish_is_judged_on_the_layout_it_is_made_for(finished):
 
 def test_wrong_algorithm_is_named(tmp_path, capsys):
     assert train.main(["--algo", "alchemy", "--out", str(tmp_path / "a")]) == 2
-    assert "algo: got 'alchemy', allowed cfp, gradient" in capsys.readouterr().err
+    assert "algo: got 'alchemy', allowed cfp, gradient, shac" in capsys.readouterr().err
     assert cfp.train.main(["--algo", "gradient", "--out", str(tmp_path / "a")]) == 2
     assert "algo: got 'gradient', allowed 'cfp'" in capsys.readouterr().err
