@@ -16,6 +16,7 @@ from cfp.config import EnvironmentConfig, to_json
 from cfp.environments import make_env
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
 from cfp.evaluation import attached, evaluate
+from cfp.video import film
 from cfp.weights import origin
 from dittogym import TorchEnv
 
@@ -195,6 +196,7 @@ def test_policy_goes_through_its_file(sees, tmp_path):
     assert np.array_equal(*actions) and np.abs(actions[0]).max() > 0
     results = [evaluate("", each, env, 2, deterministic=False, seed=3) for each in (algorithm, policy)]
     assert results[0] == results[1]
+    assert len(film(algorithm.config, policy)) == 31
 
 
 def test_policy_of_the_image_is_one_of_cfp(tmp_path):
