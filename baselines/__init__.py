@@ -1,11 +1,13 @@
 """Algorithms to compare the coarse-to-fine policy with, behind the same command lines, folders and policies."""
 
+from baselines.actor_critic import StatePolicy
 from baselines.algorithm import Algorithm, Entry
 from baselines.gradient import Gradient, GradientConfig
 from baselines.mpc import MPC, MPCConfig
 from baselines.open_loop import OpenLoop
 from baselines.planner import Planner, PlannerConfig
 from baselines.registry import ALGORITHMS, load
+from baselines.shac import Shac, ShacConfig
 
 __all__ = [
     "ALGORITHMS",
@@ -18,5 +20,8 @@ __all__ = [
     "OpenLoop",
     "Planner",
     "PlannerConfig",
+    "Shac",
+    "ShacConfig",
+    "StatePolicy",
     "load",
 ]

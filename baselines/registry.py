@@ -9,6 +9,7 @@ import cfp
 from baselines.algorithm import Entry
 from baselines.gradient import Gradient
 from baselines.mpc import MPC
+from baselines.shac import Shac
 from cfp.config import RunConfig, merge
 from cfp.errors import ConfigError
 from cfp.evaluation import Policy
@@ -21,6 +22,7 @@ ALGORITHMS: dict[str, Entry] = {
     "cfp": Entry("image", cfp.preset, Runner, cfp.load),
     "gradient": Gradient.entry(),
     "mpc": MPC.entry(),
+    "shac": Shac.entry(),
 }
 
 

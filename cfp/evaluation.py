@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.environments import make_env
+from cfp.vec_env import TorchVecEnv
 
 Noise = Literal["default", "with", "without", "both"]
 """With action noise or without; default: as the run that trained a policy evaluates it."""
@@ -34,6 +35,22 @@ class Policy(PolicyPredictor, Protocol):
     @property
     def description(self) -> dict[str, Any]:
         """What it is and comes from; ``layout`` is the seed of the one particle layout it was made for, if so."""
+
+
+@runtime_checkable
+class SeesState(Protocol):
+    """A policy that looks at the state of the simulation beside or instead of the image."""
+
+    def attached(self, env: Any) -> PolicyPredictor:
+        """The same policy, looking at a `dittogym.TorchEnv`."""
+
+
+def attached(policy: PolicyPredictor, env: VecEnv) -> PolicyPredictor:
+    """A policy for an environment of `make_env`: one that sees the state is shown it, any other stays as it is."""
+    inner = env.unwrapped
+    if isinstance(policy, SeesState) and isinstance(inner, TorchVecEnv):
+        return policy.attached(inner.torch_env)
+    return policy
 
 
 @dataclass(frozen=True)
@@ -138,7 +155,7 @@ def evaluate(
 
     Args:
         name: Of the policy, for the result.
-        policy: Anything with stable-baselines3's ``predict``.
+        policy: Anything with stable-baselines3's ``predict``; shown the state if it asks for it, see `SeesState`.
         env: Environments used for evaluation only.
         episodes: How many.
         deterministic: Act without noise.
@@ -150,12 +167,18 @@ def evaluate(
         if local["done"] and "is_success" in local["info"]:
             successes.append(bool(local["info"]["is_success"]))
 
+    watching = attached(policy, env)
     env.seed(seed)
     cuda = list(range(torch.cuda.device_count()))
     with torch.random.fork_rng(devices=cuda):
         torch.manual_seed(seed)
         returns, _ = evaluate_policy(
-            policy, env, episodes, deterministic=deterministic, callback=note_success, return_episode_rewards=True
+            watching,
+            env,
+            episodes,
+            deterministic=deterministic,
+            callback=note_success,
+            return_episode_rewards=True,
         )
     assert isinstance(returns, list)
     success = float(np.mean(successes)) if successes else None

@@ -12,7 +12,7 @@ import torch
 
 from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.environments import make_env
-from cfp.evaluation import Policy
+from cfp.evaluation import Policy, attached
 from cfp.vec_env import TorchVecEnv
 
 FRAMES_PER_SECOND = 10
@@ -32,6 +32,7 @@ def film(config: RunConfig, policy: Policy) -> list[np.ndarray]:
     """
     venv = make_env(config, policy.resolution, 1).venv
     assert isinstance(venv, TorchVecEnv)
+    watching = attached(policy, venv)
     seed = policy.description.get("layout", config.seed + EVALUATION_SEED)
     venv.seed(seed)
     observation = venv.reset()
@@ -42,7 +43,7 @@ def film(config: RunConfig, policy: Policy) -> list[np.ndarray]:
         while not done:
             assert isinstance(observation, np.ndarray)
             start = np.array([len(frames) == 1])
-            action, memory = policy.predict(observation, memory, start, policy.deterministic_by_default)
+            action, memory = watching.predict(observation, memory, start, policy.deterministic_by_default)
             tensors = venv.torch_env.step(torch.as_tensor(action, device=venv.torch_env.device))
             observation, _, terminated, truncated, _ = (_numpy(value) for value in tensors)
             frames.append(venv.torch_env.render(0))  # before a reset can replace the last picture

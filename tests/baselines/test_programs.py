@@ -8,6 +8,7 @@ import pytest
 
 import baselines
 import cfp.evaluate
+import dittogym
 from baselines import evaluate, robustness, train
 from cfp.books import Books
 from cfp.files import read_table
@@ -31,6 +32,12 @@ TINY = {
         "--grid 8 --horizon 3 --commit 2 --iterations 1 --eval-every 12 --checkpoint-every 5 --log-every 5",
         17,
         ["stage 1", "  own layout"],
+    ),
+    "shac": (
+        "--tier 100 --num-envs 2 --steps 96 --window 6 --grid 8 --age 20 --critic-updates 2 "
+        "--eval-every 48 --checkpoint-every 12 --log-every 24",
+        60,
+        ["stage 1"],
     ),
 }
 
@@ -69,6 +76,10 @@ def test_policy_is_loaded_by_its_kind(finished):
     _, folder = finished
     images = np.zeros((3, 3, 64, 64), np.uint8)
     policy = baselines.load(folder)
+    if isinstance(policy, baselines.StatePolicy):
+        env = dittogym.TorchEnv("shapematch", 3, 8, particles=100)
+        env.reset(seed=0)
+        policy = policy.attached(env)
     start = np.ones(3, bool)
     actions, _ = policy.predict(images, None, start, True)
     assert actions.shape == (3, 2, policy.resolution, policy.resolution) == policy.predict(images)[0].shape
@@ -109,7 +120,7 @@ def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monk
 def test_polish_is_judged_on_the_layout_it_is_made_for(finished):
     algo, folder = finished
     rows = [row for row in read_table(folder / "evaluations.csv") if row["stage"] == "2"]
-    assert {row["episodes"] for row in rows} == {"cfp": {"2"}, "gradient": {"1"}, "mpc": set()}[algo]
+    assert {row["episodes"] for row in rows} == {"cfp": {"2"}, "gradient": {"1"}, "mpc": set(), "shac": set()}[algo]
     if algo == "gradient":
         own = json.loads((folder / "results.json").read_text())[-1]
         assert own["returns"] == [pytest.approx(max(float(row["mean"]) for row in rows), abs=1e-3)]
@@ -118,7 +129,7 @@ def test_polish_is_judged_on_the_layout_it_is_made_for(finished):
 
 def test_wrong_algorithm_is_named(tmp_path, capsys):
     assert train.main(["--algo", "alchemy", "--out", str(tmp_path / "a")]) == 2
-    assert "algo: got 'alchemy', allowed cfp, gradient, mpc" in capsys.readouterr().err
+    assert "algo: got 'alchemy', allowed cfp, gradient, mpc, shac" in capsys.readouterr().err
     assert cfp.train.main(["--algo", "gradient", "--out", str(tmp_path / "a")]) == 2
     assert "algo: got 'gradient', allowed 'cfp'" in capsys.readouterr().err
 

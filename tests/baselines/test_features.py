@@ -1,0 +1,94 @@
+"""What a policy that sees the state is given, and what it is trained on."""
+
+import math
+
+import pytest
+import torch
+
+from baselines.features import RASTER, StateFeatures
+from baselines.training_reward import REACH, SLACK, Pairs, RewardConfig, training_reward
+from dittogym import TorchEnv
+
+
+def reset(task="run", count=500, envs=1):
+    env = TorchEnv(task, envs, particles=count, substeps=10, dtype="float64")
+    env.reset(seed=0)
+    return env
+
+
+def rasters(env):
+    return StateFeatures(clock=False)(env).view(env.num_envs, -1, RASTER, RASTER)
+
+
+def test_raster_holds_mass_momentum_and_deformation():
+    env = reset()
+    velocity = torch.tensor([0.3, -0.2], dtype=torch.float64)
+    env.state.v[:] = velocity
+    picture = rasters(env)
+    assert picture.shape == (1, 7, RASTER, RASTER)
+    assert picture[0, 0].mean().item() == pytest.approx(1.0)
+    assert torch.allclose(picture[0, 1:3], velocity[:, None, None] * picture[0, :1])
+    assert picture[0, 3:].abs().max() == 0
+
+
+def test_raster_does_not_depend_on_the_number_of_particles():
+    few, many = rasters(reset(count=2000)), rasters(reset(count="full"))
+    assert (few - many).abs().mean() < 0.03 * many.abs().mean() * 7
+
+
+def test_first_index_of_the_raster_is_along_x():
+    env = reset()
+    env.state.x[..., 0] += 0.1
+    moved = rasters(env)[0, 0]
+    along = torch.arange(RASTER, dtype=torch.float64) + 0.5
+    patch = env.spec.patch / env.model.solver.grid.resolution
+    place = (moved.sum(1) * along).sum() / moved.sum() - RASTER / 2
+    assert place.item() == pytest.approx(0.1 / patch * RASTER, abs=1e-6)
+    assert (moved.sum(0) * along).sum() / moved.sum() < RASTER / 2
+
+
+def test_object_clock_and_place_are_added():
+    env = reset("kick")
+    features = StateFeatures(place=True)
+    seen = features(env)
+    assert seen.shape == (1, features.size(1)) == (1, 10 * RASTER**2 + 6 + 2)
+    assert seen[0, -8:].tolist() == pytest.approx([1, 1, 1, 0, 0, 0, 0, 0])
+    env.step(torch.zeros(1, 2, 8, 8))
+    clock = features(env)[0, -8:-2].tolist()
+    angles = [2 * math.pi / period for period in (8, 4, 2)]
+    assert clock == pytest.approx([*map(math.cos, angles), *map(math.sin, angles)], abs=1e-6)
+
+
+def test_features_have_a_gradient():
+    env = reset()
+    action = torch.zeros(1, 2, 8, 8, dtype=torch.float64, requires_grad=True)
+    env.step(action)
+    (gradient,) = torch.autograd.grad(StateFeatures()(env).square().sum(), action)
+    assert gradient.isfinite().all() and gradient.abs().max() > 0
+
+
+def test_integrity_counts_what_drifts_apart():
+    line = torch.linspace(0, 0.1, 11, dtype=torch.float64)
+    x = torch.stack((line, torch.zeros(11, dtype=torch.float64)), 1)[None]
+    pairs = Pairs.of(x)
+    assert pairs.drift(x + 1.0).item() == 0
+    torn = x.clone()
+    torn[:, 6:, 0] += 0.05
+    counted = (pairs.distance < REACH).sum()
+    crossing = ((pairs.other > 5) != (torch.arange(11)[:, None] > 5)) & pairs.counts
+    assert pairs.drift(torn).item() == pytest.approx((crossing.sum() / counted * (0.05 / REACH - SLACK) ** 2).item())
+
+
+def test_speed_is_what_is_paid_for():
+    env = reset()
+    pairs, before = Pairs.of(env.state.x), env.env_state.centre
+    env.state.v[..., 0] = 0.5
+    _, smooth, _, _, info = env.step(torch.zeros(1, 2, 8, 8), soft=True)
+    config = RewardConfig("speed", split_weight=0.0, integrity=0.0, scale=1.0)
+    paid = training_reward(config, env, before, smooth, info, pairs)
+    assert paid.item() == pytest.approx(60 * (info["com"] - before)[0, 0].item() / 0.001)
+    assert paid.item() == pytest.approx(30, rel=0.05)
+    assert training_reward(RewardConfig("task", 0.0, 1.0, 0.0, 1.0), env, before, smooth, info, pairs) == smooth
+    margin = RewardConfig("task", 1000.0, 0.5, 0.0, 1.0)
+    lost = smooth - training_reward(margin, env, before, smooth, info, pairs)
+    assert lost.item() == pytest.approx(1000 * (info["split"].item() / env.spec.split_limit - 0.5) ** 2)

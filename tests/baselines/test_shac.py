@@ -1,0 +1,233 @@
+"""Short-horizon actor-critic, on robots of a few hundred particles."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import baselines
+import cfp
+from baselines import Shac, StatePolicy
+from baselines.registry import configure
+from baselines.shac import METRICS
+from cfp.config import EnvironmentConfig, to_json
+from cfp.environments import make_env
+from cfp.errors import CheckpointError, ConfigError, NonFiniteError
+from cfp.evaluation import attached, evaluate
+from cfp.video import film
+from cfp.weights import origin
+from dittogym import TorchEnv
+
+TASKS = ("shapematch", "run", "grow", "kick", "dig", "obstacle", "catch", "slot")
+
+
+def make(task="run", **changes):
+    environment = EnvironmentConfig(changes.pop("num_envs", 2), 300, changes.pop("substeps", 4))
+    defaults = {"environment": environment, "tier": 300, "device": "cpu", "window": 4, "critic_updates": 2}
+    return replace(Shac.preset(task, "quick"), **defaults | changes)
+
+
+def parameters(algorithm):
+    return torch.nn.utils.parameters_to_vector(algorithm.actor.parameters()).detach().clone()
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("preset", ["quick", "paper"])
+def test_every_preset_is_valid_and_survives_json(task, preset):
+    config = Shac.preset(task, preset)
+    config.check()
+    assert configure(json.loads(json.dumps(to_json(config)))) == config
+    assert config.training().parity == "clean"
+    assert config.training().action_layout == ("grid" if preset == "paper" else "image")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"window": 0}, "window: got 0"),
+        ({"gamma": 1.5}, "gamma: got 1.5"),
+        ({"learning_rate": 0.0}, "learning_rate"),
+        ({"noise": -0.1}, "noise: got -0.1"),
+    ],
+)
+def test_impossible_options_are_named(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        make(**changes).check()
+
+
+def test_training_makes_the_robot_run():
+    config = make(substeps=100, window=16, steps=480, age=32, learning_rate=1e-2, noise=0.0, tier=500)
+    algorithm, rows = Shac(config), []
+    before = speed(algorithm)
+    algorithm.learn(config.steps, rows.append)
+    assert len(rows) == 15 and algorithm.num_timesteps == 480
+    assert set(rows[0]) == set(METRICS)
+    early, late = (np.mean([row["train/reward"] for row in part]) for part in (rows[:5], rows[-5:]))
+    assert late > early + 0.8
+    assert speed(algorithm) > before + 0.02
+
+
+@torch.no_grad()
+def speed(algorithm, steps=32):
+    """Mean velocity to the right, m/s, of the policy without noise on a layout of its own."""
+    env = TorchEnv("run", 1, particles=500)
+    env.reset(seed=99)
+    policy, start = algorithm.attached(env), env.env_state.centre[0, 0].item()
+    for _ in range(steps):
+        action, _ = policy.predict(np.zeros((1, 3, 64, 64), np.uint8), deterministic=True)
+        env.step(torch.as_tensor(action))
+    return (env.env_state.centre[0, 0].item() - start) / (steps * 0.01)
+
+
+@pytest.mark.parametrize("sees", ["state", "image"])
+def test_gradient_of_the_window_is_that_of_the_loss(sees):
+    environment = EnvironmentConfig(2, 300, 4, dtype="float64")
+    algorithm = Shac(make(environment=environment, sees=sees, noise=0.0))
+    algorithm.actor.double(), algorithm.target.double()
+    seen = (lambda: algorithm.features(algorithm.env)) if sees == "state" else look_in_double(algorithm)
+    algorithm.rollout.look = seen
+    weight = [p for p in algorithm.actor.parameters() if p.requires_grad][-1]
+    start = algorithm.env.save()
+
+    def loss():
+        algorithm.env.load(start)
+        return algorithm.rollout.play(algorithm.actor, lambda seen: algorithm.value(algorithm.target, seen)).loss
+
+    (gradient,) = torch.autograd.grad(loss(), weight)
+    index = tuple(int(i) for i in np.unravel_index(int(gradient.abs().argmax()), gradient.shape))
+    losses = []
+    for sign in (1, -2, 1):
+        weight.data[index] += sign * 1e-4
+        losses.append(loss().item())
+    assert gradient[index].item() == pytest.approx((losses[0] - losses[1]) / 2e-4, rel=1e-3)
+
+
+def look_in_double(algorithm):
+    return lambda: algorithm.env.soft_observation() * (2.0 / 255.0) - 1.0
+
+
+@pytest.mark.parametrize("sees", ["state", "image"])
+def test_resumed_training_is_the_same_to_the_last_bit(sees):
+    config = make(sees=sees, age=6)
+    whole, first, second = Shac(config), Shac(config), Shac(config)
+    ignore = lambda _: None  # noqa: E731
+    whole.learn(48, ignore)
+    first.learn(24, ignore)
+    second.load_state_dict(first.state_dict())
+    second.num_timesteps = first.num_timesteps
+    rows = []
+    second.learn(24, rows.append)
+    assert torch.equal(parameters(whole), parameters(second))
+    assert torch.equal(whole.env.state.x, second.env.state.x)
+    assert rows[-1]["train/episodes"] == whole.rollout.counts["episodes"] > 0
+
+
+def test_simulation_that_is_not_finite_is_reset_and_counted(monkeypatch):
+    algorithm = Shac(make(num_envs=3))
+    algorithm.learn(12, lambda _: None)
+    env, calls, step = algorithm.env, [], algorithm.env.step
+
+    def spoil_the_second(action, *, soft):
+        calls.append(action)
+        if len(calls) == 2:
+            v = env.state.v.clone()
+            v[1, 5] = float("nan")
+            env.env_state = replace(env.env_state, particles=replace(env.state, v=v))
+        return step(action, soft=soft)
+
+    monkeypatch.setattr(env, "step", spoil_the_second)
+    before, rows = parameters(algorithm), []
+    algorithm.learn(12, rows.append)
+    assert rows[0]["train/nonfinite"] == rows[0]["train/terminated"] == 1 and rows[0]["train/skipped"] == 0
+    assert 1 <= rows[0]["train/dropped"] <= 2
+    assert env.state.x.isfinite().all()
+    after = parameters(algorithm)
+    assert after.isfinite().all() and not torch.equal(before, after)
+
+
+def test_updates_without_a_finite_gradient_end_the_training(monkeypatch):
+    algorithm = Shac(make())
+    play, before = algorithm.rollout.play, parameters(algorithm)
+    broken = lambda *given: replace(window := play(*given), loss=window.loss * float("nan"))  # noqa: E731
+    monkeypatch.setattr(algorithm.rollout, "play", broken)
+    monkeypatch.setattr(algorithm.rollout, "_drop", lambda gradient: gradient)
+    rows = []
+    with pytest.raises(NonFiniteError, match="10 updates in a row"):
+        algorithm.learn(8 * 20, rows.append)
+    assert rows[-1]["train/skipped"] == 9 and torch.equal(before, parameters(algorithm))
+
+
+def test_episodes_are_cut_at_staggered_ages_and_change_layouts():
+    algorithm = Shac(make(age=8, layouts=3))
+    first = algorithm.env.state.x[0].clone()
+    assert algorithm.rollout.limit.tolist() == [4, 8]
+    algorithm.rollout.play(algorithm.actor, lambda seen: algorithm.value(algorithm.target, seen))
+    assert algorithm.rollout.counts["episodes"] == 1 and algorithm.rollout.limit.tolist() == [8, 8]
+    assert algorithm.env.env_state.steps.tolist() == [0, 4]
+    assert not torch.equal(algorithm.env.state.x[0], first)
+
+
+def test_targets_are_those_of_td_lambda():
+    rollout = Shac(make(gamma=0.5, td_lambda=0.25)).rollout
+    rewards, values = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([4.0, 8.0, 16.0])
+    parts = [[row[None] for row in given] for given in (rewards, values)]
+    ends = [torch.tensor([end]) for end in (False, False, False)]
+    last = 3 + 0.5 * 16
+    middle = 2 + 0.5 * (0.75 * 8 + 0.25 * last)
+    targets = rollout._targets(*parts, ends)
+    assert [t.item() for t in targets] == pytest.approx([1 + 0.5 * (0.75 * 4 + 0.25 * middle), middle, last])
+    ends[1] = torch.tensor([True])
+    assert rollout._targets(*parts, ends)[1].item() == 2 + 0.5 * 8
+
+
+@pytest.mark.parametrize("sees", ["state", "image"])
+def test_policy_goes_through_its_file(sees, tmp_path):
+    algorithm = Shac(make("shapematch", sees=sees, grid=8))
+    algorithm.learn(8, lambda _: None)
+    path = tmp_path / "policy.safetensors"
+    algorithm.save(path, origin(algorithm.config, "shac", 0, 8))
+    policy = baselines.load(path)
+    assert policy.description["sees"] == sees and policy.resolution == 8
+    env = make_env(algorithm.config, 8, 2)
+    images = env.reset()
+    actions = [attached(each, env).predict(images, deterministic=True)[0] for each in (algorithm, policy)]
+    assert np.array_equal(*actions) and np.abs(actions[0]).max() > 0
+    results = [evaluate("", each, env, 2, deterministic=False, seed=3) for each in (algorithm, policy)]
+    assert results[0] == results[1]
+    assert len(film(algorithm.config, policy)) == 31
+
+
+def test_policy_of_the_image_is_one_of_cfp(tmp_path):
+    algorithm = Shac(make(sees="image"))
+    path = tmp_path / "policy.safetensors"
+    algorithm.save(path, origin(algorithm.config, "shac", 0, 0))
+    policy = cfp.load(path)
+    torch.manual_seed(0)
+    images = torch.randint(0, 256, (40, 3, 64, 64), dtype=torch.uint8)
+    spread = torch.stack([policy(images).atanh() for _ in range(30)]).std(0).mean()
+    assert spread == pytest.approx(0.105, rel=0.05)
+
+
+def test_policy_of_the_state_says_what_it_needs(tmp_path):
+    algorithm = Shac(make())
+    policy = algorithm.policy
+    with pytest.raises(RuntimeError, match="call attached"):
+        policy.predict(np.zeros((1, 3, 64, 64), np.uint8))
+    kick = TorchEnv("kick", 1, particles=100)
+    with pytest.raises(ValueError, match="env: got 'kick'"):
+        policy.attached(kick)
+    path = tmp_path / "policy.safetensors"
+    algorithm.save(path, origin(algorithm.config, "shac", 0, 0))
+    path.write_bytes(path.read_bytes().replace(b"inputs", b"outputs"[:6]))
+    with pytest.raises(CheckpointError):
+        StatePolicy.load(path)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_has_a_gradient(task):
+    algorithm = Shac(make(task, substeps=20, grid=4, window=2))
+    rows = []
+    algorithm.learn(4, rows.append)
+    assert rows[0]["train/gradient_norm"] > 0 and rows[0]["train/dropped"] == 0
