@@ -25,8 +25,8 @@ def signed_quadratic(z: Tensor, k: float) -> Tensor:
 def limited(z: Tensor, low: float | None = None, high: float | None = None, *, soft: bool = False) -> Tensor:
     """Bring ``z`` into [low, high]; ``None`` leaves an end open.
 
-    Soft, a limit l sets in over the width w, a twentieth of its size: ``w ln(1 + exp((z - l) / w))`` is taken off. The result differs
-    by at most w ln 2, at the limit, where its slope is 1/2.
+    Soft, a limit l sets in over the width w, a twentieth of its size: ``w ln(1 + exp((z - l) / w))`` is taken off. The
+    result differs by at most w ln 2, at the limit, where its slope is 1/2.
     """
     if not soft:
         return z.clamp(low, high)
