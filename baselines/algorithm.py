@@ -55,11 +55,13 @@ class Algorithm(ABC):
 
     Attributes:
         num_timesteps: Environment steps taken in this stage.
+        period: Environment steps after which the work of learning repeats, for estimates of time.
     """
 
     name: ClassVar[str]
     sees: ClassVar[Sees] = "image"
     num_timesteps: int = 0
+    period: int = 1
 
     @abstractmethod
     def __init__(self, config: Any, level: int = 0, start: Any = None) -> None: ...
@@ -170,17 +172,18 @@ class AlgorithmRun(Run):
         books.close(offset + last, lambda: latest)
 
     def measure(self, model: Algorithm) -> Cost:
-        """Time what the algorithm does between two calls back; the first time counts as well."""
+        """Time what the algorithm does in a period; the first time counts as well."""
 
         class Enough(Exception):
-            """The first call back has come."""
+            """The period is over."""
 
         def stop(_: Mapping[str, float | None]) -> None:
-            raise Enough
+            if model.num_timesteps >= model.period:
+                raise Enough
 
         start = time.perf_counter()
         try:
-            model.learn(1, stop)
+            model.learn(model.period, stop)
         except Enough:
             pass
         return Cost((time.perf_counter() - start) / max(1, model.num_timesteps))

@@ -78,6 +78,7 @@ class MPC(Algorithm):
         self.env.reset(seed=config.seed)
         layout = environment.action_layout or ("grid" if environment.parity == "reference" else "image")
         self.planner = Planner(self.env, config.planner, seed=config.seed, layout=layout)
+        self.period = config.planner.commit  # all its planning is in the first of these steps
         self.actions = torch.zeros(0, *self.env.action_shape)
         self.total, self.reward, self.over = 0.0, 0.0, False
 

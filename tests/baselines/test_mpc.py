@@ -11,6 +11,7 @@ from baselines.mpc import MPCConfig
 from cfp.config import EnvironmentConfig
 from cfp.errors import ConfigError
 from cfp.files import read_table
+from cfp.process import StopSignals
 
 ENVIRONMENT = EnvironmentConfig(num_envs=1, particles=100, substeps=2)
 CONFIG = MPCConfig(
@@ -78,3 +79,12 @@ def test_state_goes_on_the_same() -> None:
 def test_bad_options(change: dict, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         replace(CONFIG, **change).check()
+
+
+def test_estimate_covers_a_whole_plan(tmp_path) -> None:
+    """Only the first step of a commitment plans: timed alone it would make a run look several times longer."""
+    with StopSignals() as signals:
+        run = MPC.entry().open(CONFIG, tmp_path / "run", False, signals)
+        model = run.make_model(0)
+        assert run.measure(model).learning > 0
+    assert model.num_timesteps == CONFIG.planner.commit == 2
