@@ -121,9 +121,10 @@ class Runner(Run):
         assert env is not None and buffer is not None
         observation, count = env.reset(), env.num_envs
         assert isinstance(observation, np.ndarray)
-        actions = np.stack([env.action_space.sample() for _ in range(count)])
+        model._last_obs = observation
+        _, stored = model._sample_action(0, None, count)
         for _ in range(-(-model.batch_size // count)):
-            buffer.add(observation, observation, actions, np.zeros(count), np.zeros(count), [{}] * count)
+            buffer.add(observation, observation, stored, np.zeros(count), np.zeros(count), [{}] * count)
         acting = seconds(lambda: env.step(model.predict(observation)[0]))
         updating = seconds(lambda: model.train(1, model.batch_size)) * self.config.learning.gradient_steps
         arrays = (getattr(buffer, name) for name in FIELDS)
