@@ -43,6 +43,11 @@ class EnvironmentConfig:
     target: str | None = None
     """SHAPE MATCH: star, I, M, T or the path of an image; None: the task's default."""
 
+    @property
+    def layout(self) -> Literal["image", "grid"]:
+        """Orientation of the action array."""
+        return self.action_layout or ("grid" if self.parity == "reference" else "image")
+
     def task_options(self) -> dict[str, Any]:
         """What of it belongs to the task, for `dittogym.make_spec`."""
         return {} if self.target is None else {"target": self.target}
