@@ -21,12 +21,35 @@ from cfp.process import StopSignals
 from cfp.run import Run
 from cfp.state_file import Position
 from cfp.weights import origin
+from dittogym import make_spec
 
 Sees = Literal["image", "state", "simulator"]
 """What a policy may look at: the observation; anything the simulation knows; the simulator itself, to plan with."""
 
 Callback = Callable[[Mapping[str, float | None]], None]
 """Called by `Algorithm.learn` between two updates, with scalars to log by name; raises to stop the training."""
+
+
+Grid = int | Literal["coarse", "fine"]
+"""Action grid R: coarse, fine (the task's), or a number."""
+
+
+def grid_size(task: str, grid: Grid) -> int:
+    """Rows and columns of an action grid in a task."""
+    spec = make_spec(task)
+    return {"coarse": spec.coarse, "fine": spec.fine}[grid] if isinstance(grid, str) else grid
+
+
+@dataclass(frozen=True)
+class GridConfig(RunConfig):
+    """Options of a run on one action grid."""
+
+    grid: Grid = "coarse"
+    """Action grid R: coarse, fine (the task's), or a number."""
+
+    def resolution(self, level: int) -> int:
+        """Action grid R."""
+        return grid_size(self.task, self.grid)
 
 
 @dataclass(frozen=True)

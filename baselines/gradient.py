@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 import cfp
-from baselines.algorithm import Algorithm, Callback, Sees
+from baselines.algorithm import Algorithm, Callback, Grid, GridConfig, Sees, grid_size
 from baselines.objective import make_objective
 from baselines.open_loop import OpenLoop
 from cfp.config import EnvironmentConfig, ReportConfig, RunConfig, at_least_one
@@ -42,7 +42,7 @@ METRICS: dict[str, str] = {
 
 
 @dataclass(frozen=True)
-class GradientConfig(RunConfig):
+class GradientConfig(GridConfig):
     """A run of open-loop gradient descent. An iteration simulates num_envs episodes on fixed particle layouts.
 
     The environment options say how the result is judged; tier says how it is found.
@@ -52,7 +52,7 @@ class GradientConfig(RunConfig):
     """Which algorithm."""
     iterations: int = 150
     """Updates in the first stage."""
-    grid: int | Literal["coarse", "fine"] = 16
+    grid: Grid = 16
     """Action grid R: coarse, fine (the task's), or a number."""
     learning_rate: float = 0.05
     """Adam's step size at the beginning; a cosine takes it to a tenth."""
@@ -64,7 +64,7 @@ class GradientConfig(RunConfig):
     """SHAPE MATCH: standard deviations, in pixels, by which both pictures are blurred, one after the other."""
     polish: int = 0
     """Updates in a second stage, on the particles and the one layout of this seed that judge it."""
-    polish_grid: int | Literal["coarse", "fine"] = "fine"
+    polish_grid: Grid = "fine"
     """Its action grid."""
     polish_rate: float = 0.05
     """Its learning rate."""
@@ -79,9 +79,7 @@ class GradientConfig(RunConfig):
 
     def resolution(self, level: int) -> int:
         """Action grid R of a stage."""
-        grid = self.polish_grid if level else self.grid
-        spec = make_spec(self.task)
-        return {"coarse": spec.coarse, "fine": spec.fine}[grid] if isinstance(grid, str) else grid
+        return grid_size(self.task, self.polish_grid if level else self.grid)
 
     def evaluation(self, level: int) -> tuple[int, int]:
         """A polished policy is judged on its own layout while it is polished."""

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 import cfp
-from baselines.algorithm import Algorithm, Callback, Sees
+from baselines.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.open_loop import OpenLoop
 from baselines.planner import Planner, PlannerConfig
-from cfp.config import EnvironmentConfig, ReportConfig, RunConfig
+from cfp.config import EnvironmentConfig, ReportConfig
 from cfp.environments import make_torch_env
 from cfp.errors import ConfigError
 from dittogym import make_spec
@@ -28,23 +28,16 @@ METRICS: dict[str, str] = {
 
 
 @dataclass(frozen=True)
-class MPCConfig(RunConfig):
+class MPCConfig(GridConfig):
     """A planned episode: one robot on the layout of the seed, from the start to the end of the task."""
 
     algo: str = "mpc"
     """Which algorithm."""
-    grid: int | Literal["coarse", "fine"] = "coarse"
-    """Action grid R: coarse, fine (the task's), or a number."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
 
     def ends(self) -> tuple[int, ...]:
         """Environment steps after which the only stage ends, at the latest."""
         return (make_spec(self.task).horizon,)
-
-    def resolution(self, level: int) -> int:
-        """Action grid R."""
-        spec = make_spec(self.task)
-        return {"coarse": spec.coarse, "fine": spec.fine}[self.grid] if isinstance(self.grid, str) else self.grid
 
     def evaluation(self, level: int) -> tuple[int, int]:
         """The episode is evaluated on the layout that it was planned on."""
@@ -73,11 +66,9 @@ class MPC(Algorithm):
 
     def __init__(self, config: MPCConfig, level: int = 0, start: Any = None) -> None:
         self.config = config
-        environment = config.environment
         self.env = make_torch_env(config, config.resolution(0), 1)
         self.env.reset(seed=config.seed)
-        layout = environment.action_layout or ("grid" if environment.parity == "reference" else "image")
-        self.planner = Planner(self.env, config.planner, seed=config.seed, layout=layout)
+        self.planner = Planner(self.env, config.planner, seed=config.seed, layout=self.env.action_layout)
         self.period = config.planner.commit  # all its planning is in the first of these steps
         self.actions = torch.zeros(0, *self.env.action_shape)
         self.total, self.reward, self.over = 0.0, 0.0, False

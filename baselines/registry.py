@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import cfp
+from baselines import ladder
 from baselines.algorithm import Entry
+from baselines.floors import Random, Scripted, Zero
 from baselines.gradient import Gradient
 from baselines.mpc import MPC
 from baselines.shac import Shac
@@ -20,9 +22,14 @@ from cfp.weights import read_policy
 
 ALGORITHMS: dict[str, Entry] = {
     "cfp": Entry("image", cfp.preset, Runner, cfp.load),
+    "coarse": ladder.entry("coarse"),
+    "fine": ladder.entry("fine"),
     "gradient": Gradient.entry(),
     "mpc": MPC.entry(),
     "shac": Shac.entry(),
+    "zero": Zero.entry(),
+    "random": Random.entry(),
+    "scripted": Scripted.entry(),
 }
 
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 import cfp
 from baselines.actor_critic import ImageActor, StateActor, StatePolicy, image_critic, state_critic
-from baselines.algorithm import Algorithm, Callback, Sees
+from baselines.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.features import StateFeatures
 from baselines.shac_rollout import Rollout, Window
 from baselines.training_reward import RewardConfig
@@ -22,7 +22,6 @@ from cfp.errors import ConfigError, NonFiniteError
 from cfp.evaluation import Policy
 from cfp.policy import ActorPolicy
 from cfp.weights import KIND, load, read_policy, save_policy, single_level_policy
-from dittogym import make_spec
 
 BETAS = (0.7, 0.95)
 FINAL_RATE = 0.1
@@ -48,7 +47,7 @@ METRICS: dict[str, str] = {
 
 
 @dataclass(frozen=True)
-class ShacConfig(RunConfig):
+class ShacConfig(GridConfig):
     """A run of short-horizon actor-critic; num_envs robots learn side by side.
 
     The environment options say how the result is judged; tier says how it is trained.
@@ -62,8 +61,6 @@ class ShacConfig(RunConfig):
     """What the policy is given: the privileged state (matter, deformation, clock), or the image like CFP's."""
     warm_actor: str | None = None
     """Policy of one level on the image, whatever trained it, whose weights the actor begins with."""
-    grid: int | Literal["coarse", "fine"] = "coarse"
-    """Action grid R: coarse, fine (the task's), or a number."""
     tier: Literal["full", "lite"] | int | tuple[int, int] = "lite"
     """Particles of the simulations that are learned from."""
     window: int = 16
@@ -99,11 +96,6 @@ class ShacConfig(RunConfig):
     def ends(self) -> tuple[int, ...]:
         """Environment steps after which the only stage ends."""
         return (self.steps,)
-
-    def resolution(self, level: int) -> int:
-        """Action grid R."""
-        spec = make_spec(self.task)
-        return {"coarse": spec.coarse, "fine": spec.fine}[self.grid] if isinstance(self.grid, str) else self.grid
 
     def training(self) -> EnvironmentConfig:
         """Where it is trained: evenly spread particles and no stale values, actions as where it is judged."""

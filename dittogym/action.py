@@ -22,6 +22,11 @@ def to_grid_layout(action: Tensor, layout: Layout) -> Tensor:
     return action.flip(-2).transpose(-1, -2) if layout == "image" else action
 
 
+def from_grid_layout(action: Tensor, layout: Layout) -> Tensor:
+    """Undo `to_grid_layout`: an action (..., R, R) indexed (x rightwards, y upwards) in a layout."""
+    return action.transpose(-1, -2).flip(-2) if layout == "image" else action
+
+
 def patch_field(action: Tensor, patch: int, max_actuation: float | Tensor) -> Tensor:
     """Upsample an action in grid layout to the patch and scale it to muscle stress.
 

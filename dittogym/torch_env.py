@@ -83,6 +83,7 @@ class TorchEnv:
         spec: The task.
         num_envs: B.
         action_shape: (2, R, R).
+        action_layout: ``"image"`` or ``"grid"``.
         state: The :class:`torchmpm.ParticleState` of all simulations.
 
     Raises:
@@ -132,7 +133,7 @@ class TorchEnv:
         self.action_resolution = self._resolution(resolution)
         self.action_shape = (2, self.action_resolution, self.action_resolution)
         self._stale = parity == "reference"
-        self._layout: Layout = action_layout or ("grid" if self._stale else "image")
+        self.action_layout: Layout = action_layout or ("grid" if self._stale else "image")
         self._counts = counts = particle_counts(self.spec, particles)
         full = counts == particle_counts(self.spec, "full")
         self.model = dynamics.make_model(self.spec, counts, substeps=substeps, backend=backend, unscaled=self._stale)
@@ -286,7 +287,7 @@ class TorchEnv:
             ValueError: The action has the wrong shape or type or is not finite.
         """
         action = self._checked(action)
-        state, field = dynamics.transition(self.model, self.env_state, to_grid_layout(action, self._layout))
+        state, field = dynamics.transition(self.model, self.env_state, to_grid_layout(action, self.action_layout))
         observation = dynamics.observe(self.model, state)
         judged, outcome = dynamics.judge(self.model, state, field, observation)
         self._env_state, self._observation, self._field = judged, observation, field.detach()

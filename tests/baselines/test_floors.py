@@ -1,0 +1,110 @@
+"""Floors of a comparison, and single levels of the ladder."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+import baselines
+import cfp
+from baselines import train
+from baselines.floors import wave
+from cfp.actor import build_actor
+from cfp.errors import ConfigError
+from cfp.files import read_table
+from dittogym import TorchEnv
+from dittogym.action import from_grid_layout, patch_field, to_grid_layout
+from dittogym.reward import action_cost
+
+TINY = "--particles 100 --substeps 2 --eval-episodes 2 --no-video --device cpu".split()
+IMAGES = np.zeros((2, 3, 64, 64), np.uint8)
+
+
+def trained(algo, folder, *more):
+    assert train.main(["--algo", algo, *TINY, *more, "--out", str(folder)]) == 0
+    return json.loads((folder / "results.json").read_text())
+
+
+def test_zero_is_what_every_table_calls_zero_action(tmp_path):
+    rows = trained("zero", tmp_path, "--task", "grow")
+    assert rows[0]["policy"] == "zero action" and rows[0]["returns"] == rows[2]["returns"]
+
+
+def test_random_differs_by_seed_only(tmp_path):
+    trained("random", tmp_path, "--task", "shapematch")
+    policy = baselines.load(tmp_path)
+    draws = []
+    for seed in (0, 0, 1):
+        torch.manual_seed(seed)
+        draws.append(policy.predict(IMAGES)[0])
+    assert draws[0].shape == (2, 2, 32, 32) and np.array_equal(draws[0], draws[1])
+    assert not np.array_equal(draws[0], draws[2]) and not np.array_equal(draws[0][0], draws[0][1])
+    assert abs(draws[0].mean()) < 0.05 and draws[0].min() < -0.99 and draws[0].max() > 0.99
+
+
+def test_wave_is_the_one_of_the_reference_figures():
+    drive = wave(3, 8, "grid")
+    assert drive[0, 1, 2, 3] == pytest.approx(np.sin(0.3 + 1.4 + 3.3 + 2.0), abs=1e-6)
+    for layout in ("image", "grid"):
+        field = patch_field(to_grid_layout(wave(1, 8, layout), layout), 64, 45.0)  # RUN's muscles
+        assert torch.allclose(field[0, 0, :, 5], patch_field(drive[:1], 64, 45.0)[0, 0, :, 5], atol=1e-4)
+        assert float(action_cost(field)) == pytest.approx(4115.537, rel=1e-5)
+
+
+def test_scripted_drives_the_whole_episode_in_the_layout_of_the_environment(tmp_path):
+    trained("scripted", tmp_path, "--task", "shapematch", "--grid", "4", "--action-layout", "grid")
+    policy = baselines.load(tmp_path)
+    memory = None
+    for step in range(30):
+        actions, memory = policy.predict(IMAGES, memory)
+        assert np.allclose(actions[1], wave(30, 4, "grid")[step])
+
+
+def test_layouts_are_inverse():
+    action = torch.rand(2, 2, 5, 5)
+    for layout in ("image", "grid"):
+        assert torch.equal(to_grid_layout(from_grid_layout(action, layout), layout), action)
+        assert TorchEnv("run", particles=100, action_layout=layout).action_layout == layout
+
+
+LEARNING = (
+    "--num-envs 2 --random-steps 10 --batch-size 4 --buffer-size 80 --update-start 8 --gradient-steps 1 "
+    "--eval-every 10 --log-every 10 --checkpoint-every 80"
+).split()
+
+
+def test_coarse_is_the_first_stage_and_goes_on(tmp_path):
+    """With one seed the curves of coarse and CFP are the same up to the handover."""
+    trained("coarse", tmp_path / "coarse", *LEARNING, "--resolutions", "4", "--steps", "60")
+    ladder = [*LEARNING, "--resolutions", "4", "8", "--random-steps", "10", "4", "--steps", "60", "--handover", "40"]
+    trained("cfp", tmp_path / "cfp", *ladder)
+    curves = [read_table(tmp_path / name / "evaluations.csv") for name in ("coarse", "cfp")]
+    first = [row for row in curves[1] if row["stage"] == "1"]
+    assert len(first) == 4 and curves[0][:4] == first and [row["step"] for row in curves[0][4:]] == ["50", "60"]
+
+
+@pytest.mark.parametrize("task", cfp.presets.TASKS)
+def test_presets_are_single_levels(task):
+    for name in ("quick", "paper"):
+        ladder = cfp.preset(task, name)
+        for algo, level in (("coarse", 0), ("fine", -1)):
+            config = baselines.ALGORITHMS[algo].preset(task, name)
+            config.check()
+            assert config.resolutions == (ladder.resolutions[level],) and config.steps == ladder.steps
+            assert (config.alpha, config.random_steps) == (ladder.alpha[:1], ladder.random_steps[:1])
+            assert config.learning == ladder.learning and config.environment == ladder.environment
+
+
+@pytest.mark.parametrize(("task", "count"), [("run", 82_388), ("shapematch", 83_388)])
+def test_fine_from_scratch_has_the_size_of_the_papers(task, count):
+    spec = baselines.ALGORITHMS["fine"].preset(task, "paper").actor_spec(0)
+    assert sum(parameter.numel() for parameter in build_actor(spec).parameters()) == count
+
+
+def test_resolutions_can_be_studied_and_ladders_are_refused(tmp_path, capsys):
+    config = baselines.registry.configure({"algo": "fine", "task": "run", "resolutions": [4]})
+    config.check()
+    assert config.name == "fine4-run-quick-0"
+    with pytest.raises(ConfigError, match="resolutions: got \\(8, 16\\), allowed is one"):
+        baselines.registry.configure({"algo": "coarse", "resolutions": [8, 16]}).check()
