@@ -61,6 +61,7 @@ class Books:
         self._return: float | None = None
         self._last = self._logged = self._saved = self._evaluated = 0
         self._clock = time.perf_counter()
+        self.bar = tqdm(disable=True)
 
     def open(self, step: int) -> None:
         """Begin at a step of the run."""
@@ -87,15 +88,7 @@ class Books:
             Stopped: The user wants to stop; the checkpoint is written.
             Plateau: The stage is over; the checkpoint is written.
         """
-        due = {
-            name: every > 0 and step // every > self._last // every
-            for name, every in (
-                ("log", self.report.log_every),
-                ("evaluate", self.report.eval_every),
-                ("save", self.report.checkpoint_every),
-                ("film", self.report.video_every),
-            )
-        }
+        due = self._due(step)
         self._last = step
         if due["log"]:
             self._log(step, scalars())
@@ -106,11 +99,19 @@ class Books:
         if due["save"] or due["evaluate"] or self.signals.number:
             self._save(step)
         if self.signals.number:
-            self.bar.close()
             raise Stopped(self.signals.number)
         if due["evaluate"] and self.over():
-            self.bar.close()
             raise Plateau
+
+    def _due(self, step: int) -> dict[str, bool]:
+        """What has come due since the last turn."""
+        periods = {
+            "log": self.report.log_every,
+            "evaluate": self.report.eval_every,
+            "save": self.report.checkpoint_every,
+            "film": self.report.video_every,
+        }
+        return {name: every > 0 and step // every > self._last // every for name, every in periods.items()}
 
     def close(self, step: int, scalars: Scalars) -> None:
         """End the stage: a last row, evaluation and checkpoint, unless they were just made."""
@@ -118,8 +119,13 @@ class Books:
             self._log(step, scalars())
         if self.report.eval_every and self._evaluated < step:
             self._evaluate(step)
+        if self._due(step)["film"]:
+            self.film(step)
         if self._saved < step:
             self._save(step)
+
+    def leave(self) -> None:
+        """End the line of the progress bar, so that what is said next, an error too, begins one."""
         self.bar.close()
 
     def _save(self, step: int) -> None:

@@ -51,7 +51,7 @@ def open_run(
         seed: In place of the run's own.
 
     Raises:
-        CFPError: There is no run, it has no policy yet, or a file is damaged.
+        CFPError: There is no run, it has no policy yet, or a file is damaged or not of this run.
     """
     config = replace(read_config(folder, program.configure), device=device)
     if seed is not None:
@@ -59,7 +59,14 @@ def open_run(
     files = stage_files(folder, len(config.ends()))
     if not files:
         raise CheckpointError(f"{folder}: no policy has been written yet")
-    return config, {name: program.load(path) for name, path in files.items()}
+    policies = {name: program.load(path) for name, path in files.items()}
+    for (name, policy), path in zip(policies.items(), files.values(), strict=True):
+        found = policy.description["task"], policy.description["resolution"]
+        wanted = config.task, config.resolution(policy.description["stage"] - 1)
+        if found != wanted:
+            given, allowed = (f"{task} on a grid of {grid}" for task, grid in (found, wanted))
+            raise CheckpointError(f"{path}: got a policy for {given}, allowed in {name} of this run is {allowed}")
+    return config, policies
 
 
 def run(program: Program, command: Command) -> str:

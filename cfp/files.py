@@ -22,14 +22,20 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], Any]) -> None:
         write: Called with the open binary file.
 
     Raises:
-        OSError: The disk is full or the folder cannot be written; the old file, if any, is untouched.
+        OSError: The disk is full or the folder cannot be written; it names the file, and the old one, if any, is
+            untouched.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(path.name + ".part")
-    with open(aside, "wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
+    try:
+        with open(aside, "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        aside.unlink(missing_ok=True)  # on a full disk every byte counts
+        error.filename = error.filename or str(path)
+        raise
     os.replace(aside, path)
     _sync_folder(path.parent)
 

@@ -201,9 +201,14 @@ class Run(ABC):
                 self.state = None
             left = ends[level] - self.position.offset - model.num_timesteps
             if left > 0 and not self._plateau(level):
+                books, early = self._books(level, model), False
                 try:
-                    self.learn(model, left, self._books(level, model))
+                    self.learn(model, left, books)
                 except Plateau:
+                    early = True
+                finally:
+                    books.leave()
+                if early:
                     print(f"stage {level + 1} ends early: {self.config.report.patience} evaluations without a new best")
             previous = model
             if level + 1 < len(ends):

@@ -22,7 +22,7 @@ from cfp.policy import ActorPolicy, CFPPolicy
 from cfp.replay import FIELDS
 from cfp.run import Run
 from cfp.state_file import Position
-from cfp.weights import describe, load, policy_for, read_policy, save_policy, single_level_policy, write_policy
+from cfp.weights import describe, fitting, load, policy_for, read_policy, save_policy, single_level_policy, write_policy
 
 
 class Runner(Run):
@@ -79,8 +79,10 @@ class Runner(Run):
         if level == 0 and self.warm is not None:
             model.networks()[0].load_state_dict(self.warm.actor.state_dict())
         if level > 0:
-            coarse = load(self.folder / f"stage{level}.safetensors", str(model.device)).actor
-            model.networks()[0].get_submodule("coarse").load_state_dict(coarse.state_dict())
+            path = self.folder / f"stage{level}.safetensors"
+            coarse = load(path, str(model.device)).actor
+            with fitting(path):
+                model.networks()[0].get_submodule("coarse").load_state_dict(coarse.state_dict())
         return model
 
     def _make_model(self, level: int, env: VecMonitor) -> CFP:

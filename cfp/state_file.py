@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,9 @@ class StateFile:
             "offset": position.offset,
             **content,
         }
-        write_atomically(self.path, lambda file: torch.save(state, file))
+        packed = BytesIO()  # straight into a file, torch reports a full disk as a fault of its own
+        torch.save(state, packed)
+        write_atomically(self.path, lambda file: file.write(packed.getbuffer()))
 
     def load(self) -> dict[str, Any]:
         """Read the state.

@@ -12,12 +12,13 @@ import cfp
 from baselines import Shac, StatePolicy
 from baselines.registry import configure
 from baselines.shac import METRICS
+from cfp.actor import ActorSpec, build_actor
 from cfp.config import EnvironmentConfig, to_json
 from cfp.environments import make_env
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
 from cfp.evaluation import attached, evaluate
 from cfp.video import film
-from cfp.weights import origin
+from cfp.weights import describe, origin, save_policy
 from dittogym import TorchEnv
 
 TASKS = ("shapematch", "run", "grow", "kick", "dig", "obstacle", "catch", "slot")
@@ -208,6 +209,22 @@ def test_policy_of_the_image_is_one_of_cfp(tmp_path):
     images = torch.randint(0, 256, (40, 3, 64, 64), dtype=torch.uint8)
     spread = torch.stack([policy(images).atanh() for _ in range(30)]).std(0).mean()
     assert spread == pytest.approx(0.105, rel=0.05)
+
+
+def test_actor_on_the_image_begins_with_a_policy_of_any_algorithm(tmp_path):
+    config = make(sees="image")
+    actor, path = build_actor(ActorSpec((config.resolution(0),))), tmp_path / "policy.safetensors"
+    origins = cfp.Config(task="run", resolutions=(config.resolution(0),), gate_bias=())
+    save_policy(path, actor, describe(origins, 0, 5))
+    warm = replace(config, warm_actor=str(path))
+    algorithm = Shac(warm, 0, Shac.start(warm))
+    for name, value in actor.state_dict().items():
+        assert torch.equal(algorithm.actor.actor.state_dict()[name], value), name
+    with pytest.raises(ConfigError, match="warm_actor: got a policy for run, allowed kick"):
+        Shac.start(replace(warm, task="kick"))
+    with pytest.raises(ConfigError, match="warm_actor: got a policy, allowed with sees 'image'"):
+        replace(warm, sees="state").check()
+    assert Shac.start(config) is None
 
 
 def test_policy_of_the_state_says_what_it_needs(tmp_path):

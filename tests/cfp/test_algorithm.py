@@ -73,17 +73,19 @@ def squash(weights, prefix, latent, strides, noise):
     return action, density.sum((1, 2, 3))
 
 
-def act(weights, image, noises: Iterator[torch.Tensor], residual):
-    """Action, log-density and gate of an 8x8 actor, or of an 8x8 -> 16x16 one with aligned corners."""
-    if not residual:
+def act(weights, image, noises: Iterator[torch.Tensor], kind):
+    """Action, log-density and gate of an 8x8 actor, or of an 8x8 -> 16x16 one, blended there or on the patch."""
+    if kind == "plain":
         return *squash(weights, "", encode(weights, "encoder", image), (2, 1, 1), next(noises)), None
     coarse_latent = encode(weights, "coarse.encoder", image)
     coarse = squash(weights, "coarse.", coarse_latent, (2, 1, 1), next(noises))[0].detach()
-    coarse = lift(coarse, 16, True)
-    latent = encode(weights, "encoder.encoders.0", torch.cat([image, lift(coarse, 64, True)], dim=1))
+    size, aligned = (16, True) if kind == "grid" else (64, False)
+    coarse = lift(coarse, size, aligned)
+    latent = encode(weights, "encoder.encoders.0", torch.cat([image, lift(coarse, 64, aligned)], dim=1))
     action, density = squash(weights, "", latent, (2, 2, 1), next(noises))
     gate = 1 / (1 + torch.exp(-decode(weights, "gate", latent, (2, 2, 1)) + 1.5))
-    return gate * action + (1 - gate) * coarse, density, gate
+    weight = lift(gate, size, aligned)
+    return weight * lift(action, size, aligned) + (1 - weight) * coarse, density, gate
 
 
 def judge(weights, image, action, aligned):
@@ -104,13 +106,19 @@ def doubles(module, grad):
     return {name: value.detach().double().requires_grad_(grad) for name, value in module.state_dict().items()}
 
 
-@pytest.mark.parametrize("residual", [False, True])
-def test_one_update_equals_the_float64_computation(residual, monkeypatch):
-    spec = (
-        ActorSpec((8, 16), (-1.5,), interpolation="aligned") if residual else ActorSpec((8,), interpolation="aligned")
-    )
-    model = make_model(spec, alpha=ALPHA, gate_penalty=RHO, gamma=GAMMA, max_grad_norm=LIMIT, tau=0.25)
-    resolution = spec.resolutions[-1]
+KINDS = {
+    "plain": ActorSpec((8,), interpolation="aligned"),
+    "grid": ActorSpec((8, 16), (-1.5,), interpolation="aligned"),
+    "patch": ActorSpec((8, 16), (-1.5,), patch=64),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_one_update_equals_the_float64_computation(kind, monkeypatch):
+    spec, residual, aligned = KINDS[kind], kind != "plain", kind != "patch"
+    resolution = spec.action_size
+    env = FakeEnv(num_envs=2, resolution=resolution)
+    model = make_model(spec, env, alpha=ALPHA, gate_penalty=RHO, gamma=GAMMA, max_grad_norm=LIMIT, tau=0.25)
     batch = make_batch(resolution)
     actor, critic, target = model.networks()
     with torch.no_grad():
@@ -127,11 +135,11 @@ def test_one_update_equals_the_float64_computation(residual, monkeypatch):
     mean, variance = 0.01 * batch.rewards.double().mean(), 0.99 + 0.01 * batch.rewards.double().var()
     reward = (batch.rewards.double() - mean) / (variance.sqrt() + 1e-8)
     source = iter(noises)
-    action, density, _ = act(weights, later, source, residual)
-    smaller = torch.minimum(*judge(targets, later, action, True))
+    action, density, _ = act(weights, later, source, kind)
+    smaller = torch.minimum(*judge(targets, later, action, aligned))
     wanted = (reward + (1 - batch.dones.double()) * GAMMA * (smaller - ALPHA * density[:, None])).detach()
     stored = batch.actions.double().view(-1, 2, resolution, resolution)
-    critic_loss = sum(((value - wanted) ** 2).mean() for value in judge(values, now, stored, True))
+    critic_loss = sum(((value - wanted) ** 2).mean() for value in judge(values, now, stored, aligned))
     critic_gradients = dict(zip(values, torch.autograd.grad(critic_loss, list(values.values())), strict=True))
 
     scalars = model.update(batch)
@@ -143,8 +151,8 @@ def test_one_update_equals_the_float64_computation(residual, monkeypatch):
     compare_gradients(critic, critic_gradients)
 
     # The actor sees the critics after their step.
-    action, density, gate = act(weights, now, source, residual)
-    smaller = torch.minimum(*judge(doubles(critic, False), now, action, True))
+    action, density, gate = act(weights, now, source, kind)
+    smaller = torch.minimum(*judge(doubles(critic, False), now, action, aligned))
     actor_loss = (ALPHA * density[:, None] - smaller).mean()
     if residual:
         actor_loss = actor_loss + RHO * gate.flatten(1).norm(dim=1).mean() / 16

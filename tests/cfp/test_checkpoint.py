@@ -81,17 +81,18 @@ def test_resumed_training_equals_uninterrupted_training_to_the_last_bit(tmp_path
     assert all(torch.equal(*pair) for pair in zip(batch[:5], again[:5], strict=True))
 
 
-def test_checkpoint_survives_a_crash_while_the_next_is_written(tmp_path, monkeypatch):
+@pytest.mark.parametrize("writer", ["cfp.state_file.write_atomically", "cfp.replay.write_atomically"])
+def test_checkpoint_survives_a_crash_while_the_next_is_written(tmp_path, monkeypatch, writer):
     checkpoint, model = Checkpoint(tmp_path), make_model()
     model.learn(20)
     checkpoint.save(model, CONFIG, Position(1))
     model.learn(30, reset_num_timesteps=False)
 
-    def crash(state, file):
-        file.write(b"half a state")
+    def crash(path, write):
+        path.with_name(path.name + ".part").write_bytes(b"half a file")
         raise OSError("No space left on device")
 
-    monkeypatch.setattr("cfp.state_file.torch.save", crash)
+    monkeypatch.setattr(writer, crash)
     with pytest.raises(OSError, match="No space"):
         checkpoint.save(model, CONFIG, Position(1))
     monkeypatch.undo()

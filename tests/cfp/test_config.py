@@ -1,10 +1,12 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from cfp.command import parse
 from cfp.config import Config, merge, to_json
+from cfp.environments import make_env
 from cfp.errors import ConfigError
 from cfp.presets import TASKS, from_json, preset
 from cfp.state_file import check_same
@@ -48,6 +50,7 @@ def test_paper_presets_hold_the_published_numbers():
         learning = config.learning
         assert (learning.gamma, learning.tau, learning.learning_rate, learning.batch_size) == (0.99, 0.005, 3e-4, 256)
         assert (learning.buffer_size, learning.gradient_steps, learning.update_start) == (200_000, 1, 256)
+        assert config.environment.variant == ("published" if task == "slot" else None)
     assert {task: TASKS[task].seed for task in TASKS if TASKS[task].seed} == {"catch": 2, "slot": 1}
 
 
@@ -74,6 +77,7 @@ def test_impossible_options_are_named(changes, message):
         ("learning", {"gamma": 1.5}, "gamma: got 1.5, allowed 0 to 1"),
         ("learning", {"learning_rate": 0.0}, "learning_rate"),
         ("report", {"eval_episodes": 0}, "eval_episodes"),
+        ("report", {"video_every": -1}, "video_every: got -1, allowed 0"),
     ],
 )
 def test_numbers_out_of_range_are_named(group, changes, message):
@@ -139,6 +143,47 @@ def test_ladder_of_any_length_can_be_asked_for():
     assert command.run.actor_spec(2).gate_bias == (-1.0, -2.0)
     one = parse(PROGRAM, "--resolutions 16 --handover --alpha 0 --random-steps 9 --gate-bias --gate-penalty".split())
     assert one.run.stage(0).steps == one.run.steps
+
+
+def test_another_number_of_levels_stretches_what_each_has_one_of():
+    five = parse(PROGRAM, "--resolutions 4 8 16 32 64 --steps 5000".split()).run
+    assert five.handover == (1000, 2000, 3000, 4000)
+    assert five.alpha == (0.005, 0.0, 0.0, 0.0, 0.0)
+    assert five.gate_bias == (-2.0,) * 4 and five.gate_penalty == (0.8,) * 4
+    assert five.random_steps == (480, 100, 100, 100, 100)
+    three = parse(PROGRAM, "--resolutions 4 8 16 --alpha 1 2 3 --handover 100 200".split()).run
+    assert (three.alpha, three.handover) == ((1.0, 2.0, 3.0), (100, 200))
+    one = parse(PROGRAM, "--resolutions 16".split()).run
+    assert (one.handover, one.gate_bias, one.alpha) == ((), (), (0.005,))
+    with pytest.raises(ConfigError, match="alpha: got 4 values, allowed 3"):
+        parse(PROGRAM, "--resolutions 4 8 16 --alpha 1 2 3 4".split())
+
+
+def test_matter_of_the_published_run_of_slot_can_be_chosen():
+    def matter(*arguments):
+        config = parse(PROGRAM, ["--particles", "100", *arguments]).run
+        spec = make_env(config, 8, 1).venv.torch_env.spec
+        return spec.mu, spec.yield_stress, spec.max_actuation
+
+    assert matter("--task", "slot") == (500.0, 85.0, 40.0)
+    assert matter("--task", "slot", "--variant", "published") == (650.0, 90.0, 45.0)
+    assert matter("--task", "slot", "--preset", "paper") == (650.0, 90.0, 45.0)
+    with pytest.raises(ConfigError, match="has no option 'variant'"):
+        matter("--task", "run", "--variant", "published")
+
+
+def test_layout_of_actions_can_be_chosen():
+    def field(*arguments):
+        config = parse(PROGRAM, ["--task", "run", "--particles", "100", "--substeps", "1", *arguments]).run
+        env = make_env(config, 2, 1)
+        env.reset()
+        env.step(np.array([[[[0.0, 1.0], [0.0, 0.0]]] * 2], np.float32))  # row 0, column 1
+        return divmod(int(env.venv.torch_env._field[0, 0].argmax()), 64)  # to the right, upwards
+
+    image, grid, reference = field(), field("--action-layout", "grid"), field("--parity", "reference")
+    assert image[0] > grid[0] and image[1] == grid[1]  # both above the middle, one right of it and one left
+    assert grid == reference
+    assert image == field("--parity", "reference", "--action-layout", "image")
 
 
 def test_resumed_run_may_change_only_what_does_not_alter_it():

@@ -1,3 +1,4 @@
+import errno
 import json
 
 import pytest
@@ -11,10 +12,11 @@ def test_interrupted_write_leaves_the_old_file(tmp_path):
 
     def fail(file):
         file.write(b"half")
-        raise OSError("No space left on device")
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(OSError, match=r"No space.*value\.json"):
         write_atomically(path, fail)
+    assert [item.name for item in tmp_path.iterdir()] == ["value.json"]
     assert json.loads(path.read_text()) == {"a": 1}
     write_json(path, {"a": 2})
     assert json.loads(path.read_text()) == {"a": 2}

@@ -7,6 +7,7 @@ import pytest
 import torch
 from test_train import run
 
+from cfp import train
 from cfp.command import parse
 from cfp.files import read_table
 from cfp.process import StopSignals
@@ -81,6 +82,74 @@ def test_policy_that_does_not_fit_is_refused(coarse, tmp_path, capsys, options, 
     assert run(tmp_path / "a", "--start-from", str(coarse), *options) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "a").exists()
+
+
+def test_first_actor_begins_with_the_weights_of_another_policy(coarse, tmp_path, monkeypatch):
+    policy = tmp_path / "policy.safetensors"
+    policy.write_bytes((coarse / "policy.safetensors").read_bytes())
+    began, learn = [], Runner.learn
+
+    def note(runner, model, steps, books):
+        began.append({key: value.clone() for key, value in model.networks()[0].state_dict().items()})
+        learn(runner, model, steps, books)
+
+    monkeypatch.setattr(Runner, "learn", note)
+    short = ["--steps", "40", "--handover", "20", "--eval-every", "0"]
+    assert run(tmp_path / "a", *short, "--warm-actor", str(policy)) == 0
+    weights = PROGRAM.load(policy).actor.state_dict()
+    assert all(torch.equal(began[0][key], value) for key, value in weights.items())
+    trained = PROGRAM.load(tmp_path / "a" / "stage1.safetensors").actor.state_dict()
+    assert any(not torch.equal(trained[key], value) for key, value in weights.items())  # and goes on learning
+    policy.unlink()  # no longer needed
+    assert run(tmp_path / "a", *short, "--warm-actor", str(policy), "--resume", "--steps", "60") == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--resolutions", "8", "16"], "warm_actor: got a policy of levels (4,), allowed (8,)"),
+        (["--task", "run"], "warm_actor: got a policy for shapematch, allowed run"),
+        (["--action-layout", "grid"], "warm_actor: got a policy for action layout image, allowed grid"),
+        (["--parity", "reference"], "warm_actor: got a policy for action layout image, allowed grid"),
+        (["--start-from", "x"], "warm_actor: got a policy, allowed without start_from"),
+    ],
+)
+def test_weights_that_do_not_fit_are_refused(coarse, tmp_path, capsys, options, message):
+    assert run(tmp_path / "a", "--warm-actor", str(coarse), *options) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
+
+
+def test_ladder_of_three_levels_in_one_command(tmp_path):
+    folder = tmp_path / "ladder"
+    options = "--task shapematch --particles 100 --substeps 1 --num-envs 2 --device cpu --backend eager --no-video "
+    options += "--batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 --eval-every 10 --eval-episodes 2 "
+    options += "--resolutions 4 8 16 --steps 90 --log-every 10 --checkpoint-every 20"
+    assert train.main([*options.split(), "--out", str(folder)]) == 0
+    rows = read_table(folder / "evaluations.csv")
+    assert [(row["stage"], row["step"]) for row in rows if row["step"] in ("30", "60")] == [
+        ("1", "30"),
+        ("2", "30"),
+        ("2", "60"),
+        ("3", "60"),
+    ]
+    files = [folder / name for name in ("stage1.safetensors", "stage2.safetensors", "policy.safetensors")]
+    policies = [PROGRAM.load(file) for file in files]
+    assert [policy.spec.resolutions for policy in policies] == [(4,), (4, 8), (4, 8, 16)]
+    for level, policy in enumerate(policies):
+        own = [row for row in rows if row["stage"] == str(level + 1)]
+        best = max(own, key=lambda row: float(row["mean"]))  # the first of equals
+        assert policy.description["steps"] == int(best["step"])
+        if level:  # the level below is frozen as it was handed over
+            below = policies[level - 1].actor.state_dict()
+            mine = policy.actor.state_dict()
+            assert all(torch.equal(mine[f"coarse.{key}"], value) for key, value in below.items())
+    results = json.loads((folder / "results.json").read_text())
+    assert [(row["policy"], row["action"]) for row in results[2:]] == [
+        ("stage 1", "4x4"),
+        ("stage 2", "8x8"),
+        ("stage 3", "16x16"),
+    ]
 
 
 @pytest.mark.parametrize("warm", [False, True])

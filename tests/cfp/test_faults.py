@@ -1,0 +1,85 @@
+"""A full disk, and files of another run where this one's should be."""
+
+import pickle
+import resource
+
+import pytest
+import torch
+from test_train import run
+
+import cfp
+from cfp import evaluate
+from cfp.callbacks import StageCallback
+from cfp.weights import read_policy, write_policy
+
+SHORT = "--steps 60 --handover 40 --eval-every 0 --log-every 10".split()
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "short"
+    assert run(folder, *SHORT) == 0
+    return folder
+
+
+def test_full_disk_is_an_error_and_the_last_checkpoint_still_good(finished, tmp_path, monkeypatch, capsys):
+    folder, on_step = tmp_path / "run", StageCallback._on_step
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(callback):
+        if callback.step == 50:  # no file may grow beyond a mebibyte: a state no longer fits
+            resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, limits[1]))
+        return on_step(callback)
+
+    monkeypatch.setattr(StageCallback, "_on_step", fill)
+    try:
+        assert run(folder, *SHORT) == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    monkeypatch.undo()
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith("error: [Errno 27] File too large") and "state.pt" in error
+    assert not list(folder.rglob("*.part"))
+    assert run(folder, *SHORT, "--resume") == 0
+    assert f"resuming {folder} at step 40 of 60" in capsys.readouterr().out
+    for name in ("progress.csv", "results.json"):
+        assert (folder / name).read_bytes() == (finished / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"task": "run"},
+            "got a policy for run on a grid of 8, allowed in stage 2 of this run is shapematch on a grid of 8",
+        ),
+        ({"resolution": 16}, "got a policy for shapematch on a grid of 16, allowed in stage 2"),
+    ],
+)
+def test_policy_of_another_run_is_refused(finished, capsys, changes, message):
+    path = finished / "policy.safetensors"
+    tensors, description = read_policy(path)
+    try:
+        write_policy(path, tensors, description | changes)
+        assert evaluate.main([str(finished), "--episodes", "1", "--device", "cpu"]) == 2
+    finally:
+        write_policy(path, tensors, description)
+    assert f"{path}: {message}" in capsys.readouterr().err
+
+
+def test_loading_a_policy_unpickles_nothing(finished, monkeypatch):
+    def refuse(*_, **__):
+        raise AssertionError("unpickled")
+
+    for owner, name in ((pickle, "load"), (pickle, "loads"), (pickle, "Unpickler"), (torch, "load")):
+        monkeypatch.setattr(owner, name, refuse)
+    assert cfp.load(finished).description["task"] == "shapematch"
+
+
+def test_first_level_of_another_ladder_is_refused(finished, tmp_path, capsys):
+    folder = tmp_path / "run"
+    assert run(folder, *SHORT, "--resolutions", "8", "16") == 0
+    for suffix in ("safetensors", "json"):
+        (folder / f"stage1.{suffix}").write_bytes((finished / f"stage1.{suffix}").read_bytes())
+    assert run(folder, *SHORT, "--resolutions", "8", "16", "--steps", "80", "--resume") == 2
+    assert "stage1.safetensors: weights and description do not fit" in capsys.readouterr().err
