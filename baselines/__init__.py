@@ -2,6 +2,7 @@
 
 from baselines.actor_critic import StatePolicy
 from baselines.algorithm import Algorithm, Entry
+from baselines.cem import CEM, CEMConfig, CEMPlanner, CEMPlannerConfig
 from baselines.gradient import Gradient, GradientConfig
 from baselines.mpc import MPC, MPCConfig
 from baselines.open_loop import OpenLoop
@@ -11,8 +12,12 @@ from baselines.shac import Shac, ShacConfig
 
 __all__ = [
     "ALGORITHMS",
+    "CEM",
     "MPC",
     "Algorithm",
+    "CEMConfig",
+    "CEMPlanner",
+    "CEMPlannerConfig",
     "Entry",
     "Gradient",
     "GradientConfig",

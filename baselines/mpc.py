@@ -1,4 +1,4 @@
-"""The gradient planner as an algorithm: it plans its way through one episode and keeps what it did."""
+"""Planners as algorithms: each plans its way through one episode and keeps what it did."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 import cfp
 from baselines.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.open_loop import OpenLoop
-from baselines.planner import Planner, PlannerConfig
+from baselines.planner import PlanConfig, Planner, PlannerBase, PlannerConfig
 from cfp.config import EnvironmentConfig, ReportConfig
 from cfp.environments import make_torch_env
 from cfp.errors import ConfigError
@@ -28,12 +28,10 @@ METRICS: dict[str, str] = {
 
 
 @dataclass(frozen=True)
-class MPCConfig(GridConfig):
+class PlannedConfig(GridConfig):
     """A planned episode: one robot on the layout of the seed, from the start to the end of the task."""
 
-    algo: str = "mpc"
-    """Which algorithm."""
-    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    planner: PlanConfig = field(default_factory=PlanConfig)
 
     def ends(self) -> tuple[int, ...]:
         """Environment steps after which the only stage ends, at the latest."""
@@ -53,6 +51,37 @@ class MPCConfig(GridConfig):
             raise ConfigError("resample: got True, allowed False: an episode is planned on one layout")
 
 
+@dataclass(frozen=True)
+class MPCConfig(PlannedConfig):
+    """An episode planned by gradients: one robot on the layout of the seed, from the start to the end of the task."""
+
+    algo: str = "mpc"
+    """Which algorithm."""
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+
+
+def planned(task: str, name: str) -> dict[str, Any]:
+    """Defaults of a task that do not depend on how plans are found: options by name.
+
+    ``quick`` plans at the lite tier, ``paper`` in the paper's environment. The episode of SHAPE MATCH is short and its
+    reward all detail: it gets an action grid of 16.
+
+    Raises:
+        ConfigError: No such task or preset.
+    """
+    environment = cfp.preset(task, name).environment
+    if name == "quick":
+        environment = EnvironmentConfig()
+    horizon = make_spec(task).horizon
+    return {
+        "task": task,
+        "preset": "quick" if name == "quick" else "paper",
+        "environment": replace(environment, num_envs=1),
+        "report": ReportConfig(horizon // 4 + 1, 1, True, checkpoint_every=horizon // 20 + 1, log_every=10),
+        "grid": 16 if task == "shapematch" else "coarse",
+    }
+
+
 class MPC(Algorithm):
     """Model predictive control by gradients, see `baselines.Planner`.
 
@@ -63,37 +92,26 @@ class MPC(Algorithm):
 
     name: ClassVar[str] = "mpc"
     sees: ClassVar[Sees] = "simulator"
+    planner_type: ClassVar[type[PlannerBase[Any]]] = Planner
 
-    def __init__(self, config: MPCConfig, level: int = 0, start: Any = None) -> None:
+    def __init__(self, config: PlannedConfig, level: int = 0, start: Any = None) -> None:
         self.config = config
         self.env = make_torch_env(config, config.resolution(0), 1)
         self.env.reset(seed=config.seed)
-        self.planner = Planner(self.env, config.planner, seed=config.seed, layout=self.env.action_layout)
+        self.planner = self.planner_type(self.env, config.planner, seed=config.seed, layout=self.env.action_layout)
         self.period = config.planner.commit  # all its planning is in the first of these steps
         self.actions = torch.zeros(0, *self.env.action_shape)
         self.total, self.reward, self.over = 0.0, 0.0, False
 
     @staticmethod
-    def preset(task: str, name: str) -> MPCConfig:
-        """Defaults of a task: ``quick`` plans at the lite tier, ``paper`` in the paper's environment.
-
-        SHAPE MATCH gets more and smaller gradient steps: its episode is short and its reward all detail.
+    def preset(task: str, name: str) -> PlannedConfig:
+        """Defaults of a task, see `planned`; SHAPE MATCH gets more and smaller gradient steps.
 
         Raises:
             ConfigError: No such task or preset.
         """
-        environment = cfp.preset(task, name).environment
-        if name == "quick":
-            environment = EnvironmentConfig()
-        horizon, silhouette = make_spec(task).horizon, task == "shapematch"
-        return MPCConfig(
-            task=task,
-            preset="quick" if name == "quick" else "paper",
-            environment=replace(environment, num_envs=1),
-            report=ReportConfig(horizon // 4 + 1, 1, True, checkpoint_every=horizon // 20 + 1, log_every=10),
-            grid=16 if silhouette else "coarse",
-            planner=PlannerConfig(iterations=30, learning_rate=0.1) if silhouette else PlannerConfig(),
-        )
+        planner = PlannerConfig(iterations=30, learning_rate=0.1) if task == "shapematch" else PlannerConfig()
+        return MPCConfig(**planned(task, name), planner=planner)
 
     @property
     def policy(self) -> OpenLoop:

@@ -1,9 +1,10 @@
-"""Receding-horizon planning by gradients through the simulator."""
+"""Receding-horizon planning with the simulator: what all planners share, and the one that climbs gradients."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -20,21 +21,15 @@ SAFE_SPREAD = 0.8
 
 
 @dataclass(frozen=True)
-class PlannerConfig:
-    """How a plan is made."""
+class PlanConfig:
+    """What a plan is, however it is found."""
 
     horizon: int = 16
     """Control steps that a plan looks ahead."""
     commit: int = 8
     """Control steps of a plan that are carried out before the next is made."""
-    iterations: int = 6
-    """Gradient steps on a plan."""
-    learning_rate: float = 0.6
-    """Adam's step size on actions, which lie in [-1, 1]."""
     noise: float = 0.1
     """Standard deviation of the actions with which a plan is extended."""
-    clip: float = 3.0
-    """Largest gradient of one control step, in medians over the steps of the plan."""
     forgone: float = 32.0
     """Control steps at its mean reward that a plan is charged for ending the episode before its time."""
     margin: float = 1000.0
@@ -48,47 +43,71 @@ class PlannerConfig:
         """
         if not 1 <= self.commit <= self.horizon:
             raise ConfigError(f"commit: got {self.commit}, allowed 1 to the horizon, {self.horizon}")
-        for name in ("iterations", "learning_rate", "clip"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed more than 0")
         for name in ("noise", "forgone", "margin"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, allowed 0 or more")
 
+    def _check_positive(self, *names: str) -> None:
+        for name in names:
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed more than 0")
 
-class Planner:
-    """Plans for all simulations of an environment by Adam on their next actions.
 
-    The plan of a simulation is what it would do from its present state on; the gradient goes through the same
-    simulator that the environment is, so the planner sees everything: state, matter, obstacles. Between plans, the part
-    that was not carried out is kept and extended by noise. Of all plans met in the iterations, the one with the
-    highest true return is carried out; a plan that ends the episode forgoes what would come after it.
+@dataclass(frozen=True)
+class PlannerConfig(PlanConfig):
+    """How a plan is made by gradients."""
+
+    iterations: int = 6
+    """Gradient steps on a plan."""
+    learning_rate: float = 0.6
+    """Adam's step size on actions, which lie in [-1, 1]."""
+    clip: float = 3.0
+    """Largest gradient of one control step, in medians over the steps of the plan."""
+
+    def check(self) -> None:
+        """Check what the types cannot, see `PlanConfig.check`."""
+        super().check()
+        self._check_positive("iterations", "learning_rate", "clip")
+
+
+Config = TypeVar("Config", bound=PlanConfig)
+
+
+class PlannerBase(ABC, Generic[Config]):
+    """Plans for all simulations of an environment, each for itself.
+
+    The plan of a simulation is what it would do from its present state on; it is tried in the same simulator that the
+    environment is, so the planner sees everything: state, matter, obstacles. Between plans, the part that was not
+    carried out is kept and extended by noise. Of all plans met in a search, the one with the highest true return is
+    carried out; a plan that ends the episode forgoes what would come after it.
 
     Args:
         env: The environment; only read, after its reset.
         config: How to plan.
-        judge: What a step is worth: the smooth reward is climbed, the true one chooses.
+        judge: What a step is worth; the true reward chooses.
         seed: Of the noise.
         layout: The environment's action layout.
 
     Attributes:
-        failed: Plans that were not finite so far, in their return or their gradient; they are never carried out.
+        failed: Plans that were not finite so far; they are never carried out.
         plans: Plans evaluated so far.
 
     Raises:
         ConfigError: An option is out of range.
     """
 
+    options: type[Config]
+
     def __init__(
         self,
         env: TorchEnv,
-        config: PlannerConfig | None = None,
+        config: Config | None = None,
         *,
         judge: Judge = judge,
         seed: int = 0,
         layout: Layout = "image",
     ) -> None:
-        self.config = config = config or PlannerConfig()
+        self.config = config = config or self.options()
         config.check()
         self.env, self.judge, self.layout = env, judge, layout
         self.generator = torch.Generator().manual_seed(seed)
@@ -132,29 +151,13 @@ class Planner:
         left = self._left(start)
         length = min(config.horizon, left) if left else config.horizon
         kept = self._ahead[self._position :][:length]
-        plan = torch.cat((kept, self._fresh(length - len(kept)))).requires_grad_()
-        adam = torch.optim.Adam([plan], config.learning_rate, (0.9, 0.95))
-        best, chosen = torch.full_like(plan[0, :, 0, 0, 0], -torch.inf), torch.zeros_like(plan)
-        for iteration in range(config.iterations + 1):
-            learns = iteration < config.iterations
-            with torch.set_grad_enabled(learns):
-                climbed, value = self._judge(start, plan)
-            self.plans += len(value)
-            better = value.isfinite() & (value > best)
-            best = torch.where(better, value, best)
-            chosen = torch.where(_spread(better), plan.detach(), chosen)
-            if not learns:
-                self.failed += int((~value.isfinite()).sum())
-                break
-            (gradient,) = torch.autograd.grad(-climbed.sum(), plan)
-            broken = ~(value.isfinite() & gradient.isfinite().flatten(2).all(2).all(0))
-            self.failed += int(broken.sum())
-            plan.grad = torch.where(_spread(broken), 0.0, _clipped(gradient, config.clip))
-            adam.step()
-            with torch.no_grad():
-                plan.copy_(torch.where(_spread(broken), chosen, plan.clamp(-1.0, 1.0)))
-        self._ahead, self._position = chosen.detach(), 0
+        plan = torch.cat((kept, self._fresh(length - len(kept))))
+        self._ahead, self._position = self._search(start, plan).detach(), 0
         return self._ahead
+
+    @abstractmethod
+    def _search(self, start: EnvState, plan: Tensor) -> Tensor:
+        """The best plan (T, B, 2, R, R) that is found from what is kept of the last; counts all it tries."""
 
     def _left(self, start: EnvState) -> int:
         """Control steps to the end of the youngest episode."""
@@ -177,6 +180,39 @@ class Planner:
         after = min(self.config.forgone, max(self._left(start) - len(plan), 0))
         charge = torch.where(steps.ended, after / len(plan) * total.clamp_min(0.0), 0.0)
         return steps.rewards.sum(0), total - charge
+
+
+class Planner(PlannerBase[PlannerConfig]):
+    """Plans by Adam on the next actions, see `PlannerBase`: the gradient goes through the simulator.
+
+    The judge's smooth reward is climbed.
+    """
+
+    options = PlannerConfig
+
+    def _search(self, start: EnvState, plan: Tensor) -> Tensor:
+        config, plan = self.config, plan.requires_grad_()
+        adam = torch.optim.Adam([plan], config.learning_rate, (0.9, 0.95))
+        best, chosen = torch.full_like(plan[0, :, 0, 0, 0], -torch.inf), torch.zeros_like(plan)
+        for iteration in range(config.iterations + 1):
+            learns = iteration < config.iterations
+            with torch.set_grad_enabled(learns):
+                climbed, value = self._judge(start, plan)
+            self.plans += len(value)
+            better = value.isfinite() & (value > best)
+            best = torch.where(better, value, best)
+            chosen = torch.where(_spread(better), plan.detach(), chosen)
+            if not learns:
+                self.failed += int((~value.isfinite()).sum())
+                break
+            (gradient,) = torch.autograd.grad(-climbed.sum(), plan)
+            broken = ~(value.isfinite() & gradient.isfinite().flatten(2).all(2).all(0))
+            self.failed += int(broken.sum())
+            plan.grad = torch.where(_spread(broken), 0.0, _clipped(gradient, config.clip))
+            adam.step()
+            with torch.no_grad():
+                plan.copy_(torch.where(_spread(broken), chosen, plan.clamp(-1.0, 1.0)))
+        return chosen
 
 
 def _spread(mask: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from typing import Any
 import cfp
 from baselines import ladder
 from baselines.algorithm import Entry
+from baselines.cem import CEM
 from baselines.floors import Random, Scripted, Zero
 from baselines.gradient import Gradient
 from baselines.mpc import MPC
@@ -26,6 +27,7 @@ ALGORITHMS: dict[str, Entry] = {
     "fine": ladder.entry("fine"),
     "gradient": Gradient.entry(),
     "mpc": MPC.entry(),
+    "cem": CEM.entry(),
     "shac": Shac.entry(),
     "zero": Zero.entry(),
     "random": Random.entry(),

@@ -43,6 +43,14 @@ def judge(model: Model, state: EnvState, field: Tensor) -> Judgement:
     return Judgement(judged, _sum(soft.terms), _sum(outcome.terms).detach(), outcome.terminated)
 
 
+def judge_true(model: Model, state: EnvState, field: Tensor) -> Judgement:
+    """The task's true reward alone, for searches without gradients."""
+    judged, outcome = dynamics.judge(model, state, field, dynamics.observe(model, state))
+    assert outcome.terminated is not None
+    total = _sum(outcome.terms)
+    return Judgement(judged, total, total, outcome.terminated)
+
+
 def _sum(terms: Mapping[str, Tensor]) -> Tensor:
     return torch.stack(tuple(terms.values())).sum(0)
 

@@ -40,6 +40,12 @@ TINY = {
         17,
         ["stage 1", "  own layout"],
     ),
+    "cem": (
+        "--grid 8 --horizon 3 --commit 2 --iterations 2 --candidates 5 --elites 2 --eval-every 12 "
+        "--checkpoint-every 5 --log-every 5",
+        17,
+        ["stage 1", "  own layout"],
+    ),
     "shac": (
         "--tier 100 --num-envs 2 --steps 96 --window 6 --grid 8 --age 20 --critic-updates 2 "
         "--eval-every 48 --checkpoint-every 12 --log-every 24",
@@ -50,6 +56,8 @@ TINY = {
     "random": ("--grid 8", 1, ["stage 1"]),
     "scripted": ("--grid 8", 1, ["stage 1"]),
 }
+PATCHES = {algo: 64 for algo in TINY if "-" in algo}
+"""Action grids that are not 8."""
 LEVELS = ("cfp", "coarse", "fine")
 """Algorithms whose policies are those of `cfp`."""
 
@@ -85,17 +93,17 @@ def test_run_leaves_its_files(finished):
 
 
 def test_policy_is_loaded_by_its_kind(finished):
-    _, folder = finished
+    algo, folder = finished
     images = np.zeros((3, 3, 64, 64), np.uint8)
     policy = baselines.load(folder)
     if isinstance(policy, SeesState):
-        env = dittogym.TorchEnv("shapematch", 3, 8, particles=100)
+        env = dittogym.TorchEnv("shapematch", 3, policy.resolution, particles=100)
         env.reset(seed=0)
         policy = policy.attached(env)
     start = np.ones(3, bool)
     actions, _ = policy.predict(images, None, start, True)
     assert actions.shape == (3, 2, policy.resolution, policy.resolution) == policy.predict(images)[0].shape
-    assert policy.description["resolution"] == 8
+    assert policy.description["resolution"] == PATCHES.get(algo, 8)
     assert policy.description["task"] == json.loads((folder / "config.json").read_text())["task"]
 
 
