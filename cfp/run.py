@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
@@ -82,6 +83,10 @@ class Run(ABC):
         resume: Go on from the folder's checkpoint; without one, start from the beginning.
         signals: Whether the user wants to stop.
 
+    Attributes:
+        step: Environment steps of the run so far.
+        judging: Seconds that this session has spent on evaluations.
+
     Raises:
         ConfigError: The folder already holds a run and ``resume`` is not set (nothing in it is touched), or the options
             do not fit its checkpoint.
@@ -112,6 +117,7 @@ class Run(ABC):
         if self.state is None:
             self.position = self.begin()
             step = self.position.offset
+        self.step, self.judging = step, 0.0
         write_json(folder / "config.json", to_json(config))
         self.evaluations = Table(folder / "evaluations.csv", step)
         progress = ProgressTable(Table(folder / "progress.csv", step))
@@ -179,6 +185,8 @@ class Run(ABC):
                     self.learn(model, left, self._books(level, model))
                 except Plateau:
                     print(f"stage {level + 1} ends early: {self.config.report.patience} evaluations without a new best")
+                finally:
+                    self.step = self.position.offset + model.num_timesteps
             previous = model
             if level + 1 < len(ends):
                 copy_policy(self.folder / "policy.safetensors", self.folder / f"stage{level + 1}.safetensors")
@@ -200,6 +208,7 @@ class Run(ABC):
 
         def measure(step: int) -> Result:
             nonlocal best
+            begun = time.perf_counter()
             deterministic = config.report.eval_deterministic
             result = evaluate("", model, env, episodes, deterministic=deterministic, seed=seed)
             row: dict[str, Any] = {"step": step, "stage": level + 1, "episodes": episodes}
@@ -209,6 +218,7 @@ class Run(ABC):
                 best = result.mean
                 self.keep(model, level, step)
             self.evaluations.add(row)
+            self.judging += time.perf_counter() - begun
             return result
 
         def save(step: int) -> None:
