@@ -24,9 +24,9 @@ class Claimed(CFPError):
 def claim(folder: Path, patience: float = 0.0) -> Iterator[None]:
     """Hold a folder, which is created if it is not there.
 
-    The system gives the lock back when the process ends, however it ends: nothing has to be cleaned up after a crash. On
-    a shared file system this holds between machines too if that knows ``flock`` (NFS 4, Lustre with ``-o flock``); what a
-    lost machine held is free once the file server has given up on it.
+    The system gives the lock back when the process ends, however it ends: nothing has to be cleaned up after a crash.
+    On a shared file system this holds between machines too if that knows ``flock`` (NFS 4, Lustre with ``-o flock``);
+    what a lost machine held is free once the file server has given up on it.
 
     Args:
         folder: Of a run.

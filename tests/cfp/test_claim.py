@@ -5,7 +5,14 @@ import pytest
 
 from cfp.claim import Claimed, claim
 
-HOLD = "import sys; from pathlib import Path; from cfp.claim import claim\nwith claim(Path(sys.argv[1])): print(1, flush=True); input()"
+HOLD = """
+import sys
+from pathlib import Path
+from cfp.claim import claim
+with claim(Path(sys.argv[1])):
+    print(1, flush=True)
+    input()
+"""
 
 
 def holder(folder):
@@ -46,5 +53,3 @@ def test_new_folder_goes_again_if_nothing_was_written(tmp_path):
     with claim(tmp_path / "full"):
         (tmp_path / "full" / "file").touch()
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["file"]
-
-
