@@ -10,7 +10,7 @@ from typing import Literal
 
 import tyro
 
-from baselines.compare.collect import find_runs
+from baselines.compare.collect import Found, find_runs
 from baselines.compare.executor import Report, Resources, run_here, run_local
 from baselines.compare.judging import Judging
 from baselines.compare.plan import Job, Plan, check_there, make_jobs
@@ -127,13 +127,12 @@ def compare(command: Command) -> int:
         chosen = [jobs[command.only]]
     with StopSignals() as signals:
         outcomes = {} if command.report_only else _carry_out(command, chosen, signals)
-    if command.only is None:
-        _report(command, jobs)
+    runs = [] if command.only is not None else _report(command, jobs)
     if signals.number:
         print("stopped; the same command goes on")
         return 128 + signals.number
     if command.report_only:
-        return 0 if all(job.state == "finished" for job in jobs) else 1
+        return 0 if all(run.state == "finished" for run in runs) else 1
     return 0 if set(outcomes.values()) == {"finished"} else 1
 
 
@@ -168,14 +167,15 @@ def _execute(
         run_here(works, signals, told)
 
 
-def _report(command: Command, jobs: Sequence[Job]) -> None:
+def _report(command: Command, jobs: Sequence[Job]) -> list[Found]:
     general, slot = command.judging()
     about = (
         f"{', '.join(command.algos)} on {', '.join(command.tasks)}, preset {command.preset}, seeds "
         f"{', '.join(map(str, command.seeds))}. Final evaluations with {command.tier} particles."
     )
-    page = write_report(command.out, find_runs(jobs, general, slot), command.episodes, about)
-    print(f"report: {page}")
+    runs = find_runs(jobs, general, slot)
+    print(f"report: {write_report(command.out, runs, command.episodes, about)}")
+    return runs
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

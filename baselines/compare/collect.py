@@ -49,7 +49,7 @@ class Found:
 
     Attributes:
         job: The run.
-        state: See `Job.state`.
+        state: See `Job.state`; unjudged if it is finished but its final evaluation is not whole.
         error: Why it failed.
         curve: Evaluations while it trained.
         cost: None if no session has ended in order.
@@ -108,14 +108,16 @@ def find_runs(jobs: Iterable[Job], judging: Judging, slot: Judging) -> list[Foun
 
 
 def _find(job: Job, judging: Judging) -> Found:
-    error = job.folder / "error.txt"
+    error, judged, state = job.folder / "error.txt", read(job.folder, judging), job.state
+    if state == "finished" and (judged is None or not judged.whole):
+        state = "unjudged"
     return Found(
         job,
-        job.state,
+        state,
         error.read_text().strip() if error.exists() else "",
         _curve(job.folder),
         _cost(job.folder),
-        read(job.folder, judging),
+        judged,
     )
 
 

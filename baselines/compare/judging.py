@@ -71,13 +71,15 @@ class Judged:
         returns: One for each episode on the common layouts; fewer than asked for while judging goes on.
         successes: How many of them were successful, None where the task does not define success.
         own: Return on the one layout that the policy was made for, if it was.
-        cases: Mean return by disturbed case, None where a case changes nothing in the task.
+        cases: Mean return by disturbed case, None where a case changes nothing in the task or was not tried yet.
+        whole: Nothing is left to do.
     """
 
     returns: tuple[float, ...]
     successes: int | None
     own: float | None
     cases: dict[str, float | None]
+    whole: bool
 
 
 class Record:
@@ -153,6 +155,7 @@ def read(folder: Path, judging: Judging) -> Judged | None:
         None if None in successes else sum(successes),
         None if own is None else own["returns"][0],
         {name: _mean(found[0]["returns"]) if found else None for name, found in cases.items()},
+        len(parts) == len(keys) and None not in cases.values(),
     )
 
 

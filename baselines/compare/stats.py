@@ -1,7 +1,7 @@
 """Statistics of few runs.
 
 Interquartile mean and stratified bootstrap are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of
-the Statistical Precipice", NeurIPS 2021 (their library: ``rliable``): a score for each run, runs resampled within tasks.
+the Statistical Precipice", NeurIPS 2021 (their library: ``rliable``): one score a run, runs resampled within tasks.
 """
 
 from __future__ import annotations

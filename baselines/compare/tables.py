@@ -47,7 +47,9 @@ def runs_table(runs: Sequence[Found]) -> Table:
         for run in runs
     ]
     finished = sum(row["state"] == "finished" and not row["error"] for row in rows)
-    about = f"{finished} of {len(rows)} runs are finished" + ("." if finished == len(rows) else "; the others:")
+    about = f"{finished} of {len(rows)} runs are finished and judged" + (
+        "." if finished == len(rows) else "; the others:"
+    )
     columns = (
         Column("run", "run"),
         Column("algo", ""),
@@ -84,9 +86,9 @@ def returns_table(groups: Sequence[Group], episodes: int) -> Table:
     _rank(rows, "iqm", ("task", "sees"))
     about = (
         f"Each policy plays the same layouts, which neither trained nor chose it ({episodes} of them but in SLOT). The "
-        "score of a run is its mean return; IQM is the interquartile mean over seeds (up to three seeds: the mean) with a "
-        f"95 % bootstrap interval; std is that of the scores. {SEPARATE} Own layout: the return on the only layout that a "
-        "policy was made for."
+        "score of a run is its mean return; IQM is the interquartile mean over seeds (up to three seeds: the mean) "
+        f"with a 95 % bootstrap interval; std is that of the scores. {SEPARATE} Own layout: the return on the only "
+        "layout that a policy was made for."
     )
     columns = (
         *WHO,
@@ -121,8 +123,8 @@ def aggregate_table(groups: Sequence[Group]) -> Table:
     _rank([row for row in rows if row["all"]], "iqm", ("sees",))
     about = (
         "Interquartile mean over all runs of all tasks, with a bootstrap stratified by task (Agarwal et al., 2021), of "
-        "scores on a scale where 0 is the paper's resting robot and 1 the paper's CFP at the end of its training. Ranked "
-        "within what policies see, and only with a score in every task."
+        "scores on a scale where 0 is the paper's resting robot and 1 the paper's CFP at the end of its training. "
+        "Ranked within what policies see, and only with a score in every task."
     )
     columns = (
         Column("sees", "sees"),
@@ -240,8 +242,8 @@ def success_table(groups: Sequence[Group]) -> Table:
         row = _who(group) | {"successes": successes, "episodes": trials, "rate": successes / trials}
         rows.append(row | {"low": low, "high": high, "paper": theirs})
     about = (
-        "Episodes that end in success as the task defines it, of all seeds together, with Wilson's 95 % interval, which "
-        "takes episodes as independent though those of one seed share a policy. The paper reports SLOT only."
+        "Episodes that end in success as the task defines it, of all seeds together, with Wilson's 95 % interval, "
+        "which takes episodes as independent though those of one seed share a policy. The paper reports SLOT only."
     )
     columns = (
         *WHO,
@@ -305,9 +307,9 @@ def paper_table(groups: Sequence[Group]) -> Table:
         row |= {"paper": theirs[0] if theirs else None, "band": theirs[1] if theirs else None}
         rows.append(row | {"expert": expert[0] if expert else None})
     about = (
-        "Ours: interquartile mean of the final evaluation. Paper: mean of the last tenth of its training curves and half "
-        "the width of their band, three seeds, full size; expert: its best policy at this action grid; rest: a robot that "
-        "does not move, in the reference environment. Mind the steps."
+        "Ours: interquartile mean of the final evaluation. Paper: mean of the last tenth of its training curves and "
+        "half the width of their band, three seeds, full size; expert: its best policy at this action grid; rest: a "
+        "robot that does not move, in the reference environment. Mind the steps."
     )
     columns = (
         *WHO,
