@@ -79,7 +79,7 @@ def _draw(folder: Path, groups: Sequence[Group], robustness: Table) -> dict[str,
         made["efficiency"] = pictures.curves(groups), ("curves.png", "Learning curves", _curve_words(groups))
     if any(row["ratio"] is not None for row in robustness.rows):
         words = "Mean over seeds and their range; black: the paper's CFP."
-        made["robustness"] = pictures.robustness(robustness.rows), ("robustness.png", "Robustness", words)
+        made["robustness"] = pictures.robustness(groups, robustness.rows), ("robustness.png", "Robustness", words)
     for figure, (name, _, _) in made.values():
         write_figure(folder / name, figure)
     return {key: picture for key, (_, picture) in made.items()}
