@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -68,7 +69,7 @@ class Command:
     retries: int = 2
     """How often a run goes on again after its process or node was lost."""
     address: str | None = None
-    """Ray: address of the cluster; if not given, RAY_ADDRESS, or a new cluster on this machine."""
+    """Ray: address of the cluster; if not given, RAY_ADDRESS, else one on this machine, new if there is none."""
     only: int | None = None
     """Do only the run of this number, as --dry-run lists them, and write no report (array jobs)."""
     report_only: bool = False
@@ -190,6 +191,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("stopped at once; the same command goes on", file=sys.stderr)
+        return 128 + signal.SIGINT
 
 
 if __name__ == "__main__":

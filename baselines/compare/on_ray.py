@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from baselines.compare.executor import Report, Resources, run_process
 from cfp.errors import ConfigError
+from cfp.files import write_text
 from cfp.process import StopSignals
 
 
@@ -20,7 +22,8 @@ def run_ray(
 
     Args:
         works: From `baselines.compare.work.describe`.
-        address: Of the cluster; None: what ``RAY_ADDRESS`` says, or a new one on this machine.
+        address: Of the cluster; None: what ``RAY_ADDRESS`` says, else the one last started on this machine, else a new
+            one.
         resources: Of a run.
         signals: Whether the user wants to stop.
         told: Called as each ends.
@@ -54,7 +57,8 @@ def run_ray(
                 for reference in waiting:
                     ray.cancel(reference)
             for reference in done:
-                told(waiting.pop(reference), _ray_result(ray, reference))
+                index = waiting.pop(reference)
+                told(index, _result(ray, reference, Path(works[index]["folder"])))
     finally:
         if owned:
             ray.shutdown()
@@ -64,10 +68,11 @@ def _ray_task(values: dict[str, Any], threads: int, retries: int) -> str:
     return run_process(values, threads, retries, lambda: 0)
 
 
-def _ray_result(ray: Any, reference: Any) -> str:
+def _result(ray: Any, reference: Any, folder: Path) -> str:
     try:
         return str(ray.get(reference))
     except ray.exceptions.TaskCancelledError:
         return "stopped"
     except ray.exceptions.RayError as error:
-        return f"lost ({' '.join(str(error).split())[:200]})"
+        write_text(folder / "error.txt", f"{type(error).__name__}: {' '.join(str(error).split())}\n")
+        return "failed"

@@ -175,6 +175,22 @@ def test_process_that_is_killed_is_begun_again_and_then_given_up(tmp_path, monke
     assert (tmp_path / "error.txt").read_text() == "killed by SIGKILL, 3 times; see log.txt\n"
 
 
+@pytest.mark.parametrize(("urgency", "ending"), [(1, "checkpoint"), (2, None)])
+def test_process_is_asked_to_stop_before_it_is_made_to(tmp_path, monkeypatch, urgency, ending):
+    waiting = (
+        "import signal, sys, time\n"
+        "signal.signal(signal.SIGTERM, lambda *_: (open('ended', 'w').write('checkpoint'), sys.exit(143)))\n"
+        "open('ready', 'w').close(); time.sleep(60)"
+    )
+    monkeypatch.setattr("baselines.compare.executor.MODULE", (sys.executable, "-c", waiting))
+    monkeypatch.chdir(tmp_path)
+    stopped = lambda: urgency if (tmp_path / "ready").exists() else 0  # noqa: E731
+    assert run_process({"folder": str(tmp_path)}, 1, 2, stopped) == "stopped"
+    path = tmp_path / "ended"
+    assert (path.read_text() if path.exists() else None) == ending
+    assert not (tmp_path / "error.txt").exists()
+
+
 def test_comparison_that_is_killed_goes_on(tmp_path):
     """The parent dies without a word: the run stops with a checkpoint, and the next command goes on from there."""
     slow = {**MPC, "planner": {"horizon": 3, "commit": 1, "iterations": 10}, "report": {"checkpoint_every": 1}}

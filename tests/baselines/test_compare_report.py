@@ -3,6 +3,7 @@
 import csv
 import hashlib
 import json
+from html.parser import HTMLParser
 
 import pytest
 
@@ -14,6 +15,22 @@ from cfp.files import write_json, write_text
 
 CASES = [case.name for case in Judging(1).cases()]
 PLAN = {"algos": {"shac-image": {"algo": "shac", "sees": "image"}}}
+
+
+class TagBalance(HTMLParser):
+    """Fails where a tag is closed that is not the last one opened."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.tables = [], 0
+
+    def handle_starttag(self, tag, attrs):
+        self.tables += tag == "table"
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
 
 
 def write_run(job, scores, curve, *, successes=0, seconds=100.0, cases=(100.0, 80.0, 50.0), tier="lite"):
@@ -144,6 +161,9 @@ def test_page_shows_only_files_beside_it(report):
     for name in ("curves.png", "returns.png", "robustness.png", "returns.csv", "cost.csv"):
         assert f'"{name}"' in page and (report / name).stat().st_size > 0
     assert "http" not in page
+    balance = TagBalance()
+    balance.feed(page)
+    assert balance.open == [] and balance.tables == 8
 
 
 def test_evaluations_of_another_policy_do_not_count(report, tmp_path):
