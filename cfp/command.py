@@ -12,6 +12,7 @@ from typing import Any
 
 import tyro
 
+from cfp.claim import claim
 from cfp.config import RunConfig, to_json
 from cfp.errors import CFPError, ConfigError, NonFiniteError
 from cfp.estimate import estimate
@@ -144,9 +145,10 @@ def main(program: Program, arguments: Sequence[str] | None = None) -> int:
 
 def _train(program: Program, config: RunConfig, folder: Path, resume: bool) -> None:
     """Train, evaluate, draw and film."""
-    with StopSignals() as signals:
-        run = program.run(config, folder, resume, signals)
-        if config.environment.backend == "compile":
-            print("compiling the physics; the first time on a machine this takes half a minute ...")
-        run.train()
-    run.finish()
+    with claim(folder):
+        with StopSignals() as signals:
+            run = program.run(config, folder, resume, signals)
+            if config.environment.backend == "compile":
+                print("compiling the physics; the first time on a machine this takes half a minute ...")
+            run.train()
+        run.finish()

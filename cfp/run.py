@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
@@ -96,6 +97,10 @@ class Run(ABC):
         resume: Go on from the folder's checkpoint; without one, start from the beginning.
         signals: Whether the user wants to stop.
 
+    Attributes:
+        step: Environment steps of the run so far.
+        judging: Seconds that this session has spent on evaluations.
+
     Raises:
         ConfigError: The folder already holds a run and ``resume`` is not set (nothing in it is touched), or the options
             do not fit its checkpoint.
@@ -127,6 +132,7 @@ class Run(ABC):
         if self.state is None:
             self.position = self.begin()
             step = self.position.offset
+        self.step, self.judging = step, 0.0
         write_json(folder / "config.json", to_json(config))
         self.evaluations = Table(folder / "evaluations.csv", step)
         progress = ProgressTable(Table(folder / "progress.csv", step))
@@ -207,6 +213,7 @@ class Run(ABC):
                 except Plateau:
                     early = True
                 finally:
+                    self.step = self.position.offset + model.num_timesteps
                     books.leave()
                 if early:
                     print(f"stage {level + 1} ends early: {self.config.report.patience} evaluations without a new best")
@@ -230,6 +237,7 @@ class Run(ABC):
 
         def measure(step: int) -> Result:
             nonlocal best
+            begun = time.perf_counter()
             deterministic = config.report.eval_deterministic
             result = evaluate("", model, env, episodes, deterministic=deterministic, seed=seed)
             row: dict[str, Any] = {"step": step, "stage": level + 1, "episodes": episodes}
@@ -239,6 +247,7 @@ class Run(ABC):
                 best = result.mean
                 self.keep(model, level, step)
             self.evaluations.add(row)
+            self.judging += time.perf_counter() - begun
             shown = {"eval/return": result.mean, "eval/std": result.std, "eval/success": result.success}
             self.tracker.show(step, {**shown, **self.pictures(model)})
             return result

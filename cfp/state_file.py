@@ -101,7 +101,7 @@ def check_same(stored: dict[str, Any], given: RunConfig) -> None:
         ConfigError: Naming the first option that differs and may not, with both values.
     """
     past: RunConfig = merge(type(given)(), stored)
-    old, new = (_flatten(json.loads(json.dumps(to_json(config)))) for config in (past, given))
+    old, new = (flatten(json.loads(json.dumps(to_json(config)))) for config in (past, given))
     for name in {**old, **new}:
         if name.startswith(given.changeable) or old.get(name) == new.get(name):
             continue
@@ -112,8 +112,9 @@ def check_same(stored: dict[str, Any], given: RunConfig) -> None:
         )
 
 
-def _flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested options under names with dots."""
     flat: dict[str, Any] = {}
     for name, value in values.items():
-        flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+        flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
     return flat

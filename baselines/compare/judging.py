@@ -1,0 +1,181 @@
+"""Final evaluations of a run's policy, kept in ``judged.json`` of its folder so that none is made twice."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from baselines.compare.plan import judged
+from baselines.registry import load
+from cfp.config import RunConfig
+from cfp.disturbances import Case, make_cases
+from cfp.environments import choose_device, make_env
+from cfp.evaluation import Policy, Result, evaluate, judging_seed
+from cfp.files import write_json
+from cfp.robustness import report
+from cfp.weights import policy_file
+
+CHUNK = 10
+"""Episodes side by side; what is kept when an evaluation is stopped."""
+PAPER_CASES = 3
+"""Of `make_cases`: unperturbed, action dropout, observation dropout, which the paper reports."""
+
+
+@dataclass(frozen=True)
+class Judging:
+    """How policies are judged.
+
+    Attributes:
+        episodes: For each policy, on the same layouts for all.
+        tier: Particles, see `cfp.config.EnvironmentConfig`.
+        robustness: Which disturbed cases: none, those of the paper, or all of `cfp.disturbances.make_cases`.
+    """
+
+    episodes: int
+    tier: Literal["full", "lite"] | int | tuple[int, int] = "lite"
+    robustness: Literal["none", "paper", "all"] = "paper"
+
+    def cases(self) -> list[Case]:
+        """Cases of the robustness table, the unperturbed one first."""
+        return [] if self.robustness == "none" else make_cases()[: PAPER_CASES if self.robustness == "paper" else None]
+
+    def chunks(self) -> list[tuple[int, int]]:
+        """First layout and number of layouts of each part of the evaluation."""
+        return [(first, min(CHUNK, self.episodes - first)) for first in range(0, self.episodes, CHUNK)]
+
+    def key(self, what: str) -> str:
+        """Under which an entry is kept."""
+        return f"{what}, particles {self.tier}"
+
+    def to_json(self) -> dict[str, Any]:
+        """For `from_json`."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> Judging:
+        """Undo `to_json` after a way through JSON."""
+        tier = values["tier"]
+        return cls(**{**values, "tier": tuple(tier) if isinstance(tier, list) else tier})
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What the judging of a policy has found so far.
+
+    Attributes:
+        returns: One for each episode on the common layouts; fewer than asked for while judging goes on.
+        successes: How many of them were successful, None where the task does not define success.
+        own: Return on the one layout that the policy was made for, if it was.
+        cases: Mean return by disturbed case, None where a case changes nothing in the task or was not tried yet.
+        whole: Nothing is left to do.
+    """
+
+    returns: tuple[float, ...]
+    successes: int | None
+    own: float | None
+    cases: dict[str, float | None]
+    whole: bool
+
+
+class Record:
+    """``judged.json`` of a run folder; what was found for another policy file counts no longer.
+
+    Args:
+        folder: Of the run.
+
+    Raises:
+        CheckpointError: There is no policy.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / "judged.json"
+        self.policy = hashlib.sha256(policy_file(folder).read_bytes()).hexdigest()
+        there = json.loads(self.path.read_text()) if self.path.exists() else {}
+        self.entries: dict[str, Any] = there["entries"] if there.get("policy") == self.policy else {}
+
+    def once(self, key: str, make: Callable[[], Any]) -> None:
+        """Make and keep an entry that is not there."""
+        if key not in self.entries:
+            self.entries[key] = make()
+            write_json(self.path, {"policy": self.policy, "entries": self.entries})
+
+
+def judge(config: RunConfig, folder: Path, judging: Judging, stop: Callable[[], None]) -> None:
+    """Make the evaluations that are missing.
+
+    Args:
+        config: Of the run.
+        folder: Of the run.
+        judging: What is asked for.
+        stop: Called between two parts; raises to stop.
+
+    Raises:
+        CheckpointError: There is no policy, or it is damaged.
+        ConfigError: The environment refuses an option.
+    """
+    record, own = Record(folder), judged(config, judging.tier)
+    policy = load(folder / "policy.safetensors", choose_device(config.device))
+
+    def part(first: int, count: int) -> dict[str, Any]:
+        return _entry(_evaluate(own, policy, judging_seed(own) + first, count))
+
+    def disturbed(case: Case) -> list[dict[str, Any]]:
+        return [_entry(result) for result in report(own, policy, [case], judging.episodes)]
+
+    for first, count in judging.chunks():
+        stop()
+        record.once(_layouts(judging, first, count), partial(part, first, count))
+    if "layout" in policy.description:
+        layout = policy.description["layout"]
+        record.once(judging.key("own layout"), lambda: _entry(_evaluate(own, policy, layout, 1)))
+    for case in judging.cases():
+        stop()
+        record.once(_case(judging, case), partial(disturbed, case))
+
+
+def read(folder: Path, judging: Judging) -> Judged | None:
+    """What has been found so far; None without a policy or a whole part of its evaluation."""
+    if not (folder / "policy.safetensors").exists():
+        return None
+    entries = Record(folder).entries
+    keys = [_layouts(judging, first, count) for first, count in judging.chunks()]
+    parts = [entries[key] for key in keys if key in entries]
+    if not parts:
+        return None
+    successes = [part["successes"] for part in parts]
+    own = entries.get(judging.key("own layout"))
+    cases = {case.name: entries.get(_case(judging, case)) for case in judging.cases()}
+    return Judged(
+        tuple(value for part in parts for value in part["returns"]),
+        None if None in successes else sum(successes),
+        None if own is None else own["returns"][0],
+        {name: _mean(found[0]["returns"]) if found else None for name, found in cases.items()},
+        len(parts) == len(keys) and None not in cases.values(),
+    )
+
+
+def _layouts(judging: Judging, first: int, count: int) -> str:
+    return judging.key(f"layouts {first} to {first + count - 1}")
+
+
+def _case(judging: Judging, case: Case) -> str:
+    return judging.key(f"{case.name}, {judging.episodes} episodes")
+
+
+def _evaluate(config: RunConfig, policy: Policy, seed: int, count: int) -> Result:
+    env = make_env(config, policy.resolution, count)
+    return evaluate("", policy, env, count, deterministic=policy.deterministic_by_default, seed=seed)
+
+
+def _entry(result: Result) -> dict[str, Any]:
+    successes = None if result.success is None else round(result.success * len(result.returns))
+    return {"returns": list(result.returns), "successes": successes}
+
+
+def _mean(values: list[float]) -> float:
+    return sum(values) / len(values)

@@ -1,0 +1,230 @@
+"""Which runs a comparison consists of, with which options, and which of them are there."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from baselines.registry import configure, find
+from cfp.config import EVALUATION_SEED, RunConfig, to_json
+from cfp.errors import CheckpointError, ConfigError
+from cfp.run import holds_run, read_config
+from cfp.state_file import flatten
+
+IRRELEVANT = ("device", "environment.backend", "report.video", "report.checkpoint_every", "report.log_every")
+"""Options that change neither what a run learns nor which policy it keeps."""
+SAME_TASK = ("substeps", "dtype", "parity", "resample", "target")
+"""Options of the environment in which algorithms that are compared in a task must agree."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run of the comparison.
+
+    Attributes:
+        label: Name of the algorithm here: its own, or that of a variant in the plan file.
+        config: Its options.
+        folder: Its run folder.
+    """
+
+    label: str
+    config: RunConfig
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        return self.folder.name
+
+    @property
+    def sees(self) -> str:
+        """What its policy looks at."""
+        return str(getattr(self.config, "sees", find(self.config.algo).sees))
+
+    @property
+    def finished(self) -> bool:
+        """Whether it has been trained to its end, here or by ``python -m baselines.train``."""
+        return bool(read_sessions(self.folder)["finished"]) or (self.folder / "results.json").exists()
+
+    @property
+    def state(self) -> str:
+        """One of finished, failed, begun, missing."""
+        if self.finished:
+            return "finished"
+        if (self.folder / "error.txt").exists():
+            return "failed"
+        return "begun" if holds_run(self.folder) else "missing"
+
+
+def read_sessions(folder: Path) -> dict[str, Any]:
+    """``sessions.json``: whether the run is finished, and what each session that ended in order did."""
+    path = folder / "sessions.json"
+    if not path.exists():
+        return {"finished": False, "sessions": []}
+    value: dict[str, Any] = json.loads(path.read_text())
+    return value
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Options of runs beyond their presets, from a JSON file.
+
+    Attributes:
+        common: For every run.
+        tasks: By task.
+        algos: By algorithm. A name that is not one makes a variant: its options then say which ``algo``. Options under
+            its ``tasks`` are for these tasks only.
+    """
+
+    common: dict[str, Any] = field(default_factory=dict)
+    tasks: dict[str, dict[str, Any]] = field(default_factory=dict)
+    algos: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, path: Path | None) -> Plan:
+        """Read a file; without one nothing is changed.
+
+        Raises:
+            ConfigError: It cannot be read, or has other parts.
+        """
+        if path is None:
+            return cls()
+        try:
+            values = json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"plan: {path} cannot be read as JSON ({error})") from error
+        if not isinstance(values, dict) or not set(values) <= {"common", "tasks", "algos"}:
+            found = ", ".join(values) if isinstance(values, dict) else type(values).__name__
+            raise ConfigError(f"plan: {path} holds {found}, allowed an object with common, tasks, algos")
+        return cls(**values)
+
+    def options(self, label: str, task: str) -> dict[str, Any]:
+        """What the file says about a run; the later in common, task, algorithm, algorithm in a task wins."""
+        own = dict(self.algos.get(label, {}))
+        special = own.pop("tasks", {}).get(task, {})
+        merged: dict[str, Any] = {}
+        for values in (self.common, self.tasks.get(task, {}), own, special):
+            merged = _over(merged, values)
+        return merged
+
+
+def _over(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """Options over options, group by group."""
+    groups = [name for name in base if isinstance(base[name], dict) and isinstance(values.get(name), dict)]
+    return {**base, **values} | {name: _over(base[name], values[name]) for name in groups}
+
+
+def resolve(plan: Plan, label: str, task: str, preset: str, seed: int, steps: int | None, device: str) -> RunConfig:
+    """Options of a run: preset, then plan file, then what the command line says for all.
+
+    Raises:
+        ConfigError: An option is wrong.
+    """
+    values = plan.options(label, task)
+    algo = values.pop("algo", label)
+    start: dict[str, Any] = {"algo": algo, "task": task, "preset": preset}
+    base = configure(start)
+    if steps is not None and hasattr(base, "steps"):
+        values.setdefault("steps", steps)
+    report = {"video": False, **values.pop("report", {})}
+    try:
+        config = configure({**start, "seed": seed, "device": device, **values, "report": report}).adapted(base)
+        config.check()
+    except ConfigError as error:
+        raise ConfigError(f"{label} on {task}: {error}") from error
+    return config
+
+
+def make_jobs(
+    plan: Plan,
+    tasks: Sequence[str],
+    labels: Sequence[str],
+    seeds: Sequence[int],
+    runs: Path,
+    *,
+    preset: str = "quick",
+    steps: int | None = None,
+    device: str = "auto",
+) -> list[Job]:
+    """All runs of a comparison; those of one seed come first, so that a stop leaves something to compare.
+
+    Args:
+        plan: Options beyond presets.
+        tasks: Names.
+        labels: Algorithms and variants.
+        seeds: Of the runs.
+        runs: Folder of the run folders.
+        preset: Of all runs.
+        steps: Environment steps, for algorithms that have this option and for which the plan does not say it.
+        device: Of all runs.
+
+    Raises:
+        ConfigError: An option is wrong, or algorithms would not do the same task.
+    """
+    for name, given in (("tasks", tasks), ("algos", labels), ("seeds", seeds)):
+        if not given or len(set(given)) < len(given):
+            raise ConfigError(f"{name}: got {' '.join(map(str, given)) or 'none'}, allowed one or more, each once")
+    for seed in seeds:
+        if not 0 <= seed < EVALUATION_SEED - 1000:
+            raise ConfigError(f"seeds: got {seed}, allowed 0 to {EVALUATION_SEED - 1001}: above are layouts that judge")
+    for part, known in (("tasks", tasks), ("algos", labels)):
+        unused = set(getattr(plan, part)) - set(known)
+        if unused:
+            print(f"plan: {part} {', '.join(sorted(unused))} are not in this comparison")
+    jobs = []
+    for seed in seeds:
+        for task in tasks:
+            for label in labels:
+                config = resolve(plan, label, task, preset, seed, steps, device)
+                jobs.append(Job(label, config, runs / f"{label}-{task}-{preset}-{seed}"))
+    _check_same_task(jobs)
+    return jobs
+
+
+def _check_same_task(jobs: Sequence[Job]) -> None:
+    first: dict[str, Job] = {}
+    for job in jobs:
+        other = first.setdefault(job.config.task, job)
+        for name in SAME_TASK:
+            mine, theirs = (getattr(each.config.environment, name) for each in (job, other))
+            if mine != theirs:
+                raise ConfigError(
+                    f"{name}: got {mine!r} for {job.label} and {theirs!r} for {other.label} on {job.config.task}, "
+                    "allowed is the same for all, as the task would differ"
+                )
+
+
+def check_there(job: Job) -> None:
+    """Compare what is in a job's folder with what it should be.
+
+    Raises:
+        ConfigError: There is a run with other options; the message names the first that differs.
+    """
+    if not holds_run(job.folder):
+        return
+    try:
+        there = read_config(job.folder, configure)
+    except CheckpointError:
+        if (job.folder / "config.json").exists():
+            raise
+        raise ConfigError(f"{job.folder}: there is something of a run, but no config.json") from None
+    old, new = (flatten(json.loads(json.dumps(to_json(config)))) for config in (there, job.config))
+    for name in {**old, **new}:
+        if name not in IRRELEVANT and old.get(name) != new.get(name):
+            raise ConfigError(
+                f"{name}: the run in {job.folder} has {old.get(name)!r}, got {new.get(name)!r}; allowed is the same, "
+                "or another --out"
+            )
+
+
+def judged(config: RunConfig, tier: Any) -> RunConfig:
+    """Options of the environment in which a run is judged: seed 0 for all, so that all get the same layouts.
+
+    Args:
+        config: Of the run.
+        tier: Particles, see `cfp.config.EnvironmentConfig`.
+    """
+    return replace(config, seed=0, environment=replace(config.environment, particles=tier))

@@ -1,0 +1,175 @@
+"""The report of a comparison, from run folders whose contents are written by the test."""
+
+import csv
+import hashlib
+import json
+from html.parser import HTMLParser
+
+import pytest
+
+from baselines.compare.__main__ import main
+from baselines.compare.judging import Judging
+from baselines.compare.plan import Plan, make_jobs
+from cfp.config import to_json
+from cfp.files import write_json, write_text
+
+CASES = [case.name for case in Judging(1).cases()]
+PLAN = {"algos": {"shac-image": {"algo": "shac", "sees": "image"}}}
+
+
+class TagBalance(HTMLParser):
+    """Fails where a tag is closed that is not the last one opened."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.tables = [], 0
+
+    def handle_starttag(self, tag, attrs):
+        self.tables += tag == "table"
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def write_run(job, scores, curve, *, successes=0, seconds=100.0, cases=(100.0, 80.0, 50.0), tier="lite"):
+    """A folder as a run that was trained to step 1000 and judged leaves it."""
+    write_json(job.folder / "config.json", to_json(job.config))
+    write_text(job.folder / "policy.safetensors", job.name)
+    lines = [f"{step},{value}" for step, value in curve.items()]
+    write_text(job.folder / "evaluations.csv", "\n".join(["step,mean", *lines]) + "\n")
+    session = {"from": 0, "to": 1000, "seconds": seconds + 7, "judging": 7.0, "memory": 2**30, "device": "cpu"}
+    write_json(job.folder / "sessions.json", {"finished": True, "sessions": [session]})
+    judging = Judging(len(scores), tier)
+    first = {"returns": scores, "successes": successes}
+    entries = {judging.key(f"layouts 0 to {len(scores) - 1}"): first}
+    for name, value in zip(CASES, cases, strict=True):
+        entries[judging.key(f"{name}, {len(scores)} episodes")] = [{"returns": [value], "successes": 0}]
+    policy = hashlib.sha256(job.name.encode()).hexdigest()
+    write_json(job.folder / "judged.json", {"policy": policy, "entries": entries})
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    """RUN and SLOT; cfp, shac (state) and shac-image; seeds 0 and 1; shac-image failed on SLOT."""
+    out = tmp_path_factory.mktemp("report")
+    (out / "plan.json").write_text(json.dumps(PLAN))
+    labels = ["cfp", "shac", "shac-image"]
+    jobs = make_jobs(Plan(**PLAN), ["run", "slot"], labels, [0, 1], out / "runs")
+    for job in jobs:
+        shift = {"cfp": 0, "shac": 3000, "shac-image": 1000}[job.label] + 100 * job.config.seed
+        curve = {500: 2600 + shift, 1000: 4000 + shift}
+        if job.config.task == "run":
+            write_run(job, [3900 + shift, 4100 + shift], curve)
+        elif job.label != "shac-image":
+            write_run(job, [8000 + shift] * 2, {}, successes=job.config.seed)
+        else:
+            write_text(job.folder / "error.txt", "NonFiniteError: a loss | is not finite\n")
+    options = f"--tasks run slot --algos {' '.join(labels)} --seeds 0 1 --plan {out / 'plan.json'} --out {out}"
+    code = main([*options.split(), "--episodes", "2", "--slot-episodes", "4", "--report-only"])
+    assert code == 1  # two runs are missing
+    return out
+
+
+def rows(folder, name):
+    with open(folder / f"{name}.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def find(table, **wanted):
+    (row,) = [row for row in table if all(row[key] == value for key, value in wanted.items())]
+    return row
+
+
+def test_final_evaluation(report):
+    table = rows(report, "returns")
+    row = find(table, task="run", algo="cfp")
+    assert [float(row[name]) for name in ("iqm", "low", "high")] == [4050, 4000, 4100]
+    assert float(row["std"]) == pytest.approx(70.71, abs=0.01)
+    assert (row["seeds"], row["episodes"]) == ("2", "4")
+    assert find(table, task="slot", algo="shac-image")["iqm"] == ""
+
+
+def test_what_is_seen_is_never_ranked_together(report):
+    table = rows(report, "returns")
+    ranks = {(row["sees"], row["algo"]): row["rank"] for row in table if row["task"] == "run"}
+    # shac has the highest return, but is alone with the state.
+    assert ranks == {("image", "cfp"): "2", ("image", "shac-image"): "1", ("state", "shac"): "1"}
+    assert [row["sees"] for row in table] == ["image", "image", "state"] * 2
+    for name in ("index.html", "report.md"):
+        text = (report / name).read_text()
+        assert "image: cfp, shac-image; state: shac." in text
+        assert "never ranked together" in text
+
+
+def test_all_tasks_together_rank_only_who_did_all(report):
+    table = rows(report, "aggregate")
+    cfp = find(table, algo="cfp")
+    # (4000 - 2500) / 6150, with seed 1 a hundred more; (8000 - 7000) / 58000: four scores, the middle two.
+    assert float(cfp["iqm"]) == pytest.approx((1100 / 58000 + 1500 / 6150) / 2)
+    assert cfp["rank"] == "1"
+    assert find(table, algo="shac-image")["rank"] == ""
+
+
+def test_sample_efficiency(report):
+    row = find(rows(report, "efficiency"), task="run", algo="cfp")
+    # Best of those that see the image: shac-image, 5050; half of the way from 2500 to there is 3775.
+    assert float(row["best"]) == 5050
+    assert (row["steps_50%"], row["reached_50%"]) == ("1000.0", "2/2")
+    assert (row["steps_75%"], row["reached_75%"]) == ("", "0/2")
+    assert float(find(rows(report, "efficiency"), task="run", algo="shac")["best"]) == 7050
+
+
+def test_cost_beside_the_paper_s(report):
+    row = find(rows(report, "cost"), task="run", algo="cfp")
+    assert float(row["speed"]) == 10  # without the 7 s of evaluations
+    assert float(row["episode"]) == 80  # 800 steps
+    assert (row["memory"], row["paper_episode"], row["paper_memory"]) == ("1024.0", "54", "4053")
+    assert find(rows(report, "cost"), task="slot", algo="cfp")["paper_episode"] == ""
+
+
+def test_success_of_slot(report):
+    row = find(rows(report, "success"), task="slot", algo="cfp")
+    assert (row["successes"], row["episodes"], row["rate"], row["paper"]) == ("1", "4", "0.25", "0.154")
+    assert float(row["low"]) == pytest.approx(0.0456, abs=1e-4)
+    assert float(row["high"]) == pytest.approx(0.6994, abs=1e-4)
+
+
+def test_robustness_beside_the_paper_s(report):
+    table = rows(report, "robustness")
+    row = find(table, task="run", algo="cfp", case="action dropout 20%")
+    assert (float(row["ratio"]), row["paper"]) == (0.8, "0.954")
+    assert find(table, task="run", algo="cfp", case="observation dropout 20%")["paper"] == "0.877"
+    assert find(table, task="run", algo="shac", case="observation dropout 20%")["paper"] == ""
+
+
+def test_paper_s_returns_stand_beside_ours(report):
+    row = find(rows(report, "paper"), task="run", algo="cfp")
+    assert (row["ours"], row["paper"], row["band"], row["paper_steps"]) == ("4050.0", "8650", "420", "550000")
+
+
+def test_failures_are_named(report):
+    row = find(rows(report, "runs"), run="shac-image-slot-quick-1")
+    assert (row["state"], row["error"]) == ("failed", "NonFiniteError: a loss | is not finite")
+    assert "10 of 12 runs are finished and judged; the others:" in (report / "index.html").read_text()
+    assert "NonFiniteError: a loss \\| is not finite" in (report / "report.md").read_text()
+
+
+def test_page_shows_only_files_beside_it(report):
+    page = (report / "index.html").read_text()
+    for name in ("curves.png", "returns.png", "robustness.png", "returns.csv", "cost.csv"):
+        assert f'"{name}"' in page and (report / name).stat().st_size > 0
+    assert "http" not in page
+    balance = TagBalance()
+    balance.feed(page)
+    assert balance.open == [] and balance.tables == 8
+
+
+def test_evaluations_of_another_policy_do_not_count(report, tmp_path):
+    (job,) = make_jobs(Plan(), ["run"], ["cfp"], [0], tmp_path / "runs")
+    write_run(job, [1.0, 2.0], {1000: 5.0})
+    write_text(job.folder / "policy.safetensors", "another")
+    assert main(f"--tasks run --seeds 0 --out {tmp_path} --episodes 2 --report-only".split()) == 1
+    assert find(rows(tmp_path, "returns"), task="run")["iqm"] == ""
+    assert find(rows(tmp_path, "runs"), task="run")["state"] == "unjudged"

@@ -1,0 +1,55 @@
+import subprocess
+import sys
+
+import pytest
+
+from cfp.claim import Claimed, claim
+
+HOLD = """
+import sys
+from pathlib import Path
+from cfp.claim import claim
+with claim(Path(sys.argv[1])):
+    print(1, flush=True)
+    input()
+"""
+
+
+def holder(folder):
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "1\n"
+    return process
+
+
+def test_folder_is_held_by_one_process(tmp_path):
+    folder = tmp_path / "run"
+    process = holder(folder)
+    try:
+        with pytest.raises(Claimed, match=f"out: {folder} is in use by process {process.pid} on"), claim(folder):
+            pass
+    finally:
+        process.kill()
+        process.communicate()
+    with claim(folder):  # what a killed process held is free
+        assert (folder / ".lock").exists()
+    assert folder.exists() and not list(folder.iterdir())
+
+
+def test_patience_outlasts_another_process(tmp_path):
+    process = holder(tmp_path)
+    with pytest.raises(Claimed), claim(tmp_path, 0.1):
+        pass
+    process.communicate("go\n")
+    with claim(tmp_path, 60):
+        pass
+
+
+def test_new_folder_goes_again_if_nothing_was_written(tmp_path):
+    with claim(tmp_path / "a" / "empty"):
+        pass
+    assert not (tmp_path / "a" / "empty").exists()
+    with claim(tmp_path / "full"):
+        (tmp_path / "full" / "file").touch()
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["file"]
