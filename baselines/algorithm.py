@@ -19,6 +19,7 @@ from cfp.estimate import Cost
 from cfp.evaluation import Policy
 from cfp.process import StopSignals
 from cfp.run import Run
+from cfp.state_file import Position
 from cfp.weights import origin
 
 Sees = Literal["image", "state", "simulator"]
@@ -74,6 +75,15 @@ class Algorithm(ABC):
         Raises:
             ConfigError: No such task or preset.
         """
+
+    @classmethod
+    def start(cls, config: Any) -> Policy | None:
+        """What the first stage of a run begins with, where there is no checkpoint; asked before anything is written.
+
+        Raises:
+            CFPError: An option names a policy that cannot be read or does not fit.
+        """
+        return None
 
     @abstractmethod
     def learn(self, total_timesteps: int, callback: Callback) -> Algorithm:
@@ -131,12 +141,18 @@ class AlgorithmRun(Run):
     def __init__(
         self, kind: type[Algorithm], config: RunConfig, folder: Path, resume: bool, signals: StopSignals
     ) -> None:
-        super().__init__(config, folder, resume, signals)
         self.kind = kind
+        self.start: Policy | None = None
+        super().__init__(config, folder, resume, signals)
+
+    def begin(self) -> Position:
+        """Read the policy that the first stage begins with."""
+        self.start = self.kind.start(self.config)
+        return super().begin()
 
     def make_model(self, level: int) -> Algorithm:
         """The algorithm at the beginning of a stage."""
-        start = self.load(self.folder / f"stage{level}.safetensors") if level else None
+        start = self.load(self.folder / f"stage{level}.safetensors") if level else self.start
         return self.kind(self.config, level, start)
 
     def restore(self, model: Algorithm, state: dict[str, Any]) -> None:

@@ -21,7 +21,7 @@ from cfp.environments import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.evaluation import Policy
 from cfp.policy import ActorPolicy
-from cfp.weights import KIND, load, read_policy, save_policy
+from cfp.weights import KIND, load, read_policy, save_policy, single_level_policy
 from dittogym import make_spec
 
 BETAS = (0.7, 0.95)
@@ -60,6 +60,8 @@ class ShacConfig(RunConfig):
     """Environment steps of all robots together."""
     sees: Literal["state", "image"] = "state"
     """What the policy is given: the privileged state (matter, deformation, clock), or the image like CFP's."""
+    warm_actor: str | None = None
+    """Policy of one level on the image, whatever trained it, whose weights the actor begins with."""
     grid: int | Literal["coarse", "fine"] = "coarse"
     """Action grid R: coarse, fine (the task's), or a number."""
     tier: Literal["full", "lite"] | int | tuple[int, int] = "lite"
@@ -106,8 +108,7 @@ class ShacConfig(RunConfig):
     def training(self) -> EnvironmentConfig:
         """Where it is trained: evenly spread particles and no stale values, actions as where it is judged."""
         own = self.environment
-        layout = own.action_layout or ("grid" if own.parity == "reference" else "image")
-        return replace(own, particles=self.tier, parity="clean", action_layout=layout)
+        return replace(own, particles=self.tier, parity="clean", action_layout=own.layout)
 
     def check(self) -> None:
         """Check what the types cannot, see `RunConfig.check`."""
@@ -115,6 +116,8 @@ class ShacConfig(RunConfig):
         at_least_one(
             steps=self.steps, window=self.window, critic_updates=self.critic_updates, age=self.age, layouts=self.layouts
         )
+        if self.warm_actor is not None and self.sees != "image":
+            raise ConfigError(f"warm_actor: got a policy, allowed with sees 'image', got {self.sees!r}")
         for name in ("gamma", "td_lambda", "tau"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, allowed 0 to 1")
@@ -144,6 +147,9 @@ class Shac(Algorithm):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self._make_networks()
+        if start is not None:
+            assert isinstance(self.actor, ImageActor) and isinstance(start, ActorPolicy)
+            self.actor.actor.load_state_dict(start.actor.state_dict())
         self.target.load_state_dict(self.critic.state_dict())
         self.target.requires_grad_(False)
         learning = [p for p in self.actor.parameters() if p.requires_grad]
@@ -183,6 +189,13 @@ class Shac(Algorithm):
             place=not running,
             reward=RewardConfig("speed") if running else RewardConfig(),
         )
+
+    @classmethod
+    def start(cls, config: ShacConfig) -> ActorPolicy | None:
+        """The policy that the actor begins with, if the options name one."""
+        if config.warm_actor is None:
+            return None
+        return single_level_policy(config, "warm_actor", config.resolution(0))
 
     def look(self) -> Tensor:
         """What the networks are given for the present state, (B, ...)."""

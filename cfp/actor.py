@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from cfp import joint
+from cfp.composition import blend
 from cfp.networks import (
     IMAGE_SIZE,
     RESOLUTIONS,
@@ -90,11 +91,13 @@ class Sample(NamedTuple):
             a little and is not clipped.
         log_prob: Log-density of the sampled part (a residual actor's own action only), (B,).
         gate: Weight of the residual action, (B, 2, R, R), or None for a plain actor.
+        parts: What the action is made of, see `cfp.composition.Composition`.
     """
 
     action: Tensor
     log_prob: Tensor
     gate: Tensor | None
+    parts: tuple[Tensor, ...] = ()
 
 
 def squashed_log_prob(noise: Tensor, std: Tensor, action: Tensor) -> Tensor:
@@ -143,7 +146,7 @@ class Actor(nn.Module):
         """Draw an action for uint8 observations (B, 3, 64, 64)."""
         latent = self.encoder(normalise_image(observation))
         action, log_prob = self.own_action(latent, deterministic)
-        return Sample(action, log_prob, None)
+        return Sample(action, log_prob, None, (action,))
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> Tensor:
         """The action (B, 2, A, A) for uint8 observations (B, 3, 64, 64)."""
@@ -151,8 +154,8 @@ class Actor(nn.Module):
 
     def action_log_prob(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Flat actions (B, 2 R R) and log-densities (B,): what stable-baselines3's own SAC asks of an actor."""
-        action, log_prob, _ = self.sample(observation)
-        return action.flatten(1), log_prob
+        sample = self.sample(observation)
+        return sample.action.flatten(1), sample.log_prob
 
     def set_training_mode(self, mode: bool) -> None:
         """Switch between training and evaluation; without effect on these layers, asked for by stable-baselines3."""
@@ -181,13 +184,14 @@ class ResidualActor(Actor):
     def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
         """Draw a composed action; log_prob belongs to the residual part alone, as in the reference."""
         with torch.no_grad():
-            coarse = self._enlarge(self.coarse(observation, deterministic))
+            below = self.coarse.sample(observation, deterministic)
+            coarse = self._enlarge(below.action)
         patch = upsample(coarse, IMAGE_SIZE, self.interpolation)
         latent = self.encoder(normalise_image(observation), patch)
         residual, log_prob, logit = self.own_action(latent, deterministic, self.gate)
         gate = self.gate_scale * torch.sigmoid(logit + self.gate_bias)
-        weight = self._enlarge(gate)
-        return Sample(weight * self._enlarge(residual) + (1 - weight) * coarse, log_prob, gate)
+        action = blend(coarse, residual, gate, self._enlarge)
+        return Sample(action, log_prob, gate, (*below.parts, residual, gate))
 
     def _enlarge(self, image: Tensor) -> Tensor:
         return upsample(image, self.action_size, self.interpolation)

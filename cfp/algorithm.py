@@ -20,6 +20,7 @@ from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, S
 from torch import Tensor, nn
 
 from cfp.actor import Actor
+from cfp.composition import Composition
 from cfp.errors import NonFiniteError
 from cfp.losses import Losses, Precision
 from cfp.networks import TwinCritic, upsample
@@ -132,7 +133,10 @@ class CFP(SAC):
         self.max_grad_norm = max_grad_norm
         self.precision, self.compile = precision, compile
         sac_options.setdefault("replay_buffer_class", ReplayRing)
-        sac_options.setdefault("replay_buffer_kwargs", {"seed": sac_options.get("seed")})
+        spec = (sac_options.get("policy_kwargs") or {}).get("spec")
+        noisy = sac_options.get("action_noise") is not None  # then what is executed has no parts
+        ring = {"seed": sac_options.get("seed"), "composition": Composition.of(spec) if spec and not noisy else None}
+        sac_options.setdefault("replay_buffer_kwargs", ring)
         super().__init__(
             policy,
             env,
@@ -221,14 +225,31 @@ class CFP(SAC):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
+        """Actions to execute, and what the replay memory stores of them."""
+        composition = getattr(self.replay_buffer, "composition", None)
+        if self.num_timesteps >= self.random_steps and composition is not None:
+            return self._act_in_parts(composition)
         # stable-baselines3 ties the random phase to the start of the updates; here they are two settings.
         actions, stored = super()._sample_action(self.random_steps, action_noise, n_envs)
         grid = self.networks()[0].resolution
         if self.num_timesteps < self.random_steps and grid < self.action_resolution:
             # As coarse as the level acts: of independent pixels little would be left in the field.
             corner = torch.as_tensor(stored[..., :grid, :grid], dtype=torch.float32)
-            actions = stored = upsample(corner, self.action_resolution, "half_pixel").numpy()
+            assert isinstance(self.policy, CFPPolicy)
+            actions = stored = upsample(corner, self.action_resolution, self.policy.spec.interpolation).numpy()
+            if composition is not None:
+                stored = composition.alone(corner).numpy()
         return actions, stored
+
+    @torch.no_grad()
+    def _act_in_parts(self, composition: Composition) -> tuple[np.ndarray, np.ndarray]:
+        """Act as ``predict`` does, keeping the images that the actions were blended from."""
+        assert self._last_obs is not None
+        self.policy.set_training_mode(False)
+        observation, _ = self.policy.obs_to_tensor(self._last_obs)
+        assert isinstance(observation, Tensor)
+        sample = self.networks()[0].sample(observation)
+        return sample.action.cpu().numpy(), composition.join(sample.parts).cpu().numpy()
 
     def _store_transition(
         self,

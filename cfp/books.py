@@ -37,6 +37,7 @@ class Books:
         save: Called with the step; writes policy and checkpoint.
         evaluate_first: Evaluate before the first step.
         over: Asked after an evaluation: whether the stage should end now.
+        film: Called with the step when a film is due.
     """
 
     def __init__(
@@ -50,11 +51,12 @@ class Books:
         save: Callable[[int], None],
         evaluate_first: bool = False,
         over: Callable[[], bool] = lambda: False,
+        film: Callable[[int], None] = lambda step: None,
     ) -> None:
         self.level, self.total = level, total
         self.report, self.signals, self.logger = report, signals, logger
         self.evaluate, self.save, self.evaluate_first = evaluate, save, evaluate_first
-        self.over = over
+        self.over, self.film = over, film
         self.last_result: Result | None = None
         self._return: float | None = None
         self._last = self._logged = self._saved = self._evaluated = 0
@@ -91,6 +93,7 @@ class Books:
                 ("log", self.report.log_every),
                 ("evaluate", self.report.eval_every),
                 ("save", self.report.checkpoint_every),
+                ("film", self.report.video_every),
             )
         }
         self._last = step
@@ -98,6 +101,8 @@ class Books:
             self._log(step, scalars())
         if due["evaluate"]:
             self._evaluate(step)
+        if due["film"]:
+            self.film(step)
         if due["save"] or due["evaluate"] or self.signals.number:
             self._save(step)
         if self.signals.number:

@@ -9,105 +9,18 @@ from typing import Any, ClassVar, Literal
 
 from cfp.actor import ActorSpec
 from cfp.errors import ConfigError
-from cfp.losses import Precision
+from cfp.groups import EnvironmentConfig as EnvironmentConfig
+from cfp.groups import LearningConfig as LearningConfig
+from cfp.groups import NetworkConfig as NetworkConfig
+from cfp.groups import ReportConfig as ReportConfig
 from cfp.merging import merge as merge
-from cfp.networks import RESOLUTIONS, Interpolation
+from cfp.networks import RESOLUTIONS
 from dittogym import TASKS, make_spec
 
 Preset = Literal["quick", "paper"]
 
 EVALUATION_SEED = 10_000
 """Added to a run's seed for evaluations, so that they start from particle layouts not trained on."""
-
-
-@dataclass(frozen=True)
-class EnvironmentConfig:
-    """Where the robot lives: options of `dittogym.TorchEnv`."""
-
-    num_envs: int = 16
-    """Robots simulated side by side."""
-    particles: Literal["full", "lite"] | int | tuple[int, int] = "lite"
-    """Particles: full (the paper's), lite (about 2,000), a count, or one count for robot and one for object."""
-    substeps: int = 100
-    """Physics steps in one environment step."""
-    dtype: Literal["float32", "float64"] = "float32"
-    """Precision of the physics."""
-    backend: str = "auto"
-    """How the physics is computed: auto, eager, compile, ..."""
-    action_layout: Literal["image", "grid"] | None = None
-    """Orientation of the action array: image (as the observation) or grid (the reference's); None: by parity."""
-    parity: Literal["clean", "reference"] = "clean"
-    """clean: the reference's faults that only hide the truth are mended; reference: they are kept."""
-    resample: bool = False
-    """Draw the particles anew at every reset."""
-    target: str | None = None
-    """SHAPE MATCH: star, I, M, T or the path of an image; None: the task's default."""
-
-    def task_options(self) -> dict[str, Any]:
-        """What of it belongs to the task, for `dittogym.make_spec`."""
-        return {} if self.target is None else {"target": self.target}
-
-
-@dataclass(frozen=True)
-class NetworkConfig:
-    """Choices inside the networks."""
-
-    interpolation: Interpolation = "half_pixel"
-    """Bicubic upsampling: half_pixel (the environment's rule, blended on its patch) or aligned (the reference's)."""
-    split: bool = False
-    """Separate narrow encoders for observation and action (DIG)."""
-    gate_scale: float = 1.0
-    """Largest gate value (the reference: 0.25 with split encoders)."""
-
-
-@dataclass(frozen=True)
-class LearningConfig:
-    """Soft actor-critic."""
-
-    learning_rate: float = 3e-4
-    """Adam's step size for actor and critics."""
-    gamma: float = 0.99
-    """Discount factor."""
-    tau: float = 0.005
-    """Polyak factor of the target critics."""
-    batch_size: int = 256
-    """Transitions in an update."""
-    buffer_size: int = 200_000
-    """Transitions in the replay ring."""
-    gradient_steps: int = 1
-    """Updates after each batched step of num_envs robots."""
-    update_start: int = 256
-    """Updates begin when more transitions than this are stored."""
-    reward_momentum: float = 0.99
-    """Momentum of the running reward mean and variance."""
-    max_grad_norm: float = 10.0
-    """Largest gradient norm of one parameter tensor."""
-    precision: Precision = "float32"
-    """Of the networks in updates: float32, bfloat16, or auto (bfloat16 on CPUs with instructions for it)."""
-    compile: bool = False
-    """Run the updates through torch.compile."""
-    warm_critic: bool = False
-    """Each level begins with critics and reward statistics of the one before (the reference: anew)."""
-
-
-@dataclass(frozen=True)
-class ReportConfig:
-    """What is measured and written while training."""
-
-    eval_every: int = 10_000
-    """Environment steps between evaluations; 0: none."""
-    eval_episodes: int = 5
-    """Episodes of an evaluation and of the final table."""
-    eval_deterministic: bool = False
-    """Evaluate without action noise (the reference does so in SHAPE MATCH only)."""
-    patience: int = 0
-    """Evaluations in a row without a new best that end a stage early (the last: the run); 0: only steps count."""
-    checkpoint_every: int = 1_000
-    """Environment steps between checkpoints."""
-    log_every: int = 500
-    """Environment steps between rows of progress.csv and TensorBoard points."""
-    video: bool = True
-    """Record video.mp4 at the end."""
 
 
 @dataclass(frozen=True)
@@ -171,8 +84,9 @@ class RunConfig:
             checkpoint_every=self.report.checkpoint_every,
             log_every=self.report.log_every,
         )
-        if self.report.eval_every < 0:
-            raise ConfigError(f"eval_every: got {self.report.eval_every}, allowed 0 (never) or more")
+        for name in ("eval_every", "video_every"):
+            if (every := getattr(self.report, name)) < 0:
+                raise ConfigError(f"{name}: got {every}, allowed 0 (never) or more")
         if self.report.patience < 0 or (self.report.patience and not self.report.eval_every):
             raise ConfigError(f"patience: got {self.report.patience}, allowed 0, or more with evaluations (eval_every)")
 
@@ -199,6 +113,12 @@ class StageConfig:
     gate_penalty: float
 
 
+RESIDUAL_OPTIONS = ("gate_bias", "gate_penalty")
+"""Options with one value for each level but the first."""
+LEVEL_OPTIONS = ("random_steps", "alpha", *RESIDUAL_OPTIONS)
+"""Options with one value for each level that has it."""
+
+
 @dataclass(frozen=True)
 class Config(RunConfig):
     """A run of CFP. Levels are listed coarsest first; one value per level unless said otherwise."""
@@ -219,6 +139,8 @@ class Config(RunConfig):
     """Weight of the gate penalty (one less than levels)."""
     start_from: str | None = None
     """Policy of the first levels, a run folder or policy.safetensors: training begins with the level after it."""
+    warm_actor: str | None = None
+    """Policy of one level, whatever trained it, whose weights the first level's actor begins with."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     learning: LearningConfig = field(default_factory=LearningConfig)
 
@@ -237,12 +159,24 @@ class Config(RunConfig):
         return self.actor_spec(level).action_size
 
     def adapted(self, base: RunConfig) -> RunConfig:
-        """Other steps move the handovers in proportion."""
+        """Other steps move the handovers in proportion; another number of levels stretches what each has one of.
+
+        Then levels are equally long, and further ones have the values of the last one that has any.
+        """
         assert isinstance(base, Config)
-        if self.steps == base.steps or self.handover != base.handover:
-            return self
-        share = self.steps / base.steps
-        return replace(self, handover=tuple(round(step * share) for step in base.handover))
+        levels, changes = len(self.resolutions), dict[str, Any]()
+        if levels != len(base.resolutions):
+            for name in LEVEL_OPTIONS:
+                count = levels - (name in RESIDUAL_OPTIONS)
+                values: tuple[float, ...] = getattr(self, name)
+                if values and values == getattr(base, name):
+                    changes[name] = (*values, *values[-1:] * count)[:count]
+            if self.handover == base.handover:
+                changes["handover"] = tuple(round(self.steps * level / levels) for level in range(1, levels))
+        elif self.steps != base.steps and self.handover == base.handover:
+            share = self.steps / base.steps
+            changes["handover"] = tuple(round(step * share) for step in base.handover)
+        return replace(self, **changes)
 
     def actor_spec(self, level: int) -> ActorSpec:
         """The networks of the actor at a level (0 is the coarsest), with all coarser ones."""
@@ -276,8 +210,7 @@ class Config(RunConfig):
         growing = list(self.resolutions) == sorted(set(self.resolutions))
         if not levels or not growing or not set(self.resolutions) <= set(RESOLUTIONS):
             raise ConfigError(f"resolutions: got {self.resolutions}, allowed is a growing choice of {RESOLUTIONS}")
-        counts = {"random_steps": levels, "alpha": levels, "handover": levels - 1}
-        counts |= {"gate_bias": levels - 1, "gate_penalty": levels - 1}
+        counts = {name: levels - (name in RESIDUAL_OPTIONS) for name in LEVEL_OPTIONS} | {"handover": levels - 1}
         for name, count in counts.items():
             given = len(getattr(self, name))
             if given != count:
@@ -292,6 +225,8 @@ class Config(RunConfig):
     def _check_ranges(self) -> None:
         if self.learning.warm_critic and self.start_from is not None:
             raise ConfigError("warm_critic: got True, allowed without start_from (a policy brings no critics)")
+        if self.warm_actor is not None and self.start_from is not None:
+            raise ConfigError("warm_actor: got a policy, allowed without start_from (which brings the first level)")
         at_least_one(
             batch_size=self.learning.batch_size,
             buffer_size=self.learning.buffer_size,

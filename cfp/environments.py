@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from cfp.config import RunConfig
 from cfp.errors import ConfigError
+from cfp.groups import TASK_OPTIONS
 from cfp.vec_env import monitored
 from dittogym import TorchEnv
 
@@ -50,7 +51,8 @@ def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = No
     """
     options = dataclasses.asdict(config.environment)
     own = options.pop("num_envs")
-    options.pop("target")
+    for name in TASK_OPTIONS:
+        options.pop(name)
     options |= config.environment.task_options() | changes
     device = choose_device(config.device)
     try:

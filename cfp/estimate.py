@@ -50,7 +50,7 @@ def estimate(program: Program, config: RunConfig) -> str:
     Raises:
         ConfigError: An option is wrong.
     """
-    quiet = replace(config, report=replace(config.report, video=False))
+    quiet = replace(config, report=replace(config.report, video=False, video_every=0, wandb="off"))
     with tempfile.TemporaryDirectory() as folder:
         costs = program.run(quiet, Path(folder) / "run", False, StopSignals()).measure_all()
     bounds, horizon, episodes = (0, *config.ends()), make_spec(config.task).horizon, config.report.eval_episodes

@@ -61,9 +61,9 @@ def critic_target(
         gamma: Discount factor.
     """
     with torch.no_grad():
-        action, log_prob, _ = actor.sample(later)
-        value = torch.minimum(*target(later, action))
-        return rewards + goes_on * gamma * (value - alpha * log_prob[:, None])
+        drawn = actor.sample(later)
+        value = torch.minimum(*target(later, drawn.action))
+        return rewards + goes_on * gamma * (value - alpha * drawn.log_prob[:, None])
 
 
 def critic_loss(critic: TwinCritic, now: Tensor, actions: Tensor, wanted: Tensor) -> Tensor:
@@ -75,7 +75,7 @@ def actor_loss(
     actor: Actor, critic: TwinCritic, now: Tensor, alpha: Tensor, gate_penalty: float
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Mean of ``alpha log pi - min Q`` plus the gate penalty, and scalars to log (see `cfp.algorithm.METRICS`)."""
-    action, log_prob, gate = actor.sample(now)
+    action, log_prob, gate, _ = actor.sample(now)
     value = torch.minimum(*critic(now, action))
     loss = (alpha * log_prob[:, None] - value).mean()
     scalars = {"q": value.detach().mean(), "entropy": -log_prob.detach().mean()}

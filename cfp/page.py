@@ -41,12 +41,20 @@ def write_page(folder: Path, config: RunConfig, results: Sequence[Result]) -> Pa
         '<h2>Learning curve</h2><img src="curve.png" alt="Return over environment steps">',
         f"<h2>Final evaluation</h2>{_table(results)}",
         '<h2>Video</h2><video src="video.mp4" controls loop muted></video>' if video else "",
+        _films(folder),
         f"<h2>Options</h2><pre>{escape(json.dumps(to_json(config), indent=2))}</pre>",
         "</body></html>",
     ]
     path = folder / "index.html"
     write_text(path, "\n".join(part for part in parts if part) + "\n")
     return path
+
+
+def _films(folder: Path) -> str:
+    """Links to the films made while training."""
+    names = sorted(path.name for path in (folder / "videos").glob("*.mp4"))
+    items = "".join(f'<li><a href="videos/{escape(name)}">{escape(name)}</a></li>' for name in names)
+    return f"<h2>While training</h2><ul>{items}</ul>" if items else ""
 
 
 def _table(results: Sequence[Result]) -> str:

@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from cfp.composition import Composition
 from cfp.errors import CheckpointError
 from cfp.files import write_atomically
 
@@ -27,14 +29,29 @@ class ReplayRing(ReplayBuffer):
     """stable-baselines3's replay buffer, drawing batches without repetition from a generator of its own.
 
     Args:
-        args: As for stable-baselines3's `ReplayBuffer`.
+        buffer_size: As for stable-baselines3's `ReplayBuffer`.
+        observation_space: As there.
+        action_space: Of the executed actions.
+        args: As there.
         seed: Seed of the generator.
-        kwargs: As for stable-baselines3's `ReplayBuffer`.
+        composition: If given, actions are stored as its vectors, and made again when a batch is drawn.
+        kwargs: As there.
     """
 
-    def __init__(self, *args: Any, seed: int | None = None, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        *args: Any,
+        seed: int | None = None,
+        composition: Composition | None = None,
+        **kwargs: Any,
+    ) -> None:
+        stored = spaces.Box(-np.inf, np.inf, (composition.length,), np.float32) if composition else action_space
+        super().__init__(buffer_size, observation_space, stored, *args, **kwargs)
         self.generator = np.random.default_rng(seed)
+        self.composition = composition
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """Draw a batch uniformly; a transition occurs twice only if there are fewer than ``batch_size``."""
@@ -50,7 +67,10 @@ class ReplayRing(ReplayBuffer):
             self._normalize_reward(self.rewards[row, element, None], env),
         )
         # Indexing has copied already.
-        return ReplayBufferSamples(*(self.to_torch(np.asarray(array), copy=False) for array in arrays))
+        batch = ReplayBufferSamples(*(self.to_torch(np.asarray(array), copy=False) for array in arrays))
+        if self.composition is None:
+            return batch
+        return batch._replace(actions=self.composition.rebuild(batch.actions).flatten(1))
 
 
 @dataclass(frozen=True)
@@ -109,6 +129,7 @@ class ReplayArchive:
 
         Raises:
             CheckpointError: A chunk is missing or damaged.
+            ValueError: A chunk holds rows of another shape than the ring.
         """
         self.chunks = [Chunk(**chunk) for chunk in chunks]
         oldest = max(0, rows - buffer.buffer_size)
@@ -119,7 +140,10 @@ class ReplayArchive:
                 raise CheckpointError(f"{self.folder}: rows {covered} to {first} of the replay memory are missing")
             index = np.arange(first, chunk.stop) % buffer.buffer_size
             for name, values in _read_arrays(self.folder / chunk.file).items():
-                getattr(buffer, name)[index] = values[first - chunk.start :]
+                ring = getattr(buffer, name)
+                if values.shape[1:] != ring.shape[1:]:
+                    raise ValueError(f"{chunk.file}: got {name} of shape {values.shape[1:]}, allowed {ring.shape[1:]}")
+                ring[index] = values[first - chunk.start :]
             covered = chunk.stop
         if covered != rows:
             raise CheckpointError(f"{self.folder}: rows {covered} to {rows} of the replay memory are missing")

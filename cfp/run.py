@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
@@ -19,13 +20,26 @@ from cfp.environments import choose_device, make_env
 from cfp.errors import CheckpointError, ConfigError
 from cfp.estimate import Cost
 from cfp.evaluation import Policy, Result, compare, evaluate, format_table, to_rows
-from cfp.files import EventFile, ProgressTable, Table, copy_atomically, read_table, write_json
+from cfp.files import ProgressTable, Table, copy_atomically, read_table, write_json
 from cfp.page import write_page
 from cfp.plot import plot_curve
 from cfp.process import Plateau, StopSignals
 from cfp.state_file import Position, StateFile, check_same
-from cfp.video import VideoUnavailable, film, write_video
+from cfp.tracking import Tracker, check_trackers
+from cfp.video import VideoUnavailable, film, film_episode, write_video
 from cfp.weights import read_policy
+
+EVALUATION_COLUMNS: dict[str, str] = {
+    "step": "environment steps of the run so far",
+    "stage": "stage in training, 1 is the first",
+    "episodes": "episodes of the evaluation, each on a layout of its own that is not trained on",
+    "mean": "mean of their undiscounted returns; a stage keeps the policy with the highest",
+    "std": "standard deviation of the returns",
+    "lowest": "lowest return",
+    "highest": "highest return",
+    "success": "share of successes, where the task defines success",
+}
+"""Columns of ``evaluations.csv``."""
 
 MARKS = ("config.json", "checkpoint", "progress.csv", "evaluations.csv", "policy.safetensors")
 """Any of these in a folder means that it holds a run."""
@@ -93,6 +107,7 @@ class Run(ABC):
     def __init__(self, config: RunConfig, folder: Path, resume: bool, signals: StopSignals) -> None:
         config.check()
         choose_device(config.device)
+        check_trackers(config)
         for level in range(len(config.ends())):
             make_env(config, config.action_size(level), 1)  # refuses bad options before anything is written
         self.config, self.folder, self.signals = config, folder, signals
@@ -115,7 +130,8 @@ class Run(ABC):
         write_json(folder / "config.json", to_json(config))
         self.evaluations = Table(folder / "evaluations.csv", step)
         progress = ProgressTable(Table(folder / "progress.csv", step))
-        self.logger = Logger(str(folder), [progress, EventFile(folder / "tensorboard", step)])
+        self.tracker = Tracker(config, folder, step)
+        self.logger = Logger(str(folder), [progress, *self.tracker.writers])
 
     def begin(self) -> Position:
         """Where a run begins that has no checkpoint; puts what the first stage needs into the folder."""
@@ -123,6 +139,10 @@ class Run(ABC):
 
     def inherit(self, model: Any, previous: Any) -> None:  # noqa: B027  (most algorithms hand over a policy only)
         """Give a model that has just been made what it shall have of the stage before, besides its policy."""
+
+    def pictures(self, model: Any) -> dict[str, np.ndarray]:
+        """What to show of a model at an evaluation, uint8 (H, W, 3) by name."""
+        return {}
 
     @abstractmethod
     def make_model(self, level: int) -> Any:
@@ -165,6 +185,12 @@ class Run(ABC):
 
     def train(self) -> None:
         """Train the stages that are left."""
+        try:
+            self._train()
+        finally:
+            self.logger.close()
+
+    def _train(self) -> None:
         ends, previous = self.config.ends(), None
         for level in range(self.position.level, len(ends)):
             model = self.make_model(level)
@@ -183,7 +209,6 @@ class Run(ABC):
             if level + 1 < len(ends):
                 copy_policy(self.folder / "policy.safetensors", self.folder / f"stage{level + 1}.safetensors")
                 self.position = Position(level + 1, self.position.offset + model.num_timesteps)
-        self.logger.close()
 
     def _plateau(self, level: int) -> bool:
         """Whether the best evaluation of a stage is as many evaluations ago as the run is patient."""
@@ -209,7 +234,15 @@ class Run(ABC):
                 best = result.mean
                 self.keep(model, level, step)
             self.evaluations.add(row)
+            shown = {"eval/return": result.mean, "eval/std": result.std, "eval/success": result.success}
+            self.tracker.show(step, {**shown, **self.pictures(model)})
             return result
+
+        def record(step: int) -> None:
+            path = self.folder / "videos" / f"step{step:09d}.mp4"
+            size = config.action_size(level)
+            write_video(path, film_episode(config, model, size, config.report.eval_deterministic, seed))
+            self.tracker.film(step, path)
 
         def save(step: int) -> None:
             if best == -math.inf:  # not evaluated yet, or never
@@ -219,7 +252,7 @@ class Run(ABC):
         # A stage begins with what the one before has reached: it must do better than that.
         first = level > 0 and config.report.eval_every > 0 and best == -math.inf
         total, over = config.ends()[-1], partial(self._plateau, level)
-        return Books(level, total, config.report, self.signals, self.logger, measure, save, first, over)
+        return Books(level, total, config.report, self.signals, self.logger, measure, save, first, over, record)
 
     def finish(self) -> list[Result]:
         """After training: the final table, ``results.json``, curve, video and page. Returns the table's rows."""

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from stable_baselines3.common.vec_env import VecMonitor
 
 from cfp.algorithm import CFP
@@ -16,11 +17,12 @@ from cfp.config import Config
 from cfp.environments import choose_device, make_env
 from cfp.errors import ConfigError
 from cfp.estimate import Cost, seconds
+from cfp.pictures import policy_pictures
 from cfp.policy import ActorPolicy, CFPPolicy
 from cfp.replay import FIELDS
 from cfp.run import Run
 from cfp.state_file import Position
-from cfp.weights import describe, load, read_policy, save_policy, write_policy
+from cfp.weights import describe, load, policy_for, read_policy, save_policy, single_level_policy, write_policy
 
 
 class Runner(Run):
@@ -29,20 +31,23 @@ class Runner(Run):
     checkpoint_type = Checkpoint
     config: Config
     checkpoint: Checkpoint
+    warm: ActorPolicy | None = None
+    """What the first actor begins with; None if a checkpoint says more."""
 
     def begin(self) -> Position:
         """Take the first levels from a policy if the options say so; its steps count as those before its handover.
 
         Raises:
-            ConfigError: It is not the first levels of this ladder.
+            ConfigError: It is not the first levels of this ladder, or the policy that the first actor shall begin with
+                does not fit it.
             CheckpointError: It is missing, damaged, or of another kind.
         """
+        if self.config.warm_actor is not None:
+            self.warm = single_level_policy(self.config, "warm_actor", self.config.resolutions[0])
         if self.config.start_from is None:
             return Position()
-        policy = load(self.config.start_from)
+        policy = policy_for(self.config, "start_from")
         levels = len(policy.spec.resolutions)
-        if policy.description["task"] != self.config.task:
-            raise ConfigError(f"start_from: got a policy for {policy.description['task']}, allowed {self.config.task}")
         if levels >= len(self.config.resolutions) or policy.spec.resolutions != self.config.resolutions[:levels]:
             raise ConfigError(
                 f"start_from: got a policy of levels {policy.spec.resolutions}, allowed the first of "
@@ -61,9 +66,18 @@ class Runner(Run):
             mine.load_state_dict(theirs.state_dict())
         model.reward_statistics.load_state_dict(previous.reward_statistics.state_dict())
 
+    def pictures(self, model: CFP) -> dict[str, np.ndarray]:
+        """What the actor does with what the first robot shows."""
+        assert isinstance(model._last_obs, np.ndarray)
+        observation, _ = model.policy.obs_to_tensor(model._last_obs[:1])
+        assert isinstance(observation, torch.Tensor)
+        return policy_pictures(model.networks()[0], observation)
+
     def make_model(self, level: int) -> CFP:
         """Networks, replay memory and environment of a level, over the frozen policy of the coarser one."""
         model = self._make_model(level, make_env(self.config, self.config.action_size(level)))
+        if level == 0 and self.warm is not None:
+            model.networks()[0].load_state_dict(self.warm.actor.state_dict())
         if level > 0:
             coarse = load(self.folder / f"stage{level}.safetensors", str(model.device)).actor
             model.networks()[0].get_submodule("coarse").load_state_dict(coarse.state_dict())
@@ -121,9 +135,10 @@ class Runner(Run):
         assert env is not None and buffer is not None
         observation, count = env.reset(), env.num_envs
         assert isinstance(observation, np.ndarray)
-        actions = np.stack([env.action_space.sample() for _ in range(count)])
+        model._last_obs = observation
+        _, stored = model._sample_action(0, None, count)
         for _ in range(-(-model.batch_size // count)):
-            buffer.add(observation, observation, actions, np.zeros(count), np.zeros(count), [{}] * count)
+            buffer.add(observation, observation, stored, np.zeros(count), np.zeros(count), [{}] * count)
         acting = seconds(lambda: env.step(model.predict(observation)[0]))
         updating = seconds(lambda: model.train(1, model.batch_size)) * self.config.learning.gradient_steps
         arrays = (getattr(buffer, name) for name in FIELDS)

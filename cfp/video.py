@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.environments import make_env
@@ -23,17 +24,37 @@ class VideoUnavailable(RuntimeError):
     """The optional packages that write videos are not installed."""
 
 
+def available() -> bool:
+    """Whether the optional packages that write videos are installed."""
+    return bool(find_spec("imageio") and find_spec("imageio_ffmpeg"))
+
+
 def film(config: RunConfig, policy: Policy) -> list[np.ndarray]:
+    """Pictures of one episode of a policy as it is evaluated, see `film_episode`.
+
+    Args:
+        config: The run's options.
+        policy: One made for a single layout is filmed there.
+    """
+    seed = policy.description.get("layout", config.seed + EVALUATION_SEED)
+    return film_episode(config, policy, policy.resolution, policy.deterministic_by_default, seed)
+
+
+def film_episode(
+    config: RunConfig, policy: PolicyPredictor, size: int, deterministic: bool, seed: int
+) -> list[np.ndarray]:
     """Pictures of one episode, uint8 (512, 512, 3): the start, then one per environment step.
 
     Args:
         config: The run's options.
-        policy: Acts as it is evaluated; one made for a single layout is filmed there.
+        policy: Acts.
+        size: Rows and columns of its actions.
+        deterministic: Act without noise.
+        seed: Of layout and noise; torch's own generator is left as it was.
     """
-    venv = make_env(config, policy.resolution, 1).venv
+    venv = make_env(config, size, 1).venv
     assert isinstance(venv, TorchVecEnv)
     watching = attached(policy, venv)
-    seed = policy.description.get("layout", config.seed + EVALUATION_SEED)
     venv.seed(seed)
     observation = venv.reset()
     frames = [venv.torch_env.render(0)]
@@ -43,7 +64,7 @@ def film(config: RunConfig, policy: Policy) -> list[np.ndarray]:
         while not done:
             assert isinstance(observation, np.ndarray)
             start = np.array([len(frames) == 1])
-            action, memory = watching.predict(observation, memory, start, policy.deterministic_by_default)
+            action, memory = watching.predict(observation, memory, start, deterministic)
             tensors = venv.torch_env.step(torch.as_tensor(action, device=venv.torch_env.device))
             observation, _, terminated, truncated, _ = (_numpy(value) for value in tensors)
             frames.append(venv.torch_env.render(0))  # before a reset can replace the last picture
@@ -66,7 +87,7 @@ def write_video(path: Path, frames: list[np.ndarray], hold: int = FRAMES_PER_SEC
     Raises:
         VideoUnavailable: imageio or its ffmpeg is not installed; the message says how to install them.
     """
-    if not (find_spec("imageio") and find_spec("imageio_ffmpeg")):
+    if not available():
         raise VideoUnavailable(MISSING)
     import imageio.v2 as imageio
 

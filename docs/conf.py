@@ -1,5 +1,6 @@
 """Sphinx configuration. Build with ``make docs``."""
 
+import importlib
 import os
 import subprocess
 import sys
@@ -52,6 +53,24 @@ class CommandHelp(SphinxDirective):
         return [nodes.literal_block(text=done.stdout)]
 
 
+class NamesTable(SphinxDirective):
+    """A table of names and their meanings from dictionaries ``package.module.NAME``, so that none is forgotten."""
+
+    required_arguments = 1
+    final_argument_whitespace = True
+
+    def run(self) -> list[nodes.Node]:
+        """Read the dictionaries and write a line for each entry."""
+        self.env.note_reread()
+        lines = [".. list-table::", "   :header-rows: 1", "", "   * - Name", "     - Meaning"]
+        for path in self.arguments[0].split():
+            module, _, name = path.rpartition(".")
+            for key, meaning in getattr(importlib.import_module(module), name).items():
+                lines += [f"   * - ``{key}``", f"     - {meaning}"]
+        return self.parse_text_to_nodes("\n".join(["```{eval-rst}", *lines, "```"]))
+
+
 def setup(app: Sphinx) -> None:
-    """Register the directive."""
+    """Register the directives."""
     app.add_directive("command-help", CommandHelp)
+    app.add_directive("names-table", NamesTable)

@@ -231,8 +231,36 @@ def test_uniform_actions_on_the_patch_are_as_coarse_as_the_level():
     actions = torch.stack(env.actions).flatten(0, 1)
     small = F.interpolate(actions, scale_factor=0.25, mode="area")
     assert small.std() > 0.8 * actions.std() > 0.3
-    stored = model.replay_buffer.actions[:2].reshape(-1, 2, 64, 64)
-    np.testing.assert_allclose(stored, actions.numpy())
+    assert model.replay_buffer.actions.shape[-1] == 2 * 8**2 + 4 * 16**2
+    stored = model.replay_buffer.composition.rebuild(torch.tensor(model.replay_buffer.actions[:2]).flatten(0, 1))
+    np.testing.assert_allclose(stored, actions, atol=2e-6)
+
+
+@pytest.mark.parametrize("resolutions", [(8, 16), (4, 8, 16, 32)])
+def test_batch_holds_the_actions_that_were_executed(resolutions):
+    env = FakeEnv(num_envs=2, resolution=64)
+    biases = (0.0,) * (len(resolutions) - 1)
+    model = make_model(ActorSpec(resolutions, biases, patch=64), env, random_steps=4, update_start=100)
+    model.learn(12)
+    executed = {tuple(action.flatten()[:9].tolist()): action for action in torch.stack(env.actions).flatten(0, 1)}
+    drawn = model.replay_buffer.sample(12).actions
+    keys = torch.tensor(list(executed))
+    for action in drawn:
+        nearest = (keys - action[:9]).abs().sum(1).argmin()
+        torch.testing.assert_close(action, list(executed.values())[nearest].flatten(), rtol=0, atol=2e-6)
+    assert len({tuple(action[:9].tolist()) for action in drawn}) == 12
+    spread = [float(action.abs().max()) for action in env.actions]
+    assert min(spread) > 0.1
+
+
+def test_actions_no_larger_than_their_parts_are_stored_as_they_are():
+    for spec in (ActorSpec((32, 64), (0.0,), patch=64), ActorSpec((8, 16), (0.0,)), ActorSpec((8,), patch=64)):
+        model = make_model(spec, FakeEnv(num_envs=2, resolution=spec.action_size), random_steps=2)
+        model.learn(6)
+        assert model.replay_buffer.composition is None
+        assert model.replay_buffer.actions.shape[-1] == 2 * spec.action_size**2
+        executed = model.env.venv.torch_env.actions[2].flatten(1)
+        np.testing.assert_allclose(model.replay_buffer.actions[2], executed, atol=1e-6)
 
 
 @pytest.mark.parametrize("fault", ["reward"])

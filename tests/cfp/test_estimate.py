@@ -29,6 +29,16 @@ def test_dry_run_tells_options_and_costs_and_writes_nothing(tmp_path, capsys, mo
     assert time.startswith("time: about") and memory.startswith("memory: about")
 
 
+def test_replay_of_blended_actions_is_as_small_as_their_parts(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments = [*TINY, "--task", "run", "--handover", "70", "--batch-size", "4", "--buffer-size", "6000", "--dry-run"]
+    assert train.main(arguments) == 0
+    first, second = capsys.readouterr().out.strip().splitlines()[-4:-2]
+    for line, numbers in ((first, 2 * 8**2), (second, 2 * 8**2 + 4 * 16**2)):  # not the 2 x 64 x 64 of the patch
+        rows = 6000 * (2 * 3 * 64 * 64 + numbers * 4 + 3 * 4)
+        assert line.split()[-2:] == [f"{rows / 2**20:.0f}", "MiB"]
+
+
 def test_dry_run_of_another_algorithm(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert baselines_train.main([*TINY[:-2], "--algo", "gradient", "--tier", "100", "--grid", "4", "--dry-run"]) == 0

@@ -1,0 +1,115 @@
+"""Groups of options as frozen dataclasses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from cfp.losses import Precision
+from cfp.networks import Interpolation
+
+TASK_OPTIONS = ("target", "variant")
+"""Fields of `EnvironmentConfig` that are options of some task."""
+
+
+@dataclass(frozen=True)
+class EnvironmentConfig:
+    """Where the robot lives: options of `dittogym.TorchEnv`."""
+
+    num_envs: int = 16
+    """Robots simulated side by side."""
+    particles: Literal["full", "lite"] | int | tuple[int, int] = "lite"
+    """Particles: full (the paper's), lite (about 2,000), a count, or one count for robot and one for object."""
+    substeps: int = 100
+    """Physics steps in one environment step."""
+    dtype: Literal["float32", "float64"] = "float32"
+    """Precision of the physics."""
+    backend: str = "auto"
+    """How the physics is computed: auto, eager, compile, ..."""
+    action_layout: Literal["image", "grid"] | None = None
+    """Orientation of the action array: image (as the observation) or grid (the reference's); None: by parity."""
+    parity: Literal["clean", "reference"] = "clean"
+    """clean: the reference's faults that only hide the truth are mended; reference: they are kept."""
+    resample: bool = False
+    """Draw the particles anew at every reset."""
+    target: str | None = None
+    """SHAPE MATCH: star, I, M, T or the path of an image; None: the task's default."""
+    variant: Literal["registered", "published"] | None = None
+    """SLOT: matter of the registered environment (None too) or of the published training run (preset paper)."""
+
+    def task_options(self) -> dict[str, Any]:
+        """What of it belongs to the task, for `dittogym.make_spec`."""
+        return {name: value for name in TASK_OPTIONS if (value := getattr(self, name)) is not None}
+
+    @property
+    def layout(self) -> Literal["image", "grid"]:
+        """The action layout that these options amount to."""
+        return self.action_layout or ("grid" if self.parity == "reference" else "image")
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Choices inside the networks."""
+
+    interpolation: Interpolation = "half_pixel"
+    """Bicubic upsampling: half_pixel (the environment's rule, blended on its patch) or aligned (the reference's)."""
+    split: bool = False
+    """Separate narrow encoders for observation and action (DIG)."""
+    gate_scale: float = 1.0
+    """Largest gate value (the reference: 0.25 with split encoders)."""
+
+
+@dataclass(frozen=True)
+class LearningConfig:
+    """Soft actor-critic."""
+
+    learning_rate: float = 3e-4
+    """Adam's step size for actor and critics."""
+    gamma: float = 0.99
+    """Discount factor."""
+    tau: float = 0.005
+    """Polyak factor of the target critics."""
+    batch_size: int = 256
+    """Transitions in an update."""
+    buffer_size: int = 200_000
+    """Transitions in the replay ring."""
+    gradient_steps: int = 1
+    """Updates after each batched step of num_envs robots."""
+    update_start: int = 256
+    """Updates begin when more transitions than this are stored."""
+    reward_momentum: float = 0.99
+    """Momentum of the running reward mean and variance."""
+    max_grad_norm: float = 10.0
+    """Largest gradient norm of one parameter tensor."""
+    precision: Precision = "float32"
+    """Of the networks in updates: float32, bfloat16, or auto (bfloat16 on CPUs with instructions for it)."""
+    compile: bool = False
+    """Run the updates through torch.compile."""
+    warm_critic: bool = False
+    """Each level begins with critics and reward statistics of the one before (the reference: anew)."""
+
+
+@dataclass(frozen=True)
+class ReportConfig:
+    """What is measured and written while training."""
+
+    eval_every: int = 10_000
+    """Environment steps between evaluations; 0: none."""
+    eval_episodes: int = 5
+    """Episodes of an evaluation and of the final table."""
+    eval_deterministic: bool = False
+    """Evaluate without action noise (the reference does so in SHAPE MATCH only)."""
+    patience: int = 0
+    """Evaluations in a row without a new best that end a stage early (the last: the run); 0: only steps count."""
+    checkpoint_every: int = 1_000
+    """Environment steps between checkpoints."""
+    log_every: int = 500
+    """Environment steps between rows of progress.csv and TensorBoard points."""
+    video: bool = True
+    """Record video.mp4 at the end."""
+    video_every: int = 0
+    """Environment steps between films of one episode in videos/; 0: none."""
+    wandb: Literal["off", "offline", "online"] = "off"
+    """Weights & Biases: off, offline (kept in the folder of the run), or online (uploads)."""
+    wandb_project: str = "torchmpm"
+    """Project there."""
