@@ -13,14 +13,36 @@ from sphinx.util.docutils import SphinxDirective
 import torchmpm
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(Path(__file__).parent))
+
+from task_pages import write_pages  # noqa: E402
 
 project = "torchmpm"
 author = "The torchmpm authors"
 copyright = f"2026, {author}"
 version = release = torchmpm.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "sphinx.ext.viewcode"]
-exclude_patterns = ["_build", "gallery"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["_build", "generated/summary.md", "sg_execution_times.rst", "tasks"]
+sphinx_gallery_conf = {
+    "examples_dirs": "../examples/tutorials",
+    "gallery_dirs": "gallery",
+    "within_subsection_order": "FileNameSortKey",
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "show_memory": False,
+    "remove_config_comments": True,
+    "min_reported_time": 1,
+    "plot_gallery": os.environ.get("TUTORIALS", "run") == "run",
+}
+suppress_warnings = ["config.cache"]
 default_role = "code"
 html_theme = "furo"
 html_title = "torchmpm"
@@ -71,6 +93,7 @@ class NamesTable(SphinxDirective):
 
 
 def setup(app: Sphinx) -> None:
-    """Register the directives."""
+    """Register the directives, and write the pages of the tasks before any page is read."""
+    app.connect("builder-inited", lambda app: write_pages())
     app.add_directive("command-help", CommandHelp)
     app.add_directive("names-table", NamesTable)

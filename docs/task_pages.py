@@ -1,0 +1,197 @@
+"""Writes a page for each task from its `TaskSpec`, so that no number is typed a second time."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import torch
+from PIL import Image
+
+import dittogym
+from dittogym.geometry import Obstacle
+from dittogym.layout import particle_counts
+from dittogym.spec import Body, TaskSpec
+from torchmpm import Soil, VelocityRule
+
+DOCS = Path(__file__).resolve().parent
+NOTES, PAGES = DOCS / "tasks", DOCS / "generated"
+STEPS, EVERY, SIZE = 80, 2, 256
+#: Without gravity and ground to hold it a robot is torn by strong waves.
+STRENGTH = {"shapematch": 0.5}
+
+TEMPLATE = """# [[ title ]]
+
+[[ what ]]
+
+| at rest | driven by a wave of muscles |
+| --- | --- |
+| ![The task at rest]([[ spec.name ]]-rest.png) | ![The robot under a travelling wave]([[ spec.name ]]-wave.webp) |
+
+```python
+import dittogym, gymnasium
+
+env = gymnasium.make("dittogym/[[ spec.name ]]-coarse-v0", particles="lite")
+batch = dittogym.TorchEnv("[[ spec.name ]]", num_envs=16, particles="lite")
+```
+
+[[ notes ]]
+
+## Numbers
+
+| | |
+| --- | --- |
+[% for name, value in numbers %]| [[ name ]] | [[ value ]] |
+[% endfor %]
+## Geometry
+
+Node ranges are inclusive and counted from the world's origin, 128 to the metre; of several rules for one direction the first that covers a node
+counts.
+
+| Obstacle | Seen by the robot | Rules |
+| --- | --- | --- |
+[% for row in geometry %]| [[ row | join(" | ") ]] |
+[% endfor %]
+"""
+
+
+def write_pages() -> None:
+    """Write `generated/{task}.md` and its pictures for every task."""
+    PAGES.mkdir(exist_ok=True)
+    write(PAGES / "summary.md", summary())
+    for name in dittogym.TASKS:
+        spec, module = dittogym.make_spec(name), importlib.import_module(f"dittogym.tasks.{name}")
+        pictures(name)
+        environment = jinja2.Environment(
+            undefined=jinja2.StrictUndefined,
+            variable_start_string="[[",
+            variable_end_string="]]",
+            block_start_string="[%",
+            block_end_string="%]",
+        )
+        title, what = headline(name)
+        context: dict[str, Any] = {"spec": spec, "weights": spec.weights, "module": module}
+        notes = environment.from_string((NOTES / f"{name}.md").read_text()).render(context)
+        page = environment.from_string(TEMPLATE).render(
+            **context,
+            title=title,
+            what=what,
+            notes=notes,
+            numbers=numbers(spec),
+            geometry=[row(obstacle) for obstacle in spec.obstacles],
+        )
+        write(PAGES / f"{name}.md", page)
+
+
+def write(path: Path, text: str) -> None:
+    """Write a file that has changed; Sphinx reads again what is new."""
+    if not path.exists() or path.read_text() != text:
+        path.write_text(text)
+
+
+def summary() -> str:
+    """A table of all tasks."""
+    lines = ["| Task | What to do | Steps | Coarse, fine | Bodies beside the robot |", "| --- | --- | --- | --- | --- |"]
+    for name in dittogym.TASKS:
+        spec, (_, what) = dittogym.make_spec(name), headline(name)
+        objects = ", ".join(matter(body) for body in spec.objects)
+        lines.append(f"| [`{name}`](generated/{name}.md) | {what} | {spec.horizon} | {spec.coarse}, {spec.fine} | {objects} |")
+    return "\n".join(lines) + "\n"
+
+
+def headline(name: str) -> tuple[str, str]:
+    """Title of a task and what to do, from its module's docstring."""
+    title, _, what = (importlib.import_module(f"dittogym.tasks.{name}").__doc__ or "").strip().partition(": ")
+    return title, what[:1].upper() + what[1:]
+
+
+def numbers(spec: TaskSpec) -> list[tuple[str, str]]:
+    """Names and values of everything a task is made of, in words."""
+    full, lite = (particle_counts(spec, tier) for tier in ("full", "lite"))
+    window = spec.window
+    rows = [
+        ("steps of an episode", f"{spec.horizon}"),
+        ("action grid, coarse and fine", f"{spec.coarse} × {spec.coarse} and {spec.fine} × {spec.fine}, two muscles"),
+        ("width of the patch that actions cover", f"{spec.patch} nodes"),
+        ("particles of the robot, full and lite", f"{full[0]:,} and {lite[0]:,}, {spec.robot.mass:g} kg each at full size"),
+    ]
+    for body, one, other in zip(spec.objects, full[1:], lite[1:], strict=True):
+        rows.append((f"particles of the object ({matter(body)})", f"{one:,} and {other:,}, {body.mass:g} kg each"))
+    rows += [
+        ("Lamé parameters μ, λ", f"{spec.mu:g} Pa, {spec.lam:g} Pa"),
+        ("yield stress", f"{spec.yield_stress:g} Pa"),
+        ("muscle stress at action 1", f"{spec.max_actuation:g} Pa"),
+        ("gravity", f"{spec.gravity[1]:g} m/s²"),
+        ("factor on node velocities in a substep", f"{spec.damping:g}"),
+        (
+            "window",
+            f"from x = {window.left:g} m" if window.follow is None else f"{window.follow:g} m behind the robot's centre",
+        ),
+        ("centre of the observed half-window", centre(spec.view)),
+        ("centre of the action patch", centre(spec.reach)),
+        ("spread at which the robot is torn", "never" if spec.split_limit is None else f"{spec.split_limit:g} m"),
+    ]
+    if spec.goal is not None:
+        rows.append(("goal, marked in the observation", f"({spec.goal[0]:g}, {spec.goal[1]:g}) m"))
+    return rows
+
+
+def matter(body: Body) -> str:
+    """What an object is made of."""
+    return "soil" if isinstance(body.material, Soil) else "elastic"
+
+
+def centre(place: tuple[float | None, float | None]) -> str:
+    """A centre in window coordinates, in words."""
+    x, y = (("the robot's" if value is None else f"{value:g} m") for value in place)
+    return f"x: {x}, y: {y}"
+
+
+def row(obstacle: Obstacle) -> tuple[str, str, str]:
+    """Name, visibility and rules of an obstacle."""
+    rules = "<br>".join(dict.fromkeys(map(rule, obstacle.rules)))
+    return obstacle.name, "yes" if obstacle.drawn else "no", rules
+
+
+def rule(rule: VelocityRule) -> str:
+    """A velocity rule in words."""
+    ways = {"+x": "to the right", "-x": "to the left", "+y": "upwards", "-y": "downwards"}
+    where = [f"{axis} {extent(low, high)}" for axis, (low, high) in (("i", rule.i), ("j", rule.j)) if (low, high) != (None, None)]
+    hold = " and sticks" if math.isinf(rule.friction) else f", friction {rule.friction:g}" if rule.friction else ""
+    frame = " of the window" if rule.frame == "window" else ""
+    return f"nothing moves {ways[rule.direction]}{hold}: {', '.join(where) or 'everywhere'}{frame}"
+
+
+def extent(low: int | None, high: int | None) -> str:
+    """An inclusive range of nodes."""
+    if low is None:
+        return f"≤ {high}"
+    if high is None:
+        return f"≥ {low}"
+    return f"{low}" if low == high else f"{low} … {high}"
+
+
+def pictures(task: str) -> None:
+    """Draw a task at rest, and film it under a wave; kept from one build to the next."""
+    rest, film = PAGES / f"{task}-rest.png", PAGES / f"{task}-wave.webp"
+    if rest.exists() and film.exists():
+        return
+    env = dittogym.TorchEnv(task, particles="lite")
+    env.reset(seed=0)
+    Image.fromarray(env.render(size=SIZE)).save(rest)
+    grid = torch.arange(float(env.action_resolution)) / env.action_resolution
+    row, column = torch.meshgrid(grid, grid, indexing="ij")
+    frames = []
+    with torch.no_grad():
+        for step in range(min(STEPS, env.spec.horizon)):
+            across, along = torch.sin(2 * math.pi * (column + 0.15 * step)), torch.cos(2 * math.pi * (row - 0.1 * step))
+            action = STRENGTH.get(task, 1.0) * torch.stack((across, along))
+            _, _, terminated, _, _ = env.step(action[None])
+            if step % EVERY == 0:
+                frames.append(Image.fromarray(env.render(muscles=True, size=SIZE)))
+            if terminated:
+                break
+    frames[0].save(film, save_all=True, append_images=frames[1:], duration=60, loop=0, quality=70)
