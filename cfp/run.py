@@ -219,7 +219,9 @@ class Run(ABC):
                     print(f"stage {level + 1} ends early: {self.config.report.patience} evaluations without a new best")
             previous = model
             if level + 1 < len(ends):
-                copy_policy(self.folder / "policy.safetensors", self.folder / f"stage{level + 1}.safetensors")
+                newest = self.folder / "policy.safetensors"
+                if read_policy(newest)[1]["stage"] == level + 1:  # else it was done before a crash in the next stage
+                    copy_policy(newest, self.folder / f"stage{level + 1}.safetensors")
                 self.position = Position(level + 1, self.position.offset + model.num_timesteps)
 
     def _plateau(self, level: int) -> bool:

@@ -12,7 +12,7 @@ from cfp import evaluate
 from cfp.callbacks import StageCallback
 from cfp.weights import read_policy, write_policy
 
-SHORT = "--steps 60 --handover 40 --eval-every 0 --log-every 10".split()
+SHORT = "--steps 80 --handover 40 --eval-every 40 --log-every 10".split()
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +41,8 @@ def test_full_disk_is_an_error_and_the_last_checkpoint_still_good(finished, tmp_
     assert error.startswith("error: [Errno 27] File too large") and "state.pt" in error
     assert not list(folder.rglob("*.part"))
     assert run(folder, *SHORT, "--resume") == 0
-    assert f"resuming {folder} at step 40 of 60" in capsys.readouterr().out
-    for name in ("progress.csv", "results.json"):
+    assert f"resuming {folder} at step 40 of 80" in capsys.readouterr().out
+    for name in ("progress.csv", "evaluations.csv", "results.json"):
         assert (folder / name).read_bytes() == (finished / name).read_bytes()
 
 
@@ -81,5 +81,5 @@ def test_first_level_of_another_ladder_is_refused(finished, tmp_path, capsys):
     assert run(folder, *SHORT, "--resolutions", "8", "16") == 0
     for suffix in ("safetensors", "json"):
         (folder / f"stage1.{suffix}").write_bytes((finished / f"stage1.{suffix}").read_bytes())
-    assert run(folder, *SHORT, "--resolutions", "8", "16", "--steps", "80", "--resume") == 2
+    assert run(folder, *SHORT, "--resolutions", "8", "16", "--steps", "100", "--resume") == 2
     assert "stage1.safetensors: weights and description do not fit" in capsys.readouterr().err
