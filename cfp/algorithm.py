@@ -23,7 +23,7 @@ from cfp.actor import Actor
 from cfp.errors import NonFiniteError
 from cfp.losses import Losses, Precision
 from cfp.networks import TwinCritic, upsample
-from cfp.policy import CFPPolicy
+from cfp.policy import CFPPolicy, NetworkPolicy
 from cfp.replay import ReplayRing
 
 METRICS: dict[str, str] = {
@@ -81,8 +81,8 @@ class CFP(SAC):
     coarse action is drawn anew in every update, and the entropy counts the residual part only, as in the reference.
 
     Args:
-        policy: `CFPPolicy` or its name.
-        env: A vectorised environment with actions (2, R, R) in [-1, 1].
+        policy: `CFPPolicy` or its name, or another `cfp.policy.NetworkPolicy`.
+        env: A vectorised environment with actions in [-1, 1]; (2, R, R) for `CFPPolicy`.
         learning_rate: Adam's step size.
         buffer_size: Transitions in the replay ring.
         update_start: Updates begin when more transitions than this are stored.
@@ -106,7 +106,7 @@ class CFP(SAC):
 
     def __init__(
         self,
-        policy: str | type[CFPPolicy],
+        policy: str | type[NetworkPolicy],
         env: GymEnv | str,
         learning_rate: float | Schedule = 3e-4,
         buffer_size: int = 200_000,
@@ -154,7 +154,7 @@ class CFP(SAC):
 
     def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
         """Actor, critics and target critics with their own types."""
-        assert isinstance(self.policy, CFPPolicy)
+        assert isinstance(self.policy, NetworkPolicy)
         return self.policy.networks()
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
@@ -223,12 +223,18 @@ class CFP(SAC):
     ) -> tuple[np.ndarray, np.ndarray]:
         # stable-baselines3 ties the random phase to the start of the updates; here they are two settings.
         actions, stored = super()._sample_action(self.random_steps, action_noise, n_envs)
-        grid = self.networks()[0].resolution
-        if self.num_timesteps < self.random_steps and grid < self.action_resolution:
-            # As coarse as the level acts: of independent pixels little would be left in the field.
-            corner = torch.as_tensor(stored[..., :grid, :grid], dtype=torch.float32)
-            actions = stored = upsample(corner, self.action_resolution, "half_pixel").numpy()
+        if self.num_timesteps < self.random_steps:
+            actions = stored = self._random(stored)
         return actions, stored
+
+    def _random(self, actions: np.ndarray) -> np.ndarray:
+        """Of uniform actions (B, 2, A, A), those of the random phase."""
+        grid = self.networks()[0].resolution
+        if grid == self.action_resolution:
+            return actions
+        # As coarse as the level acts: of independent pixels little would be left in the field.
+        corner = torch.as_tensor(actions[..., :grid, :grid], dtype=torch.float32)
+        return upsample(corner, self.action_resolution, "half_pixel").numpy()
 
     def _store_transition(
         self,

@@ -94,6 +94,24 @@ class LearningConfig:
     warm_critic: bool = False
     """Each level begins with critics and reward statistics of the one before (the reference: anew)."""
 
+    def check(self) -> None:
+        """Check what the types cannot.
+
+        Raises:
+            ConfigError: Naming the option, what was given and what is allowed.
+        """
+        at_least_one(
+            batch_size=self.batch_size,
+            buffer_size=self.buffer_size,
+            gradient_steps=self.gradient_steps,
+            update_start=self.update_start,
+        )
+        for name, share in {"gamma": self.gamma, "tau": self.tau, "momentum": self.reward_momentum}.items():
+            if not 0 <= share <= 1:
+                raise ConfigError(f"{name}: got {share}, allowed 0 to 1")
+        if self.learning_rate <= 0:
+            raise ConfigError(f"learning_rate: got {self.learning_rate}, allowed more than 0")
+
 
 @dataclass(frozen=True)
 class ReportConfig:
@@ -205,7 +223,23 @@ class StageConfig:
 
 
 @dataclass(frozen=True)
-class Config(RunConfig):
+class SACConfig(RunConfig):
+    """A run of `cfp.algorithm.CFP`, whatever its networks."""
+
+    learning: LearningConfig = field(default_factory=LearningConfig)
+
+    def stage(self, level: int) -> StageConfig:
+        """What the training of one stage needs."""
+        raise NotImplementedError
+
+    def check(self) -> None:
+        """Check what the types cannot, see `RunConfig.check`."""
+        super().check()
+        self.learning.check()
+
+
+@dataclass(frozen=True)
+class Config(SACConfig):
     """A run of CFP. Levels are listed coarsest first; one value per level unless said otherwise."""
 
     steps: int = 20_000
@@ -225,7 +259,6 @@ class Config(RunConfig):
     start_from: str | None = None
     """Policy of the first levels, a run folder or policy.safetensors: training begins with the level after it."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
-    learning: LearningConfig = field(default_factory=LearningConfig)
 
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
 
@@ -292,23 +325,8 @@ class Config(RunConfig):
         if any(late <= early for early, late in pairwise((0, *self.ends()))):
             raise ConfigError(f"handover: got {self.handover} of {self.steps} steps, allowed are growing steps between")
         super().check()
-        self._check_ranges()
-
-    def _check_ranges(self) -> None:
         if self.learning.warm_critic and self.start_from is not None:
             raise ConfigError("warm_critic: got True, allowed without start_from (a policy brings no critics)")
-        at_least_one(
-            batch_size=self.learning.batch_size,
-            buffer_size=self.learning.buffer_size,
-            gradient_steps=self.learning.gradient_steps,
-            update_start=self.learning.update_start,
-        )
-        shares = {"gamma": self.learning.gamma, "tau": self.learning.tau, "momentum": self.learning.reward_momentum}
-        for name, share in shares.items():
-            if not 0 <= share <= 1:
-                raise ConfigError(f"{name}: got {share}, allowed 0 to 1")
-        if self.learning.learning_rate <= 0:
-            raise ConfigError(f"learning_rate: got {self.learning.learning_rate}, allowed more than 0")
 
 
 def to_json(config: RunConfig) -> dict[str, Any]:
