@@ -4,6 +4,8 @@ from baselines.actor_critic import StatePolicy
 from baselines.algorithm import Algorithm, Entry
 from baselines.cem import CEM, CEMConfig, CEMPlanner, CEMPlannerConfig
 from baselines.gradient import Gradient, GradientConfig
+from baselines.modular import ModularConfig
+from baselines.modular_policy import SegmentPolicy
 from baselines.mpc import MPC, MPCConfig
 from baselines.open_loop import OpenLoop
 from baselines.planner import Planner, PlannerConfig
@@ -22,9 +24,11 @@ __all__ = [
     "Gradient",
     "GradientConfig",
     "MPCConfig",
+    "ModularConfig",
     "OpenLoop",
     "Planner",
     "PlannerConfig",
+    "SegmentPolicy",
     "Shac",
     "ShacConfig",
     "StatePolicy",

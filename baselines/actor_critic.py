@@ -86,6 +86,22 @@ def image_critic() -> nn.Module:
     return initialise(nn.Sequential(Encoder(3, 32), nn.Flatten(), perceptron(LATENT, 1)))
 
 
+def shown(env: TorchEnv | None, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[TorchEnv, bool]:
+    """The environment that a policy looks at, and whether the observation is a single image.
+
+    Raises:
+        RuntimeError: It was not shown an environment.
+        ValueError: The images are not as many as the environment has simulations.
+    """
+    if env is None:
+        raise RuntimeError("this policy sees the state of the simulation, not the image: call attached(env) first")
+    single = isinstance(observation, np.ndarray) and observation.ndim == 3
+    count = 1 if single else len(observation)
+    if count != env.num_envs:
+        raise ValueError(f"observation: got {count} images, allowed {env.num_envs} as in the environment")
+    return env, single
+
+
 class StatePolicy:
     """Acts on the state of the environment that it is shown by `attached`, not on the image.
 
@@ -143,14 +159,9 @@ class StatePolicy:
             RuntimeError: It was not shown an environment.
             ValueError: The images are not as many as the environment has simulations.
         """
-        if self.env is None:
-            raise RuntimeError("this policy sees the state of the simulation, not the image: call attached(env) first")
-        single = isinstance(observation, np.ndarray) and observation.ndim == 3
-        count = 1 if single else len(observation)
-        if count != self.env.num_envs:
-            raise ValueError(f"observation: got {count} images, allowed {self.env.num_envs} as in the environment")
+        env, single = shown(self.env, observation)
         device = next(self.actor.parameters()).device
-        mean = self.actor(self.features(self.env).float().to(device))
+        mean = self.actor(self.features(env).float().to(device))
         if not deterministic:
             mean = mean + self.noise * torch.randn_like(mean)
         actions = mean.tanh().cpu().numpy()

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import cfp
-from baselines import ladder
+from baselines import ladder, modular
 from baselines.algorithm import Entry
 from baselines.cem import CEM
 from baselines.floors import Random, Scripted, Zero
@@ -25,6 +25,10 @@ ALGORITHMS: dict[str, Entry] = {
     "cfp": Entry("image", cfp.preset, Runner, cfp.load),
     "coarse": ladder.entry("coarse"),
     "fine": ladder.entry("fine"),
+    "gnn-16": modular.entry("gnn-16"),
+    "gnn-64": modular.entry("gnn-64"),
+    "transformer-16": modular.entry("transformer-16"),
+    "transformer-64": modular.entry("transformer-64"),
     "gradient": Gradient.entry(),
     "mpc": MPC.entry(),
     "cem": CEM.entry(),

@@ -109,13 +109,52 @@ def squashed_log_prob(noise: Tensor, std: Tensor, action: Tensor) -> Tensor:
     return (normal - torch.log(1 - action.square() + 1e-6)).flatten(1).sum(1)
 
 
-class Actor(nn.Module):
-    """Stage-1 actor: a tanh-Gaussian over (2, R, R), from the observation alone.
+def draw(mean: Tensor, width: Tensor, deterministic: bool) -> tuple[Tensor, Tensor]:
+    """Draw tanh(m + s eps), the tanh-Gaussian of all actors; deterministic means eps = 0.
 
-    With head outputs z_m and z_s: mean m = z_m, std s = clip(softplus(3 z_s - 1), 0.1, 6), action tanh(m + s eps).
+    Args:
+        mean: Network output z_m, (B, ...); the mean m before tanh.
+        width: Network output z_s, the same shape; s = clip(softplus(3 z_s - 1), 0.1, 6).
+        deterministic: Without noise.
+
+    Returns:
+        The action, the same shape, and its log-density (B,).
     """
+    std = F.softplus(3 * width - 1).clamp(*STD_BOUNDS)
+    noise = torch.zeros_like(mean) if deterministic else torch.randn_like(mean)
+    action = torch.tanh(mean + std * noise)
+    return action, squashed_log_prob(noise, std, action)
+
+
+class SquashedActor(nn.Module):
+    """What soft actor-critic asks of an actor; a subclass says how it draws."""
 
     optimizer: torch.optim.Optimizer
+
+    def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
+        """Draw an action for observations with leading B."""
+        raise NotImplementedError
+
+    def trainable_parameters(self) -> list[nn.Parameter]:
+        """Parameters that an optimiser may change: all but those of frozen coarser levels."""
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def forward(self, observation: Tensor, deterministic: bool = False) -> Tensor:
+        """The action for observations with leading B."""
+        return self.sample(observation, deterministic).action
+
+    def action_log_prob(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Flat actions and log-densities (B,): what stable-baselines3's own SAC asks of an actor."""
+        sample = self.sample(observation)
+        return sample.action.flatten(1), sample.log_prob
+
+    def set_training_mode(self, mode: bool) -> None:
+        """Switch between training and evaluation; without effect on these layers, asked for by stable-baselines3."""
+        self.train(mode)
+
+
+class Actor(SquashedActor):
+    """Stage-1 actor: a tanh-Gaussian over (2, R, R), from the observation alone; see `draw`."""
 
     def __init__(self, resolution: int) -> None:
         """Create encoder (width 32 in every task) and the heads for mean and std."""
@@ -126,10 +165,6 @@ class Actor(nn.Module):
         self.std = make_head(resolution)
         initialise(self)
 
-    def trainable_parameters(self) -> list[nn.Parameter]:
-        """Parameters that an optimiser may change: all but those of frozen coarser levels."""
-        return [parameter for parameter in self.parameters() if parameter.requires_grad]
-
     def own_action(self, latent: Tensor, deterministic: bool, *heads: nn.Sequential) -> tuple[Tensor, ...]:
         """Draw tanh(m + s eps) from a latent (B, 32, 4, 4); deterministic means eps = 0.
 
@@ -137,29 +172,13 @@ class Actor(nn.Module):
             The action, its log-density, and what further heads give for the latent.
         """
         mean, width, *others = map(at_least_float32, joint.decode([self.mean, self.std, *heads], latent))
-        std = F.softplus(3 * width - 1).clamp(*STD_BOUNDS)
-        noise = torch.zeros_like(mean) if deterministic else torch.randn_like(mean)
-        action = torch.tanh(mean + std * noise)
-        return action, squashed_log_prob(noise, std, action), *others
+        return *draw(mean, width, deterministic), *others
 
     def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
         """Draw an action for uint8 observations (B, 3, 64, 64)."""
         latent = self.encoder(normalise_image(observation))
         action, log_prob = self.own_action(latent, deterministic)
         return Sample(action, log_prob, None, (action,))
-
-    def forward(self, observation: Tensor, deterministic: bool = False) -> Tensor:
-        """The action (B, 2, A, A) for uint8 observations (B, 3, 64, 64)."""
-        return self.sample(observation, deterministic).action
-
-    def action_log_prob(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Flat actions (B, 2 R R) and log-densities (B,): what stable-baselines3's own SAC asks of an actor."""
-        sample = self.sample(observation)
-        return sample.action.flatten(1), sample.log_prob
-
-    def set_training_mode(self, mode: bool) -> None:
-        """Switch between training and evaluation; without effect on these layers, asked for by stable-baselines3."""
-        self.train(mode)
 
 
 class ResidualActor(Actor):

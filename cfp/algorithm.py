@@ -24,7 +24,7 @@ from cfp.composition import Composition
 from cfp.errors import NonFiniteError
 from cfp.losses import Losses, Precision
 from cfp.networks import TwinCritic, upsample
-from cfp.policy import CFPPolicy
+from cfp.policy import CFPPolicy, NetworkPolicy
 from cfp.replay import ReplayRing
 
 METRICS: dict[str, str] = {
@@ -82,8 +82,8 @@ class CFP(SAC):
     coarse action is drawn anew in every update, and the entropy counts the residual part only, as in the reference.
 
     Args:
-        policy: `CFPPolicy` or its name.
-        env: A vectorised environment with actions (2, R, R) in [-1, 1].
+        policy: `CFPPolicy` or its name, or another `cfp.policy.NetworkPolicy`.
+        env: A vectorised environment with actions in [-1, 1]; (2, R, R) for `CFPPolicy`.
         learning_rate: Adam's step size.
         buffer_size: Transitions in the replay ring.
         update_start: Updates begin when more transitions than this are stored.
@@ -107,7 +107,7 @@ class CFP(SAC):
 
     def __init__(
         self,
-        policy: str | type[CFPPolicy],
+        policy: str | type[NetworkPolicy],
         env: GymEnv | str,
         learning_rate: float | Schedule = 3e-4,
         buffer_size: int = 200_000,
@@ -158,7 +158,7 @@ class CFP(SAC):
 
     def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
         """Actor, critics and target critics with their own types."""
-        assert isinstance(self.policy, CFPPolicy)
+        assert isinstance(self.policy, NetworkPolicy)
         return self.policy.networks()
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
@@ -231,14 +231,23 @@ class CFP(SAC):
             return self._act_in_parts(composition)
         # stable-baselines3 ties the random phase to the start of the updates; here they are two settings.
         actions, stored = super()._sample_action(self.random_steps, action_noise, n_envs)
+        if self.num_timesteps < self.random_steps:
+            return self._random(actions, stored, composition)
+        return actions, stored
+
+    def _random(
+        self, actions: np.ndarray, stored: np.ndarray, composition: Composition | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Of uniform actions (B, 2, A, A), those of the random phase, and what is stored of them."""
         grid = self.networks()[0].resolution
-        if self.num_timesteps < self.random_steps and grid < self.action_resolution:
-            # As coarse as the level acts: of independent pixels little would be left in the field.
-            corner = torch.as_tensor(stored[..., :grid, :grid], dtype=torch.float32)
-            assert isinstance(self.policy, CFPPolicy)
-            actions = stored = upsample(corner, self.action_resolution, self.policy.spec.interpolation).numpy()
-            if composition is not None:
-                stored = composition.alone(corner).numpy()
+        if grid == self.action_resolution:
+            return actions, stored
+        # As coarse as the level acts: of independent pixels little would be left in the field.
+        corner = torch.as_tensor(stored[..., :grid, :grid], dtype=torch.float32)
+        assert isinstance(self.policy, CFPPolicy)
+        actions = stored = upsample(corner, self.action_resolution, self.policy.spec.interpolation).numpy()
+        if composition is not None:
+            stored = composition.alone(corner).numpy()
         return actions, stored
 
     @torch.no_grad()

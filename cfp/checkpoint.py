@@ -12,7 +12,7 @@ import torch
 from stable_baselines3.common.vec_env import VecMonitor
 
 from cfp.algorithm import CFP
-from cfp.config import Config
+from cfp.config import RunConfig
 from cfp.replay import ReplayArchive, ReplayRing
 from cfp.state_file import Position, StateFile
 from cfp.vec_env import TorchVecEnv
@@ -32,7 +32,7 @@ class Checkpoint(StateFile):
         super().__init__(folder)
         self.archive = ReplayArchive(folder / "replay", 0)
 
-    def save(self, model: CFP, config: Config, position: Position) -> None:
+    def save(self, model: CFP, config: RunConfig, position: Position) -> None:
         """Write networks, optimisers, statistics, counters, random generators and new replay rows.
 
         Args:

@@ -13,6 +13,7 @@ from cfp.groups import EnvironmentConfig as EnvironmentConfig
 from cfp.groups import LearningConfig as LearningConfig
 from cfp.groups import NetworkConfig as NetworkConfig
 from cfp.groups import ReportConfig as ReportConfig
+from cfp.groups import at_least_one as at_least_one
 from cfp.merging import merge as merge
 from cfp.networks import RESOLUTIONS
 from dittogym import TASKS, make_spec
@@ -91,17 +92,6 @@ class RunConfig:
             raise ConfigError(f"patience: got {self.report.patience}, allowed 0, or more with evaluations (eval_every)")
 
 
-def at_least_one(**counts: int) -> None:
-    """Check counts by name.
-
-    Raises:
-        ConfigError: One is below 1.
-    """
-    for name, value in counts.items():
-        if value < 1:
-            raise ConfigError(f"{name}: got {value}, allowed 1 or more")
-
-
 @dataclass(frozen=True)
 class StageConfig:
     """One level of the ladder, as `Config.stage` cuts it out."""
@@ -120,7 +110,23 @@ LEVEL_OPTIONS = ("random_steps", "alpha", *RESIDUAL_OPTIONS)
 
 
 @dataclass(frozen=True)
-class Config(RunConfig):
+class SACConfig(RunConfig):
+    """A run of `cfp.algorithm.CFP`, whatever its networks."""
+
+    learning: LearningConfig = field(default_factory=LearningConfig)
+
+    def stage(self, level: int) -> StageConfig:
+        """What the training of one stage needs."""
+        raise NotImplementedError
+
+    def check(self) -> None:
+        """Check what the types cannot, see `RunConfig.check`."""
+        super().check()
+        self.learning.check()
+
+
+@dataclass(frozen=True)
+class Config(SACConfig):
     """A run of CFP. Levels are listed coarsest first; one value per level unless said otherwise."""
 
     steps: int = 20_000
@@ -142,7 +148,6 @@ class Config(RunConfig):
     warm_actor: str | None = None
     """Policy of one level, whatever trained it, whose weights the first level's actor begins with."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
-    learning: LearningConfig = field(default_factory=LearningConfig)
 
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
 
@@ -220,25 +225,10 @@ class Config(RunConfig):
         if any(late <= early for early, late in pairwise((0, *self.ends()))):
             raise ConfigError(f"handover: got {self.handover} of {self.steps} steps, allowed are growing steps between")
         super().check()
-        self._check_ranges()
-
-    def _check_ranges(self) -> None:
         if self.learning.warm_critic and self.start_from is not None:
             raise ConfigError("warm_critic: got True, allowed without start_from (a policy brings no critics)")
         if self.warm_actor is not None and self.start_from is not None:
             raise ConfigError("warm_actor: got a policy, allowed without start_from (which brings the first level)")
-        at_least_one(
-            batch_size=self.learning.batch_size,
-            buffer_size=self.learning.buffer_size,
-            gradient_steps=self.learning.gradient_steps,
-            update_start=self.learning.update_start,
-        )
-        shares = {"gamma": self.learning.gamma, "tau": self.learning.tau, "momentum": self.learning.reward_momentum}
-        for name, share in shares.items():
-            if not 0 <= share <= 1:
-                raise ConfigError(f"{name}: got {share}, allowed 0 to 1")
-        if self.learning.learning_rate <= 0:
-            raise ConfigError(f"learning_rate: got {self.learning.learning_rate}, allowed more than 0")
 
 
 def to_json(config: RunConfig) -> dict[str, Any]:

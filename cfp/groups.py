@@ -5,11 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from cfp.errors import ConfigError
 from cfp.losses import Precision
 from cfp.networks import Interpolation
 
 TASK_OPTIONS = ("target", "variant")
 """Fields of `EnvironmentConfig` that are options of some task."""
+
+
+def at_least_one(**counts: int) -> None:
+    """Check counts by name.
+
+    Raises:
+        ConfigError: One is below 1.
+    """
+    for name, value in counts.items():
+        if value < 1:
+            raise ConfigError(f"{name}: got {value}, allowed 1 or more")
 
 
 @dataclass(frozen=True)
@@ -87,6 +99,24 @@ class LearningConfig:
     """Run the updates through torch.compile."""
     warm_critic: bool = False
     """Each level begins with critics and reward statistics of the one before (the reference: anew)."""
+
+    def check(self) -> None:
+        """Check what the types cannot.
+
+        Raises:
+            ConfigError: Naming the option, what was given and what is allowed.
+        """
+        at_least_one(
+            batch_size=self.batch_size,
+            buffer_size=self.buffer_size,
+            gradient_steps=self.gradient_steps,
+            update_start=self.update_start,
+        )
+        for name, share in {"gamma": self.gamma, "tau": self.tau, "momentum": self.reward_momentum}.items():
+            if not 0 <= share <= 1:
+                raise ConfigError(f"{name}: got {share}, allowed 0 to 1")
+        if self.learning_rate <= 0:
+            raise ConfigError(f"learning_rate: got {self.learning_rate}, allowed more than 0")
 
 
 @dataclass(frozen=True)

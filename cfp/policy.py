@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any, cast
 
 import numpy as np
@@ -10,8 +11,9 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac import policies as sac_policies
+from torch import nn
 
-from cfp.actor import Actor, ActorSpec, build_actor
+from cfp.actor import Actor, ActorSpec, SquashedActor, build_actor
 from cfp.networks import IMAGE_SIZE, TwinCritic
 
 
@@ -25,7 +27,71 @@ def action_space(resolution: int) -> spaces.Box:
     return spaces.Box(-1.0, 1.0, (2, resolution, resolution), np.float32)
 
 
-class CFPPolicy(sac_policies.SACPolicy):
+class NetworkPolicy(sac_policies.SACPolicy, ABC):
+    """Actor, twin critics and target critics of a kind that a subclass makes, for `cfp.algorithm.CFP`.
+
+    Args:
+        observation_space: What the networks read, as it is (``normalize_images`` is off).
+        action_space: Values in [-1, 1].
+        lr_schedule: Learning rate of both optimisers as a function of the remaining progress.
+        use_sde: Accepted because stable-baselines3 passes it; must be False.
+        optimizer_class: Optimiser of actor and critics.
+        optimizer_kwargs: Its options except the learning rate; a fused Adam if None.
+
+    Raises:
+        ValueError: ``use_sde`` is set.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        use_sde: bool = False,
+        optimizer_class: type[torch.optim.Optimizer] = torch.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        """Build the networks and their optimisers."""
+        if use_sde:
+            raise ValueError("use_sde: got True, allowed False (the policy has its own exploration noise)")
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            normalize_images=False,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs={"fused": True} if optimizer_kwargs is None else optimizer_kwargs,
+        )
+
+    @abstractmethod
+    def new_actor(self) -> SquashedActor:
+        """A fresh actor."""
+
+    @abstractmethod
+    def new_critic(self) -> nn.Module:
+        """Two fresh critics, both Q-values (B, 1) each from observations and actions."""
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        """Create networks and optimisers; what is frozen in the actor gets no optimiser."""
+        rate = lr_schedule(1)
+        options = dict(self.optimizer_kwargs, lr=rate)
+        # They offer what SAC asks of its own actor and critic, without being subclasses of those.
+        actor, critic, target = self.new_actor(), *(cast(TwinCritic, self.new_critic()) for _ in range(2))
+        actor.optimizer = self.optimizer_class(actor.trainable_parameters(), **options)
+        critic.optimizer = self.optimizer_class(critic.parameters(), **options)
+        target.load_state_dict(critic.state_dict())
+        target.requires_grad_(False)
+        target.set_training_mode(False)
+        self.actor = cast(sac_policies.Actor, actor)
+        self.critic = cast(ContinuousCritic, critic)
+        self.critic_target = cast(ContinuousCritic, target)
+
+    def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
+        """Actor, critics and target critics with their own types."""
+        return cast(Actor, self.actor), cast(TwinCritic, self.critic), cast(TwinCritic, self.critic_target)
+
+
+class CFPPolicy(NetworkPolicy):
     """Actor, twin critics and target critics of the coarse-to-fine policy.
 
     Coarser levels live inside the actor as frozen submodules, so ``state_dict`` and ``predict`` cover the whole
@@ -56,8 +122,6 @@ class CFPPolicy(sac_policies.SACPolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
         """Build the networks and their optimisers."""
-        if use_sde:
-            raise ValueError("use_sde: got True, allowed False (the policy has its own exploration noise)")
         resolution = action_space.shape[-1]
         self.spec = spec or ActorSpec((resolution,))
         size = self.spec.action_size
@@ -70,32 +134,18 @@ class CFPPolicy(sac_policies.SACPolicy):
             observation_space,
             action_space,
             lr_schedule,
-            normalize_images=False,
-            optimizer_class=optimizer_class,
-            optimizer_kwargs={"fused": True} if optimizer_kwargs is None else optimizer_kwargs,
+            use_sde,
+            optimizer_class,
+            optimizer_kwargs,
         )
 
-    def _build(self, lr_schedule: Schedule) -> None:
-        """Create networks and optimisers; the frozen levels of the actor get no optimiser."""
-        rate = lr_schedule(1)
-        options = dict(self.optimizer_kwargs, lr=rate)
-        actor, critic, target = build_actor(self.spec), self._new_critic(), self._new_critic()
-        actor.optimizer = self.optimizer_class(actor.trainable_parameters(), **options)
-        critic.optimizer = self.optimizer_class(critic.parameters(), **options)
-        target.load_state_dict(critic.state_dict())
-        target.requires_grad_(False)
-        target.set_training_mode(False)
-        # They offer what SAC asks of its own actor and critic, without being subclasses of those.
-        self.actor = cast(sac_policies.Actor, actor)
-        self.critic = cast(ContinuousCritic, critic)
-        self.critic_target = cast(ContinuousCritic, target)
+    def new_actor(self) -> Actor:
+        """The ladder."""
+        return build_actor(self.spec)
 
-    def _new_critic(self) -> TwinCritic:
+    def new_critic(self) -> TwinCritic:
+        """Critics of the executed action."""
         return TwinCritic(self.spec.action_size, self.spec.split, self.spec.interpolation)
-
-    def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
-        """Actor, critics and target critics with their own types."""
-        return cast(Actor, self.actor), cast(TwinCritic, self.critic), cast(TwinCritic, self.critic_target)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {

@@ -13,24 +13,96 @@ from cfp.algorithm import CFP
 from cfp.books import Books
 from cfp.callbacks import StageCallback
 from cfp.checkpoint import Checkpoint
-from cfp.config import Config
+from cfp.config import Config, SACConfig
 from cfp.environments import choose_device, make_env
 from cfp.errors import ConfigError
 from cfp.estimate import Cost, seconds
 from cfp.pictures import policy_pictures
-from cfp.policy import ActorPolicy, CFPPolicy
+from cfp.policy import ActorPolicy, CFPPolicy, NetworkPolicy
 from cfp.replay import FIELDS
 from cfp.run import Run
 from cfp.state_file import Position
 from cfp.weights import describe, fitting, load, policy_for, read_policy, save_policy, single_level_policy, write_policy
 
 
-class Runner(Run):
-    """Trains all levels of a ladder in its folder (paper, Section 4.2), see `cfp.run.Run`."""
+class SACRun(Run):
+    """Trains `CFP` with whatever networks in its folder; a subclass makes the models and knows their policies."""
 
     checkpoint_type = Checkpoint
-    config: Config
+    config: SACConfig
     checkpoint: Checkpoint
+    model_type: type[CFP] = CFP
+
+    def build(self, level: int, env: VecMonitor, policy: type[NetworkPolicy], networks: dict[str, Any]) -> CFP:
+        """The model of a stage as its options say.
+
+        Args:
+            level: Index of the stage.
+            env: Where it acts.
+            policy: Its networks.
+            networks: Their options.
+        """
+        stage, learning = self.config.stage(level), self.config.learning
+        if learning.compile:
+            print("compiling the updates; the first time on a machine this takes minutes ...", flush=True)
+        model = self.model_type(
+            policy,
+            env,
+            learning.learning_rate,
+            learning.buffer_size,
+            update_start=learning.update_start,
+            random_steps=stage.random_steps,
+            batch_size=learning.batch_size,
+            tau=learning.tau,
+            gamma=learning.gamma,
+            gradient_steps=learning.gradient_steps,
+            alpha=stage.alpha,
+            gate_penalty=stage.gate_penalty,
+            reward_momentum=learning.reward_momentum,
+            max_grad_norm=learning.max_grad_norm,
+            precision=learning.precision,
+            compile=learning.compile,
+            policy_kwargs=networks,
+            seed=self.config.seed,
+            device=choose_device(self.config.device),
+            stats_window_size=max(10, env.num_envs),
+        )
+        model.set_logger(self.logger)
+        return model
+
+    def restore(self, model: CFP, state: dict[str, Any]) -> None:
+        """Put the state of a checkpoint into a model that has just been made."""
+        self.checkpoint.restore(model, state)
+
+    def save(self, model: CFP) -> None:
+        """Write a checkpoint of the model."""
+        self.checkpoint.save(model, self.config, self.position)
+
+    def learn(self, model: CFP, steps: int, books: Books) -> None:
+        """Train for some more steps in stable-baselines3's loop."""
+        callback = StageCallback(books, self.position.offset)
+        model.learn(steps, callback, log_interval=1 << 62, reset_num_timesteps=False)
+
+    def measure(self, model: CFP) -> Cost:
+        """Time a few steps and updates of a model that has just been made."""
+        env, buffer = model.get_env(), model.replay_buffer
+        assert env is not None and buffer is not None
+        observation, count = env.reset(), env.num_envs
+        assert isinstance(observation, np.ndarray)
+        model._last_obs = observation
+        _, stored = model._sample_action(0, None, count)
+        for _ in range(-(-model.batch_size // count)):
+            buffer.add(observation, observation, stored, np.zeros(count), np.zeros(count), [{}] * count)
+        acting = seconds(lambda: env.step(model.predict(observation)[0]))
+        updating = seconds(lambda: model.train(1, model.batch_size)) * self.config.learning.gradient_steps
+        arrays = (getattr(buffer, name) for name in FIELDS)
+        return Cost((acting + updating) / count, sum(array.nbytes for array in arrays))
+
+
+class Runner(SACRun):
+    """Trains all levels of a ladder in its folder (paper, Section 4.2), see `cfp.run.Run`."""
+
+    config: Config
     warm: ActorPolicy | None = None
     """What the first actor begins with; None if a checkpoint says more."""
 
@@ -75,7 +147,8 @@ class Runner(Run):
 
     def make_model(self, level: int) -> CFP:
         """Networks, replay memory and environment of a level, over the frozen policy of the coarser one."""
-        model = self._make_model(level, make_env(self.config, self.config.action_size(level)))
+        env = make_env(self.config, self.config.action_size(level))
+        model = self.build(level, env, CFPPolicy, {"spec": self.config.actor_spec(level)})
         if level == 0 and self.warm is not None:
             model.networks()[0].load_state_dict(self.warm.actor.state_dict())
         if level > 0:
@@ -85,66 +158,9 @@ class Runner(Run):
                 model.networks()[0].get_submodule("coarse").load_state_dict(coarse.state_dict())
         return model
 
-    def _make_model(self, level: int, env: VecMonitor) -> CFP:
-        stage, learning = self.config.stage(level), self.config.learning
-        if learning.compile:
-            print("compiling the updates; the first time on a machine this takes minutes ...", flush=True)
-        model = CFP(
-            CFPPolicy,
-            env,
-            learning.learning_rate,
-            learning.buffer_size,
-            update_start=learning.update_start,
-            random_steps=stage.random_steps,
-            batch_size=learning.batch_size,
-            tau=learning.tau,
-            gamma=learning.gamma,
-            gradient_steps=learning.gradient_steps,
-            alpha=stage.alpha,
-            gate_penalty=stage.gate_penalty,
-            reward_momentum=learning.reward_momentum,
-            max_grad_norm=learning.max_grad_norm,
-            precision=learning.precision,
-            compile=learning.compile,
-            policy_kwargs={"spec": self.config.actor_spec(level)},
-            seed=self.config.seed,
-            device=choose_device(self.config.device),
-            stats_window_size=max(10, env.num_envs),
-        )
-        model.set_logger(self.logger)
-        return model
-
-    def restore(self, model: CFP, state: dict[str, Any]) -> None:
-        """Put the state of a checkpoint into a model that has just been made."""
-        self.checkpoint.restore(model, state)
-
-    def save(self, model: CFP) -> None:
-        """Write a checkpoint of the model."""
-        self.checkpoint.save(model, self.config, self.position)
-
     def keep(self, model: CFP, level: int, step: int) -> None:
         """Write the actor as ``policy.safetensors``."""
         save_policy(self.folder / "policy.safetensors", model.networks()[0], describe(self.config, level, step))
-
-    def learn(self, model: CFP, steps: int, books: Books) -> None:
-        """Train for some more steps in stable-baselines3's loop."""
-        callback = StageCallback(books, self.position.offset)
-        model.learn(steps, callback, log_interval=1 << 62, reset_num_timesteps=False)
-
-    def measure(self, model: CFP) -> Cost:
-        """Time a few steps and updates of a model that has just been made."""
-        env, buffer = model.get_env(), model.replay_buffer
-        assert env is not None and buffer is not None
-        observation, count = env.reset(), env.num_envs
-        assert isinstance(observation, np.ndarray)
-        model._last_obs = observation
-        _, stored = model._sample_action(0, None, count)
-        for _ in range(-(-model.batch_size // count)):
-            buffer.add(observation, observation, stored, np.zeros(count), np.zeros(count), [{}] * count)
-        acting = seconds(lambda: env.step(model.predict(observation)[0]))
-        updating = seconds(lambda: model.train(1, model.batch_size)) * self.config.learning.gradient_steps
-        arrays = (getattr(buffer, name) for name in FIELDS)
-        return Cost((acting + updating) / count, sum(array.nbytes for array in arrays))
 
     def load(self, path: Path) -> ActorPolicy:
         """Load a policy of the run."""

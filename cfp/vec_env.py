@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import gymnasium
 import numpy as np
 import torch
+from gymnasium import Space
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 from torch import Tensor
@@ -44,13 +45,15 @@ class TorchVecEnv(VecEnv):
 
     Args:
         env: The environment; it is stepped without gradients.
+        spaces: Of observations and actions, if they are not images.
     """
 
-    def __init__(self, env: BatchedEnv) -> None:
+    def __init__(self, env: BatchedEnv, spaces: tuple[Space[Any], Space[Any]] | None = None) -> None:
         """Take over an environment."""
         self.torch_env = env
         self.render_mode = "rgb_array"
-        super().__init__(env.num_envs, observation_space(), action_space(env.action_resolution))
+        own = (observation_space(), action_space(env.action_resolution)) if spaces is None else spaces
+        super().__init__(env.num_envs, *own)
         self._actions: Tensor | None = None
 
     @torch.no_grad()

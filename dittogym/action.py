@@ -64,6 +64,18 @@ def _bicubic_matrix(before: int, after: int, align_corners: bool, dtype: torch.d
     return image[:, 0, :, 0].T.contiguous().to(device, dtype)
 
 
+def patch_corner(centre: Tensor, patch: int, nodes: int) -> Tensor:
+    """First node along x and y, (B, 2) int64, of a patch that is kept whole inside the window.
+
+    Args:
+        centre: (B, 2) where its centre belongs, in window coordinates, m (the window is 1 m wide).
+        patch: Its width in nodes.
+        nodes: Nodes per axis of the window.
+    """
+    # The conversion truncates, as in the reference.
+    return (nodes * centre.detach() - patch / 2).to(torch.int64).clamp(0, nodes - patch)
+
+
 def place(field: Tensor, centre: Tensor, nodes: int) -> Tensor:
     """Put patches on the nodes of the window.
 
@@ -76,8 +88,7 @@ def place(field: Tensor, centre: Tensor, nodes: int) -> Tensor:
         (B, 2, nodes, nodes); zero off the patch, which is kept whole inside the window.
     """
     batch, _, patch, _ = field.shape
-    # The conversion truncates, as in the reference.
-    i, j = (nodes * centre.detach() - patch / 2).to(torch.int64).clamp(0, nodes - patch).split(1, dim=1)
+    i, j = patch_corner(centre, patch, nodes).split(1, dim=1)
     ids = i * nodes + j + _patch_ids(patch, nodes, field.device)
     result = field.new_zeros(batch, 2, nodes * nodes)
     return result.scatter(2, ids[:, None].expand(-1, 2, -1), field.flatten(2)).unflatten(2, (nodes, nodes))

@@ -48,8 +48,8 @@ batch = dittogym.TorchEnv("[[ spec.name ]]", num_envs=16, particles="lite")
 [% endfor %]
 ## Geometry
 
-Node ranges are inclusive and counted from the world's origin, 128 to the metre; of several rules for one direction the first that covers a node
-counts.
+Node ranges are inclusive and counted from the world's origin, 128 to the metre; of several rules for one direction
+the first that covers a node counts.
 
 | Obstacle | Seen by the robot | Rules |
 | --- | --- | --- |
@@ -94,11 +94,16 @@ def write(path: Path, text: str) -> None:
 
 def summary() -> str:
     """A table of all tasks."""
-    lines = ["| Task | What to do | Steps | Coarse, fine | Bodies beside the robot |", "| --- | --- | --- | --- | --- |"]
+    lines = [
+        "| Task | What to do | Steps | Coarse, fine | Bodies beside the robot |",
+        "| --- | --- | --- | --- | --- |",
+    ]
     for name in dittogym.TASKS:
         spec, (_, what) = dittogym.make_spec(name), headline(name)
         objects = ", ".join(matter(body) for body in spec.objects)
-        lines.append(f"| [`{name}`](generated/{name}.md) | {what} | {spec.horizon} | {spec.coarse}, {spec.fine} | {objects} |")
+        lines.append(
+            f"| [`{name}`](generated/{name}.md) | {what} | {spec.horizon} | {spec.coarse}, {spec.fine} | {objects} |"
+        )
     return "\n".join(lines) + "\n"
 
 
@@ -116,7 +121,10 @@ def numbers(spec: TaskSpec) -> list[tuple[str, str]]:
         ("steps of an episode", f"{spec.horizon}"),
         ("action grid, coarse and fine", f"{spec.coarse} × {spec.coarse} and {spec.fine} × {spec.fine}, two muscles"),
         ("width of the patch that actions cover", f"{spec.patch} nodes"),
-        ("particles of the robot, full and lite", f"{full[0]:,} and {lite[0]:,}, {spec.robot.mass:g} kg each at full size"),
+        (
+            "particles of the robot, full and lite",
+            f"{full[0]:,} and {lite[0]:,}, {spec.robot.mass:g} kg each at full size",
+        ),
     ]
     for body, one, other in zip(spec.objects, full[1:], lite[1:], strict=True):
         rows.append((f"particles of the object ({matter(body)})", f"{one:,} and {other:,}, {body.mass:g} kg each"))
@@ -128,7 +136,9 @@ def numbers(spec: TaskSpec) -> list[tuple[str, str]]:
         ("factor on node velocities in a substep", f"{spec.damping:g}"),
         (
             "window",
-            f"from x = {window.left:g} m" if window.follow is None else f"{window.follow:g} m behind the robot's centre",
+            f"from x = {window.left:g} m"
+            if window.follow is None
+            else f"{window.follow:g} m behind the robot's centre",
         ),
         ("centre of the observed half-window", centre(spec.view)),
         ("centre of the action patch", centre(spec.reach)),
@@ -159,7 +169,11 @@ def row(obstacle: Obstacle) -> tuple[str, str, str]:
 def rule(rule: VelocityRule) -> str:
     """A velocity rule in words."""
     ways = {"+x": "to the right", "-x": "to the left", "+y": "upwards", "-y": "downwards"}
-    where = [f"{axis} {extent(low, high)}" for axis, (low, high) in (("i", rule.i), ("j", rule.j)) if (low, high) != (None, None)]
+    where = [
+        f"{axis} {extent(low, high)}"
+        for axis, (low, high) in (("i", rule.i), ("j", rule.j))
+        if (low, high) != (None, None)
+    ]
     hold = " and sticks" if math.isinf(rule.friction) else f", friction {rule.friction:g}" if rule.friction else ""
     frame = " of the window" if rule.frame == "window" else ""
     return f"nothing moves {ways[rule.direction]}{hold}: {', '.join(where) or 'everywhere'}{frame}"

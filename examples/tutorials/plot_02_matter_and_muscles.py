@@ -2,13 +2,14 @@ r"""
 Elastic, plastic, muscle
 ========================
 
-Three squares are pulled by the same muscles for 25 ms and left alone for 125 ms. The elastic one springs back, the plastic
-one keeps its new shape, and a third, whose yield stress is higher, keeps some of it.
+Three squares are pulled by the same muscles for 25 ms and left alone for 125 ms. The elastic one springs back, the
+plastic one keeps its new shape, and a third, whose yield stress is higher, keeps some of it.
 """
 
 # %%
-# A muscle is a stress along a direction of the matter, given as a field on the nodes of the grid: `[:, 0]` pulls along
-# the material's x, `[:, 1]` along its y. Positive values contract. Which bodies it acts on is said with `muscle=True`.
+# A muscle is a stress along a direction of the matter, given as a field on the nodes of the grid: `[:, 0]` pulls
+# along the material's x, `[:, 1]` along its y. Positive values contract. Which bodies it acts on is said with
+# `muscle=True`.
 
 import matplotlib.pyplot as plt
 import torch
@@ -59,8 +60,8 @@ for axis, (name, state) in zip(axes[1:], ends.items(), strict=True):
 figure.tight_layout()
 
 # %%
-# The yield stress bounds the elastic strain: the deviatoric strain in a particle never exceeds ``yield_stress / (2 mu)``.
-# Flow keeps the volume, so the plastic square has the area it started with.
+# The yield stress bounds the elastic strain: the deviatoric strain in a particle never exceeds ``yield_stress / (2
+# mu)``. Flow keeps the volume, so the plastic square has the area it started with.
 
 for name, state in ends.items():
     F = state.F[0]

@@ -2,13 +2,13 @@ r"""
 Gradients through the muscles
 =============================
 
-Which pull makes the robot jump? Every step is differentiable in the action, the state and the matter, so ask for the gradient of
-a height and follow it.
+Which pull makes the robot jump? Every step is differentiable in the action, the state and the matter, so ask for the
+gradient of a height and follow it.
 """
 
 # %%
-# The graph of a control step holds its hundred substeps; `torchmpm.estimate_memory` says how much memory that takes. Here
-# ten steps in a row, small ones: 50 substeps each.
+# The graph of a control step holds its hundred substeps; `torchmpm.estimate_memory` says how much memory that takes.
+# Here ten steps in a row, small ones: 50 substeps each.
 
 import matplotlib.pyplot as plt
 import torch

@@ -2,13 +2,14 @@ r"""
 Match a shape by gradient
 =========================
 
-SHAPE MATCH asks a disc to become a star. Thirty actions of 2 x 16 x 16 numbers are 15,360 unknowns: hopeless by trial, easy by
-gradient. This is the method of ``python -m baselines.train --algo gradient``, cut down to its core and to half a minute.
+SHAPE MATCH asks a disc to become a star. Thirty actions of 2 x 16 x 16 numbers are 15,360 unknowns: hopeless by
+trial, easy by gradient. This is the method of ``python -m baselines.train --algo gradient``, cut down to its core and
+to half a minute.
 """
 
 # %%
-# The silhouette that the reward counts is made of pixels that are on or off, so its derivative is zero. `soft_silhouette` is
-# the smooth one; blurring it and the target lets matter feel where a missing arm should grow.
+# The silhouette that the reward counts is made of pixels that are on or off, so its derivative is zero.
+# `soft_silhouette` is the smooth one; blurring it and the target lets matter feel where a missing arm should grow.
 
 import matplotlib.pyplot as plt
 import torch
@@ -50,8 +51,8 @@ def episode(theta: torch.Tensor, width: float) -> tuple[torch.Tensor, float]:
 
 
 # %%
-# Each step's gradient is clipped to three times its usual norm: where matter tears, derivatives are many times larger and
-# say little.
+# Each step's gradient is clipped to three times its usual norm: where matter tears, derivatives are many times larger
+# and say little.
 
 theta = torch.zeros(env.spec.horizon, *env.action_shape, requires_grad=True)
 adam = torch.optim.Adam([theta], lr=0.1, betas=(0.9, 0.98))

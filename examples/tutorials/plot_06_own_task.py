@@ -7,8 +7,9 @@ success, and then works like the eight others: with Gymnasium, in batches, with 
 """
 
 # %%
-# The function gets a :class:`dittogym.spec.Moment` and returns named terms, one number for each simulation of the batch. What all
-# tasks share, the cost of actions, the end of a torn robot and the term for staying alive, is added by the engine as the weights say.
+# The function gets a :class:`dittogym.spec.Moment` and returns named terms, one number for each simulation of the
+# batch. What all tasks share, the cost of actions, the end of a torn robot and the term for staying alive, is added
+# by the engine as the weights say.
 
 import dataclasses
 
@@ -52,7 +53,8 @@ for _ in range(20):
 print(f"resting robot: return {total:.2f}, terms {sorted(info['reward_terms'])}, ended {terminated or truncated}")
 
 # %%
-# The same task as a differentiable function: because ``judge`` is made of torch operations, its reward can be climbed.
+# The same task as a differentiable function: because ``judge`` is made of torch operations, its reward can be
+# climbed.
 
 batch = dittogym.TorchEnv("hop", particles="lite")
 theta = torch.zeros(20, *batch.action_shape, requires_grad=True)

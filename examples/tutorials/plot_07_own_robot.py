@@ -2,13 +2,13 @@ r"""
 Your own robot from a drawing
 =============================
 
-A robot's body is a picture: a file, an array, or the corners of an outline. Here a stool, a ring and a boot are driven by the
-same wave in the same task.
+A robot's body is a picture: a file, an array, or the corners of an outline. Here a stool, a ring and a boot are
+driven by the same wave in the same task.
 """
 
 # %%
-# Bright pixels are the robot. The body gets the area of the task's own and stands where that stood, so that rewards and limits keep
-# their meaning.
+# Bright pixels are the robot. The body gets the area of the task's own and stands where that stood, so that rewards
+# and limits keep their meaning.
 
 import math
 import tempfile
@@ -64,8 +64,8 @@ figure.tight_layout()
 print({name: f"{100 * far:.1f} cm" for name, far in reached.items()})
 
 # %%
-# The same options work in `gymnasium.make`. A target for SHAPE MATCH is given in the same forms; its centre of mass should be in the
-# middle of the picture, because that is where the robot stays.
+# The same options work in `gymnasium.make`. A target for SHAPE MATCH is given in the same forms; its centre of mass
+# should be in the middle of the picture, because that is where the robot stays.
 
 row, column = np.mgrid[-32:32, -32:32]
 plus = ((abs(row) < 5) & (abs(column) < 16)) | ((abs(column) < 5) & (abs(row) < 16))

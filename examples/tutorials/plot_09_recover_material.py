@@ -2,9 +2,9 @@ r"""
 Recover a material
 ==================
 
-Which matter is this robot made of, judging by its silhouettes alone? A robot of unknown stiffness and yield stress is driven by known
-muscles and filmed. Gradient descent through the simulation finds the constants with which a simulated robot, filled
-with other particles, makes the same film.
+Which matter is this robot made of, judging by its silhouettes alone? A robot of unknown stiffness and yield stress is
+driven by known muscles and filmed. Gradient descent through the simulation finds the constants with which a simulated
+robot, filled with other particles, makes the same film.
 """
 
 # %%
@@ -35,8 +35,8 @@ def muscles() -> Tensor:
 
 
 # %%
-# Constants of the matter are options of ``reset``. A tensor that requires gradients is differentiated through: the film's graph
-# reaches back to it.
+# Constants of the matter are options of ``reset``. A tensor that requires gradients is differentiated through: the
+# film's graph reaches back to it.
 
 
 def film(env: dittogym.TorchEnv, seed: int, physics: dict[str, Tensor]) -> Tensor:
@@ -82,6 +82,8 @@ for axis, (name, true), values in zip(axes[1:], TRUTH.items(), torch.stack(histo
     axis.set(xlabel="iteration", title=f"{name}, Pa")
 figure.tight_layout()
 for name, true in TRUTH.items():
-    print(f"{name}: true {true:.1f} Pa, guess {GUESS[name]:.1f}, found {found[name]:.1f} ({found[name] / true - 1:+.1%})")
+    print(
+        f"{name}: true {true:.1f} Pa, guess {GUESS[name]:.1f}, found {found[name]:.1f} ({found[name] / true - 1:+.1%})"
+    )
 
 assert all(abs(found[name] / true - 1) < 0.05 for name, true in TRUTH.items())

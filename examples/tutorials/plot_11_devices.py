@@ -2,8 +2,8 @@ r"""
 On a GPU, and on a cluster
 ==========================
 
-The same program runs on a laptop's CPU and on a GPU: say ``device="cuda"``. What changes is how many robots it takes to fill the machine. This
-page measures that where it was built.
+The same program runs on a laptop's CPU and on a GPU: say ``device="cuda"``. What changes is how many robots it takes
+to fill the machine. This page measures that where it was built.
 """
 
 # %%
@@ -40,8 +40,8 @@ def throughput(num_envs: int, gradient: bool = False) -> float:
 
 
 # %%
-# A step of one robot cannot be spread well over many cores, a batch can: each robot is independent. On a GPU go on doubling
-# until the curve is flat, or memory ends: `torchmpm.estimate_memory` says beforehand what gradients take.
+# A step of one robot cannot be spread well over many cores, a batch can: each robot is independent. On a GPU go on
+# doubling until the curve is flat, or memory ends: `torchmpm.estimate_memory` says beforehand what gradients take.
 
 sizes = (1, 2, 4, 8, 16, 32)
 forward = [throughput(size) for size in sizes]
@@ -57,9 +57,9 @@ figure.tight_layout()
 # On the command line
 # -------------------
 #
-# ``python -m cfp.train --task run --device cuda --num-envs 256`` simulates and learns on the GPU. One run does not spread over
-# several GPUs or machines; many runs do: ``python -m baselines.compare --executor ray`` hands them to a Ray cluster, and a Slurm
-# array starts one command for each.
+# ``python -m cfp.train --task run --device cuda --num-envs 256`` simulates and learns on the GPU. One run does not
+# spread over several GPUs or machines; many runs do: ``python -m baselines.compare --executor ray`` hands them to a
+# Ray cluster, and a Slurm array starts one command for each.
 
 for size, alone, both in zip(sizes, forward, backward, strict=True):
     print(f"{size:3d} robots: {alone:7.0f} steps/s, with the gradient {both:6.0f}")

@@ -19,6 +19,10 @@ LEVEL = (
     "--num-envs 2 --resolutions 8 --steps 60 --random-steps 10 --batch-size 4 --buffer-size 60 --update-start 8 "
     "--gradient-steps 1 --eval-every 20 --checkpoint-every 10 --log-every 10 --backend eager"
 )
+MODULAR = (
+    "--num-envs 2 --steps 60 --random-steps 10 --batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 "
+    "--eval-every 20 --checkpoint-every 10 --log-every 10"
+)
 # A tiny run of each algorithm: options, a step at which it is stopped, its policies.
 TINY = {
     "cfp": (
@@ -52,6 +56,10 @@ TINY = {
         60,
         ["stage 1"],
     ),
+    "gnn-16": (MODULAR, 44, ["stage 1"]),
+    "gnn-64": (MODULAR, 44, ["stage 1"]),
+    "transformer-16": (MODULAR, 44, ["stage 1"]),
+    "transformer-64": (MODULAR, 44, ["stage 1"]),
     "zero": ("--grid 8", 1, ["stage 1"]),
     "random": ("--grid 8", 1, ["stage 1"]),
     "scripted": ("--grid 8", 1, ["stage 1"]),

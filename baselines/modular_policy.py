@@ -1,0 +1,112 @@
+"""A trained modular policy by itself."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from baselines.actor_critic import shown
+from baselines.modular_env import segmented
+from baselines.modular_networks import ModularActor
+from baselines.nodes import Nodes
+from baselines.segments import follow
+from cfp.weights import fitting, read_policy, write_policy
+from dittogym import TorchEnv
+
+
+class SegmentPolicy:
+    """Acts on the segments of the robots in the environment that it is shown by `attached`, not on the image.
+
+    Its memory is the segmentation: hand the second result of `predict` back as ``state``, or robots are segmented anew.
+
+    Args:
+        actor: The network.
+        nodes: How segments are seen and act.
+        description: What it is and comes from.
+        env: Where it looks.
+    """
+
+    def __init__(
+        self, actor: ModularActor, nodes: Nodes, description: dict[str, Any] | None = None, env: TorchEnv | None = None
+    ) -> None:
+        self.actor, self.nodes, self.env = actor, nodes, env
+        self.description = description or {}
+
+    @property
+    def resolution(self) -> int:
+        """Action grid R of the environment that it acts in."""
+        return int(self.description["resolution"])
+
+    @property
+    def deterministic_by_default(self) -> bool:
+        """Whether the run that trained it evaluates it without noise."""
+        return bool(self.description.get("deterministic", False))
+
+    def attached(self, env: TorchEnv) -> SegmentPolicy:
+        """The same policy, looking at an environment.
+
+        Raises:
+            ValueError: Another task's environment, with other things to see.
+        """
+        found, features = self.nodes.features(env.spec), self.actor.trunk.features
+        if found != features:
+            raise ValueError(f"env: got {env.spec.name!r} with {found} features, allowed {features}")
+        return SegmentPolicy(self.actor, self.nodes, self.description, env)
+
+    @torch.no_grad()
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Actions (B, 2, P, P) for the state of the attached environment, as stable-baselines3's ``predict``.
+
+        Args:
+            observation: (B, 3, 64, 64) or (3, 64, 64); only the number of images matters.
+            state: What the last call returned, None at the beginning: the segment of every particle, (B, N).
+            episode_start: (B,) bool, which elements begin anew.
+            deterministic: Without noise.
+
+        Raises:
+            RuntimeError: It was not shown an environment.
+            ValueError: The images are not as many as the environment has simulations.
+        """
+        env, single = shown(self.env, observation)
+        anew = np.ones(env.num_envs, bool) if state is None else np.zeros(env.num_envs, bool)
+        if episode_start is not None:
+            anew |= episode_start
+        labels: Tensor | None = None
+        if state is not None:
+            labels = torch.as_tensor(state[0], device=env.device)
+            labels = follow(env.state.x[:, : env.model.robot], labels, self.nodes.count)
+        labels = segmented(env, self.nodes, labels, torch.as_tensor(anew, device=env.device))
+        device = next(self.actor.parameters()).device
+        values = self.actor(self.nodes(env, labels).to(device), deterministic).to(env.device)
+        actions = self.nodes.act(env, labels, values).float().cpu().numpy()
+        return actions[0] if single else actions, (labels.cpu().numpy(),)
+
+    def save(self, path: Path) -> None:
+        """Write ``path`` (``.safetensors``) and the ``.json`` beside it."""
+        trunk = self.actor.trunk
+        own = {"nodes": dataclasses.asdict(self.nodes), "network": {"kind": trunk.kind, "features": trunk.features}}
+        write_policy(path, self.actor.state_dict(), self.description | own)
+
+    @classmethod
+    def load(cls, path: Path, device: str = "cpu") -> SegmentPolicy:
+        """Load what `save` wrote.
+
+        Raises:
+            CheckpointError: No such file, a damaged one, or one that is not such a policy.
+        """
+        tensors, description = read_policy(path, device)
+        with fitting(path):
+            actor = ModularActor(**description["network"])
+            actor.load_state_dict(tensors)
+            return cls(actor.to(device).requires_grad_(False), Nodes(**description["nodes"]), description)

@@ -1,0 +1,180 @@
+"""Modular policies: their networks, their updates, and the policy on its own."""
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+import baselines
+import cfp
+from baselines.modular import ModularConfig, ModularRun
+from baselines.modular_networks import ModularActor, ModularCritics
+from baselines.modular_policy import SegmentPolicy
+from baselines.nodes import Nodes, pack
+from cfp.config import EnvironmentConfig, ReportConfig
+from cfp.errors import CheckpointError, ConfigError
+from cfp.process import StopSignals
+from dittogym import TorchEnv
+
+KINDS = ("gnn", "transformer")
+FEATURES = 10
+
+
+def rows(batch, count, kind):
+    generator = torch.Generator().manual_seed(0)
+    features = torch.randn(batch, count, FEATURES, generator=generator)
+    if kind != "gnn":
+        return features, None
+    edges = torch.rand(batch, count, count, generator=generator) < 0.3
+    edges = edges | edges.transpose(1, 2)
+    return torch.cat((features, pack(edges)), -1), (features, edges)
+
+
+def permuted(kind, data, parts, order):
+    if kind != "gnn":
+        return data[:, order]
+    features, edges = parts
+    return torch.cat((features[:, order], pack(edges[:, order][:, :, order])), -1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("count", [16, 64])
+def test_permutation_of_segments_permutes_the_actions(kind, count):
+    torch.manual_seed(0)
+    actor, critics = ModularActor(kind, FEATURES), ModularCritics(kind, FEATURES)
+    data, parts = rows(3, count, kind)
+    order = torch.randperm(count)
+    other = permuted(kind, data, parts, order)
+    actions = actor(data, True)
+    assert actions.shape == (3, count, 2) and actions.std() > 1e-3
+    assert torch.allclose(actor(other, True), actions[:, order], atol=1e-5)
+    for value, same in zip(critics(data, actions), critics(other, actions[:, order].flatten(1)), strict=True):
+        assert value.shape == (3, 1) and torch.allclose(value, same, atol=1e-5)
+
+
+def test_messages_go_along_edges_only():
+    torch.manual_seed(0)
+    actor = ModularActor("gnn", FEATURES)
+    features = torch.randn(1, 6, FEATURES)
+    edges = torch.zeros(1, 6, 6, dtype=torch.bool)
+    for i in range(5):  # a chain; three rounds reach three nodes far
+        edges[0, i, i + 1] = edges[0, i + 1, i] = True
+    changed = features.clone()
+    changed[0, 0] += 1.0
+    before, after = (actor(torch.cat((each, pack(edges)), -1), True)[0] for each in (features, changed))
+    moved = (before - after).abs().amax(-1) > 1e-7
+    assert moved.tolist() == [True, True, True, True, False, False]
+
+
+@pytest.mark.parametrize(("kind", "actor", "critics"), [("gnn", 67_972, 300_546), ("transformer", 416_132, 996_866)])
+def test_networks_have_the_documented_sizes(kind, actor, critics):
+    """For 10 features; the same for 16 and 64 segments, whose weights are shared. The paper gives no sizes."""
+    found = [sum(p.numel() for p in network(kind, FEATURES).parameters()) for network in (ModularActor, ModularCritics)]
+    assert found == [actor, critics]
+
+
+def config(algo, **changes):
+    base = baselines.ALGORITHMS[algo].preset("run", "quick")
+    return replace(
+        base,
+        device="cpu",
+        steps=40,
+        random_steps=10,
+        environment=EnvironmentConfig(num_envs=2, particles=200, substeps=2),
+        report=ReportConfig(0, 1, video=False, checkpoint_every=20, log_every=20),
+        learning=replace(base.learning, batch_size=8, buffer_size=60, update_start=8),
+        **changes,
+    )
+
+
+def model_of(algo, folder):
+    with StopSignals() as signals:
+        return ModularRun(config(algo), folder, False, signals).make_model(0)
+
+
+@pytest.mark.parametrize("algo", ["gnn-16", "transformer-16"])
+def test_updates_reduce_the_critic_loss_of_a_fixed_batch(algo, tmp_path):
+    model = model_of(algo, tmp_path / "run")
+    env, generator = model.get_env(), torch.Generator().manual_seed(0)
+    now = torch.as_tensor(env.reset()).repeat(8, 1, 1)
+    now[..., :FEATURES] += torch.randn(now[..., :FEATURES].shape, generator=generator)
+    count = now.shape[1]
+    actions = 2 * torch.rand(16, 2 * count, generator=generator) - 1
+    rewards = actions.mean(1, keepdim=True)
+    batch = ReplayBufferSamples(now, actions, now, torch.ones(16, 1), rewards)
+    weights = copy.deepcopy(model.networks()[0].state_dict())
+    losses = [float(model.update(batch)["critic_loss"]) for _ in range(40)]
+    assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
+    assert any(not torch.equal(weights[name], value) for name, value in model.networks()[0].state_dict().items())
+
+
+def test_replay_holds_rows_and_node_actions(tmp_path):
+    model = model_of("gnn-64", tmp_path / "run")
+    model.learn(20)
+    buffer = model.replay_buffer
+    assert buffer.observations.shape[1:] == (2, 64, 14) and buffer.actions.shape[1:] == (2, 128)
+    assert np.isfinite(buffer.observations[:10]).all() and np.abs(buffer.actions[:10]).max() > 0
+    assert np.array_equal(buffer.next_observations[:9], buffer.observations[1:10])
+
+
+def test_policy_of_a_file_acts_like_the_one_in_training(tmp_path):
+    """In the training environment and attached to one of its own, step by step."""
+    model = model_of("gnn-16", tmp_path / "run")
+    nodes = Nodes(16, True)
+    description = {"format": "cfp-policy", "version": 1, "kind": "gnn-16", "resolution": 64}
+    SegmentPolicy(model.networks()[0], nodes, description).save(tmp_path / "a.safetensors")
+    policy = baselines.load(tmp_path / "a.safetensors")
+    env = TorchEnv("run", 2, 64, particles=200, substeps=2)
+    env.reset(seed=0)
+    venv = model.get_env()
+    venv.seed(0)
+    seen, memory, images = venv.reset(), None, np.zeros((2, 3, 64, 64), np.uint8)
+    for step in range(5):
+        start = np.full(2, step == 0)
+        action, memory = policy.attached(env).predict(images, memory, start, True)
+        with torch.no_grad():
+            env.step(torch.as_tensor(action))
+        seen = venv.step(model.predict(seen, deterministic=True)[0])[0]
+    assert torch.allclose(env.state.x, venv.unwrapped.torch_env.env.state.x, atol=1e-6)
+    assert np.array_equal(memory[0].shape, (2, 200)) and action.shape == (2, 2, 64, 64)
+
+
+def test_policy_must_be_shown_its_own_kind_of_task(tmp_path):
+    policy = SegmentPolicy(ModularActor("gnn", FEATURES), Nodes(16, True), {"resolution": 64})
+    with pytest.raises(RuntimeError, match="call attached"):
+        policy.predict(np.zeros((1, 3, 64, 64), np.uint8))
+    env = TorchEnv("catch", 1, 64, particles=(100, 20))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="env: got 'catch' with 16 features, allowed 10"):
+        policy.attached(env)
+    policy.save(tmp_path / "a.safetensors")
+    with pytest.raises(CheckpointError, match="description"):
+        SegmentPolicy.load(tmp_path / "a.safetensors")
+
+
+@pytest.mark.parametrize("algo", ["gnn-16", "gnn-64", "transformer-16", "transformer-64"])
+def test_presets_learn_as_the_first_stage_does(algo):
+    assert baselines.ALGORITHMS[algo].sees == "state"
+    for task in cfp.presets.TASKS:
+        for name in ("quick", "paper"):
+            mine, ladder = baselines.ALGORITHMS[algo].preset(task, name), cfp.preset(task, name)
+            mine.check()
+            assert (mine.learning, mine.environment, mine.steps) == (ladder.learning, ladder.environment, ladder.steps)
+            assert (mine.alpha, mine.random_steps) == (ladder.alpha[0], ladder.random_steps[0])
+            assert mine.segments == int(algo[-2:])
+
+
+@pytest.mark.parametrize("algo", ["gnn", "gnn-x", "mlp-16", "gnn-1"])
+def test_bad_names_are_refused(algo):
+    with pytest.raises(ConfigError, match=f"algo: got {algo!r}, allowed gnn or transformer"):
+        ModularConfig(algo=algo, task="run").check()
+
+
+def test_fewer_particles_than_segments_are_refused():
+    for particles in (63, (63, 100)):
+        options = ModularConfig(algo="gnn-64", task="kick", environment=EnvironmentConfig(particles=particles))
+        with pytest.raises(ConfigError, match="particles: got 63 of the robot, allowed 64"):
+            options.check()
