@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import signal
 import sys
 from collections.abc import Sequence
@@ -183,7 +184,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
     keep_memory()
     try:
-        about = f"Algorithms: {', '.join(ALGORITHMS)}.\n\n{Command.__doc__}"
+        about = f"Algorithms: {', '.join(ALGORITHMS)}.\n\n{inspect.getdoc(Command)}"
         return compare(tyro.cli(Command, prog="python -m baselines.compare", description=about, args=arguments))
     except CFPError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -21,7 +21,7 @@ from baselines.compare.judging import Judging, judge
 from baselines.compare.plan import Job, check_there, read_sessions
 from baselines.registry import configure, open_run
 from cfp.claim import Claimed, claim
-from cfp.config import RunConfig
+from cfp.config import RunConfig, to_json
 from cfp.environments import choose_device
 from cfp.files import write_json, write_text
 from cfp.process import Stopped, StopSignals, keep_memory, peak_memory
@@ -38,8 +38,6 @@ def describe(job: Job, judging: Judging, patience: float) -> dict[str, Any]:
         judging: How it is judged.
         patience: Seconds to wait for another process that holds the folder.
     """
-    from cfp.config import to_json
-
     return {
         "label": job.label,
         "folder": str(job.folder),
