@@ -2,6 +2,7 @@
 
 from baselines.actor_critic import StatePolicy
 from baselines.algorithm import Algorithm, Entry
+from baselines.distillation import Distill, DistillConfig
 from baselines.gradient import Gradient, GradientConfig
 from baselines.mpc import MPC, MPCConfig
 from baselines.open_loop import OpenLoop
@@ -13,6 +14,8 @@ __all__ = [
     "ALGORITHMS",
     "MPC",
     "Algorithm",
+    "Distill",
+    "DistillConfig",
     "Entry",
     "Gradient",
     "GradientConfig",

@@ -73,11 +73,9 @@ class MPC(Algorithm):
 
     def __init__(self, config: MPCConfig, level: int = 0, start: Any = None) -> None:
         self.config = config
-        environment = config.environment
         self.env = make_torch_env(config, config.resolution(0), 1)
         self.env.reset(seed=config.seed)
-        layout = environment.action_layout or ("grid" if environment.parity == "reference" else "image")
-        self.planner = Planner(self.env, config.planner, seed=config.seed, layout=layout)
+        self.planner = Planner(self.env, config.planner, seed=config.seed, layout=config.environment.layout)
         self.period = config.planner.commit  # all its planning is in the first of these steps
         self.actions = torch.zeros(0, *self.env.action_shape)
         self.total, self.reward, self.over = 0.0, 0.0, False

@@ -108,6 +108,11 @@ class Planner:
         self._position += 1
         return self._ahead[self._position - 1]
 
+    @property
+    def fresh(self) -> bool:
+        """Whether the last action was the first of its plan."""
+        return self._position == 1
+
     def forget(self) -> None:
         """Drop the present plan, for a new episode."""
         self._ahead, self._position = self._fresh(self.config.horizon), self.config.commit

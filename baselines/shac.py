@@ -106,8 +106,7 @@ class ShacConfig(RunConfig):
     def training(self) -> EnvironmentConfig:
         """Where it is trained: evenly spread particles and no stale values, actions as where it is judged."""
         own = self.environment
-        layout = own.action_layout or ("grid" if own.parity == "reference" else "image")
-        return replace(own, particles=self.tier, parity="clean", action_layout=layout)
+        return replace(own, particles=self.tier, parity="clean", action_layout=own.layout)
 
     def check(self) -> None:
         """Check what the types cannot, see `RunConfig.check`."""

@@ -37,7 +37,7 @@ METRICS: dict[str, str] = {
     "train/gate": "mean gate of the residual actor: 0 keeps the coarse action, 1 replaces it",
     "train/gate_penalty": "gate penalty inside the actor loss",
     "train/n_updates": "gradient updates so far in this stage",
-    "train/learning_rate": "learning rate of actor and critics",
+    "train/learning_rate": "learning rate of the critics, and of the actor unless it has its own",
 }
 """Every scalar that `CFP.train` logs, and what it means."""
 
@@ -94,6 +94,8 @@ class CFP(SAC):
         alpha: Temperature, a constant.
         gate_penalty: Weight rho of ``mean ||g||_2 / R`` in the actor loss (stage 2).
         reward_momentum: Momentum of the reward statistics.
+        actor_rate: Adam's step size for the actor; None: ``learning_rate``.
+        actor_start: The actor is not updated while fewer environment steps than this have been taken.
         max_grad_norm: Largest gradient norm of one parameter tensor.
         precision: Of convolutions and matrix products in an update, see `cfp.losses.choose_precision`. Acting is always
             in float32.
@@ -121,6 +123,8 @@ class CFP(SAC):
         gate_penalty: float = 0.0,
         reward_momentum: float = 0.99,
         max_grad_norm: float = 10.0,
+        actor_rate: float | None = None,
+        actor_start: int = 0,
         precision: Precision = "float32",
         compile: bool = False,
         **sac_options: Any,
@@ -130,6 +134,7 @@ class CFP(SAC):
         self.gate_penalty = gate_penalty
         self.reward_momentum = reward_momentum
         self.max_grad_norm = max_grad_norm
+        self.actor_rate, self.actor_start = actor_rate, actor_start
         self.precision, self.compile = precision, compile
         sac_options.setdefault("replay_buffer_class", ReplayRing)
         sac_options.setdefault("replay_buffer_kwargs", {"seed": sac_options.get("seed")})
@@ -171,6 +176,8 @@ class CFP(SAC):
         actor, critic, _ = self.networks()
         self.policy.set_training_mode(True)
         self._update_learning_rate([actor.optimizer, critic.optimizer])
+        if self.actor_rate is not None:
+            actor.optimizer.param_groups[0]["lr"] = self.actor_rate
         for _ in range(gradient_steps):
             scalars = self.update(self.replay_buffer.sample(batch_size))
             self._n_updates += 1
@@ -183,7 +190,8 @@ class CFP(SAC):
         _, critic, target = self.networks()
         now, later = map(self.losses.prepare, (batch.observations, batch.next_observations))
         scalars = self._update_critic(now, later, batch)
-        scalars |= self._update_actor(now)
+        if self.num_timesteps >= self.actor_start:
+            scalars |= self._update_actor(now)
         with torch.no_grad():
             torch._foreach_lerp_(list(target.parameters()), list(critic.parameters()), self.tau)
         scalars["reward_mean"] = self.reward_statistics.mean

@@ -13,6 +13,7 @@ from cfp.losses import Precision
 from cfp.merging import merge as merge
 from cfp.networks import RESOLUTIONS, Interpolation
 from dittogym import TASKS, make_spec
+from dittogym.action import Layout
 
 Preset = Literal["quick", "paper"]
 
@@ -43,6 +44,11 @@ class EnvironmentConfig:
     target: str | None = None
     """SHAPE MATCH: star, I, M, T or the path of an image; None: the task's default."""
 
+    @property
+    def layout(self) -> Layout:
+        """Orientation of the action array: as asked for, else by parity."""
+        return self.action_layout or ("grid" if self.parity == "reference" else "image")
+
     def task_options(self) -> dict[str, Any]:
         """What of it belongs to the task, for `dittogym.make_spec`."""
         return {} if self.target is None else {"target": self.target}
@@ -66,6 +72,10 @@ class LearningConfig:
 
     learning_rate: float = 3e-4
     """Adam's step size for actor and critics."""
+    actor_rate: float | None = None
+    """Adam's step size for the actor alone; None: the same as for the critics."""
+    actor_start: int = 0
+    """Environment steps of each level in which only the critics learn: a trained actor waits for their judgement."""
     gamma: float = 0.99
     """Discount factor."""
     tau: float = 0.005
@@ -200,8 +210,8 @@ class StageConfig:
 
 
 @dataclass(frozen=True)
-class Config(RunConfig):
-    """A run of CFP. Levels are listed coarsest first; one value per level unless said otherwise."""
+class LadderConfig(RunConfig):
+    """A run that trains the levels of the coarse-to-fine policy. Levels are listed coarsest first."""
 
     steps: int = 20_000
     """Environment steps of all levels together."""
@@ -209,20 +219,15 @@ class Config(RunConfig):
     """Environment steps after which each level hands over to the next (one less than levels)."""
     resolutions: tuple[int, ...] = (8, 16)
     """Action grids R of the levels."""
-    random_steps: tuple[int, ...] = (500, 100)
-    """Uniformly random environment steps at the start of each level."""
-    alpha: tuple[float, ...] = (0.01, 0.01)
-    """Entropy temperature of each level."""
     gate_bias: tuple[float, ...] = (-1.0,)
     """Bias of the gate's logit (one less than levels)."""
-    gate_penalty: tuple[float, ...] = (0.01,)
-    """Weight of the gate penalty (one less than levels)."""
-    start_from: str | None = None
-    """Policy of the first levels, a run folder or policy.safetensors: training begins with the level after it."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
-    learning: LearningConfig = field(default_factory=LearningConfig)
 
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
+    per_level: ClassVar[tuple[str, ...]] = ()
+    """Options with one value for each level."""
+    per_residual: ClassVar[tuple[str, ...]] = ("handover", "gate_bias")
+    """Options with one value for each level but the first."""
 
     def ends(self) -> tuple[int, ...]:
         """Environment steps since the beginning of the run after which each level ends."""
@@ -238,7 +243,7 @@ class Config(RunConfig):
 
     def adapted(self, base: RunConfig) -> RunConfig:
         """Other steps move the handovers in proportion."""
-        assert isinstance(base, Config)
+        assert isinstance(base, LadderConfig)
         if self.steps == base.steps or self.handover != base.handover:
             return self
         share = self.steps / base.steps
@@ -255,6 +260,47 @@ class Config(RunConfig):
             None if self.network.interpolation == "aligned" else make_spec(self.task).patch,
         )
 
+    def check(self) -> None:
+        """Check what the types cannot.
+
+        Raises:
+            ConfigError: Naming the option, what was given and what is allowed.
+        """
+        levels = len(self.resolutions)
+        growing = list(self.resolutions) == sorted(set(self.resolutions))
+        if not levels or not growing or not set(self.resolutions) <= set(RESOLUTIONS):
+            raise ConfigError(f"resolutions: got {self.resolutions}, allowed is a growing choice of {RESOLUTIONS}")
+        counts = dict.fromkeys(self.per_level, levels) | dict.fromkeys(self.per_residual, levels - 1)
+        for name, count in counts.items():
+            given = len(getattr(self, name))
+            if given != count:
+                raise ConfigError(f"{name}: got {given} values, allowed {count} for resolutions {self.resolutions}")
+        if self.task in TASKS and self.resolutions[-1] > (patch := make_spec(self.task).patch):
+            raise ConfigError(f"resolutions: got {self.resolutions}, allowed in {self.task} is at most {patch}")
+        if any(late <= early for early, late in pairwise((0, *self.ends()))):
+            raise ConfigError(f"handover: got {self.handover} of {self.steps} steps, allowed are growing steps between")
+        super().check()
+
+
+@dataclass(frozen=True)
+class Config(LadderConfig):
+    """A run of CFP. Levels are listed coarsest first; one value per level unless said otherwise."""
+
+    random_steps: tuple[int, ...] = (500, 100)
+    """Uniformly random environment steps at the start of each level (none where a policy is refined)."""
+    alpha: tuple[float, ...] = (0.01, 0.01)
+    """Entropy temperature of each level."""
+    gate_penalty: tuple[float, ...] = (0.01,)
+    """Weight of the gate penalty (one less than levels)."""
+    start_from: str | None = None
+    """Policy of the first levels, a run folder or policy.safetensors: training begins with the level after it."""
+    refine: bool = False
+    """Training begins with the last level of start_from itself, which goes on learning."""
+    learning: LearningConfig = field(default_factory=LearningConfig)
+
+    per_level: ClassVar[tuple[str, ...]] = ("random_steps", "alpha")
+    per_residual: ClassVar[tuple[str, ...]] = (*LadderConfig.per_residual, "gate_penalty")
+
     def stage(self, level: int) -> StageConfig:
         """What the training of one level needs."""
         bounds = (0, *self.ends())
@@ -267,31 +313,12 @@ class Config(RunConfig):
         )
 
     def check(self) -> None:
-        """Check what the types cannot.
-
-        Raises:
-            ConfigError: Naming the option, what was given and what is allowed.
-        """
-        levels = len(self.resolutions)
-        growing = list(self.resolutions) == sorted(set(self.resolutions))
-        if not levels or not growing or not set(self.resolutions) <= set(RESOLUTIONS):
-            raise ConfigError(f"resolutions: got {self.resolutions}, allowed is a growing choice of {RESOLUTIONS}")
-        counts = {"random_steps": levels, "alpha": levels, "handover": levels - 1}
-        counts |= {"gate_bias": levels - 1, "gate_penalty": levels - 1}
-        for name, count in counts.items():
-            given = len(getattr(self, name))
-            if given != count:
-                raise ConfigError(f"{name}: got {given} values, allowed {count} for resolutions {self.resolutions}")
-        if self.task in TASKS and self.resolutions[-1] > (patch := make_spec(self.task).patch):
-            raise ConfigError(f"resolutions: got {self.resolutions}, allowed in {self.task} is at most {patch}")
-        if any(late <= early for early, late in pairwise((0, *self.ends()))):
-            raise ConfigError(f"handover: got {self.handover} of {self.steps} steps, allowed are growing steps between")
+        """Check what the types cannot, see `LadderConfig.check`."""
         super().check()
-        self._check_ranges()
-
-    def _check_ranges(self) -> None:
         if self.learning.warm_critic and self.start_from is not None:
             raise ConfigError("warm_critic: got True, allowed without start_from (a policy brings no critics)")
+        if self.refine and self.start_from is None:
+            raise ConfigError("refine: got True, allowed with start_from, which names the policy")
         at_least_one(
             batch_size=self.learning.batch_size,
             buffer_size=self.learning.buffer_size,
@@ -302,8 +329,11 @@ class Config(RunConfig):
         for name, share in shares.items():
             if not 0 <= share <= 1:
                 raise ConfigError(f"{name}: got {share}, allowed 0 to 1")
-        if self.learning.learning_rate <= 0:
-            raise ConfigError(f"learning_rate: got {self.learning.learning_rate}, allowed more than 0")
+        for name in ("learning_rate", "actor_rate"):
+            if (rate := getattr(self.learning, name)) is not None and rate <= 0:
+                raise ConfigError(f"{name}: got {rate}, allowed more than 0")
+        if self.learning.actor_start < 0:
+            raise ConfigError(f"actor_start: got {self.learning.actor_start}, allowed 0 or more")
 
 
 def to_json(config: RunConfig) -> dict[str, Any]:

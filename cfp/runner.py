@@ -39,19 +39,34 @@ class Runner(Run):
         """
         if self.config.start_from is None:
             return Position()
-        policy = load(self.config.start_from)
-        levels = len(policy.spec.resolutions)
+        policy, refine = load(self.config.start_from), self.config.refine
+        levels, ladder = len(policy.spec.resolutions), self.config.resolutions
         if policy.description["task"] != self.config.task:
             raise ConfigError(f"start_from: got a policy for {policy.description['task']}, allowed {self.config.task}")
-        if levels >= len(self.config.resolutions) or policy.spec.resolutions != self.config.resolutions[:levels]:
-            raise ConfigError(
-                f"start_from: got a policy of levels {policy.spec.resolutions}, allowed the first of "
-                f"{self.config.resolutions} but the last"
-            )
+        if policy.spec.resolutions != ladder[:levels] or (levels == len(ladder) and not refine):
+            allowed = f"the first of {ladder}" + ("" if refine else " but the last")
+            raise ConfigError(f"start_from: got a policy of levels {policy.spec.resolutions}, allowed {allowed}")
         if levels > 1 and policy.spec != (wanted := self.config.actor_spec(levels - 1)):
             raise ConfigError(f"start_from: got networks {policy.spec}, allowed {wanted}")
-        write_policy(self.folder / f"stage{levels}.safetensors", *read_policy(self.config.start_from))
-        return Position(levels, self.config.handover[levels - 1])
+        content = read_policy(self.config.start_from)
+        if not refine:
+            write_policy(self.folder / f"stage{levels}.safetensors", *content)
+            return Position(levels, self.config.handover[levels - 1])
+        write_policy(self.start, *content)
+        return Position(levels - 1, (0, *self.config.handover)[levels - 1])
+
+    @property
+    def start(self) -> Path:
+        """The run's own copy of the policy that it refines."""
+        return self.folder / "start.safetensors"
+
+    def refines(self, level: int) -> bool:
+        """Whether the actor of a level begins as the one in `start`."""
+        return self.config.refine and self.start.exists() and read_policy(self.start)[1]["stage"] == level + 1
+
+    def begins_trained(self, level: int) -> bool:
+        """Also where a policy is refined."""
+        return super().begins_trained(level) or self.refines(level)
 
     def inherit(self, model: CFP, previous: CFP) -> None:
         """Warm critics: those of the level before, with the reward statistics in whose units they judge."""
@@ -63,13 +78,16 @@ class Runner(Run):
 
     def make_model(self, level: int) -> CFP:
         """Networks, replay memory and environment of a level, over the frozen policy of the coarser one."""
-        model = self._make_model(level, make_env(self.config, self.config.action_size(level)))
-        if level > 0:
+        refines = self.refines(level)
+        model = self._make_model(level, make_env(self.config, self.config.action_size(level)), refines)
+        if refines:
+            model.networks()[0].load_state_dict(load(self.start, str(model.device)).actor.state_dict())
+        elif level > 0:
             coarse = load(self.folder / f"stage{level}.safetensors", str(model.device)).actor
             model.networks()[0].get_submodule("coarse").load_state_dict(coarse.state_dict())
         return model
 
-    def _make_model(self, level: int, env: VecMonitor) -> CFP:
+    def _make_model(self, level: int, env: VecMonitor, refines: bool) -> CFP:
         stage, learning = self.config.stage(level), self.config.learning
         if learning.compile:
             print("compiling the updates; the first time on a machine this takes minutes ...", flush=True)
@@ -79,7 +97,7 @@ class Runner(Run):
             learning.learning_rate,
             learning.buffer_size,
             update_start=learning.update_start,
-            random_steps=stage.random_steps,
+            random_steps=0 if refines else stage.random_steps,
             batch_size=learning.batch_size,
             tau=learning.tau,
             gamma=learning.gamma,
@@ -88,6 +106,8 @@ class Runner(Run):
             gate_penalty=stage.gate_penalty,
             reward_momentum=learning.reward_momentum,
             max_grad_norm=learning.max_grad_norm,
+            actor_rate=learning.actor_rate,
+            actor_start=learning.actor_start,
             precision=learning.precision,
             compile=learning.compile,
             policy_kwargs={"spec": self.config.actor_spec(level)},

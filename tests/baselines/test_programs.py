@@ -22,6 +22,13 @@ TINY = {
         44,
         ["stage 1", "stage 2"],
     ),
+    "distill": (
+        "--teacher mpc --planner-grid 4 --horizon 2 --commit 2 --iterations 1 --num-envs 2 --tier 100 "
+        "--resolutions 4 8 --steps 60 --handover 30 --round 5 --updates 2 --batch-size 4 --eval-every 20 "
+        "--checkpoint-every 10 --log-every 10 --backend eager",
+        50,
+        ["stage 1", "stage 2"],
+    ),
     "gradient": (
         "--iterations 5 --grid 4 --tier 100 --polish 3 --polish-grid 8 "
         "--eval-every 90 --checkpoint-every 30 --log-every 30",
@@ -62,7 +69,7 @@ def test_run_leaves_its_files(finished):
     for name in ("results.json", "curve.png", "policy.safetensors", "policy.json"):
         assert (folder / name).stat().st_size > 0, name
     assert json.loads((folder / "config.json").read_text())["algo"] == algo
-    assert json.loads((folder / "policy.json").read_text())["kind"] == algo
+    assert json.loads((folder / "policy.json").read_text())["kind"] == {"distill": "cfp"}.get(algo, algo)
     assert list((folder / "tensorboard").glob("events*"))
     stages = {name[-1] for name in TINY[algo][2] if name.startswith("stage")}
     assert {row["stage"] for row in read_table(folder / "progress.csv")} == stages
@@ -120,7 +127,7 @@ def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monk
 def test_polish_is_judged_on_the_layout_it_is_made_for(finished):
     algo, folder = finished
     rows = [row for row in read_table(folder / "evaluations.csv") if row["stage"] == "2"]
-    assert {row["episodes"] for row in rows} == {"cfp": {"2"}, "gradient": {"1"}, "mpc": set(), "shac": set()}[algo]
+    assert {row["episodes"] for row in rows} == {"cfp": {"2"}, "distill": {"2"}, "gradient": {"1"}}.get(algo, set())
     if algo == "gradient":
         own = json.loads((folder / "results.json").read_text())[-1]
         assert own["returns"] == [pytest.approx(max(float(row["mean"]) for row in rows), abs=1e-3)]
@@ -129,7 +136,7 @@ def test_polish_is_judged_on_the_layout_it_is_made_for(finished):
 
 def test_wrong_algorithm_is_named(tmp_path, capsys):
     assert train.main(["--algo", "alchemy", "--out", str(tmp_path / "a")]) == 2
-    assert "algo: got 'alchemy', allowed cfp, gradient, mpc, shac" in capsys.readouterr().err
+    assert "algo: got 'alchemy', allowed cfp, distill, gradient, mpc, shac" in capsys.readouterr().err
     assert cfp.train.main(["--algo", "gradient", "--out", str(tmp_path / "a")]) == 2
     assert "algo: got 'gradient', allowed 'cfp'" in capsys.readouterr().err
 

@@ -121,7 +121,7 @@ def test_resumed_training_is_the_same_to_the_last_bit(sees):
     second.learn(24, rows.append)
     assert torch.equal(parameters(whole), parameters(second))
     assert torch.equal(whole.env.state.x, second.env.state.x)
-    assert rows[-1]["train/episodes"] == whole.rollout.counts["episodes"] > 0
+    assert rows[-1]["train/episodes"] == whole.rollout.episodes.counts["episodes"] > 0
 
 
 def test_simulation_that_is_not_finite_is_reset_and_counted(monkeypatch):
@@ -162,9 +162,9 @@ def test_updates_without_a_finite_gradient_end_the_training(monkeypatch):
 def test_episodes_are_cut_at_staggered_ages_and_change_layouts():
     algorithm = Shac(make(age=8, layouts=3))
     first = algorithm.env.state.x[0].clone()
-    assert algorithm.rollout.limit.tolist() == [4, 8]
+    assert algorithm.rollout.episodes.limit.tolist() == [4, 8]
     algorithm.rollout.play(algorithm.actor, lambda seen: algorithm.value(algorithm.target, seen))
-    assert algorithm.rollout.counts["episodes"] == 1 and algorithm.rollout.limit.tolist() == [8, 8]
+    assert algorithm.rollout.episodes.counts["episodes"] == 1 and algorithm.rollout.episodes.limit.tolist() == [8, 8]
     assert algorithm.env.env_state.steps.tolist() == [0, 4]
     assert not torch.equal(algorithm.env.state.x[0], first)
 

@@ -75,6 +75,10 @@ def test_second_level_starts_from_a_policy(coarse, tmp_path, name):
         (["--resolutions", "8", "16"], "start_from: got a policy of levels (4,), allowed the first of (8, 16)"),
         (["--warm-critic"], "warm_critic: got True, allowed without start_from"),
         (["--start-from", "no/such"], "there is no policy"),
+        (
+            ["--refine", "--resolutions", "8", "16"],
+            "start_from: got a policy of levels (4,), allowed the first of (8, 16)",
+        ),
     ],
 )
 def test_policy_that_does_not_fit_is_refused(coarse, tmp_path, capsys, options, message):
@@ -103,3 +107,24 @@ def test_critics_of_a_level_begin_with_those_before_if_asked_to(tmp_path, monkey
     runner.train()
     kept = all((value == 0.125).all() for key, value in seen[1].items() if value.requires_grad or "patches" not in key)
     assert kept == warm
+
+
+def test_refining_goes_on_with_the_weights_of_a_policy(coarse, tmp_path):
+    options = "--refine --actor-start 100 --random-steps 50 50 --eval-every 10".split()
+    assert run(tmp_path / "a", "--start-from", str(coarse), *options) == 0
+    rows = read_table(tmp_path / "a" / "evaluations.csv")
+    assert [(row["step"], row["stage"]) for row in rows[:2]] == [("0", "1"), ("10", "1")]  # judged before it learns
+    # Nothing but the critics has learned in the 30 steps of the first level, and nothing was random.
+    assert [row["mean"] for row in rows[:4]] == [rows[0]["mean"]] * 4
+    begun, given = (PROGRAM.load(place).actor.state_dict() for place in (tmp_path / "a" / "stage1.json", coarse))
+    assert all(torch.equal(begun[key], value) for key, value in given.items())
+    again = ["--refine", "--start-from", str(tmp_path / "a"), "--eval-every", "10"]
+    assert run(tmp_path / "b", *again) == 0
+    assert {row["stage"] for row in read_table(tmp_path / "b" / "progress.csv")} == {"2"}
+    fine, frozen = (PROGRAM.load(place).actor.state_dict() for place in (tmp_path / "b", coarse))
+    assert all(torch.equal(fine[f"coarse.{key}"], value) for key, value in frozen.items())
+
+
+def test_refining_needs_a_policy(tmp_path, capsys):
+    assert run(tmp_path / "a", "--refine") == 2
+    assert "refine: got True, allowed with start_from" in capsys.readouterr().err
