@@ -10,12 +10,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+import numpy as np
 import torch
 from torch import nn
 
 import cfp
 from baselines.actor_critic import quieten
-from baselines.algorithm import Algorithm, AlgorithmRun, Callback, Entry, Sees
+from baselines.algorithm import Algorithm, Callback, Sees
 from baselines.dagger import Collector, Dataset
 from baselines.episodes import Episodes
 from baselines.planner import PlannerConfig
@@ -25,13 +26,9 @@ from cfp.config import EnvironmentConfig, LadderConfig, RunConfig, at_least_one
 from cfp.environments import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.policy import ActorPolicy
-from cfp.run import Run, copy_policy
-from cfp.state_file import Position
-from cfp.weights import KIND, load, read_policy, save_policy, write_policy
+from cfp.weights import KIND, load, save_policy
 from dittogym import make_spec
 
-TRAINED = ("shac", "gradient")
-"""Teachers that are trained first if only their name is given."""
 FINAL_RATE = 0.1
 """Share of the learning rate that is left at the end of its straight decay."""
 
@@ -85,8 +82,6 @@ class DistillConfig(LadderConfig):
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     planner_grid: int | Literal["coarse", "fine"] = "coarse"
     """Action grid of the teacher mpc."""
-
-    changeable: ClassVar[tuple[str, ...]] = ("updates", *LadderConfig.changeable)
 
     def training(self) -> EnvironmentConfig:
         """Where it is taught: evenly spread particles and no stale values, actions as where it is judged."""
@@ -158,13 +153,12 @@ class Distill(Algorithm):
         Raises:
             ConfigError: No such task or preset.
         """
-        base, silhouette = cfp.preset(task, name), task == "shapematch"
-        steps = 48_000 if silhouette else 160_000
+        base, silhouette, steps = cfp.preset(task, name), task == "shapematch", 48_000
         return DistillConfig(
             task=task,
             preset=base.preset,
             environment=replace(base.environment, num_envs=16),
-            report=replace(base.report, eval_every=steps // 10, checkpoint_every=steps // 20, log_every=1),
+            report=replace(base.report, eval_every=steps // 8, checkpoint_every=steps // 16, log_every=1),
             steps=steps,
             handover=(steps // 2,),
             resolutions=base.resolutions,
@@ -180,7 +174,8 @@ class Distill(Algorithm):
     def _luck(self) -> Iterator[None]:
         """Torch's generator, seeded for what happens next and put back afterwards."""
         with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
-            torch.manual_seed(hash((self.config.seed, self.level, self.num_timesteps)) % 2**62)
+            source = np.random.SeedSequence((self.config.seed, self.level, self.num_timesteps))
+            torch.manual_seed(int(source.generate_state(1)[0]))
             yield
 
     def _teacher(self, own: RunConfig, path: Path | None) -> Teacher:
@@ -284,74 +279,3 @@ class Distill(Algorithm):
         for name in ("actor", "adam", "dataset", "collector"):
             getattr(self, name).load_state_dict(state[name])
         self.rounds = state["rounds"]
-
-    @classmethod
-    def entry(cls) -> Entry:
-        """For the registry."""
-        return Entry(cls.sees, cls.preset, DistillRun, cls.load)
-
-
-class DistillRun(AlgorithmRun):
-    """Distils in its folder, which keeps a copy of the teacher; one that is only named is trained there first.
-
-    Args:
-        config: The run's options.
-        folder: Its folder.
-        resume: Go on from the folder's checkpoint.
-        signals: Whether the user wants to stop.
-    """
-
-    config: DistillConfig
-
-    def __init__(self, config: RunConfig, folder: Path, resume: bool, signals: Any) -> None:
-        super().__init__(Distill, config, folder, resume, signals)
-
-    @property
-    def teacher(self) -> Path:
-        """The copy of the teacher."""
-        return self.folder / "teacher.safetensors"
-
-    def begin(self) -> Position:
-        """Take the teacher over, if it is a policy.
-
-        Raises:
-            ConfigError: It was trained for something else.
-            CheckpointError: There is no such policy.
-        """
-        if self.config.teacher not in ("mpc", *TRAINED):
-            read_teacher(self.config.teacher, self.config.task, self.config.environment)
-            write_policy(self.teacher, *read_policy(self.config.teacher))
-        return super().begin()
-
-    def make_model(self, level: int) -> Distill:
-        """The student at the beginning of a stage."""
-        start = self.load(self.folder / f"stage{level}.safetensors") if level else None
-        assert start is None or isinstance(start, ActorPolicy)
-        return Distill(self.config, level, start, None if self.config.teacher == "mpc" else self.teacher)
-
-    def train(self) -> None:
-        """Train the teacher if need be, then the student."""
-        if self.config.teacher in TRAINED and not self.teacher.exists():
-            school = self._school()
-            print(f"training the teacher first: {self.config.teacher} -> {school.folder}")
-            school.train()
-            copy_policy(school.folder / "policy.safetensors", self.teacher)
-        super().train()
-
-    def measure_all(self) -> list[Any]:
-        """Time the student's stages, with an untrained teacher; its own training is not part of them."""
-        if self.config.teacher in TRAINED:
-            school = self._school()
-            school.keep(school.make_model(0), 0, 0)
-            copy_policy(school.folder / "policy.safetensors", self.teacher)
-        return super().measure_all()
-
-    def _school(self) -> Run:
-        """The run that trains the teacher, with the defaults of its algorithm."""
-        from baselines.registry import configure, open_run  # the registry knows this algorithm too
-
-        config = self.config
-        chosen = configure({"algo": config.teacher, "task": config.task})
-        environment = replace(chosen.environment, target=config.environment.target)
-        chosen = replace(chosen, seed=config.seed, device=config.device, environment=environment)
-        return open_run(chosen, self.folder / "teacher", True, self.signals)

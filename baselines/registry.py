@@ -7,6 +7,7 @@ from typing import Any
 
 import cfp
 from baselines.algorithm import Entry
+from baselines.distill_run import DistillRun
 from baselines.distillation import Distill
 from baselines.gradient import Gradient
 from baselines.mpc import MPC
@@ -21,7 +22,7 @@ from cfp.weights import read_policy
 
 ALGORITHMS: dict[str, Entry] = {
     "cfp": Entry("image", cfp.preset, Runner, cfp.load),
-    "distill": Distill.entry(),
+    "distill": Entry(Distill.sees, Distill.preset, DistillRun, Distill.load),
     "gradient": Gradient.entry(),
     "mpc": MPC.entry(),
     "shac": Shac.entry(),

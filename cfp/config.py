@@ -88,6 +88,8 @@ class LearningConfig:
     """Updates after each batched step of num_envs robots."""
     update_start: int = 256
     """Updates begin when more transitions than this are stored."""
+    anchor: float = 100.0
+    """With refine: weight of the mean square by which actions differ from those of the policy that is refined."""
     reward_momentum: float = 0.99
     """Momentum of the running reward mean and variance."""
     max_grad_norm: float = 10.0
@@ -332,8 +334,9 @@ class Config(LadderConfig):
         for name in ("learning_rate", "actor_rate"):
             if (rate := getattr(self.learning, name)) is not None and rate <= 0:
                 raise ConfigError(f"{name}: got {rate}, allowed more than 0")
-        if self.learning.actor_start < 0:
-            raise ConfigError(f"actor_start: got {self.learning.actor_start}, allowed 0 or more")
+        for name in ("actor_start", "anchor"):
+            if (value := getattr(self.learning, name)) < 0:
+                raise ConfigError(f"{name}: got {value}, allowed 0 or more")
 
 
 def to_json(config: RunConfig) -> dict[str, Any]:

@@ -81,7 +81,8 @@ class Runner(Run):
         refines = self.refines(level)
         model = self._make_model(level, make_env(self.config, self.config.action_size(level)), refines)
         if refines:
-            model.networks()[0].load_state_dict(load(self.start, str(model.device)).actor.state_dict())
+            model.origin = load(self.start, str(model.device)).actor
+            model.networks()[0].load_state_dict(model.origin.state_dict())
         elif level > 0:
             coarse = load(self.folder / f"stage{level}.safetensors", str(model.device)).actor
             model.networks()[0].get_submodule("coarse").load_state_dict(coarse.state_dict())
@@ -108,6 +109,7 @@ class Runner(Run):
             max_grad_norm=learning.max_grad_norm,
             actor_rate=learning.actor_rate,
             actor_start=learning.actor_start,
+            anchor=learning.anchor if refines else 0.0,
             precision=learning.precision,
             compile=learning.compile,
             policy_kwargs={"spec": self.config.actor_spec(level)},

@@ -112,6 +112,7 @@ def test_critics_of_a_level_begin_with_those_before_if_asked_to(tmp_path, monkey
 def test_refining_goes_on_with_the_weights_of_a_policy(coarse, tmp_path):
     options = "--refine --actor-start 100 --random-steps 50 50 --eval-every 10".split()
     assert run(tmp_path / "a", "--start-from", str(coarse), *options) == 0
+    assert all(not row.get("train/drift") for row in read_table(tmp_path / "a" / "progress.csv"))
     rows = read_table(tmp_path / "a" / "evaluations.csv")
     assert [(row["step"], row["stage"]) for row in rows[:2]] == [("0", "1"), ("10", "1")]  # judged before it learns
     # Nothing but the critics has learned in the 30 steps of the first level, and nothing was random.
@@ -120,6 +121,7 @@ def test_refining_goes_on_with_the_weights_of_a_policy(coarse, tmp_path):
     assert all(torch.equal(begun[key], value) for key, value in given.items())
     again = ["--refine", "--start-from", str(tmp_path / "a"), "--eval-every", "10"]
     assert run(tmp_path / "b", *again) == 0
+    assert float(read_table(tmp_path / "b" / "progress.csv")[-1]["train/drift"]) > 0
     assert {row["stage"] for row in read_table(tmp_path / "b" / "progress.csv")} == {"2"}
     fine, frozen = (PROGRAM.load(place).actor.state_dict() for place in (tmp_path / "b", coarse))
     assert all(torch.equal(fine[f"coarse.{key}"], value) for key, value in frozen.items())
