@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,7 +17,7 @@ from cfp.config import EnvironmentConfig
 from cfp.errors import ConfigError
 from cfp.evaluation import Policy, SeesState
 from cfp.weights import read_policy
-from dittogym import TorchEnv
+from dittogym import TorchEnv, make_spec
 from dittogym.action import Layout, bicubic_matrix, to_grid_layout
 
 
@@ -151,8 +152,13 @@ def read_teacher(path: str | Path, task: str, environment: EnvironmentConfig) ->
     description = read_policy(path)[1]
     if description["task"] != task:
         raise ConfigError(f"teacher: got a policy for {description['task']}, allowed {task}")
-    if (target := description["environment"].get("target")) != environment.target:
-        raise ConfigError(f"teacher: got a policy for the target {target}, allowed {environment.target}")
+    theirs = EnvironmentConfig(**description["environment"])
+    try:
+        one, other = (np.asarray(make_spec(task, **own.task_options()).target) for own in (theirs, environment))
+    except (ValueError, TypeError, OSError) as error:
+        raise ConfigError(f"teacher: its target or the student's cannot be read ({error})") from error
+    if not np.array_equal(one, other):
+        raise ConfigError(f"teacher: got a policy for the target {theirs.target}, allowed {environment.target}")
     if description["kind"] == "mpc":
         raise ConfigError("teacher: got the record of one planned episode, allowed mpc itself, which plans anew")
     return load(path)

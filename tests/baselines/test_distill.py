@@ -241,9 +241,10 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("task", "kind", "target", "message"),
     [
+        ("shapematch", "gradient", "T", "teacher: got a policy for the target T, allowed star"),
         ("kick", "gradient", None, "teacher: got a policy for kick, allowed run"),
         ("run", "mpc", None, "teacher: got the record of one planned episode, allowed mpc itself"),
-        ("run", "gradient", "T", "teacher: got a policy for the target T, allowed None"),
+        ("run", "gradient", "T", "teacher: its target or the student's cannot be read"),
         (None, "", None, "there is no policy"),
     ],
 )
@@ -253,6 +254,7 @@ def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, kind, targ
         config = replace(Distill.preset(task, "quick"), environment=EnvironmentConfig(1, 100, target=target))
         write_policy(path, {"actions": torch.zeros(3, 2, 8, 8)}, origin(config, kind, 0, 0))
     folder = tmp_path / "run"
-    assert distill.main([*TINY, *LESSONS, "--teacher", str(path), "--out", str(folder)]) == 2
+    student = ["--task", "shapematch", "--target", "star"] if task == "shapematch" else []
+    assert distill.main([*TINY, *LESSONS, *student, "--teacher", str(path), "--out", str(folder)]) == 2
     assert message in capsys.readouterr().err
     assert not folder.exists()
