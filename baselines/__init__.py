@@ -3,6 +3,7 @@
 from baselines.actor_critic import StatePolicy
 from baselines.algorithm import Algorithm, Entry
 from baselines.cem import CEM, CEMConfig, CEMPlanner, CEMPlannerConfig
+from baselines.distillation import Distill, DistillConfig
 from baselines.gradient import Gradient, GradientConfig
 from baselines.modular import ModularConfig
 from baselines.modular_policy import SegmentPolicy
@@ -20,6 +21,8 @@ __all__ = [
     "CEMConfig",
     "CEMPlanner",
     "CEMPlannerConfig",
+    "Distill",
+    "DistillConfig",
     "Entry",
     "Gradient",
     "GradientConfig",

@@ -53,6 +53,15 @@ class StateActor(nn.Module):
         return output.unflatten(1, (2, self.resolution, self.resolution))
 
 
+def quieten(actor: Actor) -> None:
+    """Fix the width of an actor of the coarse-to-fine policy at a standard deviation of about 0.1 before tanh."""
+    layers = [layer for layer in actor.std.modules() if isinstance(layer, nn.Linear | nn.ConvTranspose2d)]
+    nn.init.zeros_(layers[-1].weight)
+    assert layers[-1].bias is not None
+    nn.init.constant_(layers[-1].bias, QUIET)
+    actor.std.requires_grad_(False)
+
+
 class ImageActor(nn.Module):
     """The first actor of the coarse-to-fine policy, trained through its mean; its width stays about 0.1.
 
@@ -64,11 +73,7 @@ class ImageActor(nn.Module):
         super().__init__()
         self.spec = ActorSpec((resolution,))
         self.actor = Actor(resolution)
-        layers = [layer for layer in self.actor.std.modules() if isinstance(layer, nn.Linear | nn.ConvTranspose2d)]
-        nn.init.zeros_(layers[-1].weight)
-        assert layers[-1].bias is not None
-        nn.init.constant_(layers[-1].bias, QUIET)
-        self.actor.std.requires_grad_(False)
+        quieten(self.actor)
 
     def forward(self, image: Tensor) -> Tensor:
         """Mean before tanh, (B, 2, R, R), of images (B, 3, 64, 64) in [-1, 1]."""

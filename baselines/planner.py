@@ -127,6 +127,11 @@ class PlannerBase(ABC, Generic[Config]):
         self._position += 1
         return self._ahead[self._position - 1]
 
+    @property
+    def fresh(self) -> bool:
+        """Whether the last action was the first of its plan."""
+        return self._position == 1
+
     def forget(self) -> None:
         """Drop the present plan, for a new episode."""
         self._ahead, self._position = self._fresh(self.config.horizon), self.config.commit

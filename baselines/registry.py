@@ -9,6 +9,8 @@ import cfp
 from baselines import ladder, modular
 from baselines.algorithm import Entry
 from baselines.cem import CEM
+from baselines.distill_run import DistillRun
+from baselines.distillation import Distill
 from baselines.floors import Random, Scripted, Zero
 from baselines.gradient import Gradient
 from baselines.mpc import MPC
@@ -29,6 +31,7 @@ ALGORITHMS: dict[str, Entry] = {
     "gnn-64": modular.entry("gnn-64"),
     "transformer-16": modular.entry("transformer-16"),
     "transformer-64": modular.entry("transformer-64"),
+    "distill": Entry(Distill.sees, Distill.preset, DistillRun, Distill.load),
     "gradient": Gradient.entry(),
     "mpc": MPC.entry(),
     "cem": CEM.entry(),

@@ -21,7 +21,7 @@ from cfp.environments import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.evaluation import Policy
 from cfp.policy import ActorPolicy
-from cfp.weights import KIND, load, read_policy, save_policy, single_level_policy
+from cfp.weights import KIND, load, policy_for, read_policy, save_policy
 
 BETAS = (0.7, 0.95)
 FINAL_RATE = 0.1
@@ -59,7 +59,7 @@ class ShacConfig(GridConfig):
     """Environment steps of all robots together."""
     sees: Literal["state", "image"] = "state"
     """What the policy is given: the privileged state (matter, deformation, clock), or the image like CFP's."""
-    warm_actor: str | None = None
+    start_from: str | None = None
     """Policy of one level on the image, whatever trained it, whose weights the actor begins with."""
     tier: Literal["full", "lite"] | int | tuple[int, int] = "lite"
     """Particles of the simulations that are learned from."""
@@ -108,8 +108,8 @@ class ShacConfig(GridConfig):
         at_least_one(
             steps=self.steps, window=self.window, critic_updates=self.critic_updates, age=self.age, layouts=self.layouts
         )
-        if self.warm_actor is not None and self.sees != "image":
-            raise ConfigError(f"warm_actor: got a policy, allowed with sees 'image', got {self.sees!r}")
+        if self.start_from is not None and self.sees != "image":
+            raise ConfigError(f"start_from: got a policy, allowed with sees 'image', got {self.sees!r}")
         for name in ("gamma", "td_lambda", "tau"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, allowed 0 to 1")
@@ -185,9 +185,12 @@ class Shac(Algorithm):
     @classmethod
     def start(cls, config: ShacConfig) -> ActorPolicy | None:
         """The policy that the actor begins with, if the options name one."""
-        if config.warm_actor is None:
+        if config.start_from is None:
             return None
-        return single_level_policy(config, "warm_actor", config.resolution(0))
+        policy, wanted = policy_for(config, config.start_from), (config.resolution(0),)
+        if policy.spec.resolutions != wanted:
+            raise ConfigError(f"start_from: got a policy of levels {policy.spec.resolutions}, allowed {wanted}")
+        return policy
 
     def look(self) -> Tensor:
         """What the networks are given for the present state, (B, ...)."""

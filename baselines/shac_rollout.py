@@ -6,12 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from baselines.episodes import Episodes
 from baselines.training_reward import Pairs, training_reward
-from cfp.vec_env import TorchVecEnv
 from dittogym import TorchEnv
 from torchmpm.state import choose
 
@@ -43,9 +42,7 @@ class Window:
 class Rollout:
     """The simulations that are learned from, and what happens to their episodes.
 
-    Element i of the batch is first cut at ``age * (i + 1) / B`` steps, later at ``age``; so not all are young at once.
-    A simulation that is not finite is reset like one that has ended, and counted. Gradients that are not finite in one
-    action of one simulation are left out and counted; the others stay.
+    Gradients that are not finite in one action of one simulation are left out and counted; the others stay.
 
     Args:
         config: The run's options.
@@ -55,16 +52,9 @@ class Rollout:
 
     def __init__(self, config: ShacConfig, env: TorchEnv, look: Callable[[], Tensor]) -> None:
         self.config, self.env, self.look = config, env, look
-        count = env.num_envs
-        self.first_layout = config.seed + count  # seeds of single elements are counted back from it, and not below 0
-        env.reset(seed=self.first_layout)
+        self.episodes = Episodes(env, config.seed, config.age, config.layouts)
         self.generator = torch.Generator().manual_seed(config.seed)
-        self.age = min(config.age, env.spec.horizon)
-        self.limit = torch.tensor([max(1, self.age * (i + 1) // count) for i in range(count)], device=env.device)
-        self.returns = torch.zeros(count, device=env.device)
-        self.ended: list[float] = []
-        self.drawn = count
-        self.counts = {"episodes": 0, "terminated": 0, "nonfinite": 0, "dropped": 0}
+        self.episodes.counts["dropped"] = 0
 
     def play(self, actor: Callable[[Tensor], Tensor], value: Callable[[Tensor], Tensor]) -> Window:
         """Make a window.
@@ -74,7 +64,7 @@ class Rollout:
             value: From what is seen to the target critic's values (B,).
         """
         env, gamma = self.env, self.config.gamma
-        self.ended = []
+        self.episodes.ended = []
         total = torch.zeros(env.num_envs, device=env.device)
         discount = torch.ones_like(total)
         seen, rewards, values, ends, truth = [], [], [], [], 0.0
@@ -85,9 +75,9 @@ class Rollout:
             _, smooth, terminated, _, info = env.step(self._act(actor(now)), soft=True)
             reward = training_reward(self.config.reward, env, before, smooth, info, pairs).float()
             truth += float(info["true_reward"].detach().mean())
-            self.returns += info["true_reward"].detach()
+            self.episodes.returns += info["true_reward"].detach()
             after = self.look()
-            out = terminated | (env.env_state.steps >= self.limit)
+            out = self.episodes.over(terminated)
             following = torch.where(terminated, 0.0, value(after))
             total = total + discount * reward
             last = out | (step + 1 == self.config.window)
@@ -97,7 +87,7 @@ class Rollout:
             values.append(following.detach())
             ends.append(out)
             if bool(out.any()):
-                self._restart(out, terminated, info["finite"])
+                self.episodes.restart(out, terminated, info["finite"])
                 pairs, fresh = self._pairs(), self.look()
                 after = choose(out, fresh, after)
             now = after
@@ -119,7 +109,7 @@ class Rollout:
 
     def _drop(self, gradient: Tensor) -> Tensor:
         finite = gradient.isfinite().flatten(1).all(1)
-        self.counts["dropped"] += int((~finite).sum())
+        self.episodes.counts["dropped"] += int((~finite).sum())
         return torch.where(finite[:, None, None, None], gradient, 0.0)
 
     def _targets(self, rewards: list[Tensor], values: list[Tensor], ends: list[Tensor]) -> list[Tensor]:
@@ -131,39 +121,15 @@ class Rollout:
             targets.append(later)
         return targets[::-1]
 
-    def _restart(self, out: Tensor, terminated: Tensor, finite: Tensor) -> None:
-        """Begin new episodes, each on the next layout."""
-        for i in out.nonzero()[:, 0].tolist():
-            self.counts["episodes"] += 1
-            self.counts["terminated"] += int(terminated[i])
-            self.counts["nonfinite"] += int(~finite[i])
-            self.ended.append(float(self.returns[i]))
-            layout = self.first_layout + self.drawn % self.config.layouts
-            self.drawn += 1
-            mask = torch.arange(self.env.num_envs, device=self.env.device) == i
-            self.env.reset(seed=layout - i, options={"reset_mask": mask})
-        self.returns = torch.where(out, 0.0, self.returns)
-        self.limit = torch.where(out, self.age, self.limit)
-
     def scalars(self) -> dict[str, float | None]:
         """Counts, and the mean true return of the episodes that ended in the last window."""
-        scalars: dict[str, float | None] = {f"train/{name}": float(count) for name, count in self.counts.items()}
-        return scalars | {"rollout/return": float(np.mean(self.ended)) if self.ended else None}
+        return self.episodes.scalars()
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next window depends on besides the networks."""
-        return {
-            "episodes": TorchVecEnv(self.env).state_dict(),
-            "generator": self.generator.get_state(),
-            "limit": self.limit.cpu(),
-            "returns": self.returns.cpu(),
-            "drawn": self.drawn,
-            "counts": dict(self.counts),
-        }
+        return self.episodes.state_dict() | {"generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Undo `state_dict`."""
-        TorchVecEnv(self.env).load_state_dict(state["episodes"])
+        self.episodes.load_state_dict(state)
         self.generator.set_state(state["generator"])
-        self.limit, self.returns = state["limit"].to(self.limit), state["returns"].to(self.returns)
-        self.drawn, self.counts = state["drawn"], dict(state["counts"])

@@ -37,8 +37,9 @@ METRICS: dict[str, str] = {
     "train/reward_std": "running standard deviation of raw rewards that they are divided by",
     "train/gate": "mean gate of the residual actor: 0 keeps the coarse action, 1 replaces it",
     "train/gate_penalty": "gate penalty inside the actor loss",
+    "train/drift": "mean square by which sampled actions differ from the mean ones of the policy that is refined",
     "train/n_updates": "gradient updates so far in this stage",
-    "train/learning_rate": "learning rate of actor and critics",
+    "train/learning_rate": "learning rate of the critics, and of the actor unless it has its own",
 }
 """Every scalar that `CFP.train` logs, and what it means."""
 
@@ -95,11 +96,17 @@ class CFP(SAC):
         alpha: Temperature, a constant.
         gate_penalty: Weight rho of ``mean ||g||_2 / R`` in the actor loss (stage 2).
         reward_momentum: Momentum of the reward statistics.
+        actor_rate: Adam's step size for the actor; None: ``learning_rate``.
+        anchor: Weight, in the actor loss, of the mean square by which actions differ from those of `origin`.
+        actor_start: The actor is not updated while fewer environment steps than this have been taken.
         max_grad_norm: Largest gradient norm of one parameter tensor.
         precision: Of convolutions and matrix products in an update, see `cfp.losses.choose_precision`. Acting is always
             in float32.
         compile: Run the losses through ``torch.compile``.
         sac_options: Further options of stable-baselines3's SAC.
+
+    Attributes:
+        origin: Actor that is refined, None for none; it has the same action grid and does not change.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CFPPolicy": CFPPolicy}
@@ -122,6 +129,9 @@ class CFP(SAC):
         gate_penalty: float = 0.0,
         reward_momentum: float = 0.99,
         max_grad_norm: float = 10.0,
+        actor_rate: float | None = None,
+        actor_start: int = 0,
+        anchor: float = 0.0,
         precision: Precision = "float32",
         compile: bool = False,
         **sac_options: Any,
@@ -131,6 +141,8 @@ class CFP(SAC):
         self.gate_penalty = gate_penalty
         self.reward_momentum = reward_momentum
         self.max_grad_norm = max_grad_norm
+        self.actor_rate, self.actor_start, self.anchor = actor_rate, actor_start, anchor
+        self.origin: Actor | None = None
         self.precision, self.compile = precision, compile
         sac_options.setdefault("replay_buffer_class", ReplayRing)
         spec = (sac_options.get("policy_kwargs") or {}).get("spec")
@@ -175,6 +187,8 @@ class CFP(SAC):
         actor, critic, _ = self.networks()
         self.policy.set_training_mode(True)
         self._update_learning_rate([actor.optimizer, critic.optimizer])
+        if self.actor_rate is not None:
+            actor.optimizer.param_groups[0]["lr"] = self.actor_rate
         for _ in range(gradient_steps):
             scalars = self.update(self.replay_buffer.sample(batch_size))
             self._n_updates += 1
@@ -187,7 +201,8 @@ class CFP(SAC):
         _, critic, target = self.networks()
         now, later = map(self.losses.prepare, (batch.observations, batch.next_observations))
         scalars = self._update_critic(now, later, batch)
-        scalars |= self._update_actor(now)
+        if self.num_timesteps >= self.actor_start:
+            scalars |= self._update_actor(now)
         with torch.no_grad():
             torch._foreach_lerp_(list(target.parameters()), list(critic.parameters()), self.tau)
         scalars["reward_mean"] = self.reward_statistics.mean
@@ -206,7 +221,9 @@ class CFP(SAC):
     def _update_actor(self, now: Tensor) -> dict[str, Tensor]:
         actor, critic, _ = self.networks()
         critic.requires_grad_(False)  # spares the critics' weight gradients, which would be thrown away
-        loss, scalars = self.losses.actor_loss(actor, critic, now, self.ent_coef_tensor, self.gate_penalty)
+        loss, scalars = self.losses.actor_loss(
+            actor, critic, now, self.ent_coef_tensor, self.gate_penalty, self.origin, self.anchor
+        )
         self._descend(loss, actor.optimizer, actor.trainable_parameters(), "actor")
         critic.requires_grad_(True)
         return scalars | {"actor_loss": loss.detach()}
@@ -283,7 +300,7 @@ class CFP(SAC):
         return [*modules, "reward_statistics"], tensors
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "reward_statistics", "losses"]
+        return [*super()._excluded_save_params(), "reward_statistics", "losses", "origin"]
 
     @property
     def action_resolution(self) -> int:

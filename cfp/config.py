@@ -103,12 +103,6 @@ class StageConfig:
     gate_penalty: float
 
 
-RESIDUAL_OPTIONS = ("gate_bias", "gate_penalty")
-"""Options with one value for each level but the first."""
-LEVEL_OPTIONS = ("random_steps", "alpha", *RESIDUAL_OPTIONS)
-"""Options with one value for each level that has it."""
-
-
 @dataclass(frozen=True)
 class SACConfig(RunConfig):
     """A run of `cfp.algorithm.CFP`, whatever its networks."""
@@ -126,8 +120,8 @@ class SACConfig(RunConfig):
 
 
 @dataclass(frozen=True)
-class Config(SACConfig):
-    """A run of CFP. Levels are listed coarsest first; one value per level unless said otherwise."""
+class LadderConfig(RunConfig):
+    """A run that trains the levels of the coarse-to-fine policy. Levels are listed coarsest first."""
 
     steps: int = 20_000
     """Environment steps of all levels together."""
@@ -135,21 +129,15 @@ class Config(SACConfig):
     """Environment steps after which each level hands over to the next (one less than levels)."""
     resolutions: tuple[int, ...] = (8, 16)
     """Action grids R of the levels."""
-    random_steps: tuple[int, ...] = (500, 100)
-    """Uniformly random environment steps at the start of each level."""
-    alpha: tuple[float, ...] = (0.01, 0.01)
-    """Entropy temperature of each level."""
     gate_bias: tuple[float, ...] = (-1.0,)
     """Bias of the gate's logit (one less than levels)."""
-    gate_penalty: tuple[float, ...] = (0.01,)
-    """Weight of the gate penalty (one less than levels)."""
-    start_from: str | None = None
-    """Policy of the first levels, a run folder or policy.safetensors: training begins with the level after it."""
-    warm_actor: str | None = None
-    """Policy of one level, whatever trained it, whose weights the first level's actor begins with."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
 
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
+    per_level: ClassVar[tuple[str, ...]] = ()
+    """Options with one value for each level."""
+    per_residual: ClassVar[tuple[str, ...]] = ("handover", "gate_bias")
+    """Options with one value for each level but the first."""
 
     def ends(self) -> tuple[int, ...]:
         """Environment steps since the beginning of the run after which each level ends."""
@@ -168,13 +156,12 @@ class Config(SACConfig):
 
         Then levels are equally long, and further ones have the values of the last one that has any.
         """
-        assert isinstance(base, Config)
+        assert isinstance(base, LadderConfig)
         levels, changes = len(self.resolutions), dict[str, Any]()
         if levels != len(base.resolutions):
-            for name in LEVEL_OPTIONS:
-                count = levels - (name in RESIDUAL_OPTIONS)
+            for name, count in self.counts().items():
                 values: tuple[float, ...] = getattr(self, name)
-                if values and values == getattr(base, name):
+                if name != "handover" and values and values == getattr(base, name):
                     changes[name] = (*values, *values[-1:] * count)[:count]
             if self.handover == base.handover:
                 changes["handover"] = tuple(round(self.steps * level / levels) for level in range(1, levels))
@@ -182,6 +169,11 @@ class Config(SACConfig):
             share = self.steps / base.steps
             changes["handover"] = tuple(round(step * share) for step in base.handover)
         return replace(self, **changes)
+
+    def counts(self) -> dict[str, int]:
+        """How many values each option has that has one for a level."""
+        levels = len(self.resolutions)
+        return dict.fromkeys(self.per_level, levels) | dict.fromkeys(self.per_residual, levels - 1)
 
     def actor_spec(self, level: int) -> ActorSpec:
         """The networks of the actor at a level (0 is the coarsest), with all coarser ones."""
@@ -193,6 +185,46 @@ class Config(SACConfig):
             self.network.interpolation,
             None if self.network.interpolation == "aligned" else make_spec(self.task).patch,
         )
+
+    def check(self) -> None:
+        """Check what the types cannot.
+
+        Raises:
+            ConfigError: Naming the option, what was given and what is allowed.
+        """
+        levels = len(self.resolutions)
+        growing = list(self.resolutions) == sorted(set(self.resolutions))
+        if not levels or not growing or not set(self.resolutions) <= set(RESOLUTIONS):
+            raise ConfigError(f"resolutions: got {self.resolutions}, allowed is a growing choice of {RESOLUTIONS}")
+        for name, count in self.counts().items():
+            given = len(getattr(self, name))
+            if given != count:
+                raise ConfigError(f"{name}: got {given} values, allowed {count} for resolutions {self.resolutions}")
+        if self.task in TASKS and self.resolutions[-1] > (patch := make_spec(self.task).patch):
+            raise ConfigError(f"resolutions: got {self.resolutions}, allowed in {self.task} is at most {patch}")
+        if any(late <= early for early, late in pairwise((0, *self.ends()))):
+            raise ConfigError(f"handover: got {self.handover} of {self.steps} steps, allowed are growing steps between")
+        super().check()
+
+
+@dataclass(frozen=True)
+class Config(LadderConfig, SACConfig):
+    """A run of CFP. Levels are listed coarsest first; one value per level unless said otherwise."""
+
+    random_steps: tuple[int, ...] = (500, 100)
+    """Uniformly random environment steps at the start of each level (none where a policy is refined)."""
+    alpha: tuple[float, ...] = (0.01, 0.01)
+    """Entropy temperature of each level."""
+    gate_penalty: tuple[float, ...] = (0.01,)
+    """Weight of the gate penalty (one less than levels)."""
+    start_from: str | None = None
+    """Policy of the first levels, a run folder or policy.safetensors: training begins with the level after it."""
+    refine: bool = False
+    """Training begins with the last level of start_from itself, which goes on learning."""
+    learning: LearningConfig = field(default_factory=LearningConfig)
+
+    per_level: ClassVar[tuple[str, ...]] = ("random_steps", "alpha")
+    per_residual: ClassVar[tuple[str, ...]] = (*LadderConfig.per_residual, "gate_penalty")
 
     def stage(self, level: int) -> StageConfig:
         """What the training of one level needs."""
@@ -206,29 +238,12 @@ class Config(SACConfig):
         )
 
     def check(self) -> None:
-        """Check what the types cannot.
-
-        Raises:
-            ConfigError: Naming the option, what was given and what is allowed.
-        """
-        levels = len(self.resolutions)
-        growing = list(self.resolutions) == sorted(set(self.resolutions))
-        if not levels or not growing or not set(self.resolutions) <= set(RESOLUTIONS):
-            raise ConfigError(f"resolutions: got {self.resolutions}, allowed is a growing choice of {RESOLUTIONS}")
-        counts = {name: levels - (name in RESIDUAL_OPTIONS) for name in LEVEL_OPTIONS} | {"handover": levels - 1}
-        for name, count in counts.items():
-            given = len(getattr(self, name))
-            if given != count:
-                raise ConfigError(f"{name}: got {given} values, allowed {count} for resolutions {self.resolutions}")
-        if self.task in TASKS and self.resolutions[-1] > (patch := make_spec(self.task).patch):
-            raise ConfigError(f"resolutions: got {self.resolutions}, allowed in {self.task} is at most {patch}")
-        if any(late <= early for early, late in pairwise((0, *self.ends()))):
-            raise ConfigError(f"handover: got {self.handover} of {self.steps} steps, allowed are growing steps between")
+        """Check what the types cannot, see `LadderConfig.check`."""
         super().check()
         if self.learning.warm_critic and self.start_from is not None:
             raise ConfigError("warm_critic: got True, allowed without start_from (a policy brings no critics)")
-        if self.warm_actor is not None and self.start_from is not None:
-            raise ConfigError("warm_actor: got a policy, allowed without start_from (which brings the first level)")
+        if self.refine and self.start_from is None:
+            raise ConfigError("refine: got True, allowed with start_from, which names the policy")
 
 
 def to_json(config: RunConfig) -> dict[str, Any]:

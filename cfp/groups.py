@@ -77,6 +77,10 @@ class LearningConfig:
 
     learning_rate: float = 3e-4
     """Adam's step size for actor and critics."""
+    actor_rate: float | None = None
+    """Adam's step size for the actor alone; None: the same as for the critics."""
+    actor_start: int = 0
+    """Environment steps of each level in which only the critics learn: a trained actor waits for their judgement."""
     gamma: float = 0.99
     """Discount factor."""
     tau: float = 0.005
@@ -89,6 +93,8 @@ class LearningConfig:
     """Updates after each batched step of num_envs robots."""
     update_start: int = 256
     """Updates begin when more transitions than this are stored."""
+    anchor: float = 100.0
+    """With refine: weight of the mean square by which actions differ from those of the policy that is refined."""
     reward_momentum: float = 0.99
     """Momentum of the running reward mean and variance."""
     max_grad_norm: float = 10.0
@@ -115,8 +121,12 @@ class LearningConfig:
         for name, share in {"gamma": self.gamma, "tau": self.tau, "momentum": self.reward_momentum}.items():
             if not 0 <= share <= 1:
                 raise ConfigError(f"{name}: got {share}, allowed 0 to 1")
-        if self.learning_rate <= 0:
-            raise ConfigError(f"learning_rate: got {self.learning_rate}, allowed more than 0")
+        for name in ("learning_rate", "actor_rate"):
+            if (rate := getattr(self, name)) is not None and rate <= 0:
+                raise ConfigError(f"{name}: got {rate}, allowed more than 0")
+        for name in ("actor_start", "anchor"):
+            if (value := getattr(self, name)) < 0:
+                raise ConfigError(f"{name}: got {value}, allowed 0 or more")
 
 
 @dataclass(frozen=True)

@@ -72,9 +72,25 @@ def critic_loss(critic: TwinCritic, now: Tensor, actions: Tensor, wanted: Tensor
 
 
 def actor_loss(
-    actor: Actor, critic: TwinCritic, now: Tensor, alpha: Tensor, gate_penalty: float
+    actor: Actor,
+    critic: TwinCritic,
+    now: Tensor,
+    alpha: Tensor,
+    gate_penalty: float,
+    origin: Actor | None = None,
+    anchor: float = 0.0,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Mean of ``alpha log pi - min Q`` plus the gate penalty, and scalars to log (see `cfp.algorithm.METRICS`)."""
+    """Mean of ``alpha log pi - min Q`` plus penalties, and scalars to log (see `cfp.algorithm.METRICS`).
+
+    Args:
+        actor: Is improved.
+        critic: Judges its actions.
+        now: Observations (B, 3, 64, 64).
+        alpha: Temperature.
+        gate_penalty: Weight of the gate.
+        origin: Actor to stay close to, with the same action grid.
+        anchor: Weight of the mean square by which actions differ from its mean ones.
+    """
     action, log_prob, gate, _ = actor.sample(now)
     value = torch.minimum(*critic(now, action))
     loss = (alpha * log_prob[:, None] - value).mean()
@@ -83,6 +99,12 @@ def actor_loss(
         penalty = gate_penalty * gate.flatten(1).norm(dim=1).mean() / actor.resolution
         loss = loss + penalty
         scalars |= {"gate": gate.detach().mean(), "gate_penalty": penalty.detach()}
+    if origin is not None:
+        with torch.no_grad():
+            before = origin(now, deterministic=True)
+        drift = (action - before).square().mean()
+        loss = loss + anchor * drift
+        scalars["drift"] = drift.detach()
     return loss, scalars
 
 

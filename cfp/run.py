@@ -150,6 +150,10 @@ class Run(ABC):
         """What to show of a model at an evaluation, uint8 (H, W, 3) by name."""
         return {}
 
+    def begins_trained(self, level: int) -> bool:
+        """Whether a stage begins with a policy that has been trained: then it is evaluated before the first step."""
+        return level > 0
+
     @abstractmethod
     def make_model(self, level: int) -> Any:
         """The model of a stage as it begins; the policy of the one before is in the folder."""
@@ -265,8 +269,8 @@ class Run(ABC):
                 self.keep(model, level, step)
             self.save(model)
 
-        # A stage begins with what the one before has reached: it must do better than that.
-        first = level > 0 and config.report.eval_every > 0 and best == -math.inf
+        # Such a stage must do better than what it begins with.
+        first = self.begins_trained(level) and config.report.eval_every > 0 and best == -math.inf
         total, over = config.ends()[-1], partial(self._plateau, level)
         return Books(level, total, config.report, self.signals, self.logger, measure, save, first, over, record)
 

@@ -22,7 +22,7 @@ from cfp.policy import ActorPolicy, CFPPolicy, NetworkPolicy
 from cfp.replay import FIELDS
 from cfp.run import Run
 from cfp.state_file import Position
-from cfp.weights import describe, fitting, load, policy_for, read_policy, save_policy, single_level_policy, write_policy
+from cfp.weights import describe, fitting, load, policy_for, read_policy, save_policy, write_policy
 
 
 class SACRun(Run):
@@ -33,7 +33,9 @@ class SACRun(Run):
     checkpoint: Checkpoint
     model_type: type[CFP] = CFP
 
-    def build(self, level: int, env: VecMonitor, policy: type[NetworkPolicy], networks: dict[str, Any]) -> CFP:
+    def build(
+        self, level: int, env: VecMonitor, policy: type[NetworkPolicy], networks: dict[str, Any], **others: Any
+    ) -> CFP:
         """The model of a stage as its options say.
 
         Args:
@@ -41,32 +43,32 @@ class SACRun(Run):
             env: Where it acts.
             policy: Its networks.
             networks: Their options.
+            others: Options of the model in place of the run's.
         """
         stage, learning = self.config.stage(level), self.config.learning
         if learning.compile:
             print("compiling the updates; the first time on a machine this takes minutes ...", flush=True)
-        model = self.model_type(
-            policy,
-            env,
-            learning.learning_rate,
-            learning.buffer_size,
-            update_start=learning.update_start,
-            random_steps=stage.random_steps,
-            batch_size=learning.batch_size,
-            tau=learning.tau,
-            gamma=learning.gamma,
-            gradient_steps=learning.gradient_steps,
-            alpha=stage.alpha,
-            gate_penalty=stage.gate_penalty,
-            reward_momentum=learning.reward_momentum,
-            max_grad_norm=learning.max_grad_norm,
-            precision=learning.precision,
-            compile=learning.compile,
-            policy_kwargs=networks,
-            seed=self.config.seed,
-            device=choose_device(self.config.device),
-            stats_window_size=max(10, env.num_envs),
-        )
+        options: dict[str, Any] = {
+            "update_start": learning.update_start,
+            "random_steps": stage.random_steps,
+            "batch_size": learning.batch_size,
+            "tau": learning.tau,
+            "gamma": learning.gamma,
+            "gradient_steps": learning.gradient_steps,
+            "alpha": stage.alpha,
+            "gate_penalty": stage.gate_penalty,
+            "reward_momentum": learning.reward_momentum,
+            "max_grad_norm": learning.max_grad_norm,
+            "actor_rate": learning.actor_rate,
+            "actor_start": learning.actor_start,
+            "precision": learning.precision,
+            "compile": learning.compile,
+            "policy_kwargs": networks,
+            "seed": self.config.seed,
+            "device": choose_device(self.config.device),
+            "stats_window_size": max(10, env.num_envs),
+        }
+        model = self.model_type(policy, env, learning.learning_rate, learning.buffer_size, **{**options, **others})
         model.set_logger(self.logger)
         return model
 
@@ -103,32 +105,42 @@ class Runner(SACRun):
     """Trains all levels of a ladder in its folder (paper, Section 4.2), see `cfp.run.Run`."""
 
     config: Config
-    warm: ActorPolicy | None = None
-    """What the first actor begins with; None if a checkpoint says more."""
 
     def begin(self) -> Position:
         """Take the first levels from a policy if the options say so; its steps count as those before its handover.
 
         Raises:
-            ConfigError: It is not the first levels of this ladder, or the policy that the first actor shall begin with
-                does not fit it.
+            ConfigError: It does not fit this ladder.
             CheckpointError: It is missing, damaged, or of another kind.
         """
-        if self.config.warm_actor is not None:
-            self.warm = single_level_policy(self.config, "warm_actor", self.config.resolutions[0])
         if self.config.start_from is None:
             return Position()
-        policy = policy_for(self.config, "start_from")
-        levels = len(policy.spec.resolutions)
-        if levels >= len(self.config.resolutions) or policy.spec.resolutions != self.config.resolutions[:levels]:
-            raise ConfigError(
-                f"start_from: got a policy of levels {policy.spec.resolutions}, allowed the first of "
-                f"{self.config.resolutions} but the last"
-            )
+        policy, refine = policy_for(self.config, self.config.start_from), self.config.refine
+        levels, ladder = len(policy.spec.resolutions), self.config.resolutions
+        if policy.spec.resolutions != ladder[:levels] or (levels == len(ladder) and not refine):
+            allowed = f"the first of {ladder}" + ("" if refine else " but the last")
+            raise ConfigError(f"start_from: got a policy of levels {policy.spec.resolutions}, allowed {allowed}")
         if levels > 1 and policy.spec != (wanted := self.config.actor_spec(levels - 1)):
             raise ConfigError(f"start_from: got networks {policy.spec}, allowed {wanted}")
-        write_policy(self.folder / f"stage{levels}.safetensors", *read_policy(self.config.start_from))
-        return Position(levels, self.config.handover[levels - 1])
+        content = read_policy(self.config.start_from)
+        if not refine:
+            write_policy(self.folder / f"stage{levels}.safetensors", *content)
+            return Position(levels, self.config.handover[levels - 1])
+        write_policy(self.start, *content)
+        return Position(levels - 1, (0, *self.config.handover)[levels - 1])
+
+    @property
+    def start(self) -> Path:
+        """The run's own copy of the policy that it refines."""
+        return self.folder / "start.safetensors"
+
+    def refines(self, level: int) -> bool:
+        """Whether the actor of a level begins as the one in `start`."""
+        return self.config.refine and self.start.exists() and read_policy(self.start)[1]["stage"] == level + 1
+
+    def begins_trained(self, level: int) -> bool:
+        """Also where a policy is refined."""
+        return super().begins_trained(level) or self.refines(level)
 
     def inherit(self, model: CFP, previous: CFP) -> None:
         """Warm critics: those of the level before, with the reward statistics in whose units they judge."""
@@ -147,11 +159,13 @@ class Runner(SACRun):
 
     def make_model(self, level: int) -> CFP:
         """Networks, replay memory and environment of a level, over the frozen policy of the coarser one."""
-        env = make_env(self.config, self.config.action_size(level))
-        model = self.build(level, env, CFPPolicy, {"spec": self.config.actor_spec(level)})
-        if level == 0 and self.warm is not None:
-            model.networks()[0].load_state_dict(self.warm.actor.state_dict())
-        if level > 0:
+        env, refines = make_env(self.config, self.config.action_size(level)), self.refines(level)
+        others = {"random_steps": 0, "anchor": self.config.learning.anchor} if refines else {}
+        model = self.build(level, env, CFPPolicy, {"spec": self.config.actor_spec(level)}, **others)
+        if refines:
+            model.origin = load(self.start, str(model.device)).actor
+            model.networks()[0].load_state_dict(model.origin.state_dict())
+        elif level > 0:
             path = self.folder / f"stage{level}.safetensors"
             coarse = load(path, str(model.device)).actor
             with fitting(path):

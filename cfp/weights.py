@@ -157,35 +157,23 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
     return policy
 
 
-def policy_for(config: RunConfig, option: str) -> ActorPolicy:
-    """Load the policy that an option of a run names.
+def policy_for(config: RunConfig, path: str) -> ActorPolicy:
+    """Load the policy that a run's option start_from names.
 
     Args:
         config: The run's options.
-        option: Name of a field that holds the path.
+        path: The option.
 
     Raises:
         ConfigError: The policy is for another task or action layout.
         CheckpointError: See `load`.
     """
-    policy = load(getattr(config, option))
+    policy = load(path)
     environment: EnvironmentConfig = merge(EnvironmentConfig(), policy.description["environment"])
     for what, made, asked in (
         ("", policy.description["task"], config.task),
         ("action layout ", environment.layout, config.environment.layout),
     ):
         if made != asked:
-            raise ConfigError(f"{option}: got a policy for {what}{made}, allowed {asked}")
-    return policy
-
-
-def single_level_policy(config: RunConfig, option: str, resolution: int) -> ActorPolicy:
-    """Load a policy of one level, see `policy_for`, for an actor of the same grid to begin with.
-
-    Raises:
-        ConfigError: Its grid is another, or it has several levels.
-    """
-    policy = policy_for(config, option)
-    if policy.spec.resolutions != (resolution,):
-        raise ConfigError(f"{option}: got a policy of levels {policy.spec.resolutions}, allowed {(resolution,)}")
+            raise ConfigError(f"start_from: got a policy for {what}{made}, allowed {asked}")
     return policy

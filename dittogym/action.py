@@ -52,12 +52,12 @@ def bicubic(image: Tensor, size: int, align_corners: bool = False) -> Tensor:
     Written as two small matrix products, which are several times faster on a CPU than PyTorch's own, forward and
     backward.
     """
-    matrix = _bicubic_matrix(image.shape[-1], size, align_corners, image.dtype, image.device)
+    matrix = bicubic_matrix(image.shape[-1], size, align_corners, image.dtype, image.device)
     return matrix @ image @ matrix.T
 
 
 @functools.lru_cache(maxsize=64)
-def _bicubic_matrix(before: int, after: int, align_corners: bool, dtype: torch.dtype, device: torch.device) -> Tensor:
+def bicubic_matrix(before: int, after: int, align_corners: bool, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Matrix (after, before) of one-dimensional interpolation, read off PyTorch's own on unit vectors."""
     basis = torch.eye(before, dtype=torch.float64)[:, None, :, None].expand(-1, -1, -1, before)
     image = interpolate(basis, size=(after, before), mode="bicubic", align_corners=align_corners)

@@ -33,6 +33,13 @@ TINY = {
     ),
     "coarse": (LEVEL, 44, ["stage 1"]),
     "fine": (LEVEL, 44, ["stage 1"]),
+    "distill": (
+        "--teacher mpc --planner-grid 4 --horizon 2 --commit 2 --iterations 1 --num-envs 2 --tier 100 "
+        "--resolutions 4 8 --steps 60 --handover 30 --round 5 --updates 2 --batch-size 4 --eval-every 20 "
+        "--checkpoint-every 10 --log-every 10 --backend eager",
+        50,
+        ["stage 1", "stage 2"],
+    ),
     "gradient": (
         "--iterations 5 --grid 4 --tier 100 --polish 3 --polish-grid 8 "
         "--eval-every 90 --checkpoint-every 30 --log-every 30",
@@ -66,7 +73,7 @@ TINY = {
 }
 PATCHES = {algo: 64 for algo in TINY if "-" in algo}
 """Action grids that are not 8."""
-LEVELS = ("cfp", "coarse", "fine")
+LEVELS = ("cfp", "coarse", "distill", "fine")
 """Algorithms whose policies are those of `cfp`."""
 
 
@@ -148,7 +155,8 @@ def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monk
 def test_polish_is_judged_on_the_layout_it_is_made_for(finished):
     algo, folder = finished
     rows = [row for row in read_table(folder / "evaluations.csv") if row["stage"] == "2"]
-    assert {row["episodes"] for row in rows} == {"cfp": {"2"}, "gradient": {"1"}}.get(algo, set())
+    wanted = {"cfp": {"2"}, "distill": {"2"}, "gradient": {"1"}}
+    assert {row["episodes"] for row in rows} == wanted.get(algo, set())
     if algo == "gradient":
         own = json.loads((folder / "results.json").read_text())[-1]
         assert own["returns"] == [pytest.approx(max(float(row["mean"]) for row in rows), abs=1e-3)]

@@ -122,7 +122,7 @@ def test_resumed_training_is_the_same_to_the_last_bit(sees):
     second.learn(24, rows.append)
     assert torch.equal(parameters(whole), parameters(second))
     assert torch.equal(whole.env.state.x, second.env.state.x)
-    assert rows[-1]["train/episodes"] == whole.rollout.counts["episodes"] > 0
+    assert rows[-1]["train/episodes"] == whole.rollout.episodes.counts["episodes"] > 0
 
 
 def test_simulation_that_is_not_finite_is_reset_and_counted(monkeypatch):
@@ -163,9 +163,9 @@ def test_updates_without_a_finite_gradient_end_the_training(monkeypatch):
 def test_episodes_are_cut_at_staggered_ages_and_change_layouts():
     algorithm = Shac(make(age=8, layouts=3))
     first = algorithm.env.state.x[0].clone()
-    assert algorithm.rollout.limit.tolist() == [4, 8]
+    assert algorithm.rollout.episodes.limit.tolist() == [4, 8]
     algorithm.rollout.play(algorithm.actor, lambda seen: algorithm.value(algorithm.target, seen))
-    assert algorithm.rollout.counts["episodes"] == 1 and algorithm.rollout.limit.tolist() == [8, 8]
+    assert algorithm.rollout.episodes.counts["episodes"] == 1 and algorithm.rollout.episodes.limit.tolist() == [8, 8]
     assert algorithm.env.env_state.steps.tolist() == [0, 4]
     assert not torch.equal(algorithm.env.state.x[0], first)
 
@@ -216,13 +216,13 @@ def test_actor_on_the_image_begins_with_a_policy_of_any_algorithm(tmp_path):
     actor, path = build_actor(ActorSpec((config.resolution(0),))), tmp_path / "policy.safetensors"
     origins = cfp.Config(task="run", resolutions=(config.resolution(0),), gate_bias=())
     save_policy(path, actor, describe(origins, 0, 5))
-    warm = replace(config, warm_actor=str(path))
+    warm = replace(config, start_from=str(path))
     algorithm = Shac(warm, 0, Shac.start(warm))
     for name, value in actor.state_dict().items():
         assert torch.equal(algorithm.actor.actor.state_dict()[name], value), name
-    with pytest.raises(ConfigError, match="warm_actor: got a policy for run, allowed kick"):
+    with pytest.raises(ConfigError, match="start_from: got a policy for run, allowed kick"):
         Shac.start(replace(warm, task="kick"))
-    with pytest.raises(ConfigError, match="warm_actor: got a policy, allowed with sees 'image'"):
+    with pytest.raises(ConfigError, match="start_from: got a policy, allowed with sees 'image'"):
         replace(warm, sees="state").check()
     assert Shac.start(config) is None
 

@@ -221,6 +221,22 @@ def test_random_phase_and_start_of_updates_are_two_settings():
     assert min(updates) == 14  # more than 12 are stored
 
 
+def test_actor_waits_for_the_critics_and_has_a_rate_of_its_own():
+    model = make_model(ActorSpec((8,)), update_start=4, batch_size=4, random_steps=0, actor_start=10, actor_rate=0.0)
+    actor, critic, _ = model.networks()
+    before = [[p.clone() for p in network.parameters()] for network in (actor, critic)]
+    same = lambda: [  # noqa: E731
+        all(map(torch.equal, old, network.parameters())) for old, network in zip(before, (actor, critic), strict=True)
+    ]
+    model.learn(8)
+    assert same() == [True, False] and not actor.optimizer.state
+    model.learn(12, reset_num_timesteps=False)
+    assert same() == [True, False] and actor.optimizer.state
+    model.actor_rate = None
+    model.learn(4, reset_num_timesteps=False)
+    assert same() == [False, False]
+
+
 def test_stage_two_starts_with_uniform_fine_actions():
     env = FakeEnv(num_envs=2, resolution=16)
     model = make_model(ActorSpec((8, 16), (-100.0,)), env, random_steps=4)

@@ -76,46 +76,16 @@ def test_second_level_starts_from_a_policy(coarse, tmp_path, name):
         (["--resolutions", "8", "16"], "start_from: got a policy of levels (4,), allowed the first of (8, 16)"),
         (["--warm-critic"], "warm_critic: got True, allowed without start_from"),
         (["--start-from", "no/such"], "there is no policy"),
+        (["--action-layout", "grid"], "start_from: got a policy for action layout image, allowed grid"),
+        (["--parity", "reference"], "start_from: got a policy for action layout image, allowed grid"),
+        (
+            ["--refine", "--resolutions", "8", "16"],
+            "start_from: got a policy of levels (4,), allowed the first of (8, 16)",
+        ),
     ],
 )
 def test_policy_that_does_not_fit_is_refused(coarse, tmp_path, capsys, options, message):
     assert run(tmp_path / "a", "--start-from", str(coarse), *options) == 2
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "a").exists()
-
-
-def test_first_actor_begins_with_the_weights_of_another_policy(coarse, tmp_path, monkeypatch):
-    policy = tmp_path / "policy.safetensors"
-    policy.write_bytes((coarse / "policy.safetensors").read_bytes())
-    began, learn = [], Runner.learn
-
-    def note(runner, model, steps, books):
-        began.append({key: value.clone() for key, value in model.networks()[0].state_dict().items()})
-        learn(runner, model, steps, books)
-
-    monkeypatch.setattr(Runner, "learn", note)
-    short = ["--steps", "40", "--handover", "20", "--eval-every", "0"]
-    assert run(tmp_path / "a", *short, "--warm-actor", str(policy)) == 0
-    weights = PROGRAM.load(policy).actor.state_dict()
-    assert all(torch.equal(began[0][key], value) for key, value in weights.items())
-    trained = PROGRAM.load(tmp_path / "a" / "stage1.safetensors").actor.state_dict()
-    assert any(not torch.equal(trained[key], value) for key, value in weights.items())  # and goes on learning
-    policy.unlink()  # no longer needed
-    assert run(tmp_path / "a", *short, "--warm-actor", str(policy), "--resume", "--steps", "60") == 0
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--resolutions", "8", "16"], "warm_actor: got a policy of levels (4,), allowed (8,)"),
-        (["--task", "run"], "warm_actor: got a policy for shapematch, allowed run"),
-        (["--action-layout", "grid"], "warm_actor: got a policy for action layout image, allowed grid"),
-        (["--parity", "reference"], "warm_actor: got a policy for action layout image, allowed grid"),
-        (["--start-from", "x"], "warm_actor: got a policy, allowed without start_from"),
-    ],
-)
-def test_weights_that_do_not_fit_are_refused(coarse, tmp_path, capsys, options, message):
-    assert run(tmp_path / "a", "--warm-actor", str(coarse), *options) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "a").exists()
 
@@ -172,3 +142,26 @@ def test_critics_of_a_level_begin_with_those_before_if_asked_to(tmp_path, monkey
     runner.train()
     kept = all((value == 0.125).all() for key, value in seen[1].items() if value.requires_grad or "patches" not in key)
     assert kept == warm
+
+
+def test_refining_goes_on_with_the_weights_of_a_policy(coarse, tmp_path):
+    options = "--refine --actor-start 100 --random-steps 50 50 --eval-every 10".split()
+    assert run(tmp_path / "a", "--start-from", str(coarse), *options) == 0
+    assert all(not row.get("train/drift") for row in read_table(tmp_path / "a" / "progress.csv"))
+    rows = read_table(tmp_path / "a" / "evaluations.csv")
+    assert [(row["step"], row["stage"]) for row in rows[:2]] == [("0", "1"), ("10", "1")]  # judged before it learns
+    # Nothing but the critics has learned in the 30 steps of the first level, and nothing was random.
+    assert [row["mean"] for row in rows[:4]] == [rows[0]["mean"]] * 4
+    begun, given = (PROGRAM.load(place).actor.state_dict() for place in (tmp_path / "a" / "stage1.json", coarse))
+    assert all(torch.equal(begun[key], value) for key, value in given.items())
+    again = ["--refine", "--start-from", str(tmp_path / "a"), "--eval-every", "10"]
+    assert run(tmp_path / "b", *again) == 0
+    assert float(read_table(tmp_path / "b" / "progress.csv")[-1]["train/drift"]) > 0
+    assert {row["stage"] for row in read_table(tmp_path / "b" / "progress.csv")} == {"2"}
+    fine, frozen = (PROGRAM.load(place).actor.state_dict() for place in (tmp_path / "b", coarse))
+    assert all(torch.equal(fine[f"coarse.{key}"], value) for key, value in frozen.items())
+
+
+def test_refining_needs_a_policy(tmp_path, capsys):
+    assert run(tmp_path / "a", "--refine") == 2
+    assert "refine: got True, allowed with start_from" in capsys.readouterr().err

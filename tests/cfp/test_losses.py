@@ -182,3 +182,18 @@ def test_compiled_update_equals_the_plain_one(precision):
         assert value.item() == pytest.approx(wanted[0][name].item(), rel=rel, abs=rel), name
     for name, value in fast.items():
         assert (value - plain[name]).abs().mean() < 1.2e-3 * (0.05 if precision == "float32" else 1.0), name
+
+
+@pytest.mark.parametrize("name", ["plain", "residual"])
+def test_anchor_costs_the_square_of_the_way_from_the_origin(name):
+    model, other = (make_model(LADDERS[name]) for _ in range(2))
+    (actor, critic, _), origin = model.networks(), other.networks()[0]
+    now = model.losses.prepare(make_batch(8).observations)
+    losses = []
+    for arguments in ((), (origin, 3.0)):
+        torch.manual_seed(5)
+        losses.append(model.losses.actor_loss(actor, critic, now, torch.tensor(0.1), 0.2, *arguments))
+    torch.manual_seed(5)
+    drift = (actor(now) - origin(now, deterministic=True)).square().mean()
+    assert losses[1][1]["drift"].item() == pytest.approx(drift.item(), rel=1e-5)
+    assert (losses[1][0] - losses[0][0]).item() == pytest.approx(3 * drift.item(), rel=1e-4)

@@ -1,0 +1,17 @@
+"""``python -m baselines.distill``: a policy of images learns from one that sees more; ``--algo distill`` by name."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from baselines import train
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line entry; returns the exit code."""
+    return train.main(["--algo", "distill", *(sys.argv[1:] if arguments is None else arguments)])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,86 @@
+"""The run of a distillation: it keeps its teacher, and trains it if need be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from baselines.algorithm import AlgorithmRun
+from baselines.distillation import Distill, DistillConfig
+from baselines.teachers import read_teacher
+from cfp.config import RunConfig
+from cfp.estimate import Cost
+from cfp.policy import ActorPolicy
+from cfp.process import StopSignals
+from cfp.run import Run, copy_policy
+from cfp.state_file import Position
+from cfp.weights import read_policy, write_policy
+
+TRAINED = ("shac", "gradient")
+"""Teachers that are trained first if only their name is given."""
+
+
+class DistillRun(AlgorithmRun):
+    """Distils in its folder, which keeps a copy of the teacher; one that is only named is trained there first.
+
+    Args:
+        config: The run's options.
+        folder: Its folder.
+        resume: Go on from the folder's checkpoint.
+        signals: Whether the user wants to stop.
+    """
+
+    config: DistillConfig
+
+    def __init__(self, config: RunConfig, folder: Path, resume: bool, signals: StopSignals) -> None:
+        super().__init__(Distill, config, folder, resume, signals)
+
+    @property
+    def teacher(self) -> Path:
+        """The copy of the teacher."""
+        return self.folder / "teacher.safetensors"
+
+    def begin(self) -> Position:
+        """Take the teacher over, if it is a policy.
+
+        Raises:
+            ConfigError: It was trained for something else.
+            CheckpointError: There is no such policy.
+        """
+        if self.config.teacher not in ("mpc", *TRAINED):
+            read_teacher(self.config.teacher, self.config.task, self.config.environment)
+            write_policy(self.teacher, *read_policy(self.config.teacher))
+        return super().begin()
+
+    def make_model(self, level: int) -> Distill:
+        """The student at the beginning of a stage."""
+        start = self.load(self.folder / f"stage{level}.safetensors") if level else None
+        assert start is None or isinstance(start, ActorPolicy)
+        return Distill(self.config, level, start, None if self.config.teacher == "mpc" else self.teacher)
+
+    def train(self) -> None:
+        """Train the teacher if need be, then the student."""
+        if self.config.teacher in TRAINED and not self.teacher.exists():
+            school = self._school()
+            print(f"training the teacher first: {self.config.teacher} -> {school.folder}")
+            school.train()
+            copy_policy(school.folder / "policy.safetensors", self.teacher)
+        super().train()
+
+    def measure_all(self) -> list[Cost]:
+        """Time the student's stages, with an untrained teacher; its own training is not part of them."""
+        if self.config.teacher in TRAINED:
+            school = self._school()
+            school.keep(school.make_model(0), 0, 0)
+            copy_policy(school.folder / "policy.safetensors", self.teacher)
+        return super().measure_all()
+
+    def _school(self) -> Run:
+        """The run that trains the teacher, with the defaults of its algorithm."""
+        from baselines.registry import configure, open_run  # the registry knows this algorithm too
+
+        config = self.config
+        chosen = configure({"algo": config.teacher, "task": config.task})
+        environment = replace(chosen.environment, target=config.environment.target)
+        chosen = replace(chosen, seed=config.seed, device=config.device, environment=environment)
+        return open_run(chosen, self.folder / "teacher", True, self.signals)

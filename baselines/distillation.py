@@ -1,0 +1,281 @@
+"""Distillation: the image networks of the coarse-to-fine policy learn what a policy or planner that sees more does."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from torch import nn
+
+import cfp
+from baselines.actor_critic import quieten
+from baselines.algorithm import Algorithm, Callback, Sees
+from baselines.dagger import Collector, Dataset
+from baselines.episodes import Episodes
+from baselines.planner import PlannerConfig
+from baselines.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
+from cfp.actor import build_actor
+from cfp.config import EnvironmentConfig, LadderConfig, RunConfig, at_least_one
+from cfp.environments import make_torch_env
+from cfp.errors import ConfigError, NonFiniteError
+from cfp.policy import ActorPolicy
+from cfp.weights import KIND, load, save_policy
+from dittogym import make_spec
+
+FINAL_RATE = 0.1
+"""Share of the learning rate that is left at the end of its straight decay."""
+
+METRICS: dict[str, str] = {
+    "rollout/return": "mean undiscounted return of the episodes that ended in the last round, None for none",
+    "train/loss": "mean square by which actions differ from the teacher's, mean over the round's updates",
+    "train/fresh_loss": "the same on the labels of the round before anything was learned from them",
+    "train/share": "share of the round that the teacher led",
+    "train/labels": "labels in the data set",
+    "train/learning_rate": "Adam's step size",
+    "train/episodes": "episodes ended in this stage",
+    "train/terminated": "those that ended before their time",
+    "train/nonfinite": "simulations that were not finite and were reset",
+}
+"""Every scalar that `Distill.learn` logs, and what it means."""
+
+
+@dataclass(frozen=True)
+class DistillConfig(LadderConfig):
+    """A distillation; num_envs robots move side by side. Levels are listed coarsest first.
+
+    The environment options say how the result is judged; tier says where it is taught.
+    """
+
+    algo: str = "distill"
+    """Which algorithm."""
+    teacher: str = "shac"
+    """mpc (plans from every state), shac or gradient (trained first), or a policy: a run folder, policy.safetensors."""
+    tier: Literal["full", "lite"] | int | tuple[int, int] = "lite"
+    """Particles of the simulations that are taught in."""
+    round: int = 64
+    """Control steps between two lessons."""
+    updates: int = 48
+    """Gradient steps in a lesson."""
+    batch_size: int = 256
+    """Labels in a gradient step."""
+    student_rate: float = 1e-3
+    """Adam's step size at the beginning of each level; it falls to a tenth."""
+    max_grad_norm: float = 1.0
+    """Largest norm of the gradient."""
+    share: float = 0.7
+    """Factor by which the share of legs that the teacher leads falls from round to round; it begins at 1."""
+    leg: int = 8
+    """Control steps after which it is drawn anew who leads a robot."""
+    capacity: int = 100_000
+    """Labels that are kept; an image takes 12 KiB."""
+    age: int = 400
+    """Control steps after which an episode is cut; the first ones are cut at staggered ages."""
+    layouts: int = 64
+    """Particle layouts that are gone through."""
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    planner_grid: int | Literal["coarse", "fine"] = "coarse"
+    """Action grid of the teacher mpc."""
+
+    def training(self) -> EnvironmentConfig:
+        """Where it is taught: evenly spread particles and no stale values, actions as where it is judged."""
+        own = self.environment
+        return replace(own, particles=self.tier, parity="clean", action_layout=own.layout)
+
+    def check(self) -> None:
+        """Check what the types cannot, see `LadderConfig.check`."""
+        super().check()
+        self.planner.check()
+        at_least_one(
+            round=self.round,
+            updates=self.updates,
+            batch_size=self.batch_size,
+            leg=self.leg,
+            capacity=self.capacity,
+            age=self.age,
+            layouts=self.layouts,
+        )
+        for name in ("student_rate", "max_grad_norm"):
+            if getattr(self, name) <= 0:
+                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed more than 0")
+        if not 0 <= self.share <= 1:
+            raise ConfigError(f"share: got {self.share}, allowed 0 to 1")
+
+
+class Distill(Algorithm):
+    """Supervised learning of the teacher's actions in the states that the student gets into.
+
+    The mean action is learned, by least squares after tanh: what differs little in the muscles costs little. The width
+    stays about 0.1 before tanh, so that the policy can be evaluated with noise, and refined by soft actor-critic.
+
+    Args:
+        config: The run's options.
+        level: Index of the level.
+        start: Policy of the levels before, which are frozen.
+        teacher: File of the teacher's policy, if it is not the one that the options name.
+    """
+
+    name: ClassVar[str] = "distill"
+    sees: ClassVar[Sees] = "image"
+
+    def __init__(
+        self, config: DistillConfig, level: int = 0, start: ActorPolicy | None = None, teacher: Path | None = None
+    ) -> None:
+        self.config, self.level = config, level
+        own = replace(config, environment=config.training())
+        self.env = make_torch_env(own, make_spec(config.task).patch)
+        self.spec = config.actor_spec(level)
+        with self._luck():
+            self.actor = build_actor(self.spec)
+        quieten(self.actor)
+        if start is not None:
+            self.actor.get_submodule("coarse").load_state_dict(start.actor.state_dict())
+        self.actor.to(self.env.device)
+        learning = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
+        self.adam = torch.optim.Adam(learning, config.student_rate)
+        episodes = Episodes(self.env, config.seed + level * config.layouts, config.age, config.layouts)
+        self.collector = Collector(self.env, self._teacher(own, teacher), episodes, config.leg)
+        self.dataset, self.rounds = Dataset(config.capacity), 0
+        self.period = config.round * self.env.num_envs
+
+    @staticmethod
+    def preset(task: str, name: str) -> DistillConfig:
+        """Defaults of a task, with the networks of the same preset of the coarse-to-fine policy.
+
+        Both teach at the lite tier; ``quick`` is judged there, ``paper`` in the paper's environment.
+
+        Raises:
+            ConfigError: No such task or preset.
+        """
+        base, silhouette, steps = cfp.preset(task, name), task == "shapematch", 48_000
+        return DistillConfig(
+            task=task,
+            preset=base.preset,
+            environment=replace(base.environment, num_envs=16),
+            report=replace(base.report, eval_every=steps // 8, checkpoint_every=steps // 16, log_every=1),
+            steps=steps,
+            handover=(steps // 2,),
+            resolutions=base.resolutions,
+            gate_bias=base.gate_bias,
+            network=base.network,
+            teacher="gradient" if silhouette else "shac",
+            round=30 if silhouette else 64,
+            planner=PlannerConfig(iterations=30, learning_rate=0.1) if silhouette else PlannerConfig(),
+            planner_grid=16 if silhouette else "coarse",
+        )
+
+    @contextmanager
+    def _luck(self) -> Iterator[None]:
+        """Torch's generator, seeded for what happens next and put back afterwards."""
+        with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
+            source = np.random.SeedSequence((self.config.seed, self.level, self.num_timesteps))
+            torch.manual_seed(int(source.generate_state(1)[0]))
+            yield
+
+    def _teacher(self, own: RunConfig, path: Path | None) -> Teacher:
+        config, layout = self.config, self.config.environment.layout
+        if path is None and config.teacher == "mpc":
+            spec, grid = self.env.spec, config.planner_grid
+            size = {"coarse": spec.coarse, "fine": spec.fine}[grid] if isinstance(grid, str) else grid
+            return PlannerTeacher(make_torch_env(own, size), config.planner, config.seed, layout)
+        policy = read_teacher(path or config.teacher, config.task, config.environment)
+        theirs = EnvironmentConfig(**policy.description["environment"])
+        return PolicyTeacher(policy, theirs.layout != layout, layout)
+
+    @property
+    def policy(self) -> ActorPolicy:
+        """What has been learned so far."""
+        policy = ActorPolicy(self.spec, self.config.report.eval_deterministic)
+        policy.actor.load_state_dict(self.actor.state_dict())
+        return policy.to(self.env.device)
+
+    def learn(self, total_timesteps: int, callback: Callback) -> Distill:
+        """Do as many rounds as cover the steps.
+
+        Raises:
+            NonFiniteError: The loss is not finite.
+        """
+        end = self.num_timesteps + total_timesteps
+        while self.num_timesteps < end:
+            with self._luck():
+                scalars = self._round()
+            self.num_timesteps += self.period
+            callback(scalars)
+        return self
+
+    def _round(self) -> dict[str, float | None]:
+        config, share = self.config, self.config.share**self.rounds
+        student = partial(self.actor, deterministic=config.report.eval_deterministic)
+        labels = self.collector.collect(config.round, share, student)
+        self.dataset.add(labels)
+        self.rounds += 1
+        with torch.no_grad():
+            part = slice(0, None, max(1, len(labels.actions) // config.batch_size))
+            fresh = float(self._loss(labels.observations[part], labels.actions[part]))
+        rate = self._rate()
+        self.adam.param_groups[0]["lr"] = rate
+        losses = [self._improve() for _ in range(config.updates)]
+        return self.collector.episodes.scalars() | {
+            "train/loss": sum(losses) / len(losses),
+            "train/fresh_loss": fresh,
+            "train/share": share,
+            "train/labels": float(len(self.dataset)),
+            "train/learning_rate": rate,
+        }
+
+    def _rate(self) -> float:
+        bounds = (0, *self.config.ends())
+        done = self.num_timesteps / (bounds[self.level + 1] - bounds[self.level])
+        return self.config.student_rate * (1.0 - (1.0 - FINAL_RATE) * min(done, 1.0))
+
+    def _loss(self, observations: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """Mean square difference of the mean action from the teacher's, both on the grid that is carried out."""
+        device, size = self.env.device, self.spec.action_size
+        wanted = project(actions.to(device), size, self.env.spec.patch)
+        return (self.actor(observations.to(device), deterministic=True) - wanted).square().mean()
+
+    def _improve(self) -> float:
+        loss = self._loss(*self.dataset.sample(self.config.batch_size))
+        if not math.isfinite(value := float(loss.detach())):
+            raise NonFiniteError(
+                f"the loss became {value} after {self.num_timesteps} environment steps of the stage; "
+                "the last checkpoint is untouched"
+            )
+        self.adam.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.adam.param_groups[0]["params"], self.config.max_grad_norm)
+        self.adam.step()
+        return value
+
+    def save(self, path: Path, description: dict[str, Any]) -> None:
+        """Write the policy, as one of CFP."""
+        save_policy(
+            path, self.actor, description | {"kind": KIND, "network": asdict(self.spec), "trained_by": self.name}
+        )
+
+    @classmethod
+    def load(cls, path: Path, device: str = "cpu") -> ActorPolicy:
+        """Load a policy."""
+        return load(path, device)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks, optimiser, labels, episodes in progress and the teacher's plans."""
+        return {
+            "actor": self.actor.state_dict(),
+            "adam": self.adam.state_dict(),
+            "dataset": self.dataset.state_dict(),
+            "collector": self.collector.state_dict(),
+            "rounds": self.rounds,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Undo `state_dict`."""
+        for name in ("actor", "adam", "dataset", "collector"):
+            getattr(self, name).load_state_dict(state[name])
+        self.rounds = state["rounds"]

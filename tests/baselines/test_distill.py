@@ -1,0 +1,260 @@
+"""Distillation into the image networks, on robots of a few hundred particles."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+import baselines
+import cfp
+from baselines import Distill, OpenLoop, PlannerConfig, Shac, distill
+from baselines.dagger import Collector, Dataset, Labels
+from baselines.distillation import METRICS
+from baselines.episodes import Episodes
+from baselines.registry import configure
+from baselines.teachers import PolicyTeacher, Teacher, project
+from cfp.config import EnvironmentConfig, ReportConfig, to_json
+from cfp.errors import ConfigError, NonFiniteError
+from cfp.files import read_table
+from cfp.weights import origin, read_policy, write_policy
+from dittogym import TASKS, TorchEnv
+from dittogym.action import patch_field, to_grid_layout
+
+
+def make(**changes):
+    environment = EnvironmentConfig(changes.pop("num_envs", 2), 300, changes.pop("substeps", 4))
+    defaults = {"environment": environment, "tier": 300, "device": "cpu", "teacher": "mpc", "batch_size": 8}
+    defaults |= {"round": 4, "updates": 2, "leg": 2, "resolutions": (8, 16), "planner": PlannerConfig(2, 2, 1)}
+    return replace(Distill.preset("run", "quick"), **defaults | changes)
+
+
+@pytest.fixture(scope="module")
+def privileged(tmp_path_factory):
+    """An untrained policy of the state, on file."""
+    path = tmp_path_factory.mktemp("teacher") / "policy.safetensors"
+    config = replace(Shac.preset("run", "quick"), environment=EnvironmentConfig(2, 300, 4), tier=300)
+    Shac(config).save(path, origin(config, "shac", 0, 0))
+    return path
+
+
+class Mirror(Teacher):
+    """Pulls where the image shows matter, by image alone: what a student can copy."""
+
+    resolution = 8
+
+    def act(self, env, seen):
+        """Actions of +-0.6 by the speed that is seen."""
+        there = torch.nn.functional.avg_pool2d(seen[:, :1].float() / 255.0, 8)
+        return torch.cat((0.8 * there - 0.4, 0.4 - 0.8 * there), 1)
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("preset", ["quick", "paper"])
+def test_every_preset_is_valid_and_survives_json(task, preset):
+    config = Distill.preset(task, preset)
+    config.check()
+    assert configure(json.loads(json.dumps(to_json(config)))) == config
+    for level in (0, 1):
+        assert config.actor_spec(level) == cfp.preset(task, preset).actor_spec(level)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"share": 1.5}, "share: got 1.5, allowed 0 to 1"),
+        ({"updates": 0}, "updates: got 0"),
+        ({"student_rate": 0.0}, "student_rate: got 0.0"),
+        ({"gate_bias": ()}, "gate_bias: got 0 values"),
+    ],
+)
+def test_impossible_options_are_named(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        make(**changes).check()
+
+
+def test_student_does_as_the_teacher_in_a_closed_loop():
+    config = make(num_envs=4, substeps=20, round=16, updates=40, batch_size=32, steps=640, handover=(512,))
+    student, rows = Distill(config), []
+    student.collector.teacher = Mirror()
+    student.learn(512, rows.append)
+    assert set(rows[0]) == set(METRICS)
+    assert rows[-1]["train/fresh_loss"] < 0.15 * rows[0]["train/fresh_loss"]
+    assert [row["train/share"] for row in rows[:3]] == pytest.approx([1.0, 0.7, 0.49])
+    fine = Distill(config, 1, student.policy)
+    fine.collector.teacher = Mirror()
+    fine.learn(128, rows.append)
+    frozen, before = fine.actor.get_submodule("coarse").state_dict(), student.actor.state_dict()
+    assert all(torch.equal(frozen[name], value) for name, value in before.items())
+    for policy in (student.policy, fine.policy):
+        env = TorchEnv("run", 2, policy.resolution, particles=300, substeps=20)
+        seen, _ = env.reset(seed=99)
+        for _ in range(20):
+            action, _ = policy.predict(seen.numpy(), deterministic=True)
+            wanted = project(Mirror().act(env, seen), policy.resolution, 64)
+            assert (torch.as_tensor(action) - wanted).square().mean().sqrt() < 0.1
+            seen = env.step(torch.as_tensor(action))[0]
+
+
+@pytest.mark.parametrize("level", [0, 1])
+@pytest.mark.parametrize("kind", ["mpc", "privileged"])
+def test_resumed_distillation_is_the_same_to_the_last_bit(kind, level, privileged):
+    config = make(teacher=kind if kind == "mpc" else str(privileged), age=6, planner=PlannerConfig(3, 3, 1))
+    start = Distill(config).policy if level else None
+    whole, first, second = (Distill(config, level, start) for _ in range(3))
+    whole.learn(32, lambda _: None)
+    first.learn(16, lambda _: None)
+    second.load_state_dict(first.state_dict())
+    second.num_timesteps = first.num_timesteps
+    second.learn(16, lambda _: None)
+    for name, value in whole.actor.state_dict().items():
+        assert torch.equal(value, second.actor.state_dict()[name]), name
+    assert torch.equal(whole.env.state.x, second.env.state.x)
+    for mine, theirs in zip(whole.dataset.rounds, second.dataset.rounds, strict=True):
+        assert torch.equal(mine.observations, theirs.observations) and torch.equal(mine.actions, theirs.actions)
+
+
+class Scripted(Teacher):
+    """Looks only every third step; answers the number of the call."""
+
+    resolution = 4
+
+    def __init__(self):
+        self.calls = -1
+
+    def act(self, env, seen):
+        """A constant action."""
+        self.calls += 1
+        self.fresh = self.calls % 3 == 0
+        return torch.full((env.num_envs, 2, 4, 4), self.calls / 10)
+
+
+# Robot 0 is cut after calls 0, 2 and 4, robot 1 after 1, 3 and 5; each then waits for the next look.
+@pytest.mark.parametrize(("share", "expected"), [(1.0, [0, 0, 1, 3, 3, 4]), (0.0, [0, 0, 3, 3])])
+def test_labels_count_only_where_the_teacher_looked_or_led(share, expected):
+    env = TorchEnv("run", 2, 64, particles=100, substeps=1)
+    collector = Collector(env, Scripted(), Episodes(env, 0, 2, 3), 3)  # the first robot begins anew after one step
+    labels = collector.collect(6, share, lambda seen: torch.zeros(2, 2, 8, 8))
+    given = (10 * labels.actions[:, 0, 0, 0]).round().int().tolist()
+    assert sorted(given) == expected
+
+
+def test_labels_are_dropped_oldest_first_and_survive_a_checkpoint():
+    dataset = Dataset(10)
+    for index in range(4):
+        images = torch.full((4, 3, 64, 64), index, dtype=torch.uint8)
+        dataset.add(Labels(images, torch.full((4, 2, 8, 8), float(index))))
+    assert len(dataset) == 8
+    copy = Dataset(10)
+    copy.load_state_dict(dataset.state_dict())
+    for data in (dataset, copy):
+        torch.manual_seed(0)
+        images, actions = data.sample(200)
+        assert sorted(set(actions[:, 0, 0, 0].tolist())) == [2.0, 3.0]
+        assert torch.equal(images[:, 0, 0, 0].float(), actions[:, 0, 0, 0])
+
+
+@pytest.mark.parametrize(("given", "wanted"), [(8, 8), (8, 16), (16, 8), (16, 32), (16, 64), (64, 64)])
+def test_projected_action_drives_the_muscles_alike(given, wanted):
+    action = 0.5 * torch.rand(3, 2, given, given).double() - 0.25
+    found = project(action, wanted, 64)
+    assert found.shape == (3, 2, wanted, wanted)
+    field = lambda image: patch_field(image, 64, 1.0)  # noqa: E731
+    error = (field(found) - field(action)).square().mean().sqrt()
+    if wanted in (given, 64):
+        assert error < 1e-12
+    else:
+        assert error < 0.3 * field(action).square().mean().sqrt() or wanted < given
+        naive = torch.nn.functional.interpolate(action, (wanted, wanted), mode="bicubic", align_corners=False)
+        assert error < (field(naive) - field(action)).square().mean().sqrt()
+
+
+def test_action_of_the_other_layout_acts_at_the_same_place():
+    record = OpenLoop(torch.rand(5, 2, 8, 8))
+    env = TorchEnv("run", 1, particles=100)
+    env.reset(seed=0)
+    seen = torch.zeros(1, 3, 64, 64, dtype=torch.uint8)
+    action = PolicyTeacher(record, False, "image").act(env, seen)
+    as_grid = PolicyTeacher(record, True, "grid").act(env, seen)
+    assert torch.equal(as_grid, to_grid_layout(action, "image"))
+    back = PolicyTeacher(record, True, "image").act(env, seen)
+    assert torch.equal(to_grid_layout(back, "image"), action)
+
+
+def test_sequence_teaches_by_the_step_of_the_episode():
+    record = OpenLoop(torch.linspace(0, 0.9, 10)[:, None, None, None].expand(10, 2, 8, 8))
+    env = TorchEnv("run", 3, particles=100, substeps=1)
+    seen, _ = env.reset(seed=0)
+    env.env_state = replace(env.env_state, steps=torch.tensor([0, 4, 20]))
+    action = PolicyTeacher(record, False, "image").act(env, seen)
+    assert action[:, 0, 0, 0].tolist() == pytest.approx([0.0, 0.4, 0.0])
+
+
+def test_loss_that_is_not_finite_ends_the_training():
+    student = Distill(make())
+    with torch.no_grad():
+        next(student.actor.parameters()).fill_(float("nan"))
+    student.collector.collect = lambda *_: Labels(torch.zeros(8, 3, 64, 64, dtype=torch.uint8), torch.zeros(8, 2, 8, 8))
+    with pytest.raises(NonFiniteError, match="loss became nan"):
+        student.learn(8, lambda _: None)
+
+
+TINY = (
+    "--task run --particles 100 --substeps 1 --num-envs 2 --resolutions 4 8 --eval-episodes 2 --no-video --device cpu "
+    "--backend eager --checkpoint-every 20"
+).split()
+LESSONS = "--tier 100 --steps 32 --handover 16 --round 4 --updates 2 --batch-size 4 --eval-every 0".split()
+
+
+def test_privileged_policy_becomes_one_of_images_that_cfp_refines(privileged, tmp_path, capsys):
+    folder = tmp_path / "distilled"
+    assert distill.main([*TINY, *LESSONS, "--teacher", str(privileged), "--out", str(folder)]) == 0
+    assert read_policy(folder / "teacher.safetensors")[1] == read_policy(privileged)[1]
+    policy = cfp.load(folder)
+    assert policy.description["trained_by"] == "distill" and policy.spec.resolutions == (4, 8)
+    std = policy.actor.std(torch.zeros(1, 32, 4, 4))
+    assert torch.nn.functional.softplus(3 * std - 1).mean() == pytest.approx(0.105, abs=1e-3)
+    options = "--steps 24 --handover 12 --batch-size 4 --update-start 8 --actor-start 6 --eval-every 12".split()
+    refined = [*TINY, *options, "--refine", "--start-from", str(folder)]
+    assert cfp.train.main([*refined, "--out", str(tmp_path / "refined")]) == 0
+    first = read_table(tmp_path / "refined" / "evaluations.csv")[0]
+    assert (first["step"], first["stage"]) == ("12", "2")
+    assert cfp.load(tmp_path / "refined").description["task"] == "run"
+    assert baselines.load(folder).spec == policy.spec
+    capsys.readouterr()
+
+
+def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch):
+    base = Shac.preset("run", "quick")
+    tiny = replace(base, steps=32, window=4, tier=100, environment=EnvironmentConfig(2, 100, 1))
+    tiny = replace(tiny, report=ReportConfig(0, 1, video=False))
+    monkeypatch.setattr(Shac, "preset", staticmethod(lambda task, name: tiny))
+    monkeypatch.setitem(baselines.ALGORITHMS, "shac", Shac.entry())
+    folder = tmp_path / "run"
+    assert distill.main([*TINY, *LESSONS, "--teacher", "shac", "--out", str(folder)]) == 0
+    assert read_table(folder / "teacher" / "progress.csv")
+    trained = (folder / "teacher" / "policy.safetensors").read_bytes()
+    assert (folder / "teacher.safetensors").read_bytes() == trained
+    assert distill.main([*TINY, *LESSONS, "--teacher", "shac", "--dry-run"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("task", "kind", "target", "message"),
+    [
+        ("shapematch", "gradient", "T", "teacher: got a policy for the target T, allowed star"),
+        ("kick", "gradient", None, "teacher: got a policy for kick, allowed run"),
+        ("run", "mpc", None, "teacher: got the record of one planned episode, allowed mpc itself"),
+        ("run", "gradient", "T", "teacher: its target or the student's cannot be read"),
+        (None, "", None, "there is no policy"),
+    ],
+)
+def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, kind, target, message):
+    path = tmp_path / "policy.safetensors"
+    if task:
+        config = replace(Distill.preset(task, "quick"), environment=EnvironmentConfig(1, 100, target=target))
+        write_policy(path, {"actions": torch.zeros(3, 2, 8, 8)}, origin(config, kind, 0, 0))
+    folder = tmp_path / "run"
+    student = ["--task", "shapematch", "--target", "star"] if task == "shapematch" else []
+    assert distill.main([*TINY, *LESSONS, *student, "--teacher", str(path), "--out", str(folder)]) == 2
+    assert message in capsys.readouterr().err
+    assert not folder.exists()
