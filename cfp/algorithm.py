@@ -37,11 +37,14 @@ METRICS: dict[str, str] = {
     "train/reward_std": "running standard deviation of raw rewards that they are divided by",
     "train/gate": "mean gate of the residual actor: 0 keeps the coarse action, 1 replaces it",
     "train/gate_penalty": "gate penalty inside the actor loss",
-    "train/drift": "mean square by which sampled actions differ from the mean ones of the policy that is refined",
     "train/n_updates": "gradient updates so far in this stage",
     "train/learning_rate": "learning rate of the critics, and of the actor unless it has its own",
 }
 """Every scalar that `CFP.train` logs, and what it means."""
+REFINING_METRICS: dict[str, str] = {
+    "train/drift": "mean square by which sampled actions differ from the mean ones of the policy that is refined",
+}
+"""What it logs besides where a policy is refined."""
 
 
 class RewardStatistics(nn.Module):
