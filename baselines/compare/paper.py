@@ -6,7 +6,7 @@ the steps, three seeds, training returns. A resting robot was measured in the re
 
 from __future__ import annotations
 
-COLUMNS = ("cfp", "coarse", "fine", "gnn16", "gnn64", "transformer16", "transformer64")
+COLUMNS = ("cfp", "coarse", "fine", "gnn-16", "gnn-64", "transformer-16", "transformer-64")
 """Names that the paper's methods have here, in the order of `CURVES`."""
 
 CURVES: dict[str, tuple[int, tuple[tuple[float, float], ...]]] = {
@@ -42,10 +42,10 @@ EXPERTS: dict[str, dict[int, tuple[float, float]]] = {
 }
 """Task to action grid to the best return of "expert policies" and its error bar. Grids of SHAPE MATCH are doubtful."""
 
-COST: dict[str, tuple[float, float]] = {"cfp": (54, 4053), "transformer64": (104, 6895), "gnn64": (83, 4199)}
+COST: dict[str, tuple[float, float]] = {"cfp": (54, 4053), "transformer-64": (104, 6895), "gnn-64": (83, 4199)}
 """Seconds of an average training episode in RUN, and memory (MB), on an RTX 4090."""
 
-SUCCESS: dict[str, float] = {"cfp": 0.154, "transformer64": 0.059, "gnn64": 0.0}
+SUCCESS: dict[str, float] = {"cfp": 0.154, "transformer-64": 0.059, "gnn-64": 0.0}
 """Share of successful episodes in SLOT; of how many is not said."""
 
 FAULTS: dict[str, tuple[float, float]] = {

@@ -72,7 +72,7 @@ def test_curves_are_joined_where_all_have_values():
 def test_paper_s_numbers_are_complete():
     assert set(paper.CURVES) == set(paper.EXPERTS) == set(paper.FAULTS) == set(paper.REST)
     assert all(len(values) == len(paper.COLUMNS) for _, values in paper.CURVES.values())
-    assert paper.curve("transformer64", "catch") == (7200, 1260)
+    assert paper.curve("transformer-64", "catch") == (7200, 1260)
     assert paper.curve("fine", "dig") == (570, 40)
     assert paper.curve("shac", "run") is paper.curve("cfp", "own task") is None
     assert paper.normalised("run", 2500) == 0 and paper.normalised("run", 8650) == 1
