@@ -148,12 +148,14 @@ class Distill(Algorithm):
     def preset(task: str, name: str) -> DistillConfig:
         """Defaults of a task, with the networks of the same preset of the coarse-to-fine policy.
 
-        Both teach at the lite tier; ``quick`` is judged there, ``paper`` in the paper's environment.
+        Both teach at the lite tier; ``quick`` is judged there, ``paper`` in the paper's environment. SHAPE MATCH, whose
+        episodes are alike and whose actions are fine, gets fewer labels and more, smaller updates.
 
         Raises:
             ConfigError: No such task or preset.
         """
-        base, silhouette, steps = cfp.preset(task, name), task == "shapematch", 48_000
+        base, silhouette = cfp.preset(task, name), task == "shapematch"
+        steps = 24_000 if silhouette else 48_000
         return DistillConfig(
             task=task,
             preset=base.preset,
@@ -166,6 +168,10 @@ class Distill(Algorithm):
             network=base.network,
             teacher="gradient" if silhouette else "shac",
             round=30 if silhouette else 64,
+            updates=160 if silhouette else 48,
+            batch_size=64 if silhouette else 256,
+            student_rate=2e-3 if silhouette else 1e-3,
+            share=0.8 if silhouette else 0.7,
             planner=PlannerConfig(iterations=30, learning_rate=0.1) if silhouette else PlannerConfig(),
             planner_grid=16 if silhouette else "coarse",
         )

@@ -8,6 +8,7 @@ import torch
 
 import baselines
 import cfp
+import cfp.train
 from baselines import Distill, OpenLoop, PlannerConfig, Shac, distill
 from baselines.dagger import Collector, Dataset, Labels
 from baselines.distillation import METRICS
@@ -31,11 +32,12 @@ def make(**changes):
 
 @pytest.fixture(scope="module")
 def privileged(tmp_path_factory):
-    """An untrained policy of the state, on file."""
-    path = tmp_path_factory.mktemp("teacher") / "policy.safetensors"
-    config = replace(Shac.preset("run", "quick"), environment=EnvironmentConfig(2, 300, 4), tier=300)
-    Shac(config).save(path, origin(config, "shac", 0, 0))
-    return path
+    """Untrained policies of the state, on file, by task."""
+    paths = {task: tmp_path_factory.mktemp(task) / "policy.safetensors" for task in ("run", "shapematch")}
+    for task, path in paths.items():
+        config = replace(Shac.preset(task, "quick"), environment=EnvironmentConfig(2, 300, 4), tier=300)
+        Shac(config).save(path, origin(config, "shac", 0, 0))
+    return paths
 
 
 class Mirror(Teacher):
@@ -99,7 +101,7 @@ def test_student_does_as_the_teacher_in_a_closed_loop():
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("kind", ["mpc", "privileged"])
 def test_resumed_distillation_is_the_same_to_the_last_bit(kind, level, privileged):
-    config = make(teacher=kind if kind == "mpc" else str(privileged), age=6, planner=PlannerConfig(3, 3, 1))
+    config = make(teacher=kind if kind == "mpc" else str(privileged["run"]), age=6, planner=PlannerConfig(3, 3, 1))
     start = Distill(config).policy if level else None
     whole, first, second = (Distill(config, level, start) for _ in range(3))
     whole.learn(32, lambda _: None)
@@ -200,16 +202,16 @@ def test_loss_that_is_not_finite_ends_the_training():
 
 
 TINY = (
-    "--task run --particles 100 --substeps 1 --num-envs 2 --resolutions 4 8 --eval-episodes 2 --no-video --device cpu "
-    "--backend eager --checkpoint-every 20"
+    "--task shapematch --particles 100 --substeps 1 --num-envs 2 --resolutions 4 8 --eval-episodes 2 "
+    "--no-video --device cpu --backend eager --checkpoint-every 20"
 ).split()
 LESSONS = "--tier 100 --steps 32 --handover 16 --round 4 --updates 2 --batch-size 4 --eval-every 0".split()
 
 
 def test_privileged_policy_becomes_one_of_images_that_cfp_refines(privileged, tmp_path, capsys):
     folder = tmp_path / "distilled"
-    assert distill.main([*TINY, *LESSONS, "--teacher", str(privileged), "--out", str(folder)]) == 0
-    assert read_policy(folder / "teacher.safetensors")[1] == read_policy(privileged)[1]
+    assert distill.main([*TINY, *LESSONS, "--teacher", str(privileged["shapematch"]), "--out", str(folder)]) == 0
+    assert read_policy(folder / "teacher.safetensors")[1] == read_policy(privileged["shapematch"])[1]
     policy = cfp.load(folder)
     assert policy.description["trained_by"] == "distill" and policy.spec.resolutions == (4, 8)
     std = policy.actor.std(torch.zeros(1, 32, 4, 4))
@@ -219,13 +221,13 @@ def test_privileged_policy_becomes_one_of_images_that_cfp_refines(privileged, tm
     assert cfp.train.main([*refined, "--out", str(tmp_path / "refined")]) == 0
     first = read_table(tmp_path / "refined" / "evaluations.csv")[0]
     assert (first["step"], first["stage"]) == ("12", "2")
-    assert cfp.load(tmp_path / "refined").description["task"] == "run"
+    assert cfp.load(tmp_path / "refined").description["task"] == "shapematch"
     assert baselines.load(folder).spec == policy.spec
     capsys.readouterr()
 
 
 def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch):
-    base = Shac.preset("run", "quick")
+    base = Shac.preset("shapematch", "quick")
     tiny = replace(base, steps=32, window=4, tier=100, environment=EnvironmentConfig(2, 100, 1))
     tiny = replace(tiny, report=ReportConfig(0, 1, video=False))
     monkeypatch.setattr(Shac, "preset", staticmethod(lambda task, name: tiny))
@@ -254,7 +256,7 @@ def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, kind, targ
         config = replace(Distill.preset(task, "quick"), environment=EnvironmentConfig(1, 100, target=target))
         write_policy(path, {"actions": torch.zeros(3, 2, 8, 8)}, origin(config, kind, 0, 0))
     folder = tmp_path / "run"
-    student = ["--task", "shapematch", "--target", "star"] if task == "shapematch" else []
+    student = ["--target", "star"] if task == "shapematch" else ["--task", "run"]
     assert distill.main([*TINY, *LESSONS, *student, "--teacher", str(path), "--out", str(folder)]) == 2
     assert message in capsys.readouterr().err
     assert not folder.exists()
