@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -17,20 +18,25 @@ from cfp.evaluation import Noise, Policy, compare, format_table, to_rows
 from cfp.process import keep_memory
 from cfp.run import make_video, read_config, stage_files
 from cfp.train import PROGRAM
+from cfp.weights import policy_file
 
 
 @dataclass(frozen=True)
 class Command:
-    """Evaluate the policies in a run folder beside zero and random action, on the same particle layouts."""
+    """Evaluate the policies of a run, or a single one, beside zero and random action, on the same particle layouts."""
 
-    folder: tyro.conf.Positional[Path]
+    folder: tyro.conf.Positional[Path | None] = None
     """A folder that a training wrote or is writing."""
+    policy: str | None = None
+    """In place of a folder: a policy file, or the name of a policy that comes with the package."""
     episodes: int = 5
     """Episodes of each policy."""
     noise: Noise = "default"
     """Action noise of the trained policies: with, without, both in rows of their own, or default, as trained."""
     seed: int | None = None
     """Seed of layouts and noise; the run's own if not given."""
+    particles: Literal["full", "lite"] | int | tuple[int, int] | None = None
+    """Particles: full (the paper's), lite, or counts; the run's own if not given."""
     device: str = "auto"
     """cpu, cuda, or auto."""
     json: bool = False
@@ -69,6 +75,15 @@ def open_run(
     return config, policies
 
 
+def open_policy(program: Program, path: str, device: str, seed: int | None) -> tuple[RunConfig, dict[str, Policy]]:
+    """A single policy and options to evaluate it with, as the run that trained it does; see `open_run`."""
+    policy = program.load(Path(path))
+    about = policy.description
+    values = {"algo": about["kind"], "task": about["task"], "environment": about["environment"]}
+    config = replace(program.configure(values), device=device, seed=about["seed"] if seed is None else seed)
+    return config, {policy_file(path).stem: policy}
+
+
 def run(program: Program, command: Command) -> str:
     """Do what a command says and return what it prints.
 
@@ -77,7 +92,16 @@ def run(program: Program, command: Command) -> str:
     """
     if command.episodes < 1:
         raise ConfigError(f"episodes: got {command.episodes}, allowed 1 or more")
-    config, policies = open_run(program, command.folder, command.device, command.seed)
+    if (command.folder is None) == (command.policy is None):
+        raise ConfigError(f"policy: got {command.policy!r} and the folder {command.folder}, allowed is one of the two")
+    if command.folder is not None:
+        config, policies = open_run(program, command.folder, command.device, command.seed)
+    else:
+        assert command.policy is not None
+        config, policies = open_policy(program, command.policy, command.device, command.seed)
+    if command.particles is not None:
+        config = replace(config, environment=replace(config.environment, particles=command.particles))
+        config.check()
     results = compare(config, policies, command.episodes, command.noise)
     if command.video is not None:
         make_video(config, list(policies.values())[-1], command.video)

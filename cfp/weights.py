@@ -22,6 +22,8 @@ from cfp.policy import ActorPolicy
 FORMAT = "cfp-policy"
 VERSION = 1
 KIND = "cfp"
+SHIPPED = Path(__file__).parent / "policies"
+"""Policies that come with the package, by name."""
 
 
 def origin(config: RunConfig, kind: str, level: int, steps: int) -> dict[str, Any]:
@@ -68,16 +70,27 @@ def write_policy(path: Path, tensors: Mapping[str, Tensor], description: dict[st
     write_json(path.with_suffix(".json"), description)
 
 
+def shipped() -> list[str]:
+    """Names of the policies that come with the package."""
+    return sorted(file.stem for file in SHIPPED.glob("*.safetensors"))
+
+
 def policy_file(path: str | Path) -> Path:
-    """The ``.safetensors`` file that a run folder, that file itself or the ``.json`` beside it stands for.
+    """The ``.safetensors`` file that a path stands for.
+
+    Args:
+        path: A run folder, that file itself, the ``.json`` beside it, or, where nothing has that path, the name of a
+            policy that comes with the package.
 
     Raises:
         CheckpointError: There is none.
     """
     file = Path(path)
+    if not file.exists() and str(path) in shipped():
+        file = SHIPPED / str(path)
     file = file / "policy.safetensors" if file.is_dir() else file.with_suffix(".safetensors")
     if not file.exists():
-        raise CheckpointError(f"{file}: there is no policy")
+        raise CheckpointError(f"{file}: there is no policy, and none of that name is shipped ({', '.join(shipped())})")
     return file
 
 
@@ -133,7 +146,8 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
     """Load a trained policy; nothing is unpickled.
 
     Args:
-        path: A run folder, a ``.safetensors`` file, or the ``.json`` beside one.
+        path: A run folder, a ``.safetensors`` file, the ``.json`` beside one, or the name of a policy that comes with
+            the package, such as ``"run"``.
         device: Where its tensors go.
 
     Returns:

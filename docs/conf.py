@@ -29,6 +29,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
     "sphinx_gallery.gen_gallery",
+    "sphinx-mathjax-offline",  # formulas without a network; the site opens from disk
 ]
 exclude_patterns = ["_build", "generated/summary.md", "sg_execution_times.rst", "tasks"]
 sphinx_gallery_conf = {

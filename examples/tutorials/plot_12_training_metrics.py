@@ -48,12 +48,12 @@ def series(name: str) -> tuple[list[int], list[float]]:
 # What to look at first
 # ---------------------
 #
-# - ``rollout/return`` is what exploring robots earn; ``evaluations.csv`` holds what the policy earns on other
-# layouts. - ``train/critic_loss`` should fall from its first peak and stay flat. If it grows without end, values run
-# away. - ``train/q`` and the reward statistics tell the scale. Rewards are centred, so values near zero mean "as
-# usual". - ``train/entropy`` falls as the policy becomes sure. If it falls to its least value at once, the policy has
-# stopped to explore; if it never falls, the critic cannot tell actions apart. - ``train/gate`` exists from the second
-# level on: 0 keeps the coarse action, 1 replaces it.
+# - ``rollout/return`` is what exploring robots earn; ``evaluations.csv`` holds what the policy earns on other layouts.
+# - ``train/critic_loss`` should fall from its first peak and stay flat. If it grows without end, values run away.
+# - ``train/q`` and the reward statistics tell the scale. Rewards are centred: values near zero mean "as usual".
+# - ``train/entropy`` falls as the policy becomes sure. At its least value at once, the policy has stopped exploring;
+#   if it never falls, the critic cannot tell actions apart.
+# - ``train/gate`` exists from the second level on: 0 keeps the coarse action, 1 replaces it.
 
 shown = ("rollout/return", "train/critic_loss", "train/q", "train/entropy", "train/reward_std", "train/gate")
 figure, axes = plt.subplots(2, 3, figsize=(11, 5.4))
@@ -68,9 +68,9 @@ figure.tight_layout()
 # Signs of trouble
 # ----------------
 #
-# - A non-finite loss stops the run with an error that names it; nothing is hidden, and the last checkpoint is good. -
-# Episodes that end early show in ``rollout/length``. In tasks that can tear a robot it is the first thing to fall. -
-# ``time/steps_per_second`` (TensorBoard only) falling over hours means that something else wants the machine.
+# - A non-finite loss stops the run with an error that names it; nothing is hidden, and the last checkpoint is good.
+# - Episodes that end early show in ``rollout/length``. In tasks that can tear a robot it is the first thing to fall.
+# - ``time/steps_per_second`` (TensorBoard only) falling over hours means that something else wants the machine.
 #
 # ``tensorboard --logdir runs`` shows all of it live, with pictures of action and gate at every evaluation.
 

@@ -4,11 +4,15 @@ import html
 import json
 import signal
 
+import numpy as np
 import pytest
 
+import cfp
+import dittogym
 from cfp import evaluate, train
 from cfp.callbacks import StageCallback
 from cfp.files import read_table
+from cfp.weights import policy_file, shipped
 
 TINY = (
     "--task shapematch --particles 100 --substeps 1 --num-envs 2 --resolutions 4 8 --steps 150 --handover 70 "
@@ -186,6 +190,43 @@ def test_evaluation_with_and_without_noise(finished, capsys):
         assert rows["both"][f"{stage}, mean"] == rows["without"][stage]
     assert rows["with"] != rows["without"]
     assert rows["with"]["stage 1"]["interval"] > 0
+
+
+def test_evaluation_of_a_single_policy_is_that_of_its_run(finished, capsys):
+    common = ["--episodes", "2", "--json", "--device", "cpu"]
+    assert evaluate.main(["--policy", str(finished / "policy.safetensors"), *common]) == 0
+    alone = json.loads(capsys.readouterr().out)
+    assert evaluate.main([str(finished), *common]) == 0
+    run = json.loads(capsys.readouterr().out)
+    assert alone[-1] | {"policy": "stage 2"} == run[-1]
+    assert evaluate.main([str(finished), *common, "--particles", "60"]) == 0
+    other = json.loads(capsys.readouterr().out)
+    assert [row["mean"] for row in other] != [row["mean"] for row in run]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "policy: got None and the folder None, allowed is one of the two"),
+        (["somewhere", "--policy", "run"], "allowed is one of the two"),
+        (["--policy", "alchemy"], "none of that name is shipped (run, shapematch)"),
+        (["--policy", "run", "--particles", "0"], "particles"),
+    ],
+)
+def test_evaluation_of_nothing_is_an_error(arguments, message, capsys):
+    assert evaluate.main([*arguments, "--episodes", "1"]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_shipped_policy_acts_in_its_task(name):
+    policy = cfp.load(name)
+    assert policy.description["task"] == name and policy_file(name).stat().st_size < 1_000_000
+    assert json.loads(policy_file(name).with_suffix(".json").read_text()) == policy.description
+    env = dittogym.TorchEnv(name, resolution=policy.resolution, particles=100, substeps=1)
+    observation, _ = env.reset(seed=0)
+    action, _ = policy.predict(observation.numpy())
+    assert action.shape == (1, *env.action_shape) and np.abs(action).max() <= 1
 
 
 def test_page_shows_the_run_and_opens_from_disk(finished):
