@@ -9,7 +9,7 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from baselines.nodes import Nodes
+from baselines.nodes import Nodes, places
 from baselines.segments import begin, follow
 from dittogym import TorchEnv
 from torchmpm.state import choose
@@ -69,8 +69,8 @@ class SegmentedEnv:
         """Advance by one control step, see `dittogym.TorchEnv.step`, with actions (B, K, 2)."""
         field = self.nodes.act(self.env, self.labels, action)
         _, reward, terminated, truncated, info = self.env.step(field)
-        x = self.env.state.x[:, : self.env.model.robot]
-        self._labels = choose(info["finite"], follow(x, self.labels, self.nodes.count), self.labels)
+        labels = follow(places(self.env), self.labels, self.nodes.count)
+        self._labels = choose(info["finite"], labels, self.labels)
         return self._look(info["finite"]), reward, terminated, truncated, info
 
     def _look(self, mask: Tensor) -> Tensor:
@@ -84,7 +84,7 @@ class SegmentedEnv:
 
 def segmented(env: TorchEnv, nodes: Nodes, labels: Tensor | None, anew: Tensor) -> Tensor:
     """Labels (B, N) in which the elements of a mask (B,) are segmented anew."""
-    x = env.state.x[:, : env.model.robot]
+    x = places(env)
     result = x.new_zeros(x.shape[:2], dtype=torch.int64) if labels is None else labels.clone()
     if bool(anew.any()):
         result[anew] = begin(x[anew], nodes.count)

@@ -13,7 +13,7 @@ from torch import Tensor
 from baselines.actor_critic import shown
 from baselines.modular_env import segmented
 from baselines.modular_networks import ModularActor
-from baselines.nodes import Nodes
+from baselines.nodes import Nodes, places
 from baselines.segments import follow
 from cfp.weights import fitting, read_policy, write_policy
 from dittogym import TorchEnv
@@ -85,7 +85,7 @@ class SegmentPolicy:
         labels: Tensor | None = None
         if state is not None:
             labels = torch.as_tensor(state[0], device=env.device)
-            labels = follow(env.state.x[:, : env.model.robot], labels, self.nodes.count)
+            labels = follow(places(env), labels, self.nodes.count)
         labels = segmented(env, self.nodes, labels, torch.as_tensor(anew, device=env.device))
         device = next(self.actor.parameters()).device
         values = self.actor(self.nodes(env, labels).to(device), deterministic).to(env.device)

@@ -17,6 +17,10 @@ LENGTH, SPEED = 0.1, 0.5
 """Units of the features, m and m/s: most values lie within [-2, 2]."""
 FLOOR = 20 / 128
 """Height of the floor, m."""
+FASTEST = 100.0
+"""Speed along an axis at which the view saturates, m/s."""
+BEYOND = 1.0
+"""Distance from the window beyond which matter is seen no farther away, m: what tears can fly off to 1e20."""
 BITS = 16
 """Neighbours that one float32 of a node's row holds; whole numbers up to 2^24 are exact there."""
 
@@ -50,7 +54,7 @@ class Nodes:
     def __call__(self, env: TorchEnv, labels: Tensor) -> Tensor:
         """Rows (B, K, columns), float32, of the environment's present state with labels (B, N)."""
         state, robot = env.env_state, env.model.robot
-        x, v = state.particles.x[:, :robot], state.particles.v[:, :robot]
+        x, v = places(env), state.particles.v[:, :robot].clamp(-FASTEST, FASTEST)
         com = x.mean(1)[:, None]
         offset = x - com
         means, sizes = averages(torch.cat((offset, offset.square(), v), -1), labels, self.count)
@@ -95,10 +99,17 @@ class Nodes:
         along = torch.arange(size, device=env.device)
         nodes = torch.stack(torch.meshgrid(along, along, indexing="ij"), -1).flatten(0, 1)
         place = state.origin[:, None] + (corner[:, None] + nodes) / grid
-        centres, _ = averages(state.particles.x[:, : env.model.robot], labels, self.count)
+        centres, _ = averages(places(env), labels, self.count)
         nearest = squared_distances(place.to(centres), centres).argmin(-1)
         field = values.to(centres).gather(1, nearest[..., None].expand(-1, -1, 2))
         return from_grid_layout(field.transpose(1, 2).unflatten(2, (size, size)), env.action_layout)
+
+
+def places(env: TorchEnv) -> Tensor:
+    """Where the robot's particles are seen, (B, N, 2), m: at most `BEYOND` outside the window, which is 1 m wide."""
+    state = env.env_state
+    low = state.origin[:, None] - BEYOND
+    return state.particles.x[:, : env.model.robot].clamp(low, low + 1.0 + 2.0 * BEYOND)
 
 
 def _has_object(spec: TaskSpec) -> bool:

@@ -95,6 +95,6 @@ class NamesTable(SphinxDirective):
 
 def setup(app: Sphinx) -> None:
     """Register the directives, and write the pages of the tasks before any page is read."""
-    app.connect("builder-inited", lambda app: write_pages())
+    app.connect("builder-inited", lambda app: write_pages(), priority=100)  # before tutorials register tasks
     app.add_directive("command-help", CommandHelp)
     app.add_directive("names-table", NamesTable)

@@ -11,9 +11,11 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 import baselines
 import cfp
 from baselines.modular import ModularConfig, ModularRun
+from baselines.modular_env import segmented
 from baselines.modular_networks import ModularActor, ModularCritics
 from baselines.modular_policy import SegmentPolicy
-from baselines.nodes import Nodes, pack
+from baselines.nodes import Nodes, pack, places
+from baselines.segments import follow
 from cfp.config import EnvironmentConfig, ReportConfig
 from cfp.errors import CheckpointError, ConfigError
 from cfp.process import StopSignals
@@ -178,3 +180,20 @@ def test_fewer_particles_than_segments_are_refused():
         options = ModularConfig(algo="gnn-64", task="kick", environment=EnvironmentConfig(particles=particles))
         with pytest.raises(ConfigError, match="particles: got 63 of the robot, allowed 64"):
             options.check()
+
+
+@pytest.mark.parametrize("graph", [False, True])
+def test_matter_that_flew_off_leaves_finite_what_is_seen(graph):
+    env = TorchEnv("shapematch", resolution=64, particles=200, substeps=1)
+    env.reset(seed=0)
+    nodes = Nodes(16, graph)
+    labels = segmented(env, nodes, None, torch.ones(1, dtype=torch.bool))
+    particles = env.state.clone()
+    particles.x[0, 0], particles.v[0, 0] = 1e25, 1e30  # finite, and out of the window: the episode goes on
+    env.env_state = replace(env.env_state, particles=particles)
+    labels = follow(places(env), labels, 16)
+    rows = nodes(env, labels)
+    assert rows.isfinite().all() and rows.abs().max() < 1e6
+    field = nodes.act(env, labels, torch.rand(1, 16, 2))
+    _, _, _, _, info = env.step(field)
+    assert info["finite"].all()
