@@ -164,18 +164,22 @@ class Shac(Algorithm):
 
     @staticmethod
     def preset(task: str, name: str) -> ShacConfig:
-        """Defaults of a task: ``quick`` is judged at the lite tier, ``paper`` in the paper's environment.
+        """Defaults of a task: ``quick`` takes minutes and is judged at the lite tier.
 
-        Both train at the lite tier. RUN and OBSTACLE are trained on speed, the others on their own smooth reward.
+        ``paper`` trains four times as long in smaller steps and is judged in the paper's environment. Both train at the
+        lite tier. RUN and OBSTACLE are trained on speed, the others on their own smooth reward.
 
         Raises:
             ConfigError: No such task or preset.
         """
         environment = replace(cfp.preset(task, name).environment, num_envs=4)
         running = task in ("run", "obstacle")
+        quick = name == "quick"
         return ShacConfig(
             task=task,
-            preset="quick" if name == "quick" else "paper",
+            preset="quick" if quick else "paper",
+            steps=13_000 if quick else 52_000,
+            learning_rate=1e-3 if quick else 5e-4,
             environment=environment,
             report=ReportConfig(0 if name == "paper" else 3200, 3, task == "shapematch", log_every=320),
             place=not running,
