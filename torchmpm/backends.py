@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -76,4 +76,6 @@ def substep_function(solver: Solver, scene: Scene) -> Callable[[Planes], Planes]
 def _compiled() -> Callable[[Solver, Scene, Planes], Planes]:
     from torchmpm.solver import Solver  # not at the top: the solver imports this module
 
-    return torch.compile(Solver.substep, dynamic=False)
+    # Sums over the nine nodes become one expression that computes their addresses once; addresses are clamped already.
+    options: dict[str, Any] = {"unroll_reductions_threshold": 16, "assert_indirect_indexing": False}
+    return torch.compile(Solver.substep, dynamic=False, options=options)
