@@ -22,7 +22,7 @@ from baselines.episodes import Episodes
 from baselines.planner import PlannerConfig
 from baselines.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
 from cfp.actor import build_actor
-from cfp.config import EnvironmentConfig, LadderConfig, RunConfig, at_least_one
+from cfp.config import EnvironmentConfig, LadderConfig, RunConfig, Tier, at_least_one
 from cfp.environments import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.policy import ActorPolicy
@@ -57,7 +57,7 @@ class DistillConfig(LadderConfig):
     """Which algorithm."""
     teacher: str = "shac"
     """mpc (plans from every state), shac or gradient (trained first), or a policy: a run folder, policy.safetensors."""
-    tier: Literal["full", "lite"] | int | tuple[int, int] = "lite"
+    tier: Tier = "lite"
     """Particles of the simulations that are taught in."""
     round: int = 64
     """Control steps between two lessons."""

@@ -16,7 +16,7 @@ from baselines.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.features import StateFeatures
 from baselines.shac_rollout import Rollout, Window
 from baselines.training_reward import RewardConfig
-from cfp.config import EnvironmentConfig, ReportConfig, RunConfig, at_least_one
+from cfp.config import EnvironmentConfig, ReportConfig, RunConfig, Tier, at_least_one
 from cfp.environments import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.evaluation import Policy
@@ -61,7 +61,7 @@ class ShacConfig(GridConfig):
     """What the policy is given: the privileged state (matter, deformation, clock), or the image like CFP's."""
     start_from: str | None = None
     """Policy of one level on the image, whatever trained it, whose weights the actor begins with."""
-    tier: Literal["full", "lite"] | int | tuple[int, int] = "lite"
+    tier: Tier = "lite"
     """Particles of the simulations that are learned from."""
     window: int = 16
     """Control steps that a gradient reaches back."""

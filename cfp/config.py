@@ -13,6 +13,7 @@ from cfp.groups import EnvironmentConfig as EnvironmentConfig
 from cfp.groups import LearningConfig as LearningConfig
 from cfp.groups import NetworkConfig as NetworkConfig
 from cfp.groups import ReportConfig as ReportConfig
+from cfp.groups import Tier as Tier
 from cfp.groups import at_least_one as at_least_one
 from cfp.merging import merge as merge
 from cfp.networks import RESOLUTIONS
