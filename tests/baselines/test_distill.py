@@ -14,7 +14,7 @@ from baselines.dagger import Collector, Dataset, Labels
 from baselines.distillation import METRICS
 from baselines.episodes import Episodes
 from baselines.registry import configure
-from baselines.teachers import PolicyTeacher, Teacher, project
+from baselines.teachers import PolicyTeacher, Teacher, project, read_teacher
 from cfp.config import EnvironmentConfig, ReportConfig, to_json
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.files import read_table
@@ -245,7 +245,8 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch):
     [
         ("shapematch", "gradient", "T", "teacher: got a policy for the target T, allowed star"),
         ("kick", "gradient", None, "teacher: got a policy for kick, allowed run"),
-        ("run", "mpc", None, "teacher: got the record of one planned episode, allowed mpc itself"),
+        ("run", "mpc", None, "teacher: got the record of one planned episode"),
+        ("run", "cem", None, "allowed in run, where every episode starts differently, is mpc itself"),
         ("run", "gradient", "T", "teacher: its target or the student's cannot be read"),
         (None, "", None, "there is no policy"),
     ],
@@ -254,9 +255,18 @@ def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, kind, targ
     path = tmp_path / "policy.safetensors"
     if task:
         config = replace(Distill.preset(task, "quick"), environment=EnvironmentConfig(1, 100, target=target))
-        write_policy(path, {"actions": torch.zeros(3, 2, 8, 8)}, origin(config, kind, 0, 0))
+        record = {"layout": 0} if kind in ("mpc", "cem") else {}
+        write_policy(path, {"actions": torch.zeros(3, 2, 8, 8)}, origin(config, kind, 0, 0) | record)
     folder = tmp_path / "run"
     student = ["--target", "star"] if task == "shapematch" else ["--task", "run"]
     assert distill.main([*TINY, *LESSONS, *student, "--teacher", str(path), "--out", str(folder)]) == 2
     assert message in capsys.readouterr().err
     assert not folder.exists()
+
+
+def test_record_teaches_where_every_episode_starts_alike(tmp_path):
+    config = replace(Distill.preset("grow", "quick"), environment=EnvironmentConfig(1, 100))
+    path = tmp_path / "record.safetensors"
+    write_policy(path, {"actions": torch.ones(3, 2, 8, 8)}, origin(config, "mpc", 0, 0) | {"layout": 0})
+    teacher = read_teacher(path, "grow", config.environment)
+    assert isinstance(teacher, OpenLoop) and len(teacher.actions) == 3
