@@ -238,7 +238,8 @@ class TorchEnv:
             The observation (B, 3, 64, 64) uint8 of all elements, and ``info``.
 
         Raises:
-            ValueError: An option is unknown, has the wrong shape, or puts particles outside the window.
+            ValueError: An option is unknown, has the wrong shape, puts particles outside the window, or makes matter
+                too stiff for the substeps.
         """
         options = dict(options or {})
         for name in options:
@@ -252,6 +253,7 @@ class TorchEnv:
         if options.get("physics") is not None:
             given = physics_values(options["physics"], self.num_envs, self.num_particles, self._like)
             physics = merged(self.spec, physics, given, mask, self._like)
+            dynamics.check_stability(self.model, physics)
         positions = self._layouts.draw(seed, mask.cpu().numpy(), options.get("positions"), self._like)
         fresh = dynamics.initial(self.model, positions, physics)
         if old is not None and self._stale:

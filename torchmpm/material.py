@@ -40,6 +40,9 @@ class Material(Protocol):
     def energy(self, F: Mat2, Jp: Tensor) -> Tensor:
         """Stored energy per unit volume, (B, N), J/m^2 (two-dimensional)."""
 
+    def stiffness(self) -> Value:
+        """Largest stress per strain in undeformed matter, over all kinds of strain (Frobenius norms), Pa."""
+
 
 def lame(young: Value, poisson: Value) -> tuple[Value, Value]:
     """Lame parameters (mu, lam) from Young's modulus (Pa) and Poisson's ratio, plane strain."""
@@ -61,6 +64,14 @@ def column(value: Value, like: Tensor, name: str = "value") -> Value:
     if value.ndim == 0 or (value.ndim == 2 and value.shape[0] in (1, batch) and value.shape[1] in (1, count)):
         return value
     raise ValueError(f"{name} must be a number or have shape (), ({batch},) or ({batch}, {count}), got {value.shape}")
+
+
+def spread(value: Value) -> Value:
+    """A material value on its own, without graph, so that it broadcasts against others: (B,) becomes (B, 1)."""
+    if not isinstance(value, Tensor):
+        return value
+    value = value.detach().to("cpu", torch.float64)
+    return value[:, None] if value.ndim == 1 else value
 
 
 def corotated_stress(F: Mat2, mu: Value, lam: Value, J: Tensor | None = None) -> Sym2:
@@ -221,6 +232,10 @@ class Elastic:
         """Stored energy per unit volume, (B, N)."""
         return corotated_energy(F, column(self.mu, Jp, "mu"), column(self.lam, Jp, "lam"))
 
+    def stiffness(self) -> Value:
+        """Largest stress per strain in undeformed matter: 2 (mu + lam), of a change of volume, Pa."""
+        return 2.0 * (spread(self.mu) + spread(self.lam))
+
 
 @dataclass(frozen=True, eq=False)
 class VonMises(Elastic):
@@ -294,6 +309,11 @@ class Soil(Elastic):
         """Stored energy per unit volume, (B, N)."""
         mu, lam = self._hardened(Jp)
         return corotated_energy(F, mu, lam, det(F).abs())
+
+    def stiffness(self) -> Value:
+        """As that of :class:`Elastic`, at Jp = 1."""
+        low, high = self.hardening_range
+        return min(max(1.0, low), high) * super().stiffness()
 
     def _hardened(self, Jp: Tensor) -> tuple[Value, Value]:
         factor = torch.exp(column(self.hardening, Jp, "hardening") * (1.0 - Jp)).clamp(*self.hardening_range)

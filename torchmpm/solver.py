@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from torchmpm.backends import BACKENDS, compiler_found, runs_native, substep_fun
 from torchmpm.boundary import Face, VelocityRule, constrain, faces
 from torchmpm.grid import PAD, Grid
 from torchmpm.linalg import Mat2, matmul
-from torchmpm.material import Material, Sym2, Value, column
+from torchmpm.material import Material, Sym2, Value, column, spread
 from torchmpm.native.library import NO_COMPILER
 from torchmpm.rollout import Segment, check_repetition, repeated
 from torchmpm.spline import Stencil, stencil
@@ -116,9 +117,10 @@ class Solver:
         backend: ``"native"`` (fused kernels, :mod:`torchmpm.native`: C++ on the CPU, Triton on CUDA), ``"eager"`` or
             ``"compile"`` (see :func:`torchmpm.backends.substep_function`), or ``"auto"``: native on a CPU where it
             works, else eager.
+        allow_unstable: Accept a ``dt`` beyond :meth:`stable_dt`.
 
     Raises:
-        ValueError: No bodies, ``dt`` not positive, or an unknown or unavailable backend.
+        ValueError: No bodies, ``dt`` not positive or beyond :meth:`stable_dt`, or an unknown or unavailable backend.
     """
 
     grid: Grid
@@ -128,6 +130,7 @@ class Solver:
     rules: tuple[VelocityRule, ...] = ()
     dt: float = 1e-4
     backend: str = "auto"
+    allow_unstable: bool = False
 
     def __post_init__(self) -> None:
         if not self.bodies:
@@ -138,11 +141,41 @@ class Solver:
             raise ValueError(f"backend must be one of {BACKENDS}, got {self.backend!r}")
         if self.backend in ("compile", "native") and not compiler_found():
             raise ValueError(f"backend {self.backend!r} {NO_COMPILER}")
+        if not self.allow_unstable and self.dt > (limit := self.stable_dt()):
+            raise ValueError(
+                f"dt must be at most {limit} s for matter so stiff and light to be stable, got {self.dt}; "
+                "allow_unstable=True accepts it"
+            )
 
     @property
     def num_particles(self) -> int:
         """N, the number of particles of all bodies."""
         return sum(body.count for body in self.bodies)
+
+    def stable_dt(self, actuation: Value = 0.0) -> float:
+        """Largest duration of a substep for which small strains of undeformed matter do not grow, s.
+
+        ``h / sqrt((k + 2 |a|) V / m)``, least over all particles, with the stiffness k = 2 (mu + lam) and the actuation
+        a. It holds however particles lie: the strain rate C of a particle cannot exceed what the kinetic energy of
+        its nodes allows, ``h^2/4 |C|^2 <= sum w |v_i|^2``, and a particle alone reaches that. Large strains, and soil
+        that has hardened, are stiffer and may need less.
+
+        Args:
+            actuation: Of the muscles, Pa; a number or a tensor of shape (), (B,) or (B, count).
+
+        Raises:
+            ValueError: Shapes of a body's values do not go together.
+        """
+        rates = [0.0]
+        for k, body in enumerate(self.bodies):
+            try:
+                pull: Value = abs(spread(actuation)) if body.muscle else 0.0
+                rate = (body.material.stiffness() + 2.0 * pull) * spread(body.volume) / spread(body.mass)
+            except RuntimeError as error:
+                raise ValueError(f"values of bodies[{k}] must have shapes that go together: {error}") from error
+            rates.append(float(rate.max()) if isinstance(rate, Tensor) else rate)
+        fastest = math.sqrt(max(rates))
+        return self.grid.h / fastest if fastest > 0 else math.inf
 
     def step(
         self,
@@ -175,8 +208,10 @@ class Solver:
                 this.
         """
         check_repetition(substeps, segment)
+        origin = self.check(state, actuation, origin)
+        if substeps == 0 or state.batch_size == 0:
+            return state
         if runs_native(self, state):
-            origin = self.check(state, actuation, origin)
             return native.step(self, state, actuation, origin, substeps, segment, mass_epsilon=MASS_EPSILON)
         substep = substep_function(self, self.scene(state, actuation, origin))
         return ParticleState.from_planes(repeated(substep, state.planes(), substeps, segment=segment))
