@@ -186,7 +186,8 @@ class StatePolicy:
         """
         tensors, description = read_policy(path, device)
         with fitting(path):
-            actor = StateActor(description["inputs"], description["resolution"])
-            actor.load_state_dict(tensors)
-            features = StateFeatures(**description["features"])
-            return cls(actor.to(device).requires_grad_(False), features, description["noise"], description)
+            with torch.device("meta"):  # so that a size that the file only claims takes no memory
+                actor = StateActor(description["inputs"], description["resolution"])
+            actor.load_state_dict(tensors, assign=True)
+            features, noise = StateFeatures(**description["features"]), float(description["noise"])
+            return cls(actor.to(device, torch.float32).requires_grad_(False), features, noise, description)

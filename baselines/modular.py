@@ -20,7 +20,7 @@ from baselines.modular_policy import SegmentPolicy
 from baselines.nodes import Nodes
 from cfp.algorithm import CFP
 from cfp.composition import Composition
-from cfp.config import RunConfig, SACConfig, StageConfig, at_least_one
+from cfp.config import RunConfig, SACConfig, StageConfig, at_least_one, not_negative
 from cfp.environments import make_torch_env
 from cfp.errors import ConfigError
 from cfp.policy import NetworkPolicy
@@ -79,6 +79,7 @@ class ModularConfig(SACConfig):
             raise ConfigError(f"algo: got {self.algo!r}, allowed {' or '.join(get_args(Kind))} with a count, as gnn-16")
         super().check()
         at_least_one(steps=self.steps)
+        not_negative(random_steps=self.random_steps, alpha=self.alpha)
         particles = self.environment.particles
         robot = particles[0] if isinstance(particles, tuple) else particles
         if isinstance(robot, int) and robot < self.segments:

@@ -107,6 +107,8 @@ class SegmentPolicy:
         """
         tensors, description = read_policy(path, device)
         with fitting(path):
-            actor = ModularActor(**description["network"])
-            actor.load_state_dict(tensors)
-            return cls(actor.to(device).requires_grad_(False), Nodes(**description["nodes"]), description)
+            with torch.device("meta"):  # so that a size that the file only claims takes no memory
+                actor = ModularActor(**description["network"])
+            actor.load_state_dict(tensors, assign=True)
+            actor.to(device, torch.float32).requires_grad_(False)
+            return cls(actor, Nodes(**description["nodes"]), description)

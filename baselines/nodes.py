@@ -12,6 +12,7 @@ from dittogym import TorchEnv
 from dittogym.action import from_grid_layout, patch_corner
 from dittogym.spec import TaskSpec
 from dittogym.window import in_window
+from torchmpm import checks
 
 LENGTH, SPEED = 0.1, 0.5
 """Units of the features, m and m/s: most values lie within [-2, 2]."""
@@ -21,6 +22,8 @@ FASTEST = 100.0
 """Speed along an axis at which the view saturates, m/s."""
 BEYOND = 1.0
 """Distance from the window beyond which matter is seen no farther away, m: what tears can fly off to 1e20."""
+MOST = 4096
+"""Segments at most."""
 BITS = 16
 """Neighbours that one float32 of a node's row holds; whole numbers up to 2^24 are exact there."""
 
@@ -38,10 +41,17 @@ class Nodes:
     Attributes:
         count: Segments K.
         graph: With neighbours.
+
+    Raises:
+        ValueError: Fewer segments than two or more than `MOST`, or no truth value.
     """
 
     count: int
     graph: bool
+
+    def __post_init__(self) -> None:
+        checks.whole("count", self.count, 2, MOST)
+        checks.flag("graph", self.graph)
 
     def features(self, spec: TaskSpec) -> int:
         """Length D of a row without neighbours."""

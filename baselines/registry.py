@@ -48,7 +48,7 @@ def find(name: str) -> Entry:
     Raises:
         ConfigError: There is none of that name.
     """
-    if name not in ALGORITHMS:
+    if not isinstance(name, str) or name not in ALGORITHMS:
         raise ConfigError(f"algo: got {name!r}, allowed {', '.join(ALGORITHMS)}")
     return ALGORITHMS[name]
 

@@ -24,6 +24,7 @@ from cfp.networks import (
     normalise_image,
     upsample,
 )
+from dittogym.geometry import NODES
 
 STD_BOUNDS = (0.1, 6.0)
 """Bounds of the standard deviation before tanh: sampling never becomes deterministic."""
@@ -79,8 +80,9 @@ class ActorSpec:
                 f"gate_bias: got {len(self.gate_bias)} values for resolutions {self.resolutions}, "
                 f"allowed is one per residual level ({len(self.resolutions) - 1})"
             )
-        if self.patch is not None and self.patch < self.resolutions[-1]:
-            raise ValueError(f"patch: got {self.patch}, allowed {self.resolutions[-1]} (the finest level) or more")
+        finest = self.resolutions[-1]
+        if self.patch is not None and not (isinstance(self.patch, int) and finest <= self.patch <= NODES):
+            raise ValueError(f"patch: got {self.patch}, allowed {finest} (the finest level) to {NODES}")
 
 
 class Sample(NamedTuple):

@@ -17,6 +17,7 @@ from cfp.config import RunConfig, to_json
 from cfp.errors import CFPError, ConfigError, NonFiniteError
 from cfp.estimate import estimate
 from cfp.evaluation import Policy
+from cfp.files import read_json
 from cfp.process import Stopped, StopSignals, keep_memory
 from cfp.run import Run, holds_run, read_config
 
@@ -101,7 +102,7 @@ def _values(choice: _Choice) -> dict[str, Any]:
     values: dict[str, Any] = {}
     if choice.config is not None:
         try:
-            values = json.loads(choice.config.read_text())
+            values = read_json(choice.config)
         except (OSError, ValueError) as error:
             raise ConfigError(f"config: {choice.config} cannot be read as JSON ({error})") from error
         if not isinstance(values, dict):
@@ -139,6 +140,9 @@ def main(program: Program, arguments: Sequence[str] | None = None) -> int:
         return 1 if isinstance(error, NonFiniteError) else 2
     except OSError as error:
         print(f"error: {error}", file=sys.stderr)
+        return 1
+    except MemoryError as error:
+        print(f"error: not enough memory for buffer_size, num_envs or particles ({error})", file=sys.stderr)
         return 1
     return 0
 

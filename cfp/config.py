@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
@@ -15,12 +16,15 @@ from cfp.groups import NetworkConfig as NetworkConfig
 from cfp.groups import ReportConfig as ReportConfig
 from cfp.groups import Tier as Tier
 from cfp.groups import at_least_one as at_least_one
+from cfp.groups import not_negative as not_negative
+from cfp.groups import positive
 from cfp.merging import merge as merge
 from cfp.networks import RESOLUTIONS
 from dittogym import TASKS, make_spec
 
 Preset = Literal["quick", "paper"]
 
+LARGEST_SEED = 2**31 - 1
 EVALUATION_SEED = 10_000
 """Added to a run's seed for evaluations, so that they start from particle layouts not trained on."""
 
@@ -79,6 +83,9 @@ class RunConfig:
         Raises:
             ConfigError: Naming the option, what was given and what is allowed.
         """
+        _check_finite(self)
+        if not 0 <= self.seed <= LARGEST_SEED:
+            raise ConfigError(f"seed: got {self.seed}, allowed 0 to {LARGEST_SEED}")
         at_least_one(
             num_envs=self.environment.num_envs,
             substeps=self.environment.substeps,
@@ -197,6 +204,8 @@ class LadderConfig(RunConfig):
         growing = list(self.resolutions) == sorted(set(self.resolutions))
         if not levels or not growing or not set(self.resolutions) <= set(RESOLUTIONS):
             raise ConfigError(f"resolutions: got {self.resolutions}, allowed is a growing choice of {RESOLUTIONS}")
+        at_least_one(steps=self.steps)
+        positive(gate_scale=self.network.gate_scale)
         for name, count in self.counts().items():
             given = len(getattr(self, name))
             if given != count:
@@ -204,7 +213,9 @@ class LadderConfig(RunConfig):
         if self.task in TASKS and self.resolutions[-1] > (patch := make_spec(self.task).patch):
             raise ConfigError(f"resolutions: got {self.resolutions}, allowed in {self.task} is at most {patch}")
         if any(late <= early for early, late in pairwise((0, *self.ends()))):
-            raise ConfigError(f"handover: got {self.handover} of {self.steps} steps, allowed are growing steps between")
+            raise ConfigError(
+                f"handover: got {self.handover}, allowed are growing numbers between 0 and the steps, {self.steps}"
+            )
         super().check()
 
 
@@ -241,6 +252,9 @@ class Config(LadderConfig, SACConfig):
     def check(self) -> None:
         """Check what the types cannot, see `LadderConfig.check`."""
         super().check()
+        for name in ("random_steps", "alpha", "gate_penalty"):
+            for value in getattr(self, name):
+                not_negative(**{name: value})
         if self.learning.warm_critic and self.start_from is not None:
             raise ConfigError("warm_critic: got True, allowed without start_from (a policy brings no critics)")
         if self.refine and self.start_from is None:
@@ -250,3 +264,14 @@ class Config(LadderConfig, SACConfig):
 def to_json(config: RunConfig) -> dict[str, Any]:
     """A configuration as plain JSON values."""
     return dataclasses.asdict(config)
+
+
+def _check_finite(options: Any) -> None:
+    """Refuse NaN and infinity wherever they are, which JSON and command lines let through."""
+    for option in dataclasses.fields(options):
+        value = getattr(options, option.name)
+        if dataclasses.is_dataclass(value):
+            _check_finite(value)
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, float) and not math.isfinite(number):
+                raise ConfigError(f"{option.name}: got {value}, allowed are finite numbers")

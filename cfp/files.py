@@ -13,6 +13,9 @@ from typing import Any, BinaryIO
 from stable_baselines3.common.logger import KVWriter, TensorBoardOutputFormat, filter_excluded_keys
 from torch.utils.tensorboard import SummaryWriter
 
+LARGEST_JSON = 2**20
+"""Bytes of a JSON file that is read."""
+
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], Any]) -> None:
     """Write a file aside, flush it to disk, and move it into place.
@@ -27,8 +30,9 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], Any]) -> None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(path.name + ".part")
+    aside.unlink(missing_ok=True)  # where it is a link, its target must not be written to
     try:
-        with open(aside, "wb") as file:
+        with open(aside, "xb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
@@ -55,6 +59,34 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file of moderate size.
+
+    Raises:
+        OSError: It is missing, or not a file that can be read.
+        ValueError: It is not JSON in UTF-8, or larger than `LARGEST_JSON`.
+    """
+    if path.exists() and not path.is_file():
+        raise OSError("it is not a file")  # a pipe or a device might never end
+    with open(path, "rb") as file:
+        content = file.read(LARGEST_JSON + 1)
+    if len(content) > LARGEST_JSON:
+        raise ValueError(f"it is larger than {LARGEST_JSON} bytes")
+    return parse_json(content.decode())
+
+
+def parse_json(text: str) -> Any:
+    """Parse JSON of any depth.
+
+    Raises:
+        ValueError: It is not JSON.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -27,6 +27,28 @@ def at_least_one(**counts: int) -> None:
             raise ConfigError(f"{name}: got {value}, allowed 1 or more")
 
 
+def not_negative(**numbers: float) -> None:
+    """Check numbers by name.
+
+    Raises:
+        ConfigError: One is below 0.
+    """
+    for name, value in numbers.items():
+        if not value >= 0:
+            raise ConfigError(f"{name}: got {value}, allowed 0 or more")
+
+
+def positive(**numbers: float) -> None:
+    """Check numbers by name.
+
+    Raises:
+        ConfigError: One is not above 0.
+    """
+    for name, value in numbers.items():
+        if not value > 0:
+            raise ConfigError(f"{name}: got {value}, allowed more than 0")
+
+
 @dataclass(frozen=True)
 class EnvironmentConfig:
     """Where the robot lives: options of `dittogym.TorchEnv`."""
@@ -121,15 +143,13 @@ class LearningConfig:
             gradient_steps=self.gradient_steps,
             update_start=self.update_start,
         )
-        for name, share in {"gamma": self.gamma, "tau": self.tau, "momentum": self.reward_momentum}.items():
-            if not 0 <= share <= 1:
+        for name in ("gamma", "tau", "reward_momentum"):
+            if not 0 <= (share := getattr(self, name)) <= 1:
                 raise ConfigError(f"{name}: got {share}, allowed 0 to 1")
-        for name in ("learning_rate", "actor_rate"):
-            if (rate := getattr(self, name)) is not None and rate <= 0:
-                raise ConfigError(f"{name}: got {rate}, allowed more than 0")
-        for name in ("actor_start", "anchor"):
-            if (value := getattr(self, name)) < 0:
-                raise ConfigError(f"{name}: got {value}, allowed 0 or more")
+        positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
+        if self.actor_rate is not None:
+            positive(actor_rate=self.actor_rate)
+        not_negative(actor_start=self.actor_start, anchor=self.anchor)
 
 
 @dataclass(frozen=True)

@@ -61,4 +61,18 @@ def _convert(value: Any, kind: Any, where: str) -> Any:
         return float(value)
     elif isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
         return value
-    raise ConfigError(f"{where}: got {value!r}, allowed {kind.__name__ if isinstance(kind, type) else kind}")
+    raise ConfigError(f"{where}: got {value!r}, allowed {_words(kind)}")
+
+
+def _words(kind: Any) -> str:
+    """A field's type for people who write JSON."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Literal:
+        return " or ".join(map(repr, arguments))
+    if origin is tuple:
+        count = "a list" if arguments[-1] is Ellipsis else f"a list of {len(arguments)}"
+        return f"{count}, each {_words(arguments[0])}"
+    if arguments:
+        return " or ".join(map(_words, arguments))
+    words = {int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "null"}
+    return words[kind]

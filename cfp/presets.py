@@ -68,7 +68,7 @@ def preset(task: str, name: str = "quick") -> Config:
     Raises:
         ConfigError: No such task or preset.
     """
-    if task not in TASKS:
+    if not isinstance(task, str) or task not in TASKS:
         raise ConfigError(f"task: got {task!r}, allowed {', '.join(dittogym.TASKS)}")
     if name not in typing.get_args(Preset):
         raise ConfigError(f"preset: got {name!r}, allowed {', '.join(typing.get_args(Preset))}")

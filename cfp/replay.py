@@ -117,11 +117,11 @@ class ReplayArchive:
         return [asdict(chunk) for chunk in self.chunks]
 
     def prune(self) -> None:
-        """Delete every file that the list does not name; call it once the checkpoint is in place."""
+        """Delete every chunk that the list does not name; call it once the checkpoint is in place."""
         wanted = {chunk.file for chunk in self.chunks}
         if self.folder.is_dir():
             for path in self.folder.iterdir():
-                if path.name not in wanted:
+                if path.name.startswith("level") and path.name not in wanted:
                     path.unlink()
 
     def load(self, buffer: ReplayBuffer, rows: int, chunks: list[dict[str, Any]]) -> None:
@@ -135,6 +135,8 @@ class ReplayArchive:
         oldest = max(0, rows - buffer.buffer_size)
         covered = oldest
         for chunk in self.chunks:
+            if Path(chunk.file).name != chunk.file:
+                raise CheckpointError(f"{self.folder}: got a chunk {chunk.file!r}, allowed are files in this folder")
             first = max(oldest, chunk.start)
             if first != covered:
                 raise CheckpointError(f"{self.folder}: rows {covered} to {first} of the replay memory are missing")
@@ -165,5 +167,5 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         with open(path, "rb") as file, np.load(file) as archive:
             return {name: archive[name] for name in FIELDS}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
         raise CheckpointError(f"{path}: this part of the replay memory is missing or damaged ({error})") from error

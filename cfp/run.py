@@ -21,7 +21,7 @@ from cfp.environments import choose_device, make_env
 from cfp.errors import CheckpointError, ConfigError
 from cfp.estimate import Cost
 from cfp.evaluation import Policy, Result, compare, evaluate, format_table, to_rows
-from cfp.files import ProgressTable, Table, copy_atomically, read_table, write_json
+from cfp.files import ProgressTable, Table, copy_atomically, read_json, read_table, write_json
 from cfp.page import write_page
 from cfp.plot import plot_curve
 from cfp.process import Plateau, StopSignals
@@ -63,7 +63,7 @@ def read_config(folder: Path, configure: Callable[[dict[str, Any]], RunConfig]) 
     """
     path = folder / "config.json"
     try:
-        config = configure(json.loads(path.read_text()))
+        config = configure(read_json(path))
         config.check()
         return config
     except FileNotFoundError as error:
@@ -125,6 +125,8 @@ class Run(ABC):
             self.state = self.checkpoint.load()
             check_same(json.loads(self.state["config"]), config)
             self.position = Position(self.state["level"], self.state["offset"])
+            if self.position.level >= len(config.ends()):
+                raise self.checkpoint.misfit(ValueError(f"it is of stage {self.position.level + 1}"))
             step = self.position.offset + self.state["model"]["num_timesteps"]
             print(f"resuming {folder} at step {step} of {config.ends()[-1]} (stage {self.position.level + 1})")
         elif resume:

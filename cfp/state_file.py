@@ -13,7 +13,7 @@ import torch
 
 from cfp.config import RunConfig, merge, to_json
 from cfp.errors import CheckpointError, ConfigError
-from cfp.files import write_atomically
+from cfp.files import parse_json, write_atomically
 
 VERSION = 1
 
@@ -85,11 +85,18 @@ class StateFile:
         if not isinstance(state, dict) or state.get("version") != VERSION:
             found = state.get("version") if isinstance(state, dict) else type(state).__name__
             raise CheckpointError(f"{self.path}: got checkpoint version {found}, allowed {VERSION}")
+        try:
+            parse_json(state["config"])
+            if min(state["level"], state["offset"], state["model"]["num_timesteps"]) < 0:
+                raise ValueError("a count is negative")
+        except (KeyError, TypeError, ValueError) as error:
+            raise self.misfit(error) from error
         return state
 
     def misfit(self, error: Exception) -> CheckpointError:
         """What to raise when a state cannot be put into a model."""
-        return CheckpointError(f"{self.path}: the checkpoint does not fit this program ({error})")
+        reason = f"{type(error).__name__}: {error}"
+        return CheckpointError(f"{self.path}: the checkpoint does not fit this program ({reason})")
 
 
 def check_same(stored: dict[str, Any], given: RunConfig) -> None:

@@ -11,17 +11,31 @@ from typing import Any
 
 import safetensors
 import safetensors.torch
+import torch
 from torch import Tensor
 
 from cfp.actor import Actor, ActorSpec
-from cfp.config import Config, EnvironmentConfig, RunConfig, merge
+from cfp.config import LARGEST_SEED, Config, EnvironmentConfig, RunConfig, merge
 from cfp.errors import CheckpointError, ConfigError
-from cfp.files import write_atomically, write_json
+from cfp.files import parse_json, write_atomically, write_json
 from cfp.policy import ActorPolicy
+from dittogym.geometry import NODES
 
 FORMAT = "cfp-policy"
 VERSION = 1
 KIND = "cfp"
+_DESCRIBED: dict[str, tuple[type, int | None, int]] = {
+    "kind": (str, None, 0),
+    "task": (str, None, 0),
+    "resolution": (int, 1, NODES),
+    "stage": (int, 1, 1000),
+    "steps": (int, 0, 2**62),
+    "seed": (int, 0, LARGEST_SEED),
+    "deterministic": (bool, None, 0),
+    "environment": (dict, None, 0),
+    "layout": (int, 0, LARGEST_SEED),
+}
+"""What every description holds (some have no layout): type, least and largest value."""
 SHIPPED = Path(__file__).parent / "policies"
 """Policies that come with the package, by name."""
 
@@ -109,12 +123,39 @@ def read_policy(path: str | Path, device: str = "cpu") -> tuple[dict[str, Tensor
         with safetensors.safe_open(file, framework="pt", device=device) as content:
             metadata = content.metadata() or {}
             tensors = {name: content.get_tensor(name) for name in content.keys()}
-    except (OSError, safetensors.SafetensorError) as error:
+        description = parse_json(metadata.get(FORMAT, "{}"))
+    except (OSError, ValueError, MemoryError, safetensors.SafetensorError) as error:
         raise CheckpointError(f"{file}: the policy is damaged ({error})") from error
-    description = json.loads(metadata.get(FORMAT, "{}"))
-    if description.get("format") != FORMAT or description.get("version") != VERSION:
-        raise CheckpointError(f"{file}: got a file without a {FORMAT} description of version {VERSION}")
-    return tensors, {"kind": KIND, **description}  # files older than kinds are all of this one
+    try:
+        description = _checked(description)
+    except ConfigError as error:
+        raise CheckpointError(f"{file}: {error}") from error
+    for name, tensor in tensors.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise CheckpointError(f"{file}: {name}: got weights that are NaN or infinite, allowed are finite ones")
+    return tensors, description
+
+
+def _checked(description: Any) -> dict[str, Any]:
+    """The description of a policy, once all that every kind has is what it should be.
+
+    Raises:
+        ConfigError: It is not.
+    """
+    known = isinstance(description, dict) and description.get("format") == FORMAT
+    if not known or description.get("version") != VERSION:
+        raise ConfigError(f"got a file without a {FORMAT} description of version {VERSION}")
+    description = {"kind": KIND, **description}  # files older than kinds are all of this one
+    for name, (kind, least, most) in _DESCRIBED.items():
+        value: Any = description.get(name)
+        if name == "layout" and value is None:
+            continue
+        wrong = type(value) is not kind  # a truth value is no number here
+        if wrong or (least is not None and not least <= value <= most):
+            allowed = kind.__name__ if least is None else f"{least} to {most}"
+            raise ConfigError(f"{name}: got {value!r}, allowed {allowed}")
+    merge(EnvironmentConfig(), description["environment"], "environment")
+    return description
 
 
 @contextmanager
@@ -126,8 +167,8 @@ def fitting(path: str | Path) -> Iterator[None]:
     """
     try:
         yield
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
+    except (KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(f"{policy_file(path)}: weights and description do not fit ({reason})") from error
 
 
@@ -163,7 +204,7 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
     if description["kind"] != KIND:
         raise CheckpointError(f"{policy_file(path)}: got a policy of kind {description['kind']!r}, allowed {KIND!r}")
     with fitting(path):
-        policy = ActorPolicy(ActorSpec.from_json(description["network"]), bool(description["deterministic"]))
+        policy = ActorPolicy(ActorSpec.from_json(description["network"]), description["deterministic"])
         policy.actor.load_state_dict(tensors)
     policy.description = description
     policy.to(device)

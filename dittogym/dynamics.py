@@ -286,7 +286,8 @@ def judge(
         soft: Smooth terms, from the soft observation; then only the terms of the outcome mean anything.
 
     Raises:
-        ValueError: The task returns a term under a name of :data:`RESERVED`.
+        ValueError: The task returns a term under a name of :data:`RESERVED`, or one that is not of shape (B,).
+        TypeError: The task returns something else.
 
     Returns:
         The state with the task's memory brought up to date, and the outcome with ``terminated`` always given and
@@ -296,6 +297,12 @@ def judge(
     weights = spec.weights
     now = measure(state.particles, model.robot)
     own = spec.judge(_moment(model, state, now, observation, soft), weights)
+    if not isinstance(own, Outcome):
+        raise TypeError(f"judge of task {spec.name!r} must return an Outcome, got {type(own).__name__}")
+    for name, term in own.terms.items():
+        if not isinstance(term, Tensor) or term.shape != now.split.shape:
+            found = f"a tensor of shape {tuple(term.shape)}" if isinstance(term, Tensor) else type(term).__name__
+            raise ValueError(f"judge of task {spec.name!r} must return terms of shape (B,), got {found} for {name!r}")
     finite = intact(model, state)
     terms = dict(own.terms)
     if taken := RESERVED & terms.keys():

@@ -25,18 +25,20 @@ def spaces(env: TorchEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     )
 
 
-def as_tensor(action: Any, env: TorchEnv) -> torch.Tensor:
-    """A NumPy action batch as a tensor, or a clear error.
+def as_tensor(action: Any, env: TorchEnv, single: bool = False) -> torch.Tensor:
+    """A NumPy action batch as a tensor, or a clear error; ``single``: one action, which becomes a batch of one.
 
     Raises:
         ValueError: Not numbers, or not of shape (B, 2, R, R).
     """
-    array = np.asarray(action)
-    expected = (env.num_envs, *env.action_shape)
+    try:
+        array = np.asarray(action)
+    except ValueError:  # rows of different lengths
+        array = np.empty((), object)
+    expected = env.action_shape if single else (env.num_envs, *env.action_shape)
     if array.dtype.kind not in "fiu" or array.shape != expected:
-        wanted = expected[1:] if env.num_envs == 1 else expected
-        raise ValueError(f"action must be numbers of shape {wanted}, got {array.dtype} of shape {np.shape(action)}")
-    return torch.as_tensor(array, dtype=env.dtype, device=env.device)
+        raise ValueError(f"action must be numbers of shape {expected}, got {array.dtype} of shape {array.shape}")
+    return torch.as_tensor(array[None] if single else array, dtype=env.dtype, device=env.device)
 
 
 def as_image(observation: torch.Tensor) -> np.ndarray:
@@ -75,6 +77,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Raises:
         ValueError: Unknown render mode, or as in :class:`dittogym.TorchEnv`.
+        TypeError: ``num_envs`` is given, or the task has no such option.
         ImportError: ``render_mode="human"`` without pygame.
     """
 
@@ -85,6 +88,11 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> None:
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be None or one of {RENDER_MODES}, got {render_mode!r}")
+        if "num_envs" in options:
+            raise TypeError(
+                f"num_envs must not be given for a single environment, got {options['num_envs']!r}; for a batch use "
+                "gymnasium.make_vec(..., vectorization_mode='vector_entry_point') or dittogym.TorchEnv"
+            )
         self.torch_env = TorchEnv(task, 1, **options)
         self.observation_space, self.action_space = spaces(self.torch_env)
         self.render_mode, self.render_muscles = render_mode, render_muscles
@@ -116,7 +124,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
             action: (2, R, R) in [-1, 1].
         """
         with torch.no_grad():
-            batch = as_tensor(np.asarray(action)[None], self.torch_env)
+            batch = as_tensor(action, self.torch_env, single=True)
             observation, reward, terminated, truncated, info = self.torch_env.step(batch)
             if self.spec is not None:
                 truncated = torch.zeros_like(truncated)  # made by Gymnasium, whose TimeLimit wrapper does it

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from torchmpm import VelocityRule
+from torchmpm import VelocityRule, checks
 from torchmpm.boundary import Range
 
 #: Nodes per metre of every DittoGym window.
@@ -66,7 +66,12 @@ def floor(friction: float = math.inf) -> Obstacle:
 
 
 def ceiling(node: int) -> Obstacle:
-    """Upper end of the world: from this node on, nothing rises."""
+    """Upper end of the world: from this node on, nothing rises.
+
+    Raises:
+        ValueError: The node is not a whole number.
+    """
+    checks.whole("node", node, 0)
     return Obstacle("ceiling", (VelocityRule("+y", j=(node, None)),), shown=(Box(bottom=node / NODES),))
 
 
@@ -87,8 +92,13 @@ def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True) -> O
         visible: Whether the robot sees it.
 
     Raises:
-        ValueError: The box is narrower than four nodes, so that its faces would overlap.
+        ValueError: A range is none, or the box is narrower than four nodes, so that its faces would overlap.
     """
+    for name, given in (("i", i), ("j", j)):
+        if not isinstance(given, tuple) or len(given) != 2 or not {type(end) for end in given} <= {int, type(None)}:
+            raise ValueError(f"{name} must be a range (low, high) of node indices, got {given!r}")
+    if None in i:
+        raise ValueError(f"i must have both ends, got {i!r}")
     (left, right), (low, high) = i, j
     if right - left < 3 or (low is not None and high is not None and high - low < 3):
         raise ValueError(f"solid needs at least 4 nodes in each direction, got i={i}, j={j}")

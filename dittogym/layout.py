@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dittogym.spec import Body, TaskSpec
 from dittogym.window import window_origin
-from torchmpm import Grid, sampling
+from torchmpm import Grid, checks, sampling
 from torchmpm.sampling import Points
 from torchmpm.state import choose
 
@@ -42,7 +42,7 @@ def particle_counts(spec: TaskSpec, particles: Particles) -> tuple[int, ...]:
     elif isinstance(particles, (int, np.integer)) and not isinstance(particles, bool):
         counts = (int(particles), *(max(1, round(particles * n / full[0])) for n in full[1:]))
     elif isinstance(particles, (tuple, list)) and len(particles) == len(full):
-        counts = tuple(int(n) for n in particles)
+        counts = tuple(checks.whole(f"particles[{i}]", n, 1) for i, n in enumerate(particles))
     else:
         shapes = " and ".join("robot" if i == 0 else "object" for i in range(len(full)))
         raise ValueError(
@@ -71,8 +71,8 @@ class LayoutSampler:
     """
 
     def __init__(self, spec: TaskSpec, counts: tuple[int, ...], seed: int | None, *, spread: bool) -> None:
-        if seed is not None and not 0 <= seed <= MAX_SEED:
-            raise ValueError(f"seed must be between 0 and {MAX_SEED}, got {seed}")
+        if seed is not None:
+            checks.whole("seed", seed, 0, MAX_SEED)
         self._spec, self._counts, self._spread = spec, counts, spread
         self._generator = np.random.RandomState(seed)
 
@@ -123,6 +123,8 @@ class Layouts:
         Raises:
             ValueError: Positions of the wrong shape or outside the window, or a seed out of range.
         """
+        if seed is not None:
+            seed = checks.whole("seed", seed, 0, MAX_SEED + 1 - self._num_envs)
         samplers = dict(self._samplers)
         redraw = seed is not None or not samplers
         if self._positions is None:
@@ -147,7 +149,13 @@ class Layouts:
         return positions
 
     def _given(self, given: Any, like: Tensor) -> Tensor:
-        positions = torch.as_tensor(given).to(like)
+        try:
+            positions = torch.as_tensor(given)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ValueError(f"positions must be numbers, got {given!r}") from error
+        if positions.is_complex():
+            raise ValueError(f"positions must be real, got {positions.dtype}")
+        positions = positions.to(like)
         shape = (sum(self._counts), 2)
         if tuple(positions.shape) not in (shape, (self._num_envs, *shape)):
             raise ValueError(

@@ -9,6 +9,7 @@ import gymnasium
 
 from dittogym.spec import TaskSpec
 from dittogym.tasks import TASKS
+from torchmpm import checks
 
 
 def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "dittogym", version: int = 0) -> None:
@@ -21,16 +22,21 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
         version: To be raised with every change of behaviour.
 
     Raises:
-        ValueError: Another task has this name, or it is not one word.
-        TypeError: ``make`` does not return a :class:`dittogym.TaskSpec`.
+        ValueError: Another task has this name, a name is not one word, or the version is negative.
+        TypeError: ``make`` is no function, or does not return a :class:`dittogym.TaskSpec`.
     """
+    if not isinstance(task, str) or re.fullmatch(r"\w+", task) is None:
+        raise ValueError(f"task must be a name of letters, digits and underscores, got {task!r}")
+    if not callable(make):
+        raise TypeError(f"make must be a function that returns a TaskSpec, got {make!r}")
+    checks.whole("version", version, 0)
+    if not isinstance(namespace, str) or re.fullmatch(r"[\w:-]+", namespace) is None:
+        raise ValueError(f"namespace must be a name of letters, digits, underscores and dashes, got {namespace!r}")
     spec = make()
     if not isinstance(spec, TaskSpec):
         raise TypeError(f"make must return a TaskSpec, got {type(spec).__name__}")
     if TASKS.get(task, make) is not make:
         raise ValueError(f"task must be a new name, got {task!r}, which is taken")
-    if re.fullmatch(r"\w+", task) is None:
-        raise ValueError(f"task must be a name of letters, digits and underscores, got {task!r}")
     for resolution in ("coarse", "fine"):
         gymnasium.register(
             id=f"{namespace}/{task}-{resolution}-v{version}",

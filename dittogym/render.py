@@ -11,7 +11,7 @@ from torch import Tensor
 from dittogym.action import place
 from dittogym.geometry import Box
 from dittogym.window import in_window
-from torchmpm import Soil
+from torchmpm import Soil, checks
 
 if TYPE_CHECKING:
     from dittogym.dynamics import EnvState, Model
@@ -28,6 +28,8 @@ MARK = 0.1
 FULL_SIZE_RADIUS = 0.0015
 #: Pictures are drawn this many times larger, then averaged down.
 OVERSAMPLING = 2
+#: Pixels per side of the largest picture.
+LARGEST = 8192
 
 
 def frame(model: Model, state: EnvState, index: int, field: Tensor | None, size: int) -> np.ndarray:
@@ -45,12 +47,12 @@ def frame(model: Model, state: EnvState, index: int, field: Tensor | None, size:
 
     Raises:
         IndexError: ``index`` is not in the batch.
-        ValueError: ``size`` is below 16.
+        IndexError: There is no such element.
+        ValueError: ``size`` is below 16 or above 8192.
     """
-    if not 0 <= index < len(state.steps):
-        raise IndexError(f"index must be between 0 and {len(state.steps) - 1}, got {index}")
-    if size < 16:
-        raise ValueError(f"size must be at least 16 pixels, got {size}")
+    if not isinstance(index, int) or not 0 <= index < len(state.steps):
+        raise IndexError(f"index must be between 0 and {len(state.steps) - 1}, got {index!r}")
+    checks.whole("size", size, 16, LARGEST)
     spec = model.spec
     particles = state.particles[index].detach()
     origin = state.origin[index].detach().cpu().double().numpy()

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from torchmpm import sampling
+from torchmpm import checks, sampling
 from torchmpm.sampling import Points
 
 
@@ -47,11 +47,18 @@ class Disc:
     Attributes:
         corner: Lower left corner of the bounding square in the world, m.
         diameter: m.
+
+    Raises:
+        ValueError: Not two numbers, or the diameter is not positive.
     """
 
     corner: tuple[float, float]
     diameter: float
     draws: int = 4
+
+    def __post_init__(self) -> None:
+        _check_pair("corner", self.corner)
+        checks.number("diameter", self.diameter, above=0.0)
 
     @property
     def size(self) -> tuple[float, float]:
@@ -76,11 +83,18 @@ class Rectangle:
     Attributes:
         corner: Lower left corner in the world, m.
         size: Width and height, m.
+
+    Raises:
+        ValueError: Not two numbers, or a size that is not positive.
     """
 
     corner: tuple[float, float]
     size: tuple[float, float]
     draws: int = 4
+
+    def __post_init__(self) -> None:
+        _check_pair("corner", self.corner)
+        _check_pair("size", self.size, above=0.0)
 
     @property
     def area(self) -> float:
@@ -120,12 +134,21 @@ class Figure:
         mask: (rows, columns) bool, row 0 at the top, without empty rows or columns at the edges.
         corner: Lower left corner in the world, m.
         pixel: Side of a pixel, m.
+
+    Raises:
+        ValueError: The mask has no pixel set, or a number is out of range.
     """
 
     mask: np.ndarray
     corner: tuple[float, float]
     pixel: float
     draws: int = 2
+
+    def __post_init__(self) -> None:
+        _check_pair("corner", self.corner)
+        checks.number("pixel", self.pixel, above=0.0)
+        if not isinstance(self.mask, np.ndarray) or self.mask.ndim != 2 or not self.mask.any():
+            raise ValueError(f"mask must be an array (rows, columns) with a pixel set, got {np.shape(self.mask)}")
 
     @property
     def size(self) -> tuple[float, float]:
@@ -140,3 +163,10 @@ class Figure:
     def positions(self, numbers: Points) -> Points:
         """World positions (N, 2) in m."""
         return sampling.image(numbers, self.mask, self.corner, self.size)
+
+
+def _check_pair(name: str, given: tuple[float, float], above: float | None = None) -> None:
+    if not isinstance(given, tuple | list) or len(given) != 2:
+        raise ValueError(f"{name} must be two numbers (x, y), got {given!r}")
+    for axis, number in zip("xy", given, strict=True):
+        checks.number(f"{name} {axis}", number, above=above)

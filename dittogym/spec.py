@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor
 
-from dittogym.geometry import Box, Obstacle, mark
+from dittogym.geometry import NODES, Box, Obstacle, mark
 from dittogym.shapes import Shape
-from torchmpm import Material, ParticleState
+from torchmpm import Material, ParticleState, checks
 
 #: Rewards per step of an element whose state is no longer finite; its episode ends.
 FAILURE_REWARD = -16.0
@@ -37,6 +37,17 @@ class Body:
     material: Material | None = None
     lite: int | None = None
     moves_visibly: bool = True
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ValueError: There are no particles, or they weigh nothing.
+            TypeError: The shape is none.
+        """
+        checks.instance("shape", self.shape, Shape)
+        checks.whole("count", self.count, 1)
+        checks.number("mass", self.mass, above=0.0)
 
 
 class Measurement(NamedTuple):
@@ -186,6 +197,24 @@ class TaskSpec:
     remember: Callable[[Moment], Mapping[str, Tensor]] = field(default=lambda moment: {})
     stale: tuple[str, ...] = ()
     target: np.ndarray | None = field(default=None, compare=False)
+
+    def __post_init__(self) -> None:
+        """Check what would otherwise fail late or silently.
+
+        Raises:
+            ValueError: A number is out of range, or there is more than one object.
+            TypeError: A body is something else, or the judge cannot be called.
+        """
+        checks.whole("horizon", self.horizon, 1)
+        checks.whole("patch", self.patch, 4, NODES)
+        for name in ("coarse", "fine"):
+            checks.whole(name, getattr(self, name), 1, self.patch)
+        checks.instance("robot", self.robot, Body)
+        checks.instances("objects", self.objects, Body)
+        if len(self.objects) > 1:
+            raise ValueError(f"objects must be at most one body, got {len(self.objects)}")
+        if not callable(self.judge):
+            raise TypeError(f"judge must be a function from Moment and Weights to Outcome, got {self.judge!r}")
 
     @property
     def bodies(self) -> tuple[Body, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import Any, Literal
 
 import numpy as np
@@ -20,8 +21,8 @@ from dittogym.reward import measure
 from dittogym.soft import soft_observation
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
-from torchmpm import ParticleState
-from torchmpm.rollout import Segment
+from torchmpm import ParticleState, checks
+from torchmpm.rollout import Segment, check_repetition
 from torchmpm.state import choose
 
 Parity = Literal["clean", "reference"]
@@ -44,6 +45,20 @@ class Snapshot:
     counts: tuple[int, ...]
     state: EnvState
     observation: Tensor
+
+
+def _device(device: str | torch.device) -> torch.device:
+    try:
+        found = torch.device(device)
+    except (TypeError, RuntimeError) as error:
+        raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}") from error
+    if found.type not in ("cpu", "cuda"):
+        raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
+    if found.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device must be available, got {device!r}, but torch finds no CUDA device")
+    if found.index is not None and found.index >= (count := max(1, torch.cuda.device_count())):
+        raise ValueError(f"device must be available, got {device!r}, but torch numbers its devices 0 to {count - 1}")
+    return found
 
 
 def _sum(terms: Mapping[str, Tensor]) -> Tensor:
@@ -119,12 +134,11 @@ class TorchEnv:
         ):
             if value not in allowed:
                 raise ValueError(f"{name} must be one of {allowed}, got {value!r}")
-        for name, number in (("num_envs", num_envs), ("substeps", substeps)):
-            if number < 1:
-                raise ValueError(f"{name} must be at least 1, got {number}")
-        self.num_envs, self.dtype, self.device = num_envs, _DTYPES[dtype], torch.device(device)
-        if self.device.type == "cuda" and not torch.cuda.is_available():
-            raise ValueError(f"device must be available, got {device!r}, but torch finds no CUDA device")
+        for name, flag in (("resample", resample), ("deterministic", deterministic)):
+            checks.flag(name, flag)
+        num_envs, substeps = checks.whole("num_envs", num_envs, 1), checks.whole("substeps", substeps, 1)
+        check_repetition(substeps, segment)
+        self.num_envs, self.dtype, self.device = num_envs, _DTYPES[dtype], _device(device)
         if deterministic and (self.device.type != "cpu" or backend == "compile"):
             raise ValueError(
                 "deterministic=True needs device 'cpu' and a backend other than 'compile', "
@@ -147,10 +161,10 @@ class TorchEnv:
 
     def _resolution(self, resolution: str | int) -> int:
         named = {"coarse": self.spec.coarse, "fine": self.spec.fine}
-        size = named.get(resolution) if isinstance(resolution, str) else resolution
-        if size is None or not 1 <= size <= self.spec.patch:
+        size: Any = named.get(resolution) if isinstance(resolution, str) else resolution
+        if isinstance(size, bool) or not isinstance(size, Integral) or not 1 <= int(size) <= self.spec.patch:
             raise ValueError(f"resolution must be 'coarse', 'fine' or 1 to {self.spec.patch}, got {resolution!r}")
-        return size
+        return int(size)
 
     @property
     def num_particles(self) -> int:
@@ -241,6 +255,8 @@ class TorchEnv:
             ValueError: An option is unknown, has the wrong shape, puts particles outside the window, or makes matter
                 too stiff for the substeps.
         """
+        if options is not None and not isinstance(options, Mapping):
+            raise ValueError(f"options must be a mapping that may hold {', '.join(_RESET_OPTIONS)}, got {options!r}")
         options = dict(options or {})
         for name in options:
             if name not in _RESET_OPTIONS:
@@ -326,7 +342,10 @@ class TorchEnv:
     def _mask(self, given: Any, name: str) -> Tensor:
         if given is None:
             return torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        mask = torch.as_tensor(given, device=self.device)
+        try:
+            mask = torch.as_tensor(given, device=self.device)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ValueError(f"{name} must be bool of shape ({self.num_envs},), got {given!r}") from error
         if mask.dtype != torch.bool or mask.shape != (self.num_envs,):
             raise ValueError(
                 f"{name} must be bool of shape ({self.num_envs},), got {mask.dtype} of shape {tuple(mask.shape)}"

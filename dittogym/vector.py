@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from dittogym.env import RENDER_FPS, RENDER_MODES, as_image, as_numpy, as_tensor, spaces
 from dittogym.spec import TaskSpec
 from dittogym.torch_env import Snapshot, TorchEnv
-from torchmpm import ParticleState
+from torchmpm import ParticleState, checks
 
 
 class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -48,9 +48,13 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> None:
         if render_mode not in (None, RENDER_MODES[0]):
             raise ValueError(f"render_mode must be None or {RENDER_MODES[0]!r} for a batch, got {render_mode!r}")
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps}")
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        if max_episode_steps is not None:
+            checks.whole("max_episode_steps", max_episode_steps, 1)
+        try:
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError as error:
+            modes = ", ".join(repr(mode.value) for mode in AutoresetMode)
+            raise ValueError(f"autoreset_mode must be one of {modes}, got {autoreset_mode!r}") from error
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.torch_env = TorchEnv(task, num_envs, **options)
         self.num_envs, self.render_mode, self.render_muscles = num_envs, render_mode, render_muscles

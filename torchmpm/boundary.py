@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchmpm import checks
 from torchmpm.grid import PAD, Grid
 
 #: Inclusive range of node indices; ``None`` at an end leaves it open.
@@ -50,11 +51,15 @@ class VelocityRule:
             raise ValueError(f"direction must be one of {_DIRECTIONS}, got {self.direction!r}")
         if self.frame not in ("world", "window"):
             raise ValueError(f"frame must be 'world' or 'window', got {self.frame!r}")
-        if not self.friction >= 0:
-            raise ValueError(f"friction must not be negative, got {self.friction}")
-        for name, (low, high) in (("i", self.i), ("j", self.j)):
-            if low is not None and high is not None and low > high:
-                raise ValueError(f"{name} must be an inclusive range (low, high) with low <= high, got {(low, high)}")
+        if self.friction != math.inf:
+            checks.number("friction", self.friction, least=0.0)
+        for name, given in (("i", self.i), ("j", self.j)):
+            ends = [end for end in given if end is not None] if isinstance(given, tuple) and len(given) == 2 else [None]
+            if not all(isinstance(end, int) for end in ends) or ends != sorted(ends):
+                raise ValueError(
+                    f"{name} must be an inclusive range (low, high) of node indices or None with low <= high, "
+                    f"got {given!r}"
+                )
 
 
 def fixed(

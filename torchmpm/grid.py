@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from torchmpm import checks
+
 #: Rows of nodes kept around the window so that every 3x3 stencil has an address. They collect what would fall
 #: outside and carry zero velocity: contributions to nodes that do not exist are dropped, never stored elsewhere.
 PAD = 3
@@ -23,7 +25,8 @@ class Grid:
         margin: Particles closer than this to the left or right end of the window (m) take no part.
 
     Raises:
-        ValueError: ``resolution`` is below 4 or ``spacing`` is not positive.
+        ValueError: ``resolution`` is not a whole number of at least 4, ``spacing`` is not positive, or ``margin`` does
+            not leave any of the window.
     """
 
     resolution: int = 128
@@ -31,10 +34,12 @@ class Grid:
     margin: float = 1e-5
 
     def __post_init__(self) -> None:
-        if self.resolution < 4:
-            raise ValueError(f"resolution must be at least 4 nodes per axis, got {self.resolution}")
-        if self.spacing is not None and not self.spacing > 0:
-            raise ValueError(f"spacing must be positive, got {self.spacing}")
+        checks.whole("resolution", self.resolution, 4)
+        if self.spacing is not None:
+            checks.number("spacing", self.spacing, above=0.0)
+        checks.number("margin", self.margin, least=0.0)
+        if not self.margin < (half := 0.5 * self.resolution * self.h):
+            raise ValueError(f"margin must be below half the window's width, {half}, got {self.margin}")
 
     @property
     def h(self) -> float:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Protocol, TypeAlias, runtime_checkable
 
 import torch
 from torch import Tensor
 
+from torchmpm import checks
 from torchmpm.linalg import Mat2, det, polar, split
 
 #: A number, or a tensor of shape (), (B,) for one value per simulation, or (B, N) for one per particle.
@@ -45,7 +46,15 @@ class Material(Protocol):
 
 
 def lame(young: Value, poisson: Value) -> tuple[Value, Value]:
-    """Lame parameters (mu, lam) from Young's modulus (Pa) and Poisson's ratio, plane strain."""
+    """Lame parameters (mu, lam) from Young's modulus (Pa) and Poisson's ratio, plane strain.
+
+    Raises:
+        ValueError: A number is out of range: Young's modulus is not negative, Poisson's ratio between -1 and 0.5.
+    """
+    checks.value("young", young, least=0.0)
+    checks.value("poisson", poisson)
+    if not isinstance(poisson, Tensor) and not -1 < poisson < 0.5:
+        raise ValueError(f"poisson must be above -1 and below 0.5, got {poisson}")
     return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 
@@ -195,11 +204,9 @@ def _clamp(stretch: Tensor, low: Value, high: Value) -> Tensor:
     return torch.where(stretch < low, low, torch.where(stretch > high, high, stretch))
 
 
-def _check_not_negative(material: Elastic) -> None:
-    for field in fields(material):
-        value = getattr(material, field.name)
-        if isinstance(value, (int, float)) and not value >= 0:
-            raise ValueError(f"{field.name} must not be negative, got {value}")
+def _check_not_negative(material: Elastic, *names: str) -> None:
+    for name in names:
+        checks.value(name, getattr(material, name), least=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +225,7 @@ class Elastic:
     lam: Value
 
     def __post_init__(self) -> None:
-        _check_not_negative(self)
+        _check_not_negative(self, "mu", "lam")
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
         """Nothing flows: the trial deformation is kept."""
@@ -251,6 +258,10 @@ class VonMises(Elastic):
     """
 
     yield_stress: Value
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_not_negative(self, "yield_stress")
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
         """Isochoric return to the yield surface; see :func:`von_mises_return`."""
@@ -288,11 +299,12 @@ class Soil(Elastic):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        _check_not_negative(self, "compression", "stretch", "hardening", "shear_cutoff")
         if not isinstance(self.compression, Tensor) and not self.compression < 1:
             raise ValueError(f"compression must be below 1, got {self.compression}")
-        low, high = self.hardening_range
-        if not 0 <= low <= high:
-            raise ValueError(f"hardening_range must be (low, high) with 0 <= low <= high, got {self.hardening_range}")
+        given = self.hardening_range
+        if not isinstance(given, tuple) or len(given) != 2 or not 0 <= given[0] <= given[1]:
+            raise ValueError(f"hardening_range must be (low, high) with 0 <= low <= high, got {given!r}")
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
         """Bring the principal stretches into their range; see :func:`clamp_stretches`."""

@@ -14,6 +14,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.weak import WeakIdKeyDictionary
 
+from torchmpm import checks
 from torchmpm.backends import runs_native, substep_function
 from torchmpm.native import ops, pack
 from torchmpm.rollout import SEGMENT, Segment, repeated
@@ -90,8 +91,7 @@ def estimate_memory(
     """
     batch = state.batch_size if isinstance(state, ParticleState) else state[0]
     for name, number in (("substeps", substeps), ("env_steps", env_steps), ("the state's batch size", batch)):
-        if number < 1:
-            raise ValueError(f"{name} must be at least 1, got {number}")
+        checks.whole(name, number, 1)
     share = _occupied(solver, state)
     state = _empty(solver, state)
     if runs_native(solver, state):

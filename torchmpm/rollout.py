@@ -9,6 +9,8 @@ from typing import Literal, TypeAlias, TypeVar
 import torch
 from torch.utils.checkpoint import checkpoint
 
+from torchmpm import checks
+
 State = TypeVar("State")
 Input = TypeVar("Input")
 Output = TypeVar("Output")
@@ -31,10 +33,9 @@ Segment: TypeAlias = "int | Literal['auto'] | None"
 SEGMENT = 10
 
 
-def check_repetition(times: int, segment: Segment) -> None:
-    """Raise the errors of :func:`repeated`."""
-    if times < 0:
-        raise ValueError(f"times must not be negative, got {times}")
+def check_repetition(times: int, segment: Segment, name: str = "times") -> None:
+    """Raise the errors of :func:`repeated`, where the caller calls ``times`` by this name."""
+    checks.whole(name, times, 0)
     if segment not in (None, "auto") and not (isinstance(segment, int) and segment >= 1):
         raise ValueError(f"segment must be at least 1, None or 'auto', got {segment!r}")
 

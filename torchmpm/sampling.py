@@ -12,18 +12,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchmpm import checks
+
 Points = NDArray[np.float64]
 
 
 def uniform(count: int, generator: np.random.Generator) -> Points:
     """``count`` independent points of the unit square, (count, 2)."""
-    return generator.random((_positive(count), 2))
+    return generator.random((checks.whole("count", count, 1), 2))
 
 
 def sobol(count: int, seed: int) -> Points:
     """``count`` points of a scrambled Sobol sequence in the unit square, (count, 2): far fewer clumps and holes."""
     engine = torch.quasirandom.SobolEngine(2, scramble=True, seed=seed)
-    return engine.draw(_positive(count), dtype=torch.float64).numpy()
+    return engine.draw(checks.whole("count", count, 1), dtype=torch.float64).numpy()
 
 
 def box(numbers: Points, corner: tuple[float, float], size: tuple[float, float]) -> Points:
@@ -45,6 +47,7 @@ def disc(numbers: Points, centre: tuple[float, float], radius: float) -> Points:
         centre: Centre, m.
         radius: Radius, m.
     """
+    checks.number("radius", radius, above=0.0)
     distance, angle = radius * np.sqrt(numbers[:, 0]), 2.0 * math.pi * numbers[:, 1]
     return np.asarray(centre) + np.stack((distance * np.cos(angle), distance * np.sin(angle)), axis=1)
 
@@ -59,6 +62,7 @@ def chord_disc(numbers: Points, centre: tuple[float, float], radius: float) -> P
         centre: Centre, m.
         radius: Radius, m.
     """
+    checks.number("radius", radius, above=0.0)
     across, along = 2.0 * numbers[:, 0] - 1.0, 2.0 * numbers[:, 1] - 1.0
     chord = np.sqrt(radius**2 - (radius * across) ** 2)
     return np.stack((centre[0] + radius * across, centre[1] + along * chord), axis=1)
@@ -72,6 +76,8 @@ def lattice(cells: tuple[int, int], corner: tuple[float, float], size: tuple[flo
         corner: Lower left corner, m.
         size: Width and height, m.
     """
+    for axis, count in zip("xy", cells, strict=True):
+        checks.whole(f"cells in {axis}", count, 1)
     columns, rows = np.meshgrid((np.arange(cells[0]) + 0.5) / cells[0], (np.arange(cells[1]) + 0.5) / cells[1])
     return box(np.stack((columns.ravel(), rows.ravel()), axis=1), corner, size)
 
@@ -103,9 +109,3 @@ def image(numbers: Points, mask: NDArray[np.bool_], corner: tuple[float, float],
     row = np.nonzero(pixels)[1][rank]
     points = np.stack((column + (place - edges[column]) / counts[column], row + depth % 1.0), axis=1)
     return box(points / pixels.shape, corner, size)
-
-
-def _positive(count: int) -> int:
-    if count < 1:
-        raise ValueError(f"count must be at least 1, got {count}")
-    return count

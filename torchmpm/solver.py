@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchmpm import muscle, native, transfer
+from torchmpm import checks, muscle, native, transfer
 from torchmpm.backends import BACKENDS, compiler_found, runs_native, substep_function
 from torchmpm.boundary import Face, VelocityRule, constrain, faces
 from torchmpm.grid import PAD, Grid
@@ -40,6 +40,7 @@ class Body:
 
     Raises:
         ValueError: ``count`` is below 1, or ``mass`` or ``volume`` is not positive.
+        TypeError: The material is not a :class:`torchmpm.Material`.
     """
 
     count: int
@@ -49,12 +50,10 @@ class Body:
     muscle: bool = False
 
     def __post_init__(self) -> None:
-        if self.count < 1:
-            raise ValueError(f"count must be at least 1, got {self.count}")
+        checks.whole("count", self.count, 1)
+        checks.instance("material", self.material, Material)
         for name in ("mass", "volume"):
-            value = getattr(self, name)
-            if not isinstance(value, Tensor) and not value > 0:
-                raise ValueError(f"{name} must be positive, got {value}")
+            checks.value(name, getattr(self, name), above=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +119,9 @@ class Solver:
         allow_unstable: Accept a ``dt`` beyond :meth:`stable_dt`.
 
     Raises:
-        ValueError: No bodies, ``dt`` not positive or beyond :meth:`stable_dt`, or an unknown or unavailable backend.
+        ValueError: No bodies, ``dt`` not positive or beyond :meth:`stable_dt`, ``damping`` negative, gravity not two
+            numbers, or an unknown or unavailable backend.
+        TypeError: ``grid``, a body or a rule is something else.
     """
 
     grid: Grid
@@ -133,10 +134,18 @@ class Solver:
     allow_unstable: bool = False
 
     def __post_init__(self) -> None:
+        checks.instance("grid", self.grid, Grid)
+        checks.instances("bodies", self.bodies, Body)
         if not self.bodies:
             raise ValueError("bodies must hold at least one Body, got none")
-        if not self.dt > 0:
-            raise ValueError(f"dt must be positive, got {self.dt}")
+        checks.instances("rules", self.rules, VelocityRule)
+        if not isinstance(self.gravity, Tensor):
+            if not isinstance(self.gravity, Sequence) or len(self.gravity) != 2:
+                raise ValueError(f"gravity must be two numbers (x, y) or a tensor, got {self.gravity!r}")
+            for component, pull in zip("xy", self.gravity, strict=True):
+                checks.number(f"gravity {component}", pull)
+        checks.number("damping", self.damping, least=0.0)
+        checks.number("dt", self.dt, above=0.0)
         if self.backend not in BACKENDS:
             raise ValueError(f"backend must be one of {BACKENDS}, got {self.backend!r}")
         if self.backend in ("compile", "native") and not compiler_found():
@@ -169,8 +178,9 @@ class Solver:
         rates = [0.0]
         for k, body in enumerate(self.bodies):
             try:
-                pull: Value = abs(spread(actuation)) if body.muscle else 0.0
-                rate = (body.material.stiffness() + 2.0 * pull) * spread(body.volume) / spread(body.mass)
+                pull = spread(actuation) if body.muscle else 0.0
+                size = pull.abs() if isinstance(pull, Tensor) else abs(pull)
+                rate = (body.material.stiffness() + 2.0 * size) * spread(body.volume) / spread(body.mass)
             except RuntimeError as error:
                 raise ValueError(f"values of bodies[{k}] must have shapes that go together: {error}") from error
             rates.append(float(rate.max()) if isinstance(rate, Tensor) else rate)
@@ -206,8 +216,10 @@ class Solver:
         Raises:
             ValueError: Shapes, dtypes or devices do not fit together, or the native backend was chosen and cannot run
                 this.
+            TypeError: The state, the actuation or the origin is something else.
         """
-        check_repetition(substeps, segment)
+        checks.instance("state", state, ParticleState)
+        check_repetition(substeps, segment, "substeps")
         origin = self.check(state, actuation, origin)
         if substeps == 0 or state.batch_size == 0:
             return state
@@ -225,11 +237,15 @@ class Solver:
         for name, value, shape in (("actuation", actuation, field_shape), ("origin", origin, (batch, 2))):
             if value is None:
                 continue
+            checks.instance(name, value, Tensor)
             if (tuple(value.shape), value.dtype, value.device) != (shape, state.dtype, state.device):
                 raise ValueError(
                     f"{name} must be {state.dtype} on {state.device} of shape {shape}, "
                     f"got {value.dtype} on {value.device} of shape {tuple(value.shape)}"
                 )
+        gravity = self.gravity
+        if isinstance(gravity, Tensor) and tuple(gravity.shape) not in ((2,), (1, 2), (batch, 2)):
+            raise ValueError(f"gravity must have shape (2,) or ({batch}, 2), got {tuple(gravity.shape)}")
         return state.x.new_zeros(batch, 2) if origin is None else origin
 
     def scene(self, state: ParticleState, actuation: Tensor | None = None, origin: Tensor | None = None) -> Scene:

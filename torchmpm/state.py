@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchmpm import checks
+
 #: Trailing shape of every field after the leading (B, N).
 _TRAILING = {"x": (2,), "v": (2,), "C": (2, 2), "F": (2, 2), "Jp": ()}
 
@@ -34,7 +36,8 @@ class ParticleState:
         Jp: (B, N) plastic volume ratio, dimensionless; only soil changes it.
 
     Raises:
-        ValueError: A field has the wrong shape, or dtype or device differ between fields.
+        ValueError: A field has the wrong shape or is not of floating point, or dtype or device differ between fields.
+        TypeError: A field is not a tensor.
     """
 
     x: Float[Tensor, "B N 2"]
@@ -44,10 +47,14 @@ class ParticleState:
     Jp: Float[Tensor, "B N"]
 
     def __post_init__(self) -> None:
+        checks.instance("x", self.x, Tensor)
         if self.x.ndim != 3 or self.x.shape[-1] != 2:
             raise ValueError(f"x must have shape (B, N, 2), got {tuple(self.x.shape)}")
+        if not self.x.is_floating_point():
+            raise ValueError(f"x must be of floating point, got {self.x.dtype}")
         for name, trailing in _TRAILING.items():
             field = getattr(self, name)
+            checks.instance(name, field, Tensor)
             if field.shape != (*self.x.shape[:2], *trailing):
                 raise ValueError(
                     f"{name} must have shape {(*self.x.shape[:2], *trailing)} to go with x of shape "
@@ -64,7 +71,14 @@ class ParticleState:
 
         Args:
             x: (B, N, 2) or (N, 2) positions in m; the latter becomes a batch of one.
+
+        Raises:
+            ValueError: They have another shape or are not of floating point.
+            TypeError: They are not a tensor.
         """
+        checks.instance("x", x, Tensor)
+        if x.ndim not in (2, 3) or x.shape[-1] != 2:
+            raise ValueError(f"x must have shape (B, N, 2) or (N, 2), got {tuple(x.shape)}")
         if x.ndim == 2:
             x = x[None]
         batch, count = x.shape[:2]

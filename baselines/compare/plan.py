@@ -11,6 +11,7 @@ from typing import Any
 from baselines.registry import configure, find
 from cfp.config import EVALUATION_SEED, RunConfig, to_json
 from cfp.errors import CheckpointError, ConfigError
+from cfp.files import read_json
 from cfp.run import holds_run, read_config
 from cfp.state_file import flatten
 
@@ -93,7 +94,7 @@ class Plan:
         if path is None:
             return cls()
         try:
-            values = json.loads(path.read_text())
+            values = read_json(path)
         except (OSError, ValueError) as error:
             raise ConfigError(f"plan: {path} cannot be read as JSON ({error})") from error
         if not isinstance(values, dict) or not set(values) <= {"common", "tasks", "algos"}:

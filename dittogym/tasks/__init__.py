@@ -48,7 +48,7 @@ def make_spec(
             raise TypeError(f"a TaskSpec takes no options but body and obstacles, got {sorted(options)}")
         spec = task
     else:
-        if task not in TASKS:
+        if not isinstance(task, str) or task not in TASKS:
             raise ValueError(f"task must be one of {', '.join(sorted(TASKS))}, got {task!r}")
         known = list(inspect.signature(TASKS[task]).parameters)
         for name in options:

@@ -181,7 +181,7 @@ def test_bad_resets() -> None:
         env.reset(options={"reset_mask": [1, 0]})
     with pytest.raises(ValueError, match="options may hold physics, positions, reset_mask, got 'position'"):
         env.reset(options={"position": 0})
-    with pytest.raises(ValueError, match="seed must be between"):
+    with pytest.raises(ValueError, match="seed must not be negative, got -1"):
         env.reset(seed=-1)
 
 

@@ -74,7 +74,7 @@ def test_repeated_rejects() -> None:
 
 def test_solver_passes_its_mistakes_on() -> None:
     solver, state = robot(5), lively(5)
-    with pytest.raises(ValueError, match="times must not be negative"):
+    with pytest.raises(ValueError, match="substeps must not be negative"):
         solver.step(state, substeps=-1)
     with pytest.raises(ValueError, match="segment must be at least 1"):
         solver.step(state, segment=0)

@@ -153,8 +153,6 @@ assert torchmpm.diagnostics.finite(after).all()
 
 # ... and what they forbid is found.
 with pytest.raises(WRONG):
-    ParticleState(*(t.to(torch.int64) for t in (state.x, state.v, state.C, state.F, state.Jp)))
-with pytest.raises(WRONG):
     ParticleState.at_rest(torch.zeros(2))
 with pytest.raises(WRONG):
     state.where(torch.tensor([1.0, 0.0]), after)

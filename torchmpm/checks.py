@@ -1,0 +1,96 @@
+"""Checks of arguments: every message names the argument, what it must be, and what was given."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from numbers import Integral, Real
+from typing import Any
+
+from torch import Tensor
+
+
+def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
+    """A whole number as a Python integer.
+
+    Raises:
+        ValueError: It is something else (truth values too), below ``least`` or above ``most``.
+    """
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise ValueError(f"{name} must be a whole number, got {value!r}")
+    number = int(value)
+    if number < least:
+        raise ValueError(f"{name} must {_at_least(least)}, got {number}")
+    if most is not None and number > most:
+        raise ValueError(f"{name} must be at most {most}, got {number}")
+    return number
+
+
+def number(name: str, value: Any, *, least: float | None = None, above: float | None = None) -> None:
+    """Check a finite number.
+
+    Raises:
+        ValueError: It is something else, below ``least``, or not above ``above``.
+    """
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise ValueError(f"{name} must be a number, got {value!r}")
+    if least is not None and not float(value) >= least:
+        raise ValueError(f"{name} must {_at_least(least)}, got {value}")
+    if above is not None and not float(value) > above:
+        raise ValueError(f"{name} must be {'positive' if above == 0 else f'above {above}'}, got {value}")
+    if not math.isfinite(value):
+        raise ValueError(f"{name} must be finite, got {value}")
+
+
+def value(name: str, given: Any, *, least: float | None = None, above: float | None = None) -> None:
+    """Check what may be a number or a tensor; what a tensor holds is not looked at, which would stall a GPU.
+
+    Raises:
+        ValueError: See `number`.
+    """
+    if isinstance(given, Tensor):
+        return
+    if not isinstance(given, Real):
+        raise ValueError(f"{name} must be a number or a tensor, got {given!r}")
+    number(name, given, least=least, above=above)
+
+
+def instance(name: str, given: Any, kind: type) -> None:
+    """Check the type of an object.
+
+    Raises:
+        TypeError: It is something else.
+    """
+    if not isinstance(given, kind) or isinstance(given, type):
+        raise TypeError(f"{name} must be a {kind.__name__}, got {_brief(given)}")
+
+
+def instances(name: str, given: Any, kind: type) -> None:
+    """Check a sequence of objects of one type.
+
+    Raises:
+        TypeError: It is no sequence, or holds something else.
+    """
+    if not isinstance(given, Sequence) or isinstance(given, str):
+        raise TypeError(f"{name} must be a sequence of {kind.__name__}, got {_brief(given)}")
+    for index, item in enumerate(given):
+        instance(f"{name}[{index}]", item, kind)
+
+
+def flag(name: str, given: Any) -> None:
+    """Check a truth value, for which any text, "no" too, would count as true.
+
+    Raises:
+        ValueError: It is neither True nor False.
+    """
+    if not isinstance(given, bool):
+        raise ValueError(f"{name} must be True or False, got {given!r}")
+
+
+def _at_least(least: float) -> str:
+    return f"be at least {least}" if least else "not be negative"
+
+
+def _brief(given: Any) -> str:
+    """What was given, in few words: values that show themselves in a line, else the type."""
+    return repr(given) if isinstance(given, str | int | float | type | None) else type(given).__name__
