@@ -142,6 +142,11 @@ class Window:
 Centre = tuple[float | None, float | None]
 
 
+def nothing(moment: Moment) -> Mapping[str, Tensor]:
+    """The memory of a task that needs none."""
+    return {}
+
+
 @dataclass(frozen=True)
 class TaskSpec:
     """Everything that makes a task.
@@ -194,7 +199,7 @@ class TaskSpec:
     coarse: int = 8
     fine: int = 16
     split_limit: float | None = None
-    remember: Callable[[Moment], Mapping[str, Tensor]] = field(default=lambda moment: {})
+    remember: Callable[[Moment], Mapping[str, Tensor]] = nothing
     stale: tuple[str, ...] = ()
     target: np.ndarray | None = field(default=None, compare=False)
 

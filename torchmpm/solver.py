@@ -178,9 +178,8 @@ class Solver:
         rates = [0.0]
         for k, body in enumerate(self.bodies):
             try:
-                pull = spread(actuation) if body.muscle else 0.0
-                size = pull.abs() if isinstance(pull, Tensor) else abs(pull)
-                rate = (body.material.stiffness() + 2.0 * size) * spread(body.volume) / spread(body.mass)
+                pull = torch.as_tensor(spread(actuation), dtype=torch.float64).abs() if body.muscle else 0.0
+                rate = (body.material.stiffness() + 2.0 * pull) * spread(body.volume) / spread(body.mass)
             except RuntimeError as error:
                 raise ValueError(f"values of bodies[{k}] must have shapes that go together: {error}") from error
             rates.append(float(rate.max()) if isinstance(rate, Tensor) else rate)
