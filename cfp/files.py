@@ -61,12 +61,12 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def read_json(path: Path) -> Any:
-    """Read a JSON file of moderate size.
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object from a file of moderate size.
 
     Raises:
         OSError: It is missing, or not a file that can be read.
-        ValueError: It is not JSON in UTF-8, or larger than `LARGEST_JSON`.
+        ValueError: It is not JSON in UTF-8, not an object, or larger than `LARGEST_JSON`.
     """
     if path.exists() and not path.is_file():
         raise OSError("it is not a file")  # a pipe or a device might never end
@@ -74,7 +74,10 @@ def read_json(path: Path) -> Any:
         content = file.read(LARGEST_JSON + 1)
     if len(content) > LARGEST_JSON:
         raise ValueError(f"it is larger than {LARGEST_JSON} bytes")
-    return parse_json(content.decode())
+    value = parse_json(content.decode())
+    if not isinstance(value, dict):
+        raise ValueError(f"it holds {type(value).__name__}, allowed an object with named values")
+    return value
 
 
 def parse_json(text: str) -> Any:
