@@ -6,7 +6,8 @@ import csv
 import io
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -32,16 +33,25 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], Any]) -> None:
     aside = path.with_name(path.name + ".part")
     aside.unlink(missing_ok=True)  # where it is a link, its target must not be written to
     try:
-        with open(aside, "xb") as file:
+        with _named(path), open(aside, "xb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
-    except OSError as error:
+    except OSError:
         aside.unlink(missing_ok=True)  # on a full disk every byte counts
-        error.filename = error.filename or str(path)
         raise
     os.replace(aside, path)
     _sync_folder(path.parent)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """A full disk is reported without a name: give it that of the file."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
 
 
 def copy_atomically(source: Path, target: Path) -> None:
@@ -129,7 +139,7 @@ class Table:
             self.columns += new
             self._rewrite()
             return
-        with open(self.path, "a", newline="") as file:
+        with _named(self.path), open(self.path, "a", newline="") as file:
             csv.DictWriter(file, self.columns).writerow(text)
 
     def _rewrite(self) -> None:

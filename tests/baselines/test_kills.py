@@ -18,9 +18,9 @@ from cfp.files import read_table
 from cfp.state_file import StateFile
 
 KILLS = int(os.environ.get("KILLS", "3"))
-SPAN = 4.0
+SPAN = 3.0
 """Seconds after its first words within which a training is killed."""
-STEPS = {"cfp": "--steps 600 --handover 300", "shac": "--steps 1920", "distill": "--steps 600 --handover 300"}
+STEPS = {"cfp": "--steps 160 --handover 80", "shac": "--steps 480", "distill": "--steps 160 --handover 80"}
 """Long enough that most kills hit the training itself."""
 TABLES = ("evaluations.csv", "progress.csv", "results.json")
 
