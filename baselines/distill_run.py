@@ -9,12 +9,13 @@ from baselines.algorithm import AlgorithmRun
 from baselines.distillation import Distill, DistillConfig
 from baselines.teachers import read_teacher
 from cfp.config import RunConfig
+from cfp.errors import CheckpointError, ConfigError
 from cfp.estimate import Cost
 from cfp.policy import ActorPolicy
 from cfp.process import StopSignals
 from cfp.run import Run, copy_policy
 from cfp.state_file import Position
-from cfp.weights import read_policy, write_policy
+from cfp.weights import read_policy, shipped, write_policy
 
 TRAINED = ("shac", "gradient")
 """Teachers that are trained first if only their name is given."""
@@ -44,13 +45,25 @@ class DistillRun(AlgorithmRun):
         """Take the teacher over, if it is a policy.
 
         Raises:
-            ConfigError: It was trained for something else.
-            CheckpointError: There is no such policy.
+            ConfigError: There is no such teacher, or it was trained for something else.
+            CheckpointError: The policy is damaged.
         """
         if self.config.teacher not in ("mpc", *TRAINED):
-            read_teacher(self.config.teacher, self.config.task, self.config.environment)
+            self._check_teacher()
             write_policy(self.teacher, *read_policy(self.config.teacher))
         return super().begin()
+
+    def _check_teacher(self) -> None:
+        teacher = self.config.teacher
+        try:
+            read_teacher(teacher, self.config.task, self.config.environment)
+        except CheckpointError as error:
+            if Path(teacher).exists():
+                raise
+            names = ", ".join(("mpc", *TRAINED, *shipped()))
+            raise ConfigError(
+                f"teacher: got {teacher!r}, allowed {names}, a run folder or a policy.safetensors"
+            ) from error
 
     def make_model(self, level: int) -> Distill:
         """The student at the beginning of a stage."""

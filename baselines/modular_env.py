@@ -47,6 +47,15 @@ class SegmentedEnv:
         self.env.env_state, self._labels, self._seen = value
 
     @property
+    def generators(self) -> dict[int, dict[str, Tensor]]:
+        """See `dittogym.TorchEnv.generators`."""
+        return self.env.generators
+
+    @generators.setter
+    def generators(self, states: dict[int, dict[str, Tensor]]) -> None:
+        self.env.generators = states
+
+    @property
     def labels(self) -> Tensor:
         """Segment (B, N) of every particle of the robot.
 

@@ -102,6 +102,7 @@ def environment_state(model: CFP) -> dict[str, Any]:
     monitor, env = _environments(model)
     return {
         "episodes": env.state_dict(),
+        "generators": env.torch_env.generators,
         "returns": torch.from_numpy(monitor.episode_returns.copy()),
         "lengths": torch.from_numpy(monitor.episode_lengths.copy()),
         "observation": torch.from_numpy(np.array(model._last_obs)),
@@ -113,6 +114,7 @@ def restore_environment(model: CFP, state: dict[str, Any]) -> None:
     monitor, env = _environments(model)
     monitor.reset()
     env.load_state_dict(state["episodes"])
+    env.torch_env.generators = state.get("generators", {})
     monitor.episode_returns = state["returns"].numpy().copy()
     monitor.episode_lengths = state["lengths"].numpy().copy()
     model._last_obs = state["observation"].numpy().copy()

@@ -105,8 +105,6 @@ def _values(choice: _Choice) -> dict[str, Any]:
             values = read_json(choice.config)
         except (OSError, ValueError) as error:
             raise ConfigError(f"config: {choice.config} cannot be read as JSON ({error})") from error
-        if not isinstance(values, dict):
-            raise ConfigError(f"config: {choice.config} holds {type(values).__name__}, allowed an object of options")
     chosen = {"algo": choice.algo, "task": choice.task, "preset": choice.preset}
     return values | {name: value for name, value in chosen.items() if value is not None}
 

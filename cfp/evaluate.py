@@ -56,11 +56,12 @@ def open_run(
         seed: In place of the run's own.
 
     Raises:
-        CFPError: There is no run, it has no policy yet, or a file is damaged or not of this run.
+        CFPError: There is no run, it has no policy yet, a file is damaged or not of this run, or the seed is negative.
     """
     config = replace(read_config(folder, program.configure), device=device)
     if seed is not None:
         config = replace(config, seed=seed)
+        config.check()
     files = stage_files(folder, len(config.ends()))
     if not files:
         raise CheckpointError(f"{folder}: no policy has been written yet")
@@ -80,6 +81,7 @@ def open_policy(program: Program, path: str, device: str, seed: int | None) -> t
     about = policy.description
     values = {"algo": about["kind"], "task": about["task"], "environment": about["environment"]}
     config = replace(program.configure(values), device=device, seed=about["seed"] if seed is None else seed)
+    config.check()
     return config, {policy_file(path).stem: policy}
 
 

@@ -6,7 +6,8 @@ import csv
 import io
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -32,16 +33,25 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], Any]) -> None:
     aside = path.with_name(path.name + ".part")
     aside.unlink(missing_ok=True)  # where it is a link, its target must not be written to
     try:
-        with open(aside, "xb") as file:
+        with _named(path), open(aside, "xb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
-    except OSError as error:
+    except OSError:
         aside.unlink(missing_ok=True)  # on a full disk every byte counts
-        error.filename = error.filename or str(path)
         raise
     os.replace(aside, path)
     _sync_folder(path.parent)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """A full disk is reported without a name: give it that of the file."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
 
 
 def copy_atomically(source: Path, target: Path) -> None:
@@ -61,12 +71,12 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def read_json(path: Path) -> Any:
-    """Read a JSON file of moderate size.
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object from a file of moderate size.
 
     Raises:
         OSError: It is missing, or not a file that can be read.
-        ValueError: It is not JSON in UTF-8, or larger than `LARGEST_JSON`.
+        ValueError: It is not JSON in UTF-8, not an object, or larger than `LARGEST_JSON`.
     """
     if path.exists() and not path.is_file():
         raise OSError("it is not a file")  # a pipe or a device might never end
@@ -74,7 +84,10 @@ def read_json(path: Path) -> Any:
         content = file.read(LARGEST_JSON + 1)
     if len(content) > LARGEST_JSON:
         raise ValueError(f"it is larger than {LARGEST_JSON} bytes")
-    return parse_json(content.decode())
+    value = parse_json(content.decode())
+    if not isinstance(value, dict):
+        raise ValueError(f"it holds {type(value).__name__}, allowed an object with named values")
+    return value
 
 
 def parse_json(text: str) -> Any:
@@ -126,7 +139,7 @@ class Table:
             self.columns += new
             self._rewrite()
             return
-        with open(self.path, "a", newline="") as file:
+        with _named(self.path), open(self.path, "a", newline="") as file:
             csv.DictWriter(file, self.columns).writerow(text)
 
     def _rewrite(self) -> None:

@@ -24,6 +24,7 @@ class BatchedEnv(Protocol):
     action_resolution: int
     device: Any
     env_state: Any
+    generators: Any
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Observations (B, 3, 64, 64) and info; ``options["reset_mask"]`` (B,) picks the elements to reset."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -76,6 +77,17 @@ class LayoutSampler:
         self._spec, self._counts, self._spread = spec, counts, spread
         self._generator = np.random.RandomState(seed)
 
+    @property
+    def generator(self) -> dict[str, Tensor]:
+        """State of the generator; an assignment brings it back."""
+        state = self._generator.get_state(legacy=False)["state"]
+        return {"key": torch.from_numpy(state["key"].astype(np.int64)), "pos": torch.tensor(state["pos"])}
+
+    @generator.setter
+    def generator(self, state: Mapping[str, Tensor]) -> None:
+        key, pos = state["key"].numpy().astype(np.uint32), int(state["pos"])
+        self._generator.set_state({"bit_generator": "MT19937", "state": {"key": key, "pos": pos}})
+
     def draw(self) -> Points:
         """Positions (N, 2) in m, robot first; every call continues the generator's sequence."""
         return np.concatenate(
@@ -110,6 +122,16 @@ class Layouts:
         self._spread, self._resample = spread, resample
         self._samplers: dict[int, LayoutSampler] = {}
         self._positions: Tensor | None = None
+
+    @property
+    def generators(self) -> dict[int, dict[str, Tensor]]:
+        """States of the elements' generators, from which the next layouts are drawn; an assignment brings them back."""
+        return {element: sampler.generator for element, sampler in self._samplers.items()}
+
+    @generators.setter
+    def generators(self, states: Mapping[int, Mapping[str, Tensor]]) -> None:
+        for element, state in states.items():
+            self._samplers[element].generator = state
 
     def draw(self, seed: int | None, mask: np.ndarray, given: Any, like: Tensor) -> Tensor:
         """Starting positions (B, N, 2) in m of all elements; those outside ``mask`` (B,) keep theirs.

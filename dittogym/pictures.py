@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import os
+import warnings
 from typing import TypeAlias
 
 import cv2
 import numpy as np
+from PIL import Image
 
+#: Pixels of the largest picture that is read from a file: it takes 0.8 GB at most.
+LARGEST = 2**26
 #: The path of an image file, or an array.
 PictureLike: TypeAlias = "str | os.PathLike[str] | np.ndarray"
 
@@ -16,13 +20,13 @@ def read_grey(picture: PictureLike, name: str, others: str = "") -> np.ndarray:
     """A picture as grey values (H, W) uint8, row 0 at the top; what is transparent is black.
 
     Args:
-        picture: The path of an image that OpenCV reads, or an array (H, W), (H, W, 3) or (H, W, 4): bool, uint8,
-            uint16, or floating point 0..1; colours in the order blue, green, red.
+        picture: The path of an image that OpenCV and Pillow read, or an array (H, W), (H, W, 3) or (H, W, 4): bool,
+            uint8, uint16, or floating point 0..1; colours in the order blue, green, red.
         name: What error messages call it.
         others: What else would have been allowed, for the message about a path that does not exist.
 
     Raises:
-        ValueError: No such file, not an image, or an array of another kind.
+        ValueError: No such file, not an image, one of more than `LARGEST` pixels, or an array of another kind.
     """
     if isinstance(picture, np.ndarray):
         return _grey(picture, name)
@@ -31,10 +35,27 @@ def read_grey(picture: PictureLike, name: str, others: str = "") -> np.ndarray:
     path = os.fspath(picture)
     if not os.path.isfile(path):
         raise ValueError(f"{name} must be {_join(others)}an array or the path of an image; no such file: {path!r}")
-    image = cv2.imread(path, cv2.IMREAD_UNCHANGED)
+    width, height = _claimed_size(path, name)
+    if width * height > LARGEST:
+        raise ValueError(f"{name} {path!r} must have at most {LARGEST} pixels, got {width} x {height}")
+    try:
+        image = cv2.imread(path, cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise ValueError(f"{name} {path!r} cannot be read as an image ({error})") from error
     if image is None:
         raise ValueError(f"{name} {path!r} cannot be read as an image")
     return _grey(image, name)
+
+
+def _claimed_size(path: str, name: str) -> tuple[int, int]:
+    """Width and height from the head of a file: a few bytes may claim to be a picture that fills the memory."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow's own about large pictures; there is a limit of ours
+            with Image.open(path) as image:
+                return image.size
+    except (OSError, ValueError, Image.DecompressionBombError) as error:
+        raise ValueError(f"{name} {path!r} cannot be read as an image ({error})") from error
 
 
 def _join(others: str) -> str:

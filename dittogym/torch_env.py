@@ -181,6 +181,15 @@ class TorchEnv:
         self._env_state = value
 
     @property
+    def generators(self) -> dict[int, dict[str, Tensor]]:
+        """States of the elements' random generators, which ``resample`` draws from; an assignment brings them back."""
+        return self._layouts.generators
+
+    @generators.setter
+    def generators(self, states: Mapping[int, Mapping[str, Tensor]]) -> None:
+        self._layouts.generators = states
+
+    @property
     def state(self) -> ParticleState:
         """The particles of all simulations."""
         return self.env_state.particles

@@ -97,9 +97,12 @@ class Plan:
             values = read_json(path)
         except (OSError, ValueError) as error:
             raise ConfigError(f"plan: {path} cannot be read as JSON ({error})") from error
-        if not isinstance(values, dict) or not set(values) <= {"common", "tasks", "algos"}:
-            found = ", ".join(values) if isinstance(values, dict) else type(values).__name__
-            raise ConfigError(f"plan: {path} holds {found}, allowed an object with common, tasks, algos")
+        if not set(values) <= {"common", "tasks", "algos"}:
+            raise ConfigError(f"plan: {path} holds {', '.join(values)}, allowed an object with common, tasks, algos")
+        groups = values | {f"{part}.{name}": own for part in ("tasks", "algos") for name, own in _items(values, part)}
+        for name, options in groups.items():
+            if not isinstance(options, dict):
+                raise ConfigError(f"plan: {name}: got {options!r}, allowed an object with named values")
         return cls(**values)
 
     def options(self, label: str, task: str) -> dict[str, Any]:
@@ -110,6 +113,11 @@ class Plan:
         for values in (self.common, self.tasks.get(task, {}), own, special):
             merged = _over(merged, values)
         return merged
+
+
+def _items(values: dict[str, Any], part: str) -> list[tuple[str, Any]]:
+    own = values.get(part, {})
+    return list(own.items()) if isinstance(own, dict) else []
 
 
 def _over(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 import baselines
 import cfp
-from baselines.modular import ModularConfig, ModularRun
+from baselines.modular import ModularConfig, ModularRun, preset
 from baselines.modular_env import segmented
 from baselines.modular_networks import ModularActor, ModularCritics
 from baselines.modular_policy import SegmentPolicy
@@ -19,6 +19,7 @@ from baselines.segments import follow
 from cfp.config import EnvironmentConfig, ReportConfig
 from cfp.errors import CheckpointError, ConfigError
 from cfp.process import StopSignals
+from cfp.weights import origin
 from dittogym import TorchEnv
 
 KINDS = ("gnn", "transformer")
@@ -126,7 +127,7 @@ def test_policy_of_a_file_acts_like_the_one_in_training(tmp_path):
     """In the training environment and attached to one of its own, step by step."""
     model = model_of("gnn-16", tmp_path / "run")
     nodes = Nodes(16, True)
-    description = {"format": "cfp-policy", "version": 1, "kind": "gnn-16", "resolution": 64}
+    description = origin(preset("gnn-16", "run", "quick"), "gnn-16", 0, 0)
     SegmentPolicy(model.networks()[0], nodes, description).save(tmp_path / "a.safetensors")
     policy = baselines.load(tmp_path / "a.safetensors")
     env = TorchEnv("run", 2, 64, particles=200, substeps=2)

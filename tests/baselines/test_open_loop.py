@@ -4,13 +4,15 @@ import torch
 
 import baselines
 from baselines import OpenLoop
+from baselines.registry import configure
 from cfp.errors import CheckpointError
+from cfp.weights import origin
 
 
 @pytest.fixture
 def policy():
     actions = torch.arange(3 * 2 * 4 * 4).reshape(3, 2, 4, 4) / 100.0
-    return OpenLoop(actions, {"format": "cfp-policy", "version": 1, "kind": "gradient", "task": "run"})
+    return OpenLoop(actions, origin(configure({"algo": "gradient", "task": "run"}), "gradient", 0, 0))
 
 
 def test_each_element_plays_from_its_own_beginning(policy):
@@ -42,7 +44,7 @@ def test_file_holds_what_was_saved(policy, tmp_path):
 
 
 def test_file_without_actions_is_refused(tmp_path):
-    wrong = OpenLoop(torch.zeros(1, 2, 4, 4), {"format": "cfp-policy", "version": 1, "kind": "cfp"})
+    wrong = OpenLoop(torch.zeros(1, 2, 4, 4), origin(configure({}), "cfp", 0, 0))
     wrong.save(tmp_path / "policy.safetensors")
     with pytest.raises(CheckpointError, match="weights and description do not fit"):
         baselines.load(tmp_path)  # says that it is an actor

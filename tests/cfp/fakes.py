@@ -34,7 +34,7 @@ class FakeEnv:
         self.start, self.push = start, push
         self.first = start + torch.arange(num_envs) / 10.0
         self.env_state = FakeState(self.first.clone(), torch.zeros(num_envs, dtype=torch.int64))
-        self.actions = []
+        self.actions, self.generators = [], {}
         self._image = torch.zeros(num_envs, 3, 64, 64, dtype=torch.uint8)
 
     def reset(self, *, seed=None, options=None):

@@ -2,6 +2,8 @@
 
 import pickle
 import resource
+import subprocess
+from contextlib import ExitStack, contextmanager, suppress
 
 import pytest
 import torch
@@ -22,23 +24,65 @@ def finished(tmp_path_factory):
     return folder
 
 
-def test_full_disk_is_an_error_and_the_last_checkpoint_still_good(finished, tmp_path, monkeypatch, capsys):
-    folder, on_step = tmp_path / "run", StageCallback._on_step
+@contextmanager
+def small_files(folder):
+    """No file may grow beyond a mebibyte: a state no longer fits."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-
-    def fill(callback):
-        if callback.step == 50:  # no file may grow beyond a mebibyte: a state no longer fits
-            resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, limits[1]))
-        return on_step(callback)
-
-    monkeypatch.setattr(StageCallback, "_on_step", fill)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, limits[1]))
     try:
-        assert run(folder, *SHORT) == 1
+        yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@contextmanager
+def full_disk(folder):
+    """Another program fills the disk to the last byte."""
+    filler = folder.parent / "filler"
+    with open(filler, "wb", buffering=0) as file, suppress(OSError):
+        while True:
+            file.write(bytes(4096))
+    try:
+        yield
+    finally:
+        filler.unlink()
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 48 MiB of its own."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=48m", "tmpfs", str(place)], capture_output=True)
+    if done.returncode:
+        pytest.skip("mounting a file system needs the rights of root")
+    yield place
+    subprocess.run(["umount", str(place)], check=True)
+
+
+@pytest.mark.parametrize(
+    ("place", "full", "message"),
+    [
+        ("tmp_path", small_files, "[Errno 27] File too large"),
+        ("small_disk", full_disk, "[Errno 28] No space left on device"),
+    ],
+)
+def test_full_disk_is_an_error_and_the_last_checkpoint_still_good(
+    finished, request, monkeypatch, capsys, place, full, message
+):
+    folder, on_step = request.getfixturevalue(place) / "run", StageCallback._on_step
+    with ExitStack() as stack:
+
+        def fill(callback):
+            if callback.step == 50:
+                stack.enter_context(full(folder))
+            return on_step(callback)
+
+        monkeypatch.setattr(StageCallback, "_on_step", fill)
+        assert run(folder, *SHORT) == 1
     monkeypatch.undo()
     error = capsys.readouterr().err.strip().splitlines()[-1]
-    assert error.startswith("error: [Errno 27] File too large") and "state.pt" in error
+    assert error.startswith(f"error: {message}: '{folder}")
     assert not list(folder.rglob("*.part"))
     assert run(folder, *SHORT, "--resume") == 0
     assert f"resuming {folder} at step 40 of 80" in capsys.readouterr().out

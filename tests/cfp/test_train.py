@@ -104,6 +104,26 @@ def test_killed_run_repeats_what_no_checkpoint_holds(finished, tmp_path, monkeyp
         assert (folder / name).read_bytes() == (finished / name).read_bytes()
 
 
+def test_layouts_that_are_drawn_anew_go_on_as_if_nothing_had_happened(tmp_path, monkeypatch):
+    options = (
+        "--resample --resolutions 4 --handover --random-steps 10 --steps 128 --eval-every 0 --eval-episodes 1".split()
+    )
+    assert run(tmp_path / "whole", *options) == 0
+    on_step = StageCallback._on_step
+
+    def interrupt(callback):
+        if callback.step == 80:  # in the second episode; the third begins at 120
+            signal.raise_signal(signal.SIGINT)
+        return on_step(callback)
+
+    monkeypatch.setattr(StageCallback, "_on_step", interrupt)
+    assert run(tmp_path / "stopped", *options) == 128 + signal.SIGINT
+    monkeypatch.undo()
+    assert run(tmp_path / "stopped", *options, "--resume") == 0
+    for name in ("progress.csv", "results.json"):
+        assert (tmp_path / "stopped" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
 def test_folder_with_a_run_is_left_alone(finished, capsys):
     before = contents(finished)
     assert run(finished) == 2

@@ -1,0 +1,132 @@
+"""What a case of bad input is, where it works, and how it is run."""
+
+import contextlib
+import io
+import shutil
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from cfp import train
+from cfp.weights import SHIPPED, read_policy, write_policy
+
+TINY = (
+    "--task shapematch --particles 100 --substeps 1 --num-envs 2 --resolutions 4 --steps 20 --random-steps 10 "
+    "--batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 --eval-every 0 --eval-episodes 1 "
+    "--checkpoint-every 10 --log-every 10 --no-video --device cpu --backend eager"
+)
+"""Options of a training that takes seconds, if it is not refused."""
+
+
+class Refused(Exception):
+    """A command line ended with an exit code that is not 0; the text is all that it printed as an error."""
+
+
+class Desk:
+    """A folder for one case, and what can be laid out there before it.
+
+    Args:
+        folder: Empty.
+        trained: A finished run of `TINY`.
+    """
+
+    def __init__(self, folder: Path, trained: Path) -> None:
+        self.folder, self.trained, self.before = folder, trained, snapshot(folder)
+
+    def file(self, name: str, content: bytes | str) -> Path:
+        """A file."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        self.before = snapshot(self.folder)
+        return path
+
+    def run(self, change: Callable[[Path], object] = lambda folder: None) -> Path:
+        """A copy of the finished run, with something done to it."""
+        folder = self.folder / "run"
+        shutil.copytree(self.trained, folder)
+        change(folder)
+        self.before = snapshot(self.folder)
+        return folder
+
+    def policy(self, changes: dict | None = None, weights: Callable[[dict], dict] = lambda tensors: tensors) -> Path:
+        """The shipped policy of RUN with another description and other weights."""
+        tensors, description = read_policy(SHIPPED / "run.safetensors")
+        path = self.folder / "stranger.safetensors"
+        write_policy(path, weights(tensors), {**description, **(changes or {})})
+        self.before = snapshot(self.folder)
+        return path
+
+
+def snapshot(folder: Path) -> dict[str, bytes | None]:
+    """All that is in a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+
+
+@dataclass(frozen=True)
+class Case:
+    """Bad input.
+
+    Attributes:
+        name: What is wrong.
+        call: Does it.
+        words: What the message must contain: the argument, what was given, what is allowed.
+        error: Type of the exception.
+        leaves: Beginning of the paths that it may add.
+    """
+
+    name: str
+    call: Callable[[Desk], object]
+    words: tuple[str, ...]
+    error: type[Exception] = ValueError
+    leaves: str = "nothing"
+
+    def message(self, desk: Desk) -> str:
+        """What the user is told, in one line and with the folder left out.
+
+        Raises:
+            AssertionError: It was accepted, or something else was raised.
+        """
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                self.call(desk)
+            except self.error as error:
+                return " ".join(str(error).split()).replace(str(desk.folder) + "/", "")
+            except Exception as error:
+                raise AssertionError(f"raised {type(error).__name__}: {error}") from error
+        raise AssertionError("was accepted")
+
+
+def command(main: Callable[[list[str]], int], arguments: str) -> Callable[[Desk], None]:
+    """A call of a command line; ``{folder}`` in the arguments stands for the desk's."""
+
+    def call(desk: Desk) -> None:
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(printed):
+            try:
+                code = main(arguments.format(folder=desk.folder).split())
+            except SystemExit as error:
+                code = error.code
+        if code:
+            raise Refused(printed.getvalue())
+
+    return call
+
+
+def prepared(prepare: Callable[[Desk], object], call: Callable[[Desk], object]) -> Callable[[Desk], object]:
+    """First one, then the other."""
+
+    def both(desk: Desk) -> object:
+        prepare(desk)
+        return call(desk)
+
+    return both
+
+
+def make_trained(folder: Path) -> Path:
+    """Train the run that desks copy."""
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        assert train.main([*TINY.split(), "--out", str(folder)]) == 0
+    return folder

@@ -1,0 +1,305 @@
+"""Bad images, policies, checkpoints and files of options."""
+
+import json
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import torch
+from bad_cases import TINY, Case, Refused, command, prepared
+
+import baselines.evaluate
+import cfp
+import cfp.evaluate
+import cfp.train
+from cfp.errors import CheckpointError
+from dittogym import make_spec
+
+FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+
+def png(width, height, rows=b""):
+    """A PNG that says how large it is, with any content."""
+
+    def chunk(kind, content):
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+def picture(grey):
+    return cv2.imencode(".png", np.asarray(grey, np.uint8))[1].tobytes()
+
+
+def target(name, content, *words):
+    """A picture as the target of SHAPE MATCH and, by the same reader, as a robot."""
+    call = prepared(
+        lambda desk: desk.file("picture.png", content),
+        lambda desk: make_spec("shapematch", target=desk.folder / "picture.png"),
+    )
+    return Case(f"image {name}", call, ("target", *words))
+
+
+IMAGES = [
+    Case(
+        "image missing", lambda desk: make_spec("shapematch", target="no.png"), ("target must be", "no such", "no.png")
+    ),
+    Case("image is a folder", lambda desk: make_spec("shapematch", target=desk.folder), ("target must be", "no such")),
+    target("empty", b"", "cannot be read as an image"),
+    target("of text", "hello", "cannot be read as an image"),
+    target("cut short", picture(np.eye(64) * 255)[:40], "cannot be read as an image"),
+    target("of zero pixels", png(0, 5), "cannot be read as an image"),
+    target("all white", picture(np.full((64, 64), 255)), "pixels of the shape and of the ground, got 4096 of 4096"),
+    target("all black", picture(np.zeros((64, 64))), "pixels of the shape and of the ground, got 0 of 4096"),
+    target("that would fill the memory", png(10_000, 10_000), "at most 67108864 pixels, got 10000 x 10000"),
+    target("that would fill it twice", png(30_000, 30_000), "cannot be read as an image", "900000000 pixels"),
+    target("that would fill any memory", png(2**31 - 1, 2**31 - 1), "cannot be read as an image"),
+]
+
+
+def policy(name, *words, content=None, load=cfp.load, **laid):
+    """A policy file of a stranger."""
+
+    def prepare(desk):
+        if content is None:
+            desk.policy(**laid)
+        else:
+            desk.file("stranger.safetensors", content)
+
+    call = prepared(prepare, lambda desk: load(desk.folder / "stranger.safetensors"))
+    return Case(f"policy {name}", call, ("stranger.safetensors: ", *words), CheckpointError)
+
+
+def header(values, data=b""):
+    """A safetensors file with a header of one's own."""
+    text = json.dumps(values).encode()
+    return struct.pack("<Q", len(text)) + text + data
+
+
+def first(change):
+    """Do something to the first tensor."""
+
+    def weights(tensors):
+        name = next(iter(tensors))
+        return {**tensors, name: change(tensors[name])}
+
+    return weights
+
+
+SHIPPED = (cfp.weights.SHIPPED / "run.safetensors").read_bytes()
+HUGE = {"x": {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 2**42]}}
+
+POLICIES = [
+    Case("policy missing", lambda desk: cfp.load("nobody"), ("nobody.safetensors", "shipped (run, "), CheckpointError),
+    Case(
+        "policy in an empty folder",
+        lambda desk: cfp.load(desk.folder),
+        ("there is no policy", "run, "),
+        CheckpointError,
+    ),
+    policy("empty", "damaged", content=b""),
+    policy("of text", "damaged", content="hello, I am a policy"),
+    policy("cut short", "damaged", content=SHIPPED[: len(SHIPPED) // 2]),
+    policy("cut in its header", "damaged", content=SHIPPED[:100]),
+    policy("with a header of terabytes", "damaged", content=struct.pack("<Q", 2**42) + b"{}"),
+    policy("with a tensor of terabytes", "damaged", content=header(HUGE)),
+    policy("without a description", "got a file without a cfp-policy description", content=header({})),
+    policy("with a broken description", "damaged", content=header({"__metadata__": {"cfp-policy": "{"}})),
+    policy(
+        "with a deep description", "nested too deeply", content=header({"__metadata__": {"cfp-policy": "[" * 99_999}})
+    ),
+    policy("with a list for a description", "without a", content=header({"__metadata__": {"cfp-policy": "[1]"}})),
+    policy("of another version", "description of version 1", changes={"version": 2}),
+    policy("of another kind", "kind 'mpc', allowed 'cfp'", changes={"kind": "mpc"}),
+    policy("of a task by number", "task: got 3, allowed str", changes={"task": 3}),
+    policy("of no grid", "resolution: got 0, allowed 1 to 128", changes={"resolution": 0}),
+    policy("of a grid of True", "resolution: got True, allowed 1 to 128", changes={"resolution": True}),
+    policy("of stage -1", "stage: got -1, allowed 1 to", changes={"stage": -1}),
+    policy("that is maybe deterministic", "deterministic: got 'yes', allowed bool", changes={"deterministic": "yes"}),
+    policy("for a layout by name", "layout: got 'x', allowed 0 to", changes={"layout": "x"}),
+    policy("for no environment", "environment: got None, allowed dict", changes={"environment": None}),
+    policy("for an unknown environment", "environment.colour: no such option", changes={"environment": {"colour": 1}}),
+    policy("without a network", "do not fit", changes={"network": {}}),
+    policy("with an unknown network", "do not fit", "'colour'", changes={"network": {"colour": 1}}),
+    policy("with a grid of 7", "resolution: got 7, allowed 4, 8", changes={"network": {"resolutions": [7]}}),
+    policy("with grids in a text", "do not fit", changes={"network": {"resolutions": "8, 16"}}),
+    policy(
+        "with a patch of a mile",
+        "patch: got 1000000",
+        "to 128",
+        changes={"network": {"resolutions": [8], "patch": 10**6}},
+    ),
+    policy("with another ladder", "do not fit", changes={"network": {"resolutions": [16]}}),
+    policy("of NaN", "weights that are NaN or infinite", weights=first(lambda tensor: tensor * float("nan"))),
+    policy("of other shapes", "do not fit", weights=first(lambda tensor: tensor[..., :1])),
+    policy("with a tensor too many", "do not fit", weights=lambda tensors: {**tensors, "extra": torch.zeros(1)}),
+    policy("with a tensor too few", "do not fit", weights=lambda tensors: dict(list(tensors.items())[1:])),
+    policy(
+        "of shac with a mile of inputs",
+        "do not fit",
+        load=baselines.load,
+        changes={"kind": "shac", "inputs": 10**12, "features": {}, "noise": 0.1},
+    ),
+    policy(
+        "of segments without number",
+        "do not fit",
+        load=baselines.load,
+        changes={
+            "kind": "gnn-16",
+            "network": {"kind": "gnn", "features": 10**12},
+            "nodes": {"count": 10**9, "graph": 1},
+        },
+    ),
+    policy("of actions that are none", "do not fit", load=baselines.load, changes={"kind": "gradient"}),
+    Case(
+        "policy of alchemy",
+        prepared(
+            lambda desk: desk.policy({"kind": "alchemy"}),
+            lambda desk: baselines.load(desk.folder / "stranger.safetensors"),
+        ),
+        ("algo: got 'alchemy', allowed cfp, coarse",),
+    ),
+]
+
+
+def resumed(name, change, *words):
+    """A run whose folder was changed before it is resumed."""
+    call = prepared(lambda desk: desk.run(change), command(cfp.train.main, TINY + " --resume --out {folder}/run"))
+    return Case(f"run with {name}", call, words, Refused, leaves="run/tensorboard/")
+
+
+def evaluated(name, change, *words):
+    """A run whose folder was changed before it is evaluated."""
+    call = command(baselines.evaluate.main, "{folder}/run --episodes 1 --device cpu")
+    return Case(f"evaluated run with {name}", prepared(lambda desk: desk.run(change), call), words, Refused)
+
+
+def write(name, content):
+    return lambda folder: (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+
+
+def cut(name):
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:-200])
+
+
+def options(**changes):
+    def change(folder):
+        path = folder / "config.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+    return change
+
+
+def state(**changes):
+    """Another value in the checkpoint; None takes it out."""
+
+    def change(folder):
+        path = folder / "checkpoint" / "state.pt"
+        content = torch.load(path, weights_only=True) | changes
+        torch.save({name: value for name, value in content.items() if value is not None}, path)
+
+    return change
+
+
+class Stranger:
+    """What a file of pickles could hold."""
+
+
+def chunk_outside(folder):
+    path = folder / "checkpoint" / "state.pt"
+    content = torch.load(path, weights_only=True)
+    content["chunks"][0]["file"] = "../../../secret.npz"
+    torch.save(content, path)
+
+
+def chunk_of_objects(folder):
+    path = next((folder / "checkpoint" / "replay").iterdir())
+    np.savez(path, **dict.fromkeys(FIELDS, np.array([Stranger()], object)))
+
+
+RUNS = [
+    resumed("a checkpoint cut short", cut("checkpoint/state.pt"), "state.pt: the checkpoint is damaged"),
+    resumed("an empty checkpoint", write("checkpoint/state.pt", b""), "state.pt: the checkpoint is damaged"),
+    resumed("a checkpoint of text", write("checkpoint/state.pt", "hello"), "state.pt: the checkpoint is damaged"),
+    resumed(
+        "a checkpoint that runs code",
+        lambda folder: torch.save({"version": 1, "x": Stranger()}, folder / "checkpoint" / "state.pt"),
+        "state.pt: the checkpoint is damaged (UnpicklingError)",
+    ),
+    resumed("a checkpoint of version 99", state(version=99), "got checkpoint version 99, allowed 1"),
+    resumed("a checkpoint without a model", state(model=None), "does not fit this program (KeyError: 'model')"),
+    resumed("a checkpoint before its time", state(offset=-5), "does not fit this program", "negative"),
+    resumed("a checkpoint of stage 8", state(level=7), "does not fit this program", "it is of stage 8"),
+    resumed("a checkpoint of broken options", state(config="{"), "does not fit this program (JSONDecodeError"),
+    resumed("a checkpoint of another task", state(config='{"task": "run"}'), "task: the run was started with 'run'"),
+    resumed("a chunk outside", chunk_outside, "got a chunk '../../../secret.npz', allowed are files in this folder"),
+    resumed("a chunk of objects", chunk_of_objects, "this part of the replay memory is missing or damaged"),
+    resumed("broken options", write("config.json", "{"), "config.json: cannot be read"),
+    resumed("a task that is not", options(task="swim"), "config.json: cannot be read (task: got 'swim'"),
+    evaluated("no options", lambda folder: (folder / "config.json").unlink(), "there is no run (no config.json)"),
+    evaluated(
+        "options of a list",
+        write("config.json", "[1]"),
+        "config.json: cannot be read (it holds list, allowed an object",
+    ),
+    evaluated("unknown options", options(colour=1), "config.json: cannot be read (colour: no such option"),
+    evaluated("no policy", lambda folder: (folder / "policy.safetensors").unlink(), "no policy has been written yet"),
+    evaluated("a policy cut short", cut("policy.safetensors"), "policy.safetensors: the policy is damaged"),
+]
+
+
+def file_of_options(name, content, *words, main=cfp.train.main, option="config"):
+    """A JSON file."""
+    arguments = f"--{option} {{folder}}/options.json --out {{folder}}/run --dry-run"
+    call = prepared(lambda desk: desk.file("options.json", content), command(main, arguments))
+    return Case(f"{option} file {name}", call, words, Refused)
+
+
+CONFIGS = [
+    file_of_options("empty", "", "config: options.json cannot be read as JSON"),
+    file_of_options("broken", '{"steps": 3,}', "config: options.json cannot be read as JSON", "line 1"),
+    file_of_options("in another encoding", b"\xff\xfe{\x00}\x00", "options.json cannot be read", "utf-8"),
+    file_of_options("nested too deeply", "[" * 99_999, "options.json cannot be read as JSON (it is nested too deeply)"),
+    file_of_options("too large", " " * (2**20 + 1), "options.json cannot be read", "larger than 1048576 bytes"),
+    file_of_options("of a list", "[1]", "cannot be read as JSON (it holds list, allowed an object"),
+    file_of_options("with an unknown name", '{"stepz": 1}', "stepz: no such option, allowed algo, task,"),
+    file_of_options("with a group of nothing", '{"learning": null}', "learning: got None, allowed an object"),
+    file_of_options("with a task of a list", '{"task": ["run"]}', "task: got ['run'], allowed shapematch, run,"),
+    file_of_options("with a preset of a list", '{"preset": [1]}', "preset: got [1], allowed quick, paper"),
+    file_of_options("with steps as text", '{"steps": "x"}', "steps: got 'x', allowed a whole number"),
+    file_of_options("with steps without end", '{"steps": 1e999}', "steps: got inf, allowed a whole number"),
+    file_of_options(
+        "with a rate of NaN", '{"learning": {"learning_rate": NaN}}', "learning_rate: got nan, allowed are"
+    ),
+    file_of_options("with an infinite temperature", '{"alpha": [Infinity, 0]}', "alpha: got (inf, 0.0)", "finite"),
+    file_of_options(
+        "with half particles", '{"environment": {"particles": [1.5, 2]}}', "a list of 2, each a whole number"
+    ),
+    file_of_options("with a dtype in a list", '{"environment": {"dtype": ["float32"]}}', "'float32' or 'float64'"),
+    file_of_options(
+        "with a target of a number", '{"environment": {"target": 3}}', "target: got 3, allowed text or null"
+    ),
+    file_of_options("that says where to write", '{"out": "/etc"}', "out: no such option"),
+    Case(
+        "config file missing",
+        command(cfp.train.main, "--config no.json --out run --dry-run"),
+        ("config: no.json cannot be read", "No such file"),
+        Refused,
+    ),
+    Case(
+        "config file is a folder",
+        command(cfp.train.main, "--config {folder} --out run --dry-run"),
+        ("cannot be read as JSON (it is not a file)",),
+        Refused,
+    ),
+    Case(
+        "config file never ends",
+        command(cfp.train.main, "--config /dev/zero --out run --dry-run"),
+        ("config: /dev/zero cannot be read as JSON (it is not a file)",),
+        Refused,
+    ),
+]
+
+CASES = [*IMAGES, *POLICIES, *RUNS, *CONFIGS]

@@ -1,0 +1,147 @@
+"""Bad command lines of every program."""
+
+import json
+
+from bad_cases import TINY, Case, Refused, command, prepared
+
+import baselines.compare.__main__ as compare
+import baselines.distill
+import baselines.evaluate
+import baselines.robustness
+import baselines.train
+import cfp.evaluate
+import cfp.train
+
+NEW = " --out {folder}/new "
+
+
+def training(name, options, *words, main=cfp.train.main):
+    return Case(f"train with {name}", command(main, TINY + NEW + options), words, Refused)
+
+
+def learning(algo, name, options, *words):
+    common = f"--algo {algo} --particles 100 --substeps 1 --eval-episodes 1 --no-video --device cpu"
+    return Case(f"{algo} with {name}", command(baselines.train.main, common + NEW + options), words, Refused)
+
+
+def distilling(name, options, *words):
+    common = "--particles 100 --substeps 1 --tier 100 --eval-episodes 1 --no-video --device cpu"
+    return Case(f"distill with {name}", command(baselines.distill.main, common + NEW + options), words, Refused)
+
+
+def evaluating(name, options, *words, main=cfp.evaluate.main):
+    return Case(f"evaluate {name}", command(main, options + " --device cpu"), words, Refused)
+
+
+def comparing(name, options, *words):
+    return Case(f"compare {name}", command(compare.main, options + NEW), words, Refused)
+
+
+def planned(name, plan, *words):
+    call = command(compare.main, "--plan {folder}/plan.json --dry-run" + NEW)
+    return Case(f"plan {name}", prepared(lambda desk: desk.file("plan.json", json.dumps(plan)), call), words, Refused)
+
+
+TRAIN = [
+    training("an unknown task", "--task swim", "task: got 'swim', allowed shapematch, run"),
+    training("an unknown preset", "--preset slow", "preset: got 'slow', allowed quick, paper"),
+    training("an unknown option", "--colour red", "Unrecognized options: --colour"),
+    training("a seed by name", "--seed x", "--seed", "'x'"),
+    training("seed -1", "--seed -1", "seed: got -1, allowed 0 to 2147483647"),
+    training("a seed of ten digits", "--seed 9999999999", "seed: got 9999999999, allowed 0 to 2147483647"),
+    training("no steps", "--steps 0", "steps: got 0, allowed 1 or more"),
+    training("steps and a half", "--steps 1.5", "Error parsing --steps", "'1.5'"),
+    training(
+        "a late handover",
+        "--resolutions 4 8 --random-steps 9 9 --handover 50",
+        "handover: got (50,)",
+        "between 0 and the steps, 20",
+    ),
+    training("a grid of 5", "--resolutions 5", "resolutions: got (5,), allowed is a growing choice of (4, 8,"),
+    training("a negative temperature", "--alpha -1", "alpha: got -1.0, allowed 0 or more"),
+    training("a temperature that is no number", "--alpha nan", "alpha: got (nan,), allowed are finite numbers"),
+    training("random steps below 0", "--random-steps -1", "random_steps: got -1, allowed 0 or more"),
+    training("a gate without scale", "--gate-scale 0", "gate_scale: got 0.0, allowed more than 0"),
+    training("an endless rate", "--learning-rate inf", "learning_rate: got inf, allowed are finite numbers"),
+    training("gradients clipped to nothing", "--max-grad-norm 0", "max_grad_norm: got 0.0, allowed more than 0"),
+    training("a share of 2", "--reward-momentum 2", "reward_momentum: got 2.0, allowed 0 to 1"),
+    training("precision half", "--precision half", "'half'", "--precision", "bfloat16"),
+    training("few particles", "--particles few", "--particles", "'few'", "'full', 'lite'"),
+    training("no particles", "--particles 0", "particles must be at least 1 for every body, got 0"),
+    training("no robots", "--num-envs 0", "num_envs: got 0, allowed 1 or more"),
+    training("an unknown backend", "--backend warp", "backend must be one of ('auto', 'eager'", "got 'warp'"),
+    training("a device of its own", "--device meta", "device must be 'cpu' or 'cuda', got 'meta'"),
+    training("a target that is not there", "--target none.png", "target must be 'star'", "no such file: 'none.png'"),
+    training("a variant of another task", "--variant published", "task 'shapematch' has no option 'variant'"),
+    training("a policy that is not there", "--start-from none", "none.safetensors: there is no policy"),
+    training("a policy of another task", "--start-from run", "start_from: got a policy for run, allowed shapematch"),
+    training("an algorithm of baselines", "--algo shac", "algo: got 'shac', allowed 'cfp'; python -m baselines.train"),
+    Case(
+        "train into a file",
+        prepared(lambda desk: desk.file("new", "mine"), command(cfp.train.main, TINY + NEW)),
+        ("out: new is a file, allowed is a folder",),
+        Refused,
+    ),
+    Case(
+        "train into a run",
+        prepared(lambda desk: desk.run(), command(cfp.train.main, TINY + " --out {folder}/run")),
+        ("out: run already holds a run, allowed with --resume",),
+        Refused,
+    ),
+    Case(
+        "train under a file",
+        prepared(lambda desk: desk.file("new", "mine"), command(cfp.train.main, TINY + " --out {folder}/new/run")),
+        ("Not a directory", "new/run"),
+        Refused,
+    ),
+]
+
+OTHERS = [
+    learning("alchemy", "gold", "", "algo: got 'alchemy', allowed cfp, coarse, fine, gnn-16"),
+    learning("coarse", "two grids", "--resolutions 4 8", "resolutions: got (4, 8), allowed is one"),
+    learning("gnn-16", "ten particles", "--particles 10", "particles: got 10 of the robot, allowed 16"),
+    learning("gnn-16", "a negative temperature", "--alpha -1", "alpha: got -1.0, allowed 0 or more"),
+    learning("gradient", "no iterations", "--iterations 0", "iterations: got 0, allowed 1 or more"),
+    learning("gradient", "a negative window", "--window -1", "window: got -1, allowed 0 or more"),
+    learning("gradient", "a grid of 99", "--grid 99", "resolution must be 'coarse', 'fine' or 1 to 64, got 99"),
+    learning("mpc", "two robots", "--num-envs 2", "num_envs: got 2, allowed 1"),
+    learning("mpc", "a horizon before its end", "--horizon 2 --commit 3", "commit: got 3, allowed 1 to the horizon, 2"),
+    learning("cem", "one elite", "--elites 1", "elites: got 1, allowed 2 to the candidates"),
+    learning("shac", "an endless discount", "--gamma nan", "gamma: got nan, allowed are finite numbers"),
+    learning(
+        "shac", "a policy of the state", "--start-from run", "start_from: got a policy, allowed with sees 'image'"
+    ),
+    learning("zero", "a grid of none", "--grid 0", "resolution must be 'coarse', 'fine' or 1 to 64, got 0"),
+    distilling("an unknown teacher", "--teacher socrates", "teacher: got 'socrates'", "mpc, shac, gradient"),
+    distilling("a teacher of another task", "--teacher run", "teacher: got a policy for run, allowed shapematch"),
+    distilling("a share of 2", "--share 2", "share: got 2.0, allowed 0 to 1"),
+    distilling("no labels", "--capacity 0", "capacity: got 0, allowed 1 or more"),
+    evaluating("nothing", "", "policy: got None and the folder None, allowed is one of the two"),
+    evaluating("a folder that is not there", "{folder}/none", "none: there is no run (no config.json)"),
+    evaluating("an unknown policy", "--policy alchemy", "none of that name is shipped (run, "),
+    evaluating("no episodes", "--policy run --episodes 0", "episodes: got 0, allowed 1 or more"),
+    evaluating("with seed -1", "--policy run --seed -1", "seed: got -1, allowed 0 to"),
+    evaluating("with noise maybe", "--policy run --noise maybe", "'maybe'", "--noise", "without"),
+    evaluating("no particles", "--policy run --particles 0", "particles must be at least 1", "got 0"),
+    evaluating("an empty folder", "{folder}", "there is no run", main=baselines.evaluate.main),
+    evaluating("a disturbed nothing", "{folder}", "there is no run", main=baselines.robustness.main),
+    comparing("unknown tasks", "--tasks swim", "task: got 'swim'"),
+    comparing("unknown algorithms", "--algos alchemy", "algo: got 'alchemy', allowed cfp"),
+    comparing("a seed twice", "--seeds 1 1", "seeds: got 1 1, allowed one or more, each once"),
+    comparing("without seeds", "--seeds", "seeds: got none, allowed one or more"),
+    comparing("seed -1", "--seeds -1", "seeds: got -1, allowed 0 to 8999"),
+    comparing("no episodes", "--episodes 0", "episodes: got 0, allowed 1 or more"),
+    comparing("minus one worker", "--workers -1", "workers: got -1, allowed 0 or more"),
+    comparing(
+        "parts of a GPU at home", "--gpus-per-run 0.5", "gpus_per_run: got 0.5, allowed with --executor ray only"
+    ),
+    comparing("run 99", "--only 99", "only: got 99, allowed 0 to 2"),
+    comparing("a plan that is not there", "--plan none.json", "plan: none.json cannot be read"),
+    planned("of a list", [1], "plan: plan.json cannot be read as JSON (it holds list"),
+    planned("of other parts", {"colour": 1}, "holds colour, allowed an object with common, tasks, algos"),
+    planned("with a part of nothing", {"common": None}, "plan: common: got None, allowed an object"),
+    planned("with a task of nothing", {"tasks": {"shapematch": 3}}, "plan: tasks.shapematch: got 3, allowed an object"),
+    planned("with unknown options", {"common": {"colour": 1}}, "cfp on shapematch: colour: no such option"),
+]
+
+CASES = [*TRAIN, *OTHERS]

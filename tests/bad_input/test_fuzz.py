@@ -1,0 +1,154 @@
+"""Whatever is in a file of options, a picture or a policy: the documented errors come out, or what it says."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import baselines
+from baselines.registry import ALGORITHMS, configure
+from cfp.actor import build_actor
+from cfp.config import Config, to_json
+from cfp.errors import CheckpointError, ConfigError
+from cfp.process import peak_memory
+from cfp.weights import describe, save_policy
+from dittogym.targets import load_target
+
+LARGEST_GROWTH = 2**30
+"""Bytes by which the memory may grow at most while a file of a few kilobytes is refused."""
+FUZZ = settings(max_examples=60, deadline=20_000, suppress_health_check=list(HealthCheck))
+SCALARS = (
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=8)
+    | st.sampled_from([2**63, 10**400, -1, 0, "run", "quick", "cfp", "../../x", "\x00"])
+)
+JSON = st.recursive(
+    SCALARS,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@pytest.fixture(autouse=True)
+def bounded_memory():
+    before = peak_memory()
+    yield
+    assert peak_memory() - before < LARGEST_GROWTH
+
+
+def paths(values, prefix=()):
+    """Every place in nested dictionaries, groups included."""
+    for name, value in values.items():
+        yield (*prefix, name)
+        if isinstance(value, dict):
+            yield from paths(value, (*prefix, name))
+
+
+def replaced(values, path, value):
+    name, *rest = path
+    return {**values, name: replaced(values[name], rest, value) if rest else value}
+
+
+def damaged(content, cuts, changes):
+    """Bytes with some overwritten and the end cut off."""
+    result = bytearray(content[: len(content) - cuts])
+    for place, byte in changes:
+        if result:
+            result[place % len(result)] = byte
+    return bytes(result)
+
+
+CHANGES = st.lists(st.tuples(st.integers(0, 4000), st.integers(0, 255)), max_size=12)
+CUTS = st.sampled_from([0, 0, 0, 1, 9, 500])
+
+
+@pytest.mark.parametrize("algo", ["cfp", "gnn-16", "distill", "gradient", "cem", "shac"])
+@FUZZ
+@given(data=st.data())
+def test_options_of_any_kind(algo, data):
+    values = to_json(ALGORITHMS[algo].preset("shapematch", "quick"))
+    for _ in range(data.draw(st.integers(1, 3))):
+        values = replaced(values, data.draw(st.sampled_from(sorted(paths(values)))), data.draw(JSON))
+    try:
+        config = configure(values)
+        config.check()
+    except ConfigError as error:
+        assert str(error)
+    else:
+        assert configure(json.loads(json.dumps(to_json(config)))) == config
+
+
+@FUZZ
+@given(JSON)
+def test_options_of_any_shape(values):
+    if isinstance(values, dict):
+        try:
+            configure(values)
+        except ConfigError as error:
+            assert str(error)
+
+
+def pictures():
+    grey = np.zeros((48, 48), np.uint8)
+    grey[10:38, 12:36] = 255
+    return {kind: cv2.imencode(kind, grey)[1].tobytes() for kind in (".png", ".jpg", ".bmp", ".tiff", ".webp")}
+
+
+@pytest.mark.parametrize("kind", pictures())
+@pytest.mark.filterwarnings("ignore")
+@FUZZ
+@given(cuts=CUTS, changes=CHANGES)
+def test_pictures_of_any_bytes(kind, tmp_path_factory, cuts, changes):
+    path = tmp_path_factory.getbasetemp() / f"picture{kind}"
+    path.write_bytes(damaged(pictures()[kind], cuts, changes))
+    try:
+        target = load_target(path)
+    except ValueError as error:
+        assert str(error).startswith("target ")
+    else:
+        assert target.shape == (64, 64) and target.dtype == bool
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    """A valid policy: path, bytes, description, weights."""
+    config = Config(resolutions=(4, 8))
+    actor, description = build_actor(config.actor_spec(0)), describe(config, 0, 7)
+    path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
+    save_policy(path, actor, description)
+    return path, path.read_bytes(), json.loads(json.dumps(description)), actor
+
+
+def loaded(path):
+    try:
+        policy = baselines.load(path)
+    except (CheckpointError, ConfigError) as error:
+        assert str(error)
+    else:
+        assert policy.resolution >= 1 and isinstance(policy.description["task"], str)
+
+
+@FUZZ
+@given(cuts=CUTS, changes=CHANGES)
+def test_policies_of_any_bytes(policy, cuts, changes):
+    path, content, _, _ = policy
+    path.write_bytes(damaged(content, cuts, changes))
+    loaded(path)
+
+
+@FUZZ
+@given(data=st.data())
+def test_policies_of_any_description(policy, data):
+    path, _, description, actor = policy
+    kind = data.draw(st.sampled_from(sorted(ALGORITHMS)))
+    own = {"inputs": 10, "noise": 0.1, "features": {}, "nodes": {"count": 16, "graph": True}}
+    description = {**description, **own, "kind": data.draw(st.sampled_from([kind, "cfp"]))}
+    description = replaced(description, data.draw(st.sampled_from(sorted(paths(description)))), data.draw(JSON))
+    save_policy(path, actor, description)
+    loaded(path)
