@@ -16,12 +16,28 @@ Points = NDArray[np.float64]
 
 
 def uniform(count: int, generator: np.random.Generator) -> Points:
-    """``count`` independent points of the unit square, (count, 2)."""
+    """Independent points of the unit square.
+
+    Args:
+        count: N, at least 1.
+        generator: Where they are drawn from.
+
+    Returns:
+        (N, 2).
+    """
     return generator.random((_positive(count), 2))
 
 
 def sobol(count: int, seed: int) -> Points:
-    """``count`` points of a scrambled Sobol sequence in the unit square, (count, 2): far fewer clumps and holes."""
+    """Points of a scrambled Sobol sequence in the unit square: far fewer clumps and holes than random ones.
+
+    Args:
+        count: N, at least 1.
+        seed: Of the scrambling.
+
+    Returns:
+        (N, 2).
+    """
     engine = torch.quasirandom.SobolEngine(2, scramble=True, seed=seed)
     return engine.draw(_positive(count), dtype=torch.float64).numpy()
 
@@ -33,6 +49,9 @@ def box(numbers: Points, corner: tuple[float, float], size: tuple[float, float])
         numbers: (N, 2) points of the unit square.
         corner: Lower left corner, m.
         size: Width and height, m.
+
+    Returns:
+        (N, 2) positions, m.
     """
     return np.asarray(corner) + numbers * np.asarray(size)
 
@@ -44,6 +63,9 @@ def disc(numbers: Points, centre: tuple[float, float], radius: float) -> Points:
         numbers: (N, 2) points of the unit square.
         centre: Centre, m.
         radius: Radius, m.
+
+    Returns:
+        (N, 2) positions, m.
     """
     distance, angle = radius * np.sqrt(numbers[:, 0]), 2.0 * math.pi * numbers[:, 1]
     return np.asarray(centre) + np.stack((distance * np.cos(angle), distance * np.sin(angle)), axis=1)
@@ -58,6 +80,9 @@ def chord_disc(numbers: Points, centre: tuple[float, float], radius: float) -> P
         numbers: (N, 2) points of the unit square.
         centre: Centre, m.
         radius: Radius, m.
+
+    Returns:
+        (N, 2) positions, m.
     """
     across, along = 2.0 * numbers[:, 0] - 1.0, 2.0 * numbers[:, 1] - 1.0
     chord = np.sqrt(radius**2 - (radius * across) ** 2)
@@ -71,6 +96,9 @@ def lattice(cells: tuple[int, int], corner: tuple[float, float], size: tuple[flo
         cells: Number of cells in x and y.
         corner: Lower left corner, m.
         size: Width and height, m.
+
+    Returns:
+        (N, 2) positions, m, N the number of cells.
     """
     columns, rows = np.meshgrid((np.arange(cells[0]) + 0.5) / cells[0], (np.arange(cells[1]) + 0.5) / cells[1])
     return box(np.stack((columns.ravel(), rows.ravel()), axis=1), corner, size)
@@ -84,9 +112,12 @@ def image(numbers: Points, mask: NDArray[np.bool_], corner: tuple[float, float],
 
     Args:
         numbers: (N, 2) points of the unit square.
-        mask: (rows, columns), row 0 at the top.
+        mask: (H, W), row 0 at the top.
         corner: Lower left corner of the whole image, m.
         size: Width and height of the whole image, m.
+
+    Returns:
+        (N, 2) positions, m.
 
     Raises:
         ValueError: The mask has no pixel set.
