@@ -203,7 +203,7 @@ class Shac(Algorithm):
         return self.env.soft_observation().float() * (2.0 / 255.0) - 1.0
 
     def value(self, critic: nn.Module, seen: Tensor) -> Tensor:
-        """Values (B,) of what is seen, (B, ...)."""
+        """Values (B,) that a ``critic`` gives to what is ``seen``, (B, ...)."""
         value: Tensor = critic(seen)[..., 0] / max(1.0 - self.config.gamma, 1e-2)
         return value
 
@@ -220,7 +220,7 @@ class Shac(Algorithm):
         return policy.to(self.env.device)
 
     def attached(self, env: Any) -> Any:
-        """The present policy, looking at an environment."""
+        """The present policy, looking at the environment ``env``."""
         policy = self.policy
         return policy.attached(env) if isinstance(policy, StatePolicy) else policy
 

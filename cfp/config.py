@@ -62,7 +62,7 @@ class RunConfig:
         raise NotImplementedError
 
     def resolution(self, level: int) -> int:
-        """Action grid R of a stage (0 is the first)."""
+        """Action grid R of a stage; ``level`` is its index, 0 the first."""
         raise NotImplementedError
 
     def action_size(self, level: int) -> int:
@@ -70,7 +70,7 @@ class RunConfig:
         return self.resolution(level)
 
     def evaluation(self, level: int) -> tuple[int, int]:
-        """Seed of the first layout, and episodes, by which a stage is evaluated while it trains."""
+        """Seed of the first layout, and episodes, by which stage ``level`` is evaluated while it trains."""
         return self.seed + EVALUATION_SEED, self.report.eval_episodes
 
     def adapted(self, base: RunConfig) -> RunConfig:
@@ -118,7 +118,7 @@ class SACConfig(RunConfig):
     learning: LearningConfig = field(default_factory=LearningConfig)
 
     def stage(self, level: int) -> StageConfig:
-        """What the training of one stage needs."""
+        """What the training of stage ``level`` needs."""
         raise NotImplementedError
 
     def check(self) -> None:

@@ -104,7 +104,7 @@ class Outcome(NamedTuple):
         terminated: (B,) bool, the task's own reasons to end; ``None`` for none.
         success: (B,) bool; ``None`` where success is not defined.
         info: Further quantities for ``info``, leading B.
-        memory: Replaces the memory; ``None`` keeps it.
+        memory: Replaces the memory, leading B; ``None`` keeps it.
     """
 
     terms: Mapping[str, Tensor]
@@ -116,7 +116,15 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of the reward terms."""
+    """Weights of the reward terms.
+
+    Attributes:
+        location: Of the task's own terms of place.
+        velocity: Of its terms of speed.
+        split: Of the term of a torn robot, which all tasks share where they have a limit of the spread.
+        action: Of the size of the actuation field.
+        alive: Reward of every step.
+    """
 
     location: float = 0.0
     velocity: float = 0.0

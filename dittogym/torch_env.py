@@ -338,12 +338,15 @@ class TorchEnv:
         return soft_observation(self.model, self.env_state)
 
     def render(self, index: int = 0, *, muscles: bool = False, size: int = 512) -> np.ndarray:
-        """Picture of one simulation, (size, size, 3) uint8 RGB.
+        """Picture of one simulation in RGB.
 
         Args:
             index: Which element of the batch.
             muscles: Colour the robot by the actuation of the last step: contraction red, expansion blue.
             size: Pixels per side.
+
+        Returns:
+            (S, S, 3) uint8 for S = ``size``.
         """
         field = self._field if muscles else None
         return frame(self.model, self.env_state, index, field, size)

@@ -35,7 +35,7 @@ class Body:
         count: Number of particles.
         material: Constitutive law, such as :class:`torchmpm.VonMises`.
         mass: Mass of a particle, kg; a number or a tensor of shape (), (B,) or (B, count).
-        volume: Undeformed volume of a particle, m^2 (two-dimensional); same shapes.
+        volume: Undeformed volume of a particle, m^2 (two-dimensional); a number, (), (B,) or (B, count).
         muscle: Whether the actuation field acts on it.
 
     Raises:
@@ -228,7 +228,19 @@ class Solver:
         return ParticleState.from_planes(repeated(substep, state.planes(), substeps, segment=segment))
 
     def check(self, state: ParticleState, actuation: Tensor | None, origin: Tensor | None) -> Tensor:
-        """Check the arguments of a step, see :meth:`step`, and fill in the origin."""
+        """Check the arguments of a step, see :meth:`step`, and fill in the origin.
+
+        Args:
+            state: Where the particles are.
+            actuation: (B, 2, G, G), Pa, or ``None``.
+            origin: (B, 2), m, or ``None``.
+
+        Returns:
+            The origin (B, 2), m.
+
+        Raises:
+            ValueError: Shapes, dtypes or devices do not fit together.
+        """
         batch, nodes = state.batch_size, self.grid.resolution
         if state.num_particles != self.num_particles:
             raise ValueError(f"state has {state.num_particles} particles, the solver's bodies {self.num_particles}")
@@ -248,7 +260,13 @@ class Solver:
         return state.x.new_zeros(batch, 2) if origin is None else origin
 
     def scene(self, state: ParticleState, actuation: Tensor | None = None, origin: Tensor | None = None) -> Scene:
-        """Check the arguments of a step and prepare what its substeps share; see :meth:`step`."""
+        """Check the arguments of a step and prepare what its substeps share; see :meth:`step`.
+
+        Args:
+            state: Where the particles are.
+            actuation: (B, 2, G, G), Pa, or ``None``.
+            origin: (B, 2), m, or ``None``.
+        """
         origin, nodes = self.check(state, actuation, origin), self.grid.resolution
         inside = pad(state.x.new_ones(nodes, nodes), [PAD] * 4).flatten()[None]
         if actuation is not None:
@@ -266,7 +284,15 @@ class Solver:
         )
 
     def substep(self, scene: Scene, planes: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        """One substep on component planes (see :meth:`ParticleState.planes`): transfer, grid, transfer back."""
+        """One substep: transfer to the grid, grid, transfer back.
+
+        Args:
+            scene: What the substeps of a step share.
+            planes: The 13 component planes, (B, N) each, see :meth:`ParticleState.planes`.
+
+        Returns:
+            The new planes, (B, N) each.
+        """
         x, y = planes[:2]
         grid = self.to_grid(scene, planes)
         v, C = transfer.grid_to_particles(self.grid, grid.nodes, grid_velocity(scene, grid.momentum))
@@ -274,7 +300,12 @@ class Solver:
         return tuple(torch.where(grid.inside, new, old) for new, old in zip(moved, planes, strict=True))
 
     def to_grid(self, scene: Scene, planes: tuple[Tensor, ...]) -> Scattered:
-        """First half of a substep: deform the particles, find their forces, collect mass and momentum on the nodes."""
+        """First half of a substep: deform the particles, find their forces, collect mass and momentum on the nodes.
+
+        Args:
+            scene: What the substeps of a step share.
+            planes: The 13 component planes, (B, N) each.
+        """
         x, y, vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, Jp = planes
         inside = self.grid.contains(x, scene.origin[:, 0:1])
         nodes = stencil(self.grid, x, y, scene.origin)
@@ -310,7 +341,15 @@ class Solver:
             start += body.count
 
     def per_particle(self, state: ParticleState, name: str) -> Tensor:
-        """A value of the bodies, ``"mass"`` or ``"volume"``, as a plane over all particles, (1 or B, N)."""
+        """A value of the bodies as a plane over all particles.
+
+        Args:
+            state: Gives batch size, dtype and device.
+            name: ``"mass"`` (kg) or ``"volume"`` (m^2).
+
+        Returns:
+            (1, N) or (B, N).
+        """
         like = state.Jp.detach()
         columns = []
         for body, part in self.parts():

@@ -3,13 +3,12 @@
 Hypothesis draws the scenes: bodies of all materials, from one particle up, windows, gravity, damping, rules, muscles.
 """
 
-import itertools
 from dataclasses import dataclass, replace
 
 import pytest
 import scenes
 import torch
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import assert_close, assert_identical, generator
 from torch import Tensor
