@@ -176,6 +176,7 @@ class Distill(Algorithm):
             batch_size=64 if silhouette else 256,
             student_rate=2e-3 if silhouette else 1e-3,
             share=0.8 if silhouette else 0.7,
+            faults=0.2,
             planner=PlannerConfig(iterations=30, learning_rate=0.1) if silhouette else PlannerConfig(),
             planner_grid=16 if silhouette else "coarse",
         )

@@ -250,7 +250,10 @@ class Elastic:
         return corotated_energy(F, column(self.mu, Jp, "mu"), column(self.lam, Jp, "lam"))
 
     def stiffness(self) -> Value:
-        """Largest stress per strain in undeformed matter: 2 (mu + lam), of a change of volume, Pa."""
+        """Largest stress per strain in undeformed matter, Pa: 2 (mu + lam), that of a change of volume.
+
+        A number, or where the constants are tensors one of shape (), (B, 1) or (B, N).
+        """
         return 2.0 * (spread(self.mu) + spread(self.lam))
 
 
@@ -340,7 +343,7 @@ class Soil(Elastic):
         return corotated_energy(F, mu, lam, det(F).abs())
 
     def stiffness(self) -> Value:
-        """As that of :class:`Elastic`, at Jp = 1."""
+        """As that of :class:`Elastic`, at Jp = 1, Pa: a number or a tensor of shape (), (B, 1) or (B, N)."""
         low, high = self.hardening_range
         return min(max(1.0, low), high) * super().stiffness()
 
