@@ -184,6 +184,10 @@ class TaskSpec:
         remember: What to keep from the start of an episode, tensors with a leading B.
         stale: Entries of the memory that a reset leaves as they are under ``parity="reference"``.
         target: (64, 64) bool picture to match, centred on the robot, row 0 at the top; for pictures of the task.
+
+    Raises:
+        ValueError: A number is out of range, or there is more than one object.
+        TypeError: A body is something else, or the judge cannot be called.
     """
 
     name: str
@@ -212,12 +216,7 @@ class TaskSpec:
     target: np.ndarray | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
-        """Check what would otherwise fail late or silently.
-
-        Raises:
-            ValueError: A number is out of range, or there is more than one object.
-            TypeError: A body is something else, or the judge cannot be called.
-        """
+        """Check what would otherwise fail late or silently."""
         checks.whole("horizon", self.horizon, 1)
         checks.whole("patch", self.patch, 4, NODES)
         for name in ("coarse", "fine"):

@@ -182,7 +182,10 @@ class TorchEnv:
 
     @property
     def generators(self) -> dict[int, dict[str, Tensor]]:
-        """States of the elements' random generators, which ``resample`` draws from; an assignment brings them back."""
+        """States of the elements' random generators, which ``resample`` draws from; an assignment brings them back.
+
+        By element: tensors ``key`` (624,) and ``pos`` () of the Mersenne Twister.
+        """
         return self._layouts.generators
 
     @generators.setter
