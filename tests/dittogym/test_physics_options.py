@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from tiny import SMALL, actions, assert_same_bits, everything, stir, tiny
+from tiny import SMALL, TASKS, actions, assert_same_bits, everything, stir, tiny
 
 import dittogym
 from dittogym import TorchEnv
@@ -383,6 +383,14 @@ def test_bad_physics(physics: object, message: str) -> None:
     assert env.state is before
     env.reset()
     assert_same_bits(everything(env), numbers)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_substeps_of_the_tasks_are_stable(task: str) -> None:
+    """With full muscles, by a third in DIG and by more than twice elsewhere."""
+    env = tiny(task)
+    limit = env.model.solver.stable_dt(env.spec.max_actuation)
+    assert limit > (1.3 if task == "dig" else 2.5) * DT
 
 
 def test_matter_too_stiff_for_the_substeps_is_refused() -> None:
