@@ -31,7 +31,7 @@ _RESET_OPTIONS = ("physics", "positions", "reset_mask")
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A moment of an environment, see :meth:`TorchEnv.save`.
+    """A moment of an environment, see :meth:`dittogym.TorchEnv.save`.
 
     Attributes:
         task: Name of the task.

@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -45,11 +46,19 @@ sphinx_gallery_conf = {
     "plot_gallery": os.environ.get("TUTORIALS", "run") == "run",
 }
 suppress_warnings = ["config.cache"]
+nitpicky = True
+#: Annotations name types of other libraries, and aliases, that have no page here.
+nitpick_ignore_regex = [
+    (r"py:class", r"(?!(torchmpm|dittogym|cfp|baselines)\.).*"),
+    (r"py:class", r"torchmpm\.rollout\.(State|Input|Output)|cfp\.(run\.Run|process\.StopSignals|evaluation\.Policy)"),
+    (r"py:class", r"dittogym\.native\.Painter"),
+    (r"py:.*", r"(gymnasium|torch)\..*"),
+]
 default_role = "code"
 html_theme = "furo"
 html_title = "torchmpm"
 html_static_path = ["_static"]
-html_css_files = ["house.css"]
+html_css_files = ["site.css"]
 
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
@@ -119,9 +128,23 @@ class HousePicture(SphinxDirective):
         return [nodes.raw(text=house.picture(), format="html")]
 
 
+def keep_colons(app: Sphinx, what: str, name: str, item: object, options: object, lines: list[str]) -> None:
+    """Napoleon takes the words before a colon in the first line of an attribute's docstring for its type."""
+    if what == "attribute":
+        lines.insert(0, "")
+
+
+def drop_links_back(app: Sphinx, page: str, template: str, context: dict[str, object], doctree: object) -> None:
+    """Links from a source to its documentation miss where a class is shown under the shorter, public name."""
+    if page.startswith("_modules/"):
+        context["body"] = re.sub(r'<a class="viewcode-back".*?</a>', "", str(context["body"]))
+
+
 def setup(app: Sphinx) -> None:
     """Register the directives, and write the pages of the tasks before any page is read."""
     app.connect("builder-inited", lambda app: write_pages(), priority=100)  # before tutorials register tasks
+    app.connect("html-page-context", drop_links_back)
+    app.connect("autodoc-process-docstring", keep_colons, priority=400)  # before Napoleon
     app.add_directive("command-help", CommandHelp)
     app.add_directive("names-table", NamesTable)
     app.add_directive("house-picture", HousePicture)

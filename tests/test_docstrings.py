@@ -301,7 +301,7 @@ def test_public_names_are_documented(package: str) -> None:
 @pytest.mark.parametrize("package", PACKAGES)
 def test_the_reference_shows_every_public_name(package: str) -> None:
     page = (REFERENCE / f"{package}.md").read_text()
-    shown = set(re.findall(r"^\.\. auto\w+:: (\S+)", page, flags=re.MULTILINE))
+    shown = set(re.findall(r"^\.\. (?:auto|py:)\w+:: (\S+)", page, flags=re.MULTILINE))
     assert {f"{package}.{name}" for name in importlib.import_module(package).__all__} - shown == set()
 
 
