@@ -35,8 +35,8 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
         given: Mapping from ``dittogym.physics.NAMES`` to a number, or a tensor or array of shape () or (B,); for
             ``gravity`` of shape (2,) or (B, 2); for those of ``PER_PARTICLE`` also (B, N), robot first, of which a body
             without such a constant ignores its part.
-        batch: B.
-        particles: N.
+        batch: Number B of simulations.
+        particles: Number N of particles.
         like: Gives dtype and device.
 
     Raises:

@@ -81,7 +81,7 @@ class TorchEnv:
 
     Attributes:
         spec: The task.
-        num_envs: B.
+        num_envs: Number B of simulations.
         action_shape: (2, R, R).
         action_layout: ``"image"`` or ``"grid"``.
         state: The :class:`torchmpm.ParticleState` of all simulations.
