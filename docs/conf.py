@@ -128,10 +128,22 @@ class HousePicture(SphinxDirective):
         return [nodes.raw(text=house.picture(), format="html")]
 
 
-def keep_colons(app: Sphinx, what: str, name: str, item: object, options: object, lines: list[str]) -> None:
-    """Napoleon takes the words before a colon in the first line of an attribute's docstring for its type."""
-    if what == "attribute":
-        lines.insert(0, "")
+class KeepColons:
+    """Napoleon takes the words before a colon in the docstring of an attribute for its type; this puts the text back."""
+
+    def __init__(self, app: Sphinx) -> None:
+        self.said: dict[str, list[str]] = {}
+        app.connect("autodoc-process-docstring", self.before, priority=400)
+        app.connect("autodoc-process-docstring", self.after, priority=600)
+
+    def before(self, app: Sphinx, what: str, name: str, item: object, options: object, lines: list[str]) -> None:
+        """Keep what Napoleon is going to read."""
+        if what in ("attribute", "property"):
+            self.said[name] = lines.copy()
+
+    def after(self, app: Sphinx, what: str, name: str, item: object, options: object, lines: list[str]) -> None:
+        """Undo what it did."""
+        lines[:] = self.said.pop(name, lines)
 
 
 def drop_links_back(app: Sphinx, page: str, template: str, context: dict[str, object], doctree: object) -> None:
@@ -144,7 +156,7 @@ def setup(app: Sphinx) -> None:
     """Register the directives, and write the pages of the tasks before any page is read."""
     app.connect("builder-inited", lambda app: write_pages(), priority=100)  # before tutorials register tasks
     app.connect("html-page-context", drop_links_back)
-    app.connect("autodoc-process-docstring", keep_colons, priority=400)  # before Napoleon
+    KeepColons(app)
     app.add_directive("command-help", CommandHelp)
     app.add_directive("names-table", NamesTable)
     app.add_directive("house-picture", HousePicture)
