@@ -129,7 +129,7 @@ class HousePicture(SphinxDirective):
 
 
 class KeepColons:
-    """Napoleon takes the words before a colon in the docstring of an attribute for its type; this puts the text back."""
+    """Napoleon takes words before a colon in the docstring of an attribute for its type; this puts the text back."""
 
     def __init__(self, app: Sphinx) -> None:
         self.said: dict[str, list[str]] = {}
@@ -138,7 +138,7 @@ class KeepColons:
 
     def before(self, app: Sphinx, what: str, name: str, item: object, options: object, lines: list[str]) -> None:
         """Keep what Napoleon is going to read."""
-        if what in ("attribute", "property"):
+        if what == "attribute":
             self.said[name] = lines.copy()
 
     def after(self, app: Sphinx, what: str, name: str, item: object, options: object, lines: list[str]) -> None:
