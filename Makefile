@@ -61,8 +61,9 @@ lint: install  ## style, formatting, types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-docs: $(DOCS_STAMP)  ## build the site into docs/_build/html, warnings are errors
+docs: $(DOCS_STAMP)  ## build the site into docs/_build/html, warnings and dead links are errors
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	$(BIN)/python docs/links.py docs/_build/html
 	@echo "Open docs/_build/html/index.html"
 
 bench: install  ## milliseconds a substep

@@ -77,8 +77,8 @@ def load(path: str | Path, device: str = "cpu") -> Policy:
         device: Where its tensors go.
 
     Returns:
-        A policy with stable-baselines3's ``predict``. Some remember: hand the second result back as ``state``. Its
-        ``description`` tells task and origin.
+        A policy with stable-baselines3's ``predict``. Some remember, and want the second result back as ``state``.
+        Its ``description`` tells task and origin.
 
     Raises:
         CheckpointError: No such file, a damaged one, or one that is not such a policy.

@@ -192,7 +192,7 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
         device: Where its tensors go.
 
     Returns:
-        A policy with stable-baselines3's ``predict(observation, deterministic=...)``: uint8 (3, 64, 64) or
+        A policy with stable-baselines3's ``predict(observation, deterministic=...)``, uint8 (3, 64, 64) or
         (B, 3, 64, 64) in, float32 (2, A, A) or (B, 2, A, A) out. ``policy.resolution`` is A, for
         ``gymnasium.make(..., resolution=...)``: the patch after several levels, see `ActorSpec`. Its ``description``
         tells task and origin.

@@ -276,7 +276,7 @@ def judge(
     """Reward terms, termination and success after a transition.
 
     Elements whose state is not finite, or whose robot has left the window, end with the single term ``failure`` =
-    :data:`dittogym.spec.FAILURE_REWARD`; their neighbours are not touched.
+    ``dittogym.spec.FAILURE_REWARD``; their neighbours are not touched.
 
     Args:
         model: The task.

@@ -112,7 +112,7 @@ class Layouts:
     Args:
         spec: The task.
         counts: Particles of each body.
-        num_envs: B.
+        num_envs: Number B of simulations.
         spread: Evenly spread instead of random numbers, see :class:`LayoutSampler`.
         resample: Draw anew at every reset.
     """

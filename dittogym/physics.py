@@ -32,11 +32,11 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
     """Check what a user asks for and bring it to one value per simulation or particle; gradients flow through.
 
     Args:
-        given: Mapping from :data:`NAMES` to a number, or a tensor or array of shape () or (B,); for ``gravity`` of
-            shape (2,) or (B, 2); for those of :data:`PER_PARTICLE` also (B, N), robot first, of which a body without
-            such a constant ignores its part.
-        batch: B.
-        particles: N.
+        given: Mapping from ``dittogym.physics.NAMES`` to a number, or a tensor or array of shape () or (B,); for
+            ``gravity`` of shape (2,) or (B, 2); for those of ``PER_PARTICLE`` also (B, N), robot first, of which a body
+            without such a constant ignores its part.
+        batch: Number B of simulations.
+        particles: Number N of particles.
         like: Gives dtype and device.
 
     Raises:

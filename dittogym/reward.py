@@ -45,9 +45,9 @@ def beyond(z: Tensor, width: float, *, soft: bool = False) -> Tensor:
 
 
 def mean_over_nearest(values: Tensor, x: Tensor, point: Tensor, share: float, *, soft: bool = False) -> Tensor:
-    """Mean of ``values`` over the particles that :func:`nearest` chooses.
+    """Mean of ``values`` over the particles that ``nearest`` chooses.
 
-    Soft, particles fade out around the distance within which there are as many, over :data:`FADE`, and the choice is
+    Soft, particles fade out around the distance within which there are as many, over ``FADE``, and the choice is
     differentiated too; the widest particle is not left out.
 
     Args:

@@ -32,7 +32,7 @@ _RESET_OPTIONS = ("physics", "positions", "reset_mask")
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A moment of an environment, see :meth:`TorchEnv.save`.
+    """A moment of an environment, see :meth:`dittogym.TorchEnv.save`.
 
     Attributes:
         task: Name of the task.
@@ -96,7 +96,7 @@ class TorchEnv:
 
     Attributes:
         spec: The task.
-        num_envs: B.
+        num_envs: Number B of simulations.
         action_shape: (2, R, R).
         action_layout: ``"image"`` or ``"grid"``.
         state: The :class:`torchmpm.ParticleState` of all simulations.

@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -45,11 +46,19 @@ sphinx_gallery_conf = {
     "plot_gallery": os.environ.get("TUTORIALS", "run") == "run",
 }
 suppress_warnings = ["config.cache"]
+nitpicky = True
+#: Annotations name types of other libraries, and aliases, that have no page here.
+nitpick_ignore_regex = [
+    (r"py:class", r"(?!(torchmpm|dittogym|cfp|baselines)\.).*"),
+    (r"py:class", r"torchmpm\.rollout\.(State|Input|Output)|cfp\.(run\.Run|process\.StopSignals|evaluation\.Policy)"),
+    (r"py:class", r"dittogym\.native\.Painter"),
+    (r"py:.*", r"(gymnasium|torch)\..*"),
+]
 default_role = "code"
 html_theme = "furo"
 html_title = "torchmpm"
 html_static_path = ["_static"]
-html_css_files = ["house.css"]
+html_css_files = ["site.css"]
 
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
@@ -119,9 +128,35 @@ class HousePicture(SphinxDirective):
         return [nodes.raw(text=house.picture(), format="html")]
 
 
+class KeepColons:
+    """Napoleon takes words before a colon in the docstring of an attribute for its type; this puts the text back."""
+
+    def __init__(self, app: Sphinx) -> None:
+        self.said: dict[str, list[str]] = {}
+        app.connect("autodoc-process-docstring", self.before, priority=400)
+        app.connect("autodoc-process-docstring", self.after, priority=600)
+
+    def before(self, app: Sphinx, what: str, name: str, item: object, options: object, lines: list[str]) -> None:
+        """Keep what Napoleon is going to read."""
+        if what == "attribute":
+            self.said[name] = lines.copy()
+
+    def after(self, app: Sphinx, what: str, name: str, item: object, options: object, lines: list[str]) -> None:
+        """Undo what it did."""
+        lines[:] = self.said.pop(name, lines)
+
+
+def drop_links_back(app: Sphinx, page: str, template: str, context: dict[str, object], doctree: object) -> None:
+    """Links from a source to its documentation miss where a class is shown under the shorter, public name."""
+    if page.startswith("_modules/"):
+        context["body"] = re.sub(r'<a class="viewcode-back".*?</a>', "", str(context["body"]))
+
+
 def setup(app: Sphinx) -> None:
     """Register the directives, and write the pages of the tasks before any page is read."""
     app.connect("builder-inited", lambda app: write_pages(), priority=100)  # before tutorials register tasks
+    app.connect("html-page-context", drop_links_back)
+    KeepColons(app)
     app.add_directive("command-help", CommandHelp)
     app.add_directive("names-table", NamesTable)
     app.add_directive("house-picture", HousePicture)

@@ -63,7 +63,7 @@ def survey(name: str) -> Floor:
 
 
 def picture() -> str:
-    """The house as HTML, styled by ``house.css``."""
+    """The house as HTML, styled by ``site.css``."""
     floors = []
     for floor in map(survey, PACKAGES):
         rooms = "".join(f'<li title="{escape(what)}">{escape(room)}</li>' for room, what in floor.rooms.items())

@@ -27,6 +27,8 @@ REFERENCE = Path(__file__).resolve().parents[1] / "docs/reference"
 TENSORS = re.compile(r"^(?!Callable).*\b(Tensor|ndarray|NDArray|Points|Value|Float|Planes|Mat2|Sym2)\b")
 #: A shape such as (B, N, 2), (B,) or (), or words for a lone number or a whole batch of anything.
 SHAPE = re.compile(r"\((?:[A-Z]|\d|2·)[\w ]*(?:,[^()]*)?\)|\(\)|\bnumbers?\b|\bleading B\b|\bscalars?\b")
+#: A first line of Returns with a colon that is not in code or in a reference.
+COLON = re.compile(r"^Returns:\n(?:[^`:\n]|:\w+:`[^`]+`|``[^`]+``|`[^`]+`)*:(?!\w+:`)", re.MULTILINE)
 #: Units of quantities by the names that they have everywhere.
 UNITS = {
     "actuation": "Pa",
@@ -225,6 +227,8 @@ def faults(name: Name) -> list[str]:
     returns = "" if isinstance(name.item, type) or function is None else str(function.__annotations__.get("return"))
     if TENSORS.search(returns) and not SHAPE.search(name.result):
         found.append(f"gives no shape of its result, {returns}")
+    if COLON.search(name.texts[0]):
+        found.append("has a colon in the first line of Returns, before which Sphinx reads a type")
     if lacks_unit(name.path.rpartition(".")[2], returns, name.text):
         found.append("gives no unit of its result")
     for error in raised(function, name.item if isinstance(name.item, type) else None):
@@ -301,7 +305,7 @@ def test_public_names_are_documented(package: str) -> None:
 @pytest.mark.parametrize("package", PACKAGES)
 def test_the_reference_shows_every_public_name(package: str) -> None:
     page = (REFERENCE / f"{package}.md").read_text()
-    shown = set(re.findall(r"^\.\. auto\w+:: (\S+)", page, flags=re.MULTILINE))
+    shown = set(re.findall(r"^\.\. (?:auto|py:)\w+:: (\S+)", page, flags=re.MULTILINE))
     assert {f"{package}.{name}" for name in importlib.import_module(package).__all__} - shown == set()
 
 

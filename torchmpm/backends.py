@@ -29,7 +29,7 @@ def compiler_found() -> bool:
 
 
 def runs_native(solver: Solver, state: ParticleState) -> bool:
-    """Whether a step from this state is one for :mod:`torchmpm.native`.
+    """Whether a step from this state is one for ``torchmpm.native``.
 
     ``"auto"`` takes it on the CPU wherever it works. Where it does not, a warning is logged once that says why. On CUDA
     it waits to be asked for: its kernels there have been tested, but on no device yet.

@@ -56,7 +56,7 @@ def lame(young: Value, poisson: Value) -> tuple[Value, Value]:
         poisson: Poisson's ratio, between -1 and 0.5; likewise a number or a tensor.
 
     Returns:
-        (mu, lam), Pa: numbers, or tensors of the arguments' shape.
+        (mu, lam) in Pa, numbers or tensors of the arguments' shape.
 
     Raises:
         ValueError: A number is out of range.
@@ -132,7 +132,7 @@ def von_mises_return(F: Mat2, limit: Value) -> Mat2:
     ``sqrt((e_1 - e_2)^2 / 2 + 1e-8)``. Where it exceeds ``limit`` = yield stress / (2 mu), the difference e_1 - e_2 is
     brought back to its value at yield and the volume is kept: plastic flow is isochoric. Elsewhere F is returned as it
     came. Without logarithm or SVD: the test compares stretch ratios, and sum and difference of the returned stretches
-    rescale the rotation and the reflection part of F (see :mod:`torchmpm.linalg`).
+    rescale the rotation and the reflection part of F (see ``torchmpm.linalg``).
 
     The derivative jumps at the yield surface; exactly on it this returns the elastic side.
 
@@ -170,7 +170,7 @@ def clamp_stretches(F: Mat2, low: Value, high: Value, shear_cutoff: float = 0.0)
     """Bring both principal stretches of F into [low, high].
 
     No SVD: sum and difference of the stretches rescale the rotation and the reflection part of F (see
-    :mod:`torchmpm.linalg`), the larger of which holds the orthogonal factor R of F = R S.
+    ``torchmpm.linalg``), the larger of which holds the orthogonal factor R of F = R S.
 
     Args:
         F: Trial deformation gradient, planes (B, N).

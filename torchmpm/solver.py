@@ -113,8 +113,8 @@ class Solver:
         damping: Factor on every node velocity in every substep (1 = none).
         rules: Velocity rules, see :class:`torchmpm.VelocityRule`.
         dt: Duration of a substep, s.
-        backend: ``"native"`` (fused kernels, :mod:`torchmpm.native`: C++ on the CPU, Triton on CUDA), ``"eager"`` or
-            ``"compile"`` (see :func:`torchmpm.backends.substep_function`), or ``"auto"``: native on a CPU where it
+        backend: ``"native"`` (fused kernels, ``torchmpm.native``: C++ on the CPU, Triton on CUDA), ``"eager"`` or
+            ``"compile"`` (see ``torchmpm.backends.substep_function``), or ``"auto"``: native on a CPU where it
             works, else eager.
         allow_unstable: Accept a ``dt`` beyond :meth:`stable_dt`.
 

@@ -1,6 +1,6 @@
-"""The observation as one C++ function, for CPUs with a compiler; elsewhere :mod:`dittogym.observation` draws it.
+"""The observation as one C++ function, for CPUs with a compiler; elsewhere ``dittogym.observation`` draws it.
 
-It is compiled, kept and loaded like the kernels of :mod:`torchmpm.native`. With the pixel raster it yields the same
+It is compiled, kept and loaded like the kernels of ``torchmpm.native``. With the pixel raster it yields the same
 bytes; splats are summed in another order, so that a byte may differ by one.
 """
 

@@ -34,7 +34,7 @@ def make_spec(
     """The specification of a task.
 
     Args:
-        task: A name from :data:`TASKS`, or a specification.
+        task: A name from :data:`dittogym.TASKS`, or a specification.
         body: A robot of one's own, see :func:`dittogym.robots.with_body`.
         obstacles: Static geometry in place of the task's own, see :mod:`dittogym.geometry`.
         options: Options of that task, such as ``target`` of SHAPE MATCH.

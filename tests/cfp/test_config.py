@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import dittogym
 from cfp.command import parse
 from cfp.config import Config, merge, to_json
 from cfp.environments import make_env
@@ -11,6 +12,7 @@ from cfp.errors import ConfigError
 from cfp.presets import TASKS, from_json, preset
 from cfp.state_file import check_same
 from cfp.train import PROGRAM
+from dittogym import make_spec
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -22,6 +24,17 @@ def test_every_preset_is_valid_and_survives_json(task, name):
     levels = range(len(config.resolutions))
     assert sum(config.stage(level).steps for level in levels) == config.steps
     assert [config.actor_spec(level).resolutions[-1] for level in levels] == list(config.resolutions)
+
+
+def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):
+    spec = replace(make_spec("run"), name="hop", coarse=4, fine=32)
+    monkeypatch.setitem(dittogym.TASKS, "hop", lambda: spec)
+    config = preset("hop")
+    config.check()
+    assert (config.task, config.resolutions) == ("hop", (4, 32))
+    assert replace(config, task="run", resolutions=(8, 16)) == preset("run")
+    with pytest.raises(ConfigError, match="preset: got 'paper', allowed for hop quick"):
+        preset("hop", "paper")
 
 
 def test_paper_presets_hold_the_published_numbers():
@@ -98,7 +111,7 @@ def test_numbers_out_of_range_are_named(group, changes, message):
         ({"environment": {"dtype": "float16"}}, "dtype: got 'float16'"),
         ({"environment": {"particles": [1, 2, 3]}}, "particles"),
         ({"task": "jump"}, "task: got 'jump', allowed shapematch, run"),
-        ({"preset": "slow"}, "preset: got 'slow', allowed quick, paper"),
+        ({"preset": "slow"}, "preset: got 'slow', allowed for shapematch quick, paper"),
     ],
 )
 def test_wrong_json_is_named(values, message):
