@@ -46,7 +46,7 @@ TRAIN = [
     training("an unknown task", "--task swim", "task: got 'swim', allowed shapematch, run"),
     training("an unknown preset", "--preset slow", "preset: got 'slow', allowed quick, paper"),
     training("an unknown option", "--colour red", "Unrecognized options: --colour"),
-    training("a seed by name", "--seed x", "--seed", "'x'"),
+    training("a seed by name", "--seed x", "Error parsing --seed: invalid literal for int()", "'x'"),
     training("seed -1", "--seed -1", "seed: got -1, allowed 0 to 2147483647"),
     training("a seed of ten digits", "--seed 9999999999", "seed: got 9999999999, allowed 0 to 2147483647"),
     training("no steps", "--steps 0", "steps: got 0, allowed 1 or more"),
