@@ -140,7 +140,7 @@ class StatePolicy:
         return bool(self.description.get("deterministic", False))
 
     def attached(self, env: TorchEnv) -> StatePolicy:
-        """The same policy, looking at an environment.
+        """The same policy, looking at the environment ``env``.
 
         Raises:
             ValueError: Another task's environment, with other things to see.
@@ -158,7 +158,16 @@ class StatePolicy:
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Actions (B, 2, R, R) for the state of the attached environment; the image is not looked at.
+        """Actions for the state of the attached environment; the image is not looked at.
+
+        Args:
+            observation: (B, 3, 64, 64) or (3, 64, 64); only the number of images matters.
+            state: Arrays with a leading B, handed through: the policy has no memory.
+            episode_start: (B,) bool; changes nothing.
+            deterministic: Without noise.
+
+        Returns:
+            Actions (B, 2, R, R), or (2, R, R) for one image, and ``state``.
 
         Raises:
             RuntimeError: It was not shown an environment.

@@ -95,6 +95,10 @@ class Algorithm(ABC):
     def preset(task: str, name: str) -> RunConfig:
         """Defaults of a task.
 
+        Args:
+            task: Its name.
+            name: ``"quick"`` or ``"paper"``.
+
         Raises:
             ConfigError: No such task or preset.
         """
@@ -110,7 +114,12 @@ class Algorithm(ABC):
 
     @abstractmethod
     def learn(self, total_timesteps: int, callback: Callback) -> Algorithm:
-        """Take some more environment steps and learn from them; call back between updates."""
+        """Take some more environment steps and learn from them.
+
+        Args:
+            total_timesteps: How many at least.
+            callback: Called between updates, with scalars to log.
+        """
 
     @property
     @abstractmethod
@@ -124,17 +133,32 @@ class Algorithm(ABC):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Actions (B, 2, R, R) for observations (B, 3, 64, 64), and the policy's memory for the next step."""
+        """Choose actions.
+
+        Args:
+            observation: (B, 3, 64, 64) uint8.
+            state: What the last call returned, None at the beginning; arrays with a leading B.
+            episode_start: (B,) bool, which elements begin anew.
+            deterministic: Without noise.
+
+        Returns:
+            Actions (B, 2, R, R), and the policy's memory for the next step.
+        """
         return self.policy.predict(observation, state, episode_start, deterministic)
 
     @abstractmethod
     def save(self, path: Path, description: dict[str, Any]) -> None:
-        """Write the policy, see `cfp.weights.write_policy`."""
+        """Write the policy, see `cfp.weights.write_policy`.
+
+        Args:
+            path: The ``.safetensors`` file.
+            description: What it is and comes from.
+        """
 
     @classmethod
     @abstractmethod
     def load(cls, path: Path, device: str = "cpu") -> Policy:
-        """Load a policy that `save` wrote."""
+        """Load the policy that `save` wrote to ``path``, onto a device."""
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
@@ -142,7 +166,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Undo `state_dict` in an algorithm made with the same options."""
+        """Go on from the ``state`` that `state_dict` gave, in an algorithm made with the same options."""
 
     @classmethod
     def entry(cls) -> Entry:

@@ -79,6 +79,15 @@ class Dataset:
             self.rounds.append(Labels(torch.from_numpy(pixels.reshape(-1, *TorchEnv.observation_shape)), actions))
 
 
+def lose(values: Tensor, share: float) -> Tensor:
+    """Set a share of the entries to 0 in half of the elements (B, ...), drawn from torch's generator."""
+    if not share:
+        return values
+    lost = torch.rand(values.shape) < share
+    lost &= torch.rand(len(values), *[1] * (values.ndim - 1)) < 0.5
+    return values.masked_fill(lost.to(values.device), 0)
+
+
 class Collector:
     """Lets a mixture of student and teacher move, and asks the teacher about every state.
 
@@ -90,10 +99,11 @@ class Collector:
         teacher: Who is asked.
         episodes: Of the simulations.
         leg: Control steps.
+        faults: Share of the entries that the student loses, see `lose`, while it looks and moves.
     """
 
-    def __init__(self, env: TorchEnv, teacher: Teacher, episodes: Episodes, leg: int) -> None:
-        self.env, self.teacher, self.episodes, self.leg = env, teacher, episodes, leg
+    def __init__(self, env: TorchEnv, teacher: Teacher, episodes: Episodes, leg: int, faults: float = 0.0) -> None:
+        self.env, self.teacher, self.episodes, self.leg, self.faults = env, teacher, episodes, leg, faults
         self.position = leg
         self.led = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
         self.lost = self.led.clone()
@@ -121,7 +131,7 @@ class Collector:
             counts = ~self.lost if self.teacher.fresh else follows
             images.append(seen[counts].cpu())
             actions.append(told[counts].cpu())
-            own = self._enlarged(student(seen))
+            own = self._enlarged(lose(student(lose(seen, self.faults)), self.faults))
             seen = self._step(choose(follows, self._enlarged(told), own))
         return Labels(torch.cat(images), torch.cat(actions))
 

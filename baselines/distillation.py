@@ -17,12 +17,12 @@ from torch import nn
 import cfp
 from baselines.actor_critic import quieten
 from baselines.algorithm import Algorithm, Callback, Sees
-from baselines.dagger import Collector, Dataset
+from baselines.dagger import Collector, Dataset, lose
 from baselines.episodes import Episodes
 from baselines.planner import PlannerConfig
 from baselines.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
 from cfp.actor import build_actor
-from cfp.config import EnvironmentConfig, LadderConfig, RunConfig, at_least_one
+from cfp.config import EnvironmentConfig, LadderConfig, RunConfig, Tier, at_least_one
 from cfp.environments import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.policy import ActorPolicy
@@ -57,7 +57,7 @@ class DistillConfig(LadderConfig):
     """Which algorithm."""
     teacher: str = "shac"
     """mpc (plans from every state), shac or gradient (trained first), or a policy: a run folder, policy.safetensors."""
-    tier: Literal["full", "lite"] | int | tuple[int, int] = "lite"
+    tier: Tier = "lite"
     """Particles of the simulations that are taught in."""
     round: int = 64
     """Control steps between two lessons."""
@@ -73,6 +73,9 @@ class DistillConfig(LadderConfig):
     """Factor by which the share of legs that the teacher leads falls from round to round; it begins at 1."""
     leg: int = 8
     """Control steps after which it is drawn anew who leads a robot."""
+    faults: float = 0.0
+    """Share of entries that become 0 in half of the images that the student sees and of the actions that it takes, so
+    that it learns to do without them."""
     capacity: int = 100_000
     """Labels that are kept; an image takes 12 KiB."""
     age: int = 400
@@ -104,8 +107,9 @@ class DistillConfig(LadderConfig):
         for name in ("student_rate", "max_grad_norm"):
             if getattr(self, name) <= 0:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, allowed more than 0")
-        if not 0 <= self.share <= 1:
-            raise ConfigError(f"share: got {self.share}, allowed 0 to 1")
+        for name in ("share", "faults"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed 0 to 1")
 
 
 class Distill(Algorithm):
@@ -140,7 +144,7 @@ class Distill(Algorithm):
         learning = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
         self.adam = torch.optim.Adam(learning, config.student_rate)
         episodes = Episodes(self.env, config.seed + level * config.layouts, config.age, config.layouts)
-        self.collector = Collector(self.env, self._teacher(own, teacher), episodes, config.leg)
+        self.collector = Collector(self.env, self._teacher(own, teacher), episodes, config.leg, config.faults)
         self.dataset, self.rounds = Dataset(config.capacity), 0
         self.period = config.round * self.env.num_envs
 
@@ -247,7 +251,8 @@ class Distill(Algorithm):
         return (self.actor(observations.to(device), deterministic=True) - wanted).square().mean()
 
     def _improve(self) -> float:
-        loss = self._loss(*self.dataset.sample(self.config.batch_size))
+        labels = self.dataset.sample(self.config.batch_size)
+        loss = self._loss(lose(labels.observations, self.config.faults), labels.actions)
         if not math.isfinite(value := float(loss.detach())):
             raise NonFiniteError(
                 f"the loss became {value} after {self.num_timesteps} environment steps of the stage; "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ import cfp
 from baselines.algorithm import Algorithm, Callback, Grid, GridConfig, Sees, grid_size
 from baselines.objective import make_objective
 from baselines.open_loop import OpenLoop
-from cfp.config import EnvironmentConfig, ReportConfig, RunConfig, at_least_one
+from cfp.config import EnvironmentConfig, ReportConfig, RunConfig, Tier, at_least_one
 from cfp.environments import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from dittogym import make_spec
@@ -58,7 +58,7 @@ class GradientConfig(GridConfig):
     """Adam's step size at the beginning; a cosine takes it to a tenth."""
     window: int = 0
     """Control steps that a gradient reaches back; 0: the whole episode."""
-    tier: Literal["full", "lite"] | int | tuple[int, int] = "lite"
+    tier: Tier = "lite"
     """Particles of the simulation in the first stage."""
     blur: tuple[float, ...] = (4.0, 2.0, 1.0, 0.0)
     """SHAPE MATCH: standard deviations, in pixels, by which both pictures are blurred, one after the other."""

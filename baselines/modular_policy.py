@@ -48,7 +48,7 @@ class SegmentPolicy:
         return bool(self.description.get("deterministic", False))
 
     def attached(self, env: TorchEnv) -> SegmentPolicy:
-        """The same policy, looking at an environment.
+        """The same policy, looking at the environment ``env``.
 
         Raises:
             ValueError: Another task's environment, with other things to see.

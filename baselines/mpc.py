@@ -13,7 +13,8 @@ import cfp
 from baselines.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.open_loop import OpenLoop
 from baselines.planner import PlanConfig, Planner, PlannerBase, PlannerConfig
-from cfp.config import EnvironmentConfig, ReportConfig
+from baselines.reduced import Reduced
+from cfp.config import EnvironmentConfig, ReportConfig, Tier
 from cfp.environments import make_torch_env
 from cfp.errors import ConfigError
 from dittogym import make_spec
@@ -29,8 +30,13 @@ METRICS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class PlannedConfig(GridConfig):
-    """A planned episode: one robot on the layout of the seed, from the start to the end of the task."""
+    """A planned episode: one robot on the layout of the seed, from the start to the end of the task.
 
+    The environment options say where plans are carried out and judged; tier says where they are tried.
+    """
+
+    tier: Tier | None = None
+    """Particles of the simulations that plans are tried in, at most the environment's; None: as many."""
     planner: PlanConfig = field(default_factory=PlanConfig)
 
     def ends(self) -> tuple[int, ...]:
@@ -63,8 +69,8 @@ class MPCConfig(PlannedConfig):
 def planned(task: str, name: str) -> dict[str, Any]:
     """Defaults of a task that do not depend on how plans are found: options by name.
 
-    ``quick`` plans at the lite tier, ``paper`` in the paper's environment. The episode of SHAPE MATCH is short and its
-    reward all detail: it gets an action grid of 16.
+    ``quick`` carries plans out at the lite tier, ``paper`` in the paper's environment; both try them at the lite tier.
+    The episode of SHAPE MATCH is short and its reward all detail: it gets an action grid of 16.
 
     Raises:
         ConfigError: No such task or preset.
@@ -79,6 +85,7 @@ def planned(task: str, name: str) -> dict[str, Any]:
         "environment": replace(environment, num_envs=1),
         "report": ReportConfig(horizon // 4 + 1, 1, True, checkpoint_every=horizon // 20 + 1, log_every=10),
         "grid": 16 if task == "shapematch" else "coarse",
+        "tier": None if name == "quick" else "lite",
     }
 
 
@@ -98,10 +105,22 @@ class MPC(Algorithm):
         self.config = config
         self.env = make_torch_env(config, config.resolution(0), 1)
         self.env.reset(seed=config.seed)
-        self.planner = self.planner_type(self.env, config.planner, seed=config.seed, layout=self.env.action_layout)
+        self.reduced = None if config.tier is None else self._reduced(config, config.tier)
+        tried = self.reduced.small if self.reduced else self.env
+        self.planner = self.planner_type(tried, config.planner, seed=config.seed, layout=self.env.action_layout)
         self.period = config.planner.commit  # all its planning is in the first of these steps
         self.actions = torch.zeros(0, *self.env.action_shape)
         self.total, self.reward, self.over = 0.0, 0.0, False
+
+    def _reduced(self, config: PlannedConfig, tier: Tier) -> Reduced:
+        layout = self.env.action_layout
+        environment = replace(config.environment, particles=tier, parity="clean", action_layout=layout)
+        small = make_torch_env(replace(config, environment=environment), config.resolution(0), 1)
+        small.reset(seed=config.seed)
+        try:
+            return Reduced(self.env, small)
+        except ValueError as error:
+            raise ConfigError(f"tier: {error}") from error
 
     @staticmethod
     def preset(task: str, name: str) -> PlannedConfig:
@@ -122,6 +141,8 @@ class MPC(Algorithm):
         """Carry out some more steps, fewer if the episode ends."""
         end = self.num_timesteps + total_timesteps
         while self.num_timesteps < end and not self.over:
+            if self.reduced:
+                self.reduced.follow(self.env.env_state)
             action = self.planner.act()
             self._carry_out(action)
             self.actions = torch.cat((self.actions, action.float().cpu()))

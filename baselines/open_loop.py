@@ -17,6 +17,9 @@ class OpenLoop:
     Args:
         actions: (T, 2, R, R), in [-1, 1].
         description: What it is and comes from.
+
+    Raises:
+        ValueError: The actions have another shape.
     """
 
     deterministic_by_default = True

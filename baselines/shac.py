@@ -16,7 +16,7 @@ from baselines.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.features import StateFeatures
 from baselines.shac_rollout import Rollout, Window
 from baselines.training_reward import RewardConfig
-from cfp.config import EnvironmentConfig, ReportConfig, RunConfig, at_least_one
+from cfp.config import EnvironmentConfig, ReportConfig, RunConfig, Tier, at_least_one
 from cfp.environments import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.evaluation import Policy
@@ -61,7 +61,7 @@ class ShacConfig(GridConfig):
     """What the policy is given: the privileged state (matter, deformation, clock), or the image like CFP's."""
     start_from: str | None = None
     """Policy of one level on the image, whatever trained it, whose weights the actor begins with."""
-    tier: Literal["full", "lite"] | int | tuple[int, int] = "lite"
+    tier: Tier = "lite"
     """Particles of the simulations that are learned from."""
     window: int = 16
     """Control steps that a gradient reaches back."""
@@ -203,7 +203,7 @@ class Shac(Algorithm):
         return self.env.soft_observation().float() * (2.0 / 255.0) - 1.0
 
     def value(self, critic: nn.Module, seen: Tensor) -> Tensor:
-        """Values (B,) of what is seen, (B, ...)."""
+        """Values (B,) that a ``critic`` gives to what is ``seen``, (B, ...)."""
         value: Tensor = critic(seen)[..., 0] / max(1.0 - self.config.gamma, 1e-2)
         return value
 
@@ -220,7 +220,7 @@ class Shac(Algorithm):
         return policy.to(self.env.device)
 
     def attached(self, env: Any) -> Any:
-        """The present policy, looking at an environment."""
+        """The present policy, looking at the environment ``env``."""
         policy = self.policy
         return policy.attached(env) if isinstance(policy, StatePolicy) else policy
 

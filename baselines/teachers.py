@@ -159,6 +159,10 @@ def read_teacher(path: str | Path, task: str, environment: EnvironmentConfig) ->
         raise ConfigError(f"teacher: its target or the student's cannot be read ({error})") from error
     if not np.array_equal(one, other):
         raise ConfigError(f"teacher: got a policy for the target {theirs.target}, allowed {environment.target}")
-    if description["kind"] == "mpc":
-        raise ConfigError("teacher: got the record of one planned episode, allowed mpc itself, which plans anew")
+    drawn = any(body.shape.draws for body in make_spec(task, **environment.task_options()).bodies)
+    if drawn and "layout" in description:
+        raise ConfigError(
+            f"teacher: got the record of one planned episode, allowed in {task}, where every episode starts "
+            "differently, is mpc itself, which plans anew"
+        )
     return load(path)

@@ -44,6 +44,9 @@ class ActorSpec:
         patch: Size of the images on which a residual actor blends; None: the grid of its own level, as the reference
             does. Two cubic enlargements are not one, so only images of the size of the environment's patch (then not
             enlarged any more) make a closed gate leave the field of the coarser level as it was.
+
+    Raises:
+        ValueError: A resolution has no head, the ladder does not grow, or biases and levels do not match.
     """
 
     resolutions: tuple[int, ...]
@@ -65,11 +68,7 @@ class ActorSpec:
         return cls(**plain)
 
     def __post_init__(self) -> None:
-        """Check the lengths and the resolutions.
-
-        Raises:
-            ValueError: A resolution has no head, the ladder does not grow, or biases and levels do not match.
-        """
+        """Check the lengths and the resolutions."""
         for resolution in self.resolutions:
             if resolution not in RESOLUTIONS:
                 raise ValueError(f"action resolution: got {resolution}, allowed {', '.join(map(str, RESOLUTIONS))}")

@@ -200,7 +200,7 @@ class CFP(SAC):
         self.logger.record("train/n_updates", self._n_updates)
 
     def update(self, batch: ReplayBufferSamples) -> dict[str, Tensor]:
-        """Do one update on a batch and return what it is judged by (0-dimensional tensors, see `METRICS`)."""
+        """Do one update on a ``batch``; what it is judged by, scalars by name, see `METRICS`."""
         _, critic, target = self.networks()
         now, later = map(self.losses.prepare, (batch.observations, batch.next_observations))
         scalars = self._update_critic(now, later, batch)

@@ -14,6 +14,7 @@ from cfp.groups import EnvironmentConfig as EnvironmentConfig
 from cfp.groups import LearningConfig as LearningConfig
 from cfp.groups import NetworkConfig as NetworkConfig
 from cfp.groups import ReportConfig as ReportConfig
+from cfp.groups import Tier as Tier
 from cfp.groups import at_least_one as at_least_one
 from cfp.groups import not_negative as not_negative
 from cfp.groups import positive
@@ -61,7 +62,7 @@ class RunConfig:
         raise NotImplementedError
 
     def resolution(self, level: int) -> int:
-        """Action grid R of a stage (0 is the first)."""
+        """Action grid R of a stage; ``level`` is its index, 0 the first."""
         raise NotImplementedError
 
     def action_size(self, level: int) -> int:
@@ -69,7 +70,7 @@ class RunConfig:
         return self.resolution(level)
 
     def evaluation(self, level: int) -> tuple[int, int]:
-        """Seed of the first layout, and episodes, by which a stage is evaluated while it trains."""
+        """Seed of the first layout, and episodes, by which stage ``level`` is evaluated while it trains."""
         return self.seed + EVALUATION_SEED, self.report.eval_episodes
 
     def adapted(self, base: RunConfig) -> RunConfig:
@@ -117,7 +118,7 @@ class SACConfig(RunConfig):
     learning: LearningConfig = field(default_factory=LearningConfig)
 
     def stage(self, level: int) -> StageConfig:
-        """What the training of one stage needs."""
+        """What the training of stage ``level`` needs."""
         raise NotImplementedError
 
     def check(self) -> None:

@@ -7,12 +7,11 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
 from cfp.command import Program
-from cfp.config import RunConfig
+from cfp.config import RunConfig, Tier
 from cfp.errors import CFPError, CheckpointError, ConfigError
 from cfp.evaluation import Noise, Policy, compare, format_table, to_rows
 from cfp.process import keep_memory
@@ -35,7 +34,7 @@ class Command:
     """Action noise of the trained policies: with, without, both in rows of their own, or default, as trained."""
     seed: int | None = None
     """Seed of layouts and noise; the run's own if not given."""
-    particles: Literal["full", "lite"] | int | tuple[int, int] | None = None
+    particles: Tier | None = None
     """Particles: full (the paper's), lite, or counts; the run's own if not given."""
     device: str = "auto"
     """cpu, cuda, or auto."""

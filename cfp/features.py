@@ -29,5 +29,5 @@ class ImageFeatures(BaseFeaturesExtractor):
         self.encoder = Encoder(3, width)
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Features (B, 16 width) of images (B, 3, 64, 64) in [0, 1]."""
+        """Features (B, 16 width) of ``observations`` (B, 3, 64, 64) in [0, 1]."""
         return torch.flatten(self.encoder(2 * observations - 1), 1)

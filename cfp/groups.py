@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 from cfp.errors import ConfigError
 from cfp.losses import Precision
 from cfp.networks import Interpolation
+
+Tier: TypeAlias = Literal["full", "lite"] | int | tuple[int, int]
+"""Particles: the paper's, about 2,000, a count, or one count for robot and one for object."""
 
 TASK_OPTIONS = ("target", "variant")
 """Fields of `EnvironmentConfig` that are options of some task."""
@@ -52,7 +55,7 @@ class EnvironmentConfig:
 
     num_envs: int = 16
     """Robots simulated side by side."""
-    particles: Literal["full", "lite"] | int | tuple[int, int] = "lite"
+    particles: Tier = "lite"
     """Particles: full (the paper's), lite (about 2,000), a count, or one count for robot and one for object."""
     substeps: int = 100
     """Physics steps in one environment step."""

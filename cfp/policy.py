@@ -184,7 +184,15 @@ class ActorPolicy(BasePolicy):
         return self.spec.action_size
 
     def forward(self, observation: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
-        """Actions (B, 2, R, R) for uint8 observations (B, 3, 64, 64)."""
+        """Choose actions.
+
+        Args:
+            observation: (B, 3, 64, 64) uint8.
+            deterministic: Without noise.
+
+        Returns:
+            (B, 2, R, R) in [-1, 1].
+        """
         action: torch.Tensor = self.actor(observation, deterministic)
         return action
 

@@ -148,7 +148,7 @@ class TorchVecEnv(VecEnv):
         return [result for _ in self._indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """No element is wrapped."""
+        """No element is wrapped, whatever the ``wrapper_class``."""
         return [False for _ in self._indices(indices)]
 
 

@@ -139,6 +139,9 @@ def make_model(
         substeps: Substeps of a control step.
         backend: Of the solver.
         unscaled: As in the reference: unit volumes, and the pixel raster, whatever the counts.
+
+    Raises:
+        ValueError: The matter is too stiff, see :func:`check_stability`.
     """
     full = counts == tuple(body.count for body in spec.bodies)
     shares = tuple(1.0 if unscaled else body.count / n for body, n in zip(spec.bodies, counts, strict=True))
@@ -149,8 +152,30 @@ def make_model(
         damping=spec.damping,
         rules=tuple(rule for obstacle in spec.obstacles for rule in obstacle.rules),
         backend=backend,
+        allow_unstable=True,  # checked with the muscles, here and when a reset changes the matter
     )
-    return Model(spec, solver, substeps, shares, pixels=full or unscaled)
+    model = Model(spec, solver, substeps, shares, pixels=full or unscaled)
+    check_stability(model, {})
+    return model
+
+
+def check_stability(model: Model, physics: Physics) -> None:
+    """Refuse matter that the solver's substep is too long for.
+
+    Args:
+        model: The task.
+        physics: Constants that differ from the task's.
+
+    Raises:
+        ValueError: Substeps would have to be shorter.
+    """
+    solver = model.solver_for(physics)
+    limit = solver.stable_dt(physics.get("max_actuation", model.spec.max_actuation))
+    if solver.dt > limit:
+        raise ValueError(
+            f"mu, lam, max_actuation and mass must be such that substeps of {solver.dt} s are stable, got matter so "
+            f"stiff and light that they would have to be at most {limit} s"
+        )
 
 
 def _bodies(spec: TaskSpec, counts: tuple[int, ...], shares: tuple[float, ...], physics: Physics) -> tuple[Body, ...]:

@@ -110,7 +110,15 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start a new episode; see :meth:`dittogym.TorchEnv.reset`."""
+        """Start a new episode; see :meth:`dittogym.TorchEnv.reset`.
+
+        Args:
+            seed: Draws the particles anew.
+            options: As there.
+
+        Returns:
+            The observation (3, 64, 64) uint8, and ``info``.
+        """
         super().reset(seed=seed)
         with torch.no_grad():
             observation, info = self.torch_env.reset(seed=seed, options=options)
@@ -122,6 +130,9 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
 
         Args:
             action: (2, R, R) in [-1, 1].
+
+        Returns:
+            Observation (3, 64, 64) uint8, reward, terminated, truncated, ``info``.
         """
         with torch.no_grad():
             batch = as_tensor(action, self.torch_env, single=True)
@@ -137,7 +148,10 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         return self.torch_env.save()
 
     def load(self, snapshot: Snapshot) -> np.ndarray:
-        """Go on from a saved moment; returns its observation. See :meth:`dittogym.TorchEnv.load`."""
+        """Go on from the moment ``snapshot``, and return its observation (3, 64, 64) uint8.
+
+        See :meth:`dittogym.TorchEnv.load`.
+        """
         return as_image(self.torch_env.load(snapshot))[0]
 
     def render(self) -> np.ndarray | None:

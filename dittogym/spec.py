@@ -104,7 +104,7 @@ class Outcome(NamedTuple):
         terminated: (B,) bool, the task's own reasons to end; ``None`` for none.
         success: (B,) bool; ``None`` where success is not defined.
         info: Further quantities for ``info``, leading B.
-        memory: Replaces the memory; ``None`` keeps it.
+        memory: Replaces the memory, leading B; ``None`` keeps it.
     """
 
     terms: Mapping[str, Tensor]
@@ -116,7 +116,15 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of the reward terms."""
+    """Weights of the reward terms.
+
+    Attributes:
+        location: Of the task's own terms of place.
+        velocity: Of its terms of speed.
+        split: Of the term of a torn robot, which all tasks share where they have a limit of the spread.
+        action: Of the size of the actuation field.
+        alive: Reward of every step.
+    """
 
     location: float = 0.0
     velocity: float = 0.0
@@ -140,6 +148,11 @@ class Window:
 
 #: Centre (x, y) in window coordinates, m; ``None`` stands for the robot's centre.
 Centre = tuple[float | None, float | None]
+
+
+def nothing(moment: Moment) -> Mapping[str, Tensor]:
+    """The memory of a task that needs none."""
+    return {}
 
 
 @dataclass(frozen=True)
@@ -194,7 +207,7 @@ class TaskSpec:
     coarse: int = 8
     fine: int = 16
     split_limit: float | None = None
-    remember: Callable[[Moment], Mapping[str, Tensor]] = field(default=lambda moment: {})
+    remember: Callable[[Moment], Mapping[str, Tensor]] = nothing
     stale: tuple[str, ...] = ()
     target: np.ndarray | None = field(default=None, compare=False)
 

@@ -261,7 +261,8 @@ class TorchEnv:
             The observation (B, 3, 64, 64) uint8 of all elements, and ``info``.
 
         Raises:
-            ValueError: An option is unknown, has the wrong shape, or puts particles outside the window.
+            ValueError: An option is unknown, has the wrong shape, puts particles outside the window, or makes matter
+                too stiff for the substeps.
         """
         if options is not None and not isinstance(options, Mapping):
             raise ValueError(f"options must be a mapping that may hold {', '.join(_RESET_OPTIONS)}, got {options!r}")
@@ -277,6 +278,7 @@ class TorchEnv:
         if options.get("physics") is not None:
             given = physics_values(options["physics"], self.num_envs, self.num_particles, self._like)
             physics = merged(self.spec, physics, given, mask, self._like)
+            dynamics.check_stability(self.model, physics)
         positions = self._layouts.draw(seed, mask.cpu().numpy(), options.get("positions"), self._like)
         fresh = dynamics.initial(self.model, positions, physics)
         if old is not None and self._stale:
@@ -336,12 +338,15 @@ class TorchEnv:
         return soft_observation(self.model, self.env_state)
 
     def render(self, index: int = 0, *, muscles: bool = False, size: int = 512) -> np.ndarray:
-        """Picture of one simulation, (size, size, 3) uint8 RGB.
+        """Picture of one simulation in RGB.
 
         Args:
             index: Which element of the batch.
             muscles: Colour the robot by the actuation of the last step: contraction red, expansion blue.
             size: Pixels per side.
+
+        Returns:
+            (S, S, 3) uint8 for S = ``size``.
         """
         field = self._field if muscles else None
         return frame(self.model, self.env_state, index, field, size)

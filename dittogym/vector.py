@@ -73,7 +73,15 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start new episodes, of all elements or of ``options["reset_mask"]``; see :meth:`dittogym.TorchEnv.reset`."""
+        """Start new episodes, of all elements or of ``options["reset_mask"]``; see :meth:`dittogym.TorchEnv.reset`.
+
+        Args:
+            seed: Seeds element i with ``seed + i`` and draws its particles anew.
+            options: As there.
+
+        Returns:
+            The observations (B, 3, 64, 64) uint8 of all elements, and ``info``.
+        """
         super().reset(seed=seed)
         observation, info = self.torch_env.reset(seed=seed, options=options)
         mask = (options or {}).get("reset_mask")
@@ -86,6 +94,9 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Args:
             actions: (B, 2, R, R) in [-1, 1].
+
+        Returns:
+            Observations (B, 3, 64, 64) uint8, rewards (B,) float64, terminated and truncated (B,) bool, ``info``.
         """
         fresh = self._ended.copy()
         observation, reward, terminated, _, raw = self.torch_env.step(as_tensor(actions, self.torch_env))
@@ -125,16 +136,23 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self.torch_env.save()
 
     def load(self, snapshot: Snapshot, mask: np.ndarray | None = None) -> np.ndarray:
-        """Go on from a saved moment, in all elements or those of ``mask``; returns the observations of all.
+        """Go on from a saved moment; see :meth:`dittogym.TorchEnv.load`.
 
-        An element that had ended and was to be reset goes on instead. See :meth:`dittogym.TorchEnv.load`.
+        An element that had ended and was to be reset goes on instead.
+
+        Args:
+            snapshot: Of this environment or one like it; one of a single simulation goes into every element.
+            mask: (B,) bool, load only these elements.
+
+        Returns:
+            The observations (B, 3, 64, 64) uint8 of all elements.
         """
         observation = self.torch_env.load(snapshot, mask)
         self._ended &= False if mask is None else ~np.asarray(mask)
         return as_image(observation)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """One picture per simulation in mode ``"rgb_array"``, else nothing."""
+        """A picture for each simulation, (512, 512, 3) uint8, in mode ``"rgb_array"``, else nothing."""
         if self.render_mode is None:
             return None
         return tuple(self.torch_env.render(i, muscles=self.render_muscles) for i in range(self.num_envs))

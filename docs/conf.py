@@ -15,6 +15,7 @@ import torchmpm
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(Path(__file__).parent))
 
+import house  # noqa: E402
 from task_pages import write_pages  # noqa: E402
 
 project = "torchmpm"
@@ -47,6 +48,8 @@ suppress_warnings = ["config.cache"]
 default_role = "code"
 html_theme = "furo"
 html_title = "torchmpm"
+html_static_path = ["_static"]
+html_css_files = ["house.css"]
 
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
@@ -82,15 +85,38 @@ class NamesTable(SphinxDirective):
     required_arguments = 1
     final_argument_whitespace = True
 
-    def run(self) -> list[nodes.Node]:
-        """Read the dictionaries and write a line for each entry."""
-        self.env.note_reread()
-        lines = [".. list-table::", "   :header-rows: 1", "", "   * - Name", "     - Meaning"]
+    def names(self) -> dict[str, str]:
+        """Read the dictionaries."""
+        names: dict[str, str] = {}
         for path in self.arguments[0].split():
             module, _, name = path.rpartition(".")
-            for key, meaning in getattr(importlib.import_module(module), name).items():
-                lines += [f"   * - ``{key}``", f"     - {meaning}"]
+            names |= getattr(importlib.import_module(module), name)
+        return names
+
+    def run(self) -> list[nodes.Node]:
+        """Write a line for each name."""
+        self.env.note_reread()
+        lines = [".. list-table::", "   :header-rows: 1", "", "   * - Name", "     - Meaning"]
+        for key, meaning in self.names().items():
+            lines += [f"   * - ``{key}``", f"     - {meaning}"]
         return self.parse_text_to_nodes("\n".join(["```{eval-rst}", *lines, "```"]))
+
+
+class HouseRooms(NamesTable):
+    """A table of the files of a package."""
+
+    def names(self) -> dict[str, str]:
+        """First lines of their docstrings."""
+        return house.rooms(self.arguments[0])
+
+
+class HousePicture(SphinxDirective):
+    """The packages and what they import, see `house.picture`."""
+
+    def run(self) -> list[nodes.Node]:
+        """Draw it."""
+        self.env.note_reread()
+        return [nodes.raw(text=house.picture(), format="html")]
 
 
 def setup(app: Sphinx) -> None:
@@ -98,3 +124,5 @@ def setup(app: Sphinx) -> None:
     app.connect("builder-inited", lambda app: write_pages(), priority=100)  # before tutorials register tasks
     app.add_directive("command-help", CommandHelp)
     app.add_directive("names-table", NamesTable)
+    app.add_directive("house-picture", HousePicture)
+    app.add_directive("house-rooms", HouseRooms)

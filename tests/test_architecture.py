@@ -1,6 +1,7 @@
 """The rules of the house, read from the syntax trees of the packages: who imports whom, and no hidden global state."""
 
 import ast
+import runpy
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -159,6 +160,17 @@ def test_every_package_is_walked() -> None:
 @pytest.mark.parametrize("path", modules(*ORDER), ids=label)
 def test_imports_run_one_way(path: Path) -> None:
     assert direction_faults(path.read_text(), path.relative_to(ROOT)) == []
+
+
+@pytest.mark.parametrize("package", ORDER)
+def test_the_picture_of_the_house_shows_every_file(package: str) -> None:
+    house = runpy.run_path(str(ROOT / "docs/house.py"))
+    floor, below = house["survey"](package), ORDER[: ORDER.index(package)]
+    assert house["PACKAGES"] == ORDER[::-1]
+    assert set(floor.own) <= set(below) and (not below or floor.own)
+    files = {path.stem for path in (ROOT / package).glob("*.py")} - {"__init__"}
+    assert {room for room in floor.rooms if not room.endswith("/")} == files
+    assert all(floor.rooms.values()), "a module without a docstring"
 
 
 @pytest.mark.parametrize("path", modules(*PURE), ids=label)

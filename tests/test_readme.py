@@ -1,9 +1,12 @@
 """The examples of the README and of the docs run as they stand, and keep to the shapes that the annotations promise."""
 
+import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Lets beartype check every annotation of the physics, shapes included, while what follows runs.
@@ -20,31 +23,45 @@ def examples(page: str) -> str:
     return "\n".join(re.findall(r"^```python\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE))
 
 
-def run(source: str) -> subprocess.CompletedProcess[str]:
-    """Run a program in a process of its own: the hook must be there before the first import."""
-    return subprocess.run([sys.executable, "-c", source], cwd=ROOT, capture_output=True, text=True)
+def run(source: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run a program in a folder, and in a process of its own: the hook must be there before the first import."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run([sys.executable, "-c", source], cwd=folder, env=environment, capture_output=True, text=True)
 
 
-def test_examples_run_with_checked_annotations() -> None:
-    checks = [
+PAGES = {
+    "README.md": (
         "assert muscles.grad.abs().max() > 0",
         "assert env.observation_space.shape == (3, 64, 64)",
         "assert reward.shape == (16,) and action.grad.flatten(1).norm(dim=1).min() > 0",
-    ]
-    done = run("\n".join([CHECKED, examples("README.md"), *checks]))
-    assert done.returncode == 0, done.stderr
-
-
-def test_examples_of_ones_own() -> None:
-    checks = [
+    ),
+    "docs/start.md": (
+        "assert len(frames) == 60 and Image.open('moving.webp').n_frames > 30",
+        "assert info['displacement'].item() > 0.2",
+    ),
+    "docs/own.md": (
         "assert env.action_space.shape == (2, 4, 4) and env.observation_space.shape == (3, 16, 16)",
         "assert batch.num_envs == 4 and 0 <= action < 8",
         'assert dittogym.make_spec("hop").horizon == 200',
-    ]
-    done = run("\n".join([CHECKED, examples("docs/own.md"), *checks]))
+    ),
+    "docs/concepts/gradients.md": (
+        "assert gradient.abs().max() > 0",
+        "assert env.model.segment == segment < 100",
+    ),
+    "docs/develop/adding.md": (
+        "assert width > 2 * start.x[..., 0].std() and bulk.grad.abs() > 0",
+        "assert pull.grad.flatten(1).norm(dim=1).min() > 0",
+        "assert policy.actions.shape == (30, 2, 32, 32) and (folder / 'index.html').exists()",
+    ),
+}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_examples_run_with_checked_annotations(page: str, tmp_path: Path) -> None:
+    done = run("\n".join([CHECKED, examples(page), *PAGES[page]]), tmp_path)
     assert done.returncode == 0, done.stderr
 
 
-def test_checked_annotations_notice_a_wrong_shape() -> None:
-    done = run(f"{CHECKED}\nimport torch\ntorchmpm.ParticleState.at_rest(torch.zeros(5, 3))")
+def test_checked_annotations_notice_a_wrong_shape(tmp_path: Path) -> None:
+    done = run(f"{CHECKED}\nimport torch\ntorchmpm.ParticleState.at_rest(torch.zeros(5, 3))", tmp_path)
     assert "TypeCheckError" in done.stderr

@@ -65,7 +65,13 @@ class VelocityRule:
 def fixed(
     i: Range = (None, None), j: Range = (None, None), frame: Literal["world", "window"] = "world"
 ) -> tuple[VelocityRule, ...]:
-    """Rules that hold the nodes of a box at rest, whatever direction they would move in."""
+    """Rules that hold the nodes of a box at rest, whatever direction they would move in.
+
+    Args:
+        i: Inclusive range of node indices in x.
+        j: Inclusive range of node indices in y.
+        frame: What the ranges count from, see :class:`VelocityRule`.
+    """
     return tuple(VelocityRule(direction, i, j, 0.0, frame) for direction in _DIRECTIONS)
 
 

@@ -69,8 +69,8 @@ def impulses(
     Args:
         solver: The solver.
         state: Where the substep starts.
-        actuation: As in :meth:`torchmpm.Solver.step`.
-        origin: As in :meth:`torchmpm.Solver.step`.
+        actuation: (B, 2, G, G), Pa, as in :meth:`torchmpm.Solver.step`.
+        origin: (B, 2), m, as in :meth:`torchmpm.Solver.step`.
 
     Returns:
         ``"gravity"``, ``"damping"`` and ``"boundary"``, each (B, 2), kg m/s. Their sum is the change of

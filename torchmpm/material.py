@@ -30,23 +30,36 @@ LARGEST_JP = 1e30
 
 @runtime_checkable
 class Material(Protocol):
-    """What the solver asks of a material."""
+    """What the solver asks of a material.
+
+    All methods take ``F``, the planes (B, N) of a deformation gradient, and ``Jp``, the plastic volume ratio (B, N).
+    """
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
-        """Project the trial deformation gradient (planes (B, N)) onto the elastic range."""
+        """Project the trial ``F`` onto the elastic range; the new planes (B, N) and ``Jp`` (B, N)."""
 
     def stress(self, F: Mat2, Jp: Tensor) -> Sym2:
-        """Kirchhoff stress of the projected F, planes (B, N), Pa; ``Jp`` is the one from before the projection."""
+        """Kirchhoff stress of the projected ``F``, planes (B, N), Pa; ``Jp`` is from before the projection."""
 
     def energy(self, F: Mat2, Jp: Tensor) -> Tensor:
-        """Stored energy per unit volume, (B, N), J/m^2 (two-dimensional)."""
+        """Stored energy per unit volume at ``F`` and ``Jp``, (B, N), J/m^2 (two-dimensional)."""
+
+    def stiffness(self) -> Value:
+        """Largest stress per strain in undeformed matter, over all kinds of strain (Frobenius norms), Pa."""
 
 
 def lame(young: Value, poisson: Value) -> tuple[Value, Value]:
-    """Lame parameters (mu, lam) from Young's modulus (Pa) and Poisson's ratio, plane strain.
+    """Lame parameters in plane strain.
+
+    Args:
+        young: Young's modulus, Pa; a number or a tensor of any shape, such as (B,).
+        poisson: Poisson's ratio, between -1 and 0.5; likewise a number or a tensor.
+
+    Returns:
+        (mu, lam), Pa: numbers, or tensors of the arguments' shape.
 
     Raises:
-        ValueError: A number is out of range: Young's modulus is not negative, Poisson's ratio between -1 and 0.5.
+        ValueError: A number is out of range.
     """
     checks.value("young", young, least=0.0)
     checks.value("poisson", poisson)
@@ -70,6 +83,14 @@ def column(value: Value, like: Tensor, name: str = "value") -> Value:
     if value.ndim == 0 or (value.ndim == 2 and value.shape[0] in (1, batch) and value.shape[1] in (1, count)):
         return value
     raise ValueError(f"{name} must be a number or have shape (), ({batch},) or ({batch}, {count}), got {value.shape}")
+
+
+def spread(value: Value) -> Value:
+    """A material value on its own, without graph, so that it broadcasts against others: (B,) becomes (B, 1)."""
+    if not isinstance(value, Tensor):
+        return value
+    value = value.detach().to("cpu", torch.float64)
+    return value[:, None] if value.ndim == 1 else value
 
 
 def corotated_stress(F: Mat2, mu: Value, lam: Value, J: Tensor | None = None) -> Sym2:
@@ -200,7 +221,7 @@ def _check_not_negative(material: Elastic, *names: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Elastic:
-    """Fixed corotated elastic solid.
+    """Fixed corotated elastic solid. A constant is a number or a tensor of shape (), (B,) or (B, N).
 
     Attributes:
         mu: Second Lame parameter (shear modulus), Pa.
@@ -217,16 +238,20 @@ class Elastic:
         _check_not_negative(self, "mu", "lam")
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
-        """Nothing flows: the trial deformation is kept."""
+        """Nothing flows: the planes (B, N) of the trial ``F``, and ``Jp`` (B, N), are kept."""
         return F, Jp
 
     def stress(self, F: Mat2, Jp: Tensor) -> Sym2:
-        """Kirchhoff stress, planes (B, N), Pa; see :func:`corotated_stress`."""
+        """Kirchhoff stress at ``F``, planes (B, N), Pa; see :func:`corotated_stress`. ``Jp`` only gives the shape."""
         return corotated_stress(F, column(self.mu, Jp, "mu"), column(self.lam, Jp, "lam"))
 
     def energy(self, F: Mat2, Jp: Tensor) -> Tensor:
-        """Stored energy per unit volume, (B, N)."""
+        """Stored energy per unit volume at ``F``, (B, N), J/m^2; ``Jp`` only gives the shape."""
         return corotated_energy(F, column(self.mu, Jp, "mu"), column(self.lam, Jp, "lam"))
+
+    def stiffness(self) -> Value:
+        """Largest stress per strain in undeformed matter: 2 (mu + lam), of a change of volume, Pa."""
+        return 2.0 * (spread(self.mu) + spread(self.lam))
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +259,7 @@ class VonMises(Elastic):
     """Fixed corotated solid that flows plastically once its deviatoric strain reaches a limit.
 
     The robot material of DittoGym (Huang et al., ICLR 2024): soft enough to be driven by muscles, plastic enough to
-    keep a new shape.
+    keep a new shape. A constant is a number or a tensor of shape (), (B,) or (B, N).
 
     Attributes:
         mu: Second Lame parameter, Pa.
@@ -249,7 +274,10 @@ class VonMises(Elastic):
         _check_not_negative(self, "yield_stress")
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
-        """Isochoric return to the yield surface; see :func:`von_mises_return`."""
+        """Isochoric return of ``F`` to the yield surface, planes (B, N), and ``Jp`` (B, N) as it is.
+
+        See :func:`von_mises_return`.
+        """
         limit = column(self.yield_stress, Jp, "yield_stress") / (2.0 * column(self.mu, Jp, "mu"))
         return von_mises_return(F, limit), Jp
 
@@ -261,6 +289,7 @@ class Soil(Elastic):
     Snow plasticity (Stomakhin et al., "A material point method for snow simulation", 2013) with the values of
     DittoGym's DIG. The plastic volume ratio Jp collects the area that stretches lost to their bounds; the elastic
     constants are multiplied by ``exp(hardening (1 - Jp))`` within ``hardening_range``, with Jp of the substep before.
+    A constant is a number or a tensor of shape (), (B,) or (B, N).
 
     Attributes:
         mu: Second Lame parameter at Jp = 1, Pa.
@@ -292,20 +321,28 @@ class Soil(Elastic):
             raise ValueError(f"hardening_range must be (low, high) with 0 <= low <= high, got {given!r}")
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
-        """Bring the principal stretches into their range; see :func:`clamp_stretches`."""
+        """Bring the principal stretches of ``F`` into their range; its planes (B, N), and the new ``Jp`` (B, N).
+
+        See :func:`clamp_stretches`.
+        """
         low, high = 1.0 - column(self.compression, Jp, "compression"), 1.0 + column(self.stretch, Jp, "stretch")
         F, squeezed = clamp_stretches(F, low, high, self.shear_cutoff)
         return F, (Jp * squeezed).clamp_max(LARGEST_JP)
 
     def stress(self, F: Mat2, Jp: Tensor) -> Sym2:
-        """Kirchhoff stress, planes (B, N), Pa; an inverted element is at rest in its mirrored shape."""
+        """Kirchhoff stress at ``F`` and ``Jp``, planes (B, N), Pa; an inverted element rests in its mirrored shape."""
         mu, lam = self._hardened(Jp)
         return corotated_stress(F, mu, lam, det(F).abs())
 
     def energy(self, F: Mat2, Jp: Tensor) -> Tensor:
-        """Stored energy per unit volume, (B, N)."""
+        """Stored energy per unit volume at ``F`` and ``Jp``, (B, N), J/m^2."""
         mu, lam = self._hardened(Jp)
         return corotated_energy(F, mu, lam, det(F).abs())
+
+    def stiffness(self) -> Value:
+        """As that of :class:`Elastic`, at Jp = 1."""
+        low, high = self.hardening_range
+        return min(max(1.0, low), high) * super().stiffness()
 
     def _hardened(self, Jp: Tensor) -> tuple[Value, Value]:
         factor = torch.exp(column(self.hardening, Jp, "hardening") * (1.0 - Jp)).clamp(*self.hardening_range)

@@ -89,7 +89,8 @@ def estimate_memory(
     Raises:
         ValueError: A number is below 1, or the solver cannot run such a state.
     """
-    for name, number in (("substeps", substeps), ("env_steps", env_steps)):
+    batch = state.batch_size if isinstance(state, ParticleState) else state[0]
+    for name, number in (("substeps", substeps), ("env_steps", env_steps), ("the state's batch size", batch)):
         checks.whole(name, number, 1)
     share = _occupied(solver, state)
     state = _empty(solver, state)

@@ -18,12 +18,28 @@ Points = NDArray[np.float64]
 
 
 def uniform(count: int, generator: np.random.Generator) -> Points:
-    """``count`` independent points of the unit square, (count, 2)."""
+    """Independent points of the unit square.
+
+    Args:
+        count: N, at least 1.
+        generator: Where they are drawn from.
+
+    Returns:
+        (N, 2).
+    """
     return generator.random((checks.whole("count", count, 1), 2))
 
 
 def sobol(count: int, seed: int) -> Points:
-    """``count`` points of a scrambled Sobol sequence in the unit square, (count, 2): far fewer clumps and holes."""
+    """Points of a scrambled Sobol sequence in the unit square: far fewer clumps and holes than random ones.
+
+    Args:
+        count: N, at least 1.
+        seed: Of the scrambling.
+
+    Returns:
+        (N, 2).
+    """
     engine = torch.quasirandom.SobolEngine(2, scramble=True, seed=seed)
     return engine.draw(checks.whole("count", count, 1), dtype=torch.float64).numpy()
 
@@ -35,6 +51,9 @@ def box(numbers: Points, corner: tuple[float, float], size: tuple[float, float])
         numbers: (N, 2) points of the unit square.
         corner: Lower left corner, m.
         size: Width and height, m.
+
+    Returns:
+        (N, 2) positions, m.
     """
     return np.asarray(corner) + numbers * np.asarray(size)
 
@@ -46,6 +65,9 @@ def disc(numbers: Points, centre: tuple[float, float], radius: float) -> Points:
         numbers: (N, 2) points of the unit square.
         centre: Centre, m.
         radius: Radius, m.
+
+    Returns:
+        (N, 2) positions, m.
     """
     checks.number("radius", radius, above=0.0)
     distance, angle = radius * np.sqrt(numbers[:, 0]), 2.0 * math.pi * numbers[:, 1]
@@ -61,6 +83,9 @@ def chord_disc(numbers: Points, centre: tuple[float, float], radius: float) -> P
         numbers: (N, 2) points of the unit square.
         centre: Centre, m.
         radius: Radius, m.
+
+    Returns:
+        (N, 2) positions, m.
     """
     checks.number("radius", radius, above=0.0)
     across, along = 2.0 * numbers[:, 0] - 1.0, 2.0 * numbers[:, 1] - 1.0
@@ -75,6 +100,9 @@ def lattice(cells: tuple[int, int], corner: tuple[float, float], size: tuple[flo
         cells: Number of cells in x and y.
         corner: Lower left corner, m.
         size: Width and height, m.
+
+    Returns:
+        (N, 2) positions, m, N the number of cells.
     """
     for axis, count in zip("xy", cells, strict=True):
         checks.whole(f"cells in {axis}", count, 1)
@@ -90,9 +118,12 @@ def image(numbers: Points, mask: NDArray[np.bool_], corner: tuple[float, float],
 
     Args:
         numbers: (N, 2) points of the unit square.
-        mask: (rows, columns), row 0 at the top.
+        mask: (H, W), row 0 at the top.
         corner: Lower left corner of the whole image, m.
         size: Width and height of the whole image, m.
+
+    Returns:
+        (N, 2) positions, m.
 
     Raises:
         ValueError: The mask has no pixel set.

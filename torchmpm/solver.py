@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from torchmpm.backends import BACKENDS, compiler_found, runs_native, substep_fun
 from torchmpm.boundary import Face, VelocityRule, constrain, faces
 from torchmpm.grid import PAD, Grid
 from torchmpm.linalg import Mat2, matmul
-from torchmpm.material import Material, Sym2, Value, column
+from torchmpm.material import Material, Sym2, Value, column, spread
 from torchmpm.native.library import NO_COMPILER
 from torchmpm.rollout import Segment, check_repetition, repeated
 from torchmpm.spline import Stencil, stencil
@@ -34,7 +35,7 @@ class Body:
         count: Number of particles.
         material: Constitutive law, such as :class:`torchmpm.VonMises`.
         mass: Mass of a particle, kg; a number or a tensor of shape (), (B,) or (B, count).
-        volume: Undeformed volume of a particle, m^2 (two-dimensional); same shapes.
+        volume: Undeformed volume of a particle, m^2 (two-dimensional); a number, (), (B,) or (B, count).
         muscle: Whether the actuation field acts on it.
 
     Raises:
@@ -115,10 +116,11 @@ class Solver:
         backend: ``"native"`` (fused kernels, :mod:`torchmpm.native`: C++ on the CPU, Triton on CUDA), ``"eager"`` or
             ``"compile"`` (see :func:`torchmpm.backends.substep_function`), or ``"auto"``: native on a CPU where it
             works, else eager.
+        allow_unstable: Accept a ``dt`` beyond :meth:`stable_dt`.
 
     Raises:
-        ValueError: No bodies, ``dt`` not positive, ``damping`` negative, gravity not two numbers, or an unknown or
-            unavailable backend.
+        ValueError: No bodies, ``dt`` not positive or beyond :meth:`stable_dt`, ``damping`` negative, gravity not two
+            numbers, or an unknown or unavailable backend.
         TypeError: ``grid``, a body or a rule is something else.
     """
 
@@ -129,6 +131,7 @@ class Solver:
     rules: tuple[VelocityRule, ...] = ()
     dt: float = 1e-4
     backend: str = "auto"
+    allow_unstable: bool = False
 
     def __post_init__(self) -> None:
         checks.instance("grid", self.grid, Grid)
@@ -147,11 +150,41 @@ class Solver:
             raise ValueError(f"backend must be one of {BACKENDS}, got {self.backend!r}")
         if self.backend in ("compile", "native") and not compiler_found():
             raise ValueError(f"backend {self.backend!r} {NO_COMPILER}")
+        if not self.allow_unstable and self.dt > (limit := self.stable_dt()):
+            raise ValueError(
+                f"dt must be at most {limit} s for matter so stiff and light to be stable, got {self.dt}; "
+                "allow_unstable=True accepts it"
+            )
 
     @property
     def num_particles(self) -> int:
         """N, the number of particles of all bodies."""
         return sum(body.count for body in self.bodies)
+
+    def stable_dt(self, actuation: Value = 0.0) -> float:
+        """Largest duration of a substep for which small strains of undeformed matter do not grow, s.
+
+        ``h / sqrt((k + 2 |a|) V / m)``, least over all particles, with the stiffness k = 2 (mu + lam) and the actuation
+        a. It holds however particles lie: the strain rate C of a particle cannot exceed what the kinetic energy of
+        its nodes allows, ``h^2/4 |C|^2 <= sum w |v_i|^2``, and a particle alone reaches that. Large strains, and soil
+        that has hardened, are stiffer and may need less.
+
+        Args:
+            actuation: Of the muscles, Pa; a number or a tensor of shape (), (B,) or (B, count).
+
+        Raises:
+            ValueError: Shapes of a body's values do not go together.
+        """
+        rates = [0.0]
+        for k, body in enumerate(self.bodies):
+            try:
+                pull = torch.as_tensor(spread(actuation), dtype=torch.float64).abs() if body.muscle else 0.0
+                rate = (body.material.stiffness() + 2.0 * pull) * spread(body.volume) / spread(body.mass)
+            except RuntimeError as error:
+                raise ValueError(f"values of bodies[{k}] must have shapes that go together: {error}") from error
+            rates.append(float(rate.max()) if isinstance(rate, Tensor) else rate)
+        fastest = math.sqrt(max(rates))
+        return self.grid.h / fastest if fastest > 0 else math.inf
 
     def step(
         self,
@@ -186,14 +219,28 @@ class Solver:
         """
         checks.instance("state", state, ParticleState)
         check_repetition(substeps, segment, "substeps")
+        origin = self.check(state, actuation, origin)
+        if substeps == 0 or state.batch_size == 0:
+            return state
         if runs_native(self, state):
-            origin = self.check(state, actuation, origin)
             return native.step(self, state, actuation, origin, substeps, segment, mass_epsilon=MASS_EPSILON)
         substep = substep_function(self, self.scene(state, actuation, origin))
         return ParticleState.from_planes(repeated(substep, state.planes(), substeps, segment=segment))
 
     def check(self, state: ParticleState, actuation: Tensor | None, origin: Tensor | None) -> Tensor:
-        """Check the arguments of a step, see :meth:`step`, and fill in the origin."""
+        """Check the arguments of a step, see :meth:`step`, and fill in the origin.
+
+        Args:
+            state: Where the particles are.
+            actuation: (B, 2, G, G), Pa, or ``None``.
+            origin: (B, 2), m, or ``None``.
+
+        Returns:
+            The origin (B, 2), m.
+
+        Raises:
+            ValueError: Shapes, dtypes or devices do not fit together.
+        """
         batch, nodes = state.batch_size, self.grid.resolution
         if state.num_particles != self.num_particles:
             raise ValueError(f"state has {state.num_particles} particles, the solver's bodies {self.num_particles}")
@@ -213,7 +260,13 @@ class Solver:
         return state.x.new_zeros(batch, 2) if origin is None else origin
 
     def scene(self, state: ParticleState, actuation: Tensor | None = None, origin: Tensor | None = None) -> Scene:
-        """Check the arguments of a step and prepare what its substeps share; see :meth:`step`."""
+        """Check the arguments of a step and prepare what its substeps share; see :meth:`step`.
+
+        Args:
+            state: Where the particles are.
+            actuation: (B, 2, G, G), Pa, or ``None``.
+            origin: (B, 2), m, or ``None``.
+        """
         origin, nodes = self.check(state, actuation, origin), self.grid.resolution
         inside = pad(state.x.new_ones(nodes, nodes), [PAD] * 4).flatten()[None]
         if actuation is not None:
@@ -231,7 +284,15 @@ class Solver:
         )
 
     def substep(self, scene: Scene, planes: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        """One substep on component planes (see :meth:`ParticleState.planes`): transfer, grid, transfer back."""
+        """One substep: transfer to the grid, grid, transfer back.
+
+        Args:
+            scene: What the substeps of a step share.
+            planes: The 13 component planes, (B, N) each, see :meth:`ParticleState.planes`.
+
+        Returns:
+            The new planes, (B, N) each.
+        """
         x, y = planes[:2]
         grid = self.to_grid(scene, planes)
         v, C = transfer.grid_to_particles(self.grid, grid.nodes, grid_velocity(scene, grid.momentum))
@@ -239,7 +300,12 @@ class Solver:
         return tuple(torch.where(grid.inside, new, old) for new, old in zip(moved, planes, strict=True))
 
     def to_grid(self, scene: Scene, planes: tuple[Tensor, ...]) -> Scattered:
-        """First half of a substep: deform the particles, find their forces, collect mass and momentum on the nodes."""
+        """First half of a substep: deform the particles, find their forces, collect mass and momentum on the nodes.
+
+        Args:
+            scene: What the substeps of a step share.
+            planes: The 13 component planes, (B, N) each.
+        """
         x, y, vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, Jp = planes
         inside = self.grid.contains(x, scene.origin[:, 0:1])
         nodes = stencil(self.grid, x, y, scene.origin)
@@ -275,7 +341,15 @@ class Solver:
             start += body.count
 
     def per_particle(self, state: ParticleState, name: str) -> Tensor:
-        """A value of the bodies, ``"mass"`` or ``"volume"``, as a plane over all particles, (1 or B, N)."""
+        """A value of the bodies as a plane over all particles.
+
+        Args:
+            state: Gives batch size, dtype and device.
+            name: ``"mass"`` (kg) or ``"volume"`` (m^2).
+
+        Returns:
+            (1, N) or (B, N).
+        """
         like = state.Jp.detach()
         columns = []
         for body, part in self.parts():

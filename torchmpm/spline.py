@@ -73,8 +73,9 @@ def stencil(grid: Grid, x: Tensor, y: Tensor, origin: Tensor) -> Stencil:
         f = u - base
         fraction.append(f)
         weight.append(quadratic_weights(f))
-        # Clamped as integers: also the conversion of a NaN ends at an address that exists.
-        node.append(base.to(torch.int64).clamp(-PAD, grid.resolution) + PAD)
+        # Clamped before the conversion, which is undefined for large numbers; a NaN ends at the low end: padding.
+        address = torch.where(base > -PAD, base, -PAD).clamp_max(grid.resolution)
+        node.append(address.to(torch.int64) + PAD)
     offset = torch.arange(3, device=x.device)
     ids = (node[0][:, None, None] + offset[:, None, None]) * grid.width + node[1][:, None, None] + offset[:, None]
     return Stencil(ids.flatten(1), weight[0], weight[1], fraction[0], fraction[1], grid.width**2)

@@ -112,7 +112,7 @@ class ParticleState:
         return self.x.device
 
     def to(self, *args: Any, **kwargs: Any) -> ParticleState:
-        """Copy to another dtype or device; takes the arguments of :meth:`torch.Tensor.to`."""
+        """Copy to another dtype or device; ``args`` and ``kwargs`` are those of :meth:`torch.Tensor.to`."""
         return self.map(lambda t: t.to(*args, **kwargs))
 
     def detach(self) -> ParticleState:

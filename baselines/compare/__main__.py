@@ -19,7 +19,7 @@ from baselines.compare.plan import Job, Plan, check_there, make_jobs
 from baselines.compare.report import write_report
 from baselines.compare.work import describe
 from baselines.registry import ALGORITHMS
-from cfp.config import Preset
+from cfp.config import Preset, Tier
 from cfp.errors import CFPError, ConfigError
 from cfp.process import StopSignals, keep_memory
 
@@ -53,7 +53,7 @@ class Command:
     """cpu, cuda, or auto."""
     episodes: int = 10
     """Episodes of the final evaluation of each policy."""
-    tier: Literal["full", "lite"] | int | tuple[int, int] = "lite"
+    tier: Tier = "lite"
     """Particles of the final evaluation, for all."""
     slot_episodes: int = 100
     """Least episodes in SLOT, of all seeds of an algorithm together, for the success rate."""

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from baselines.compare.plan import judged
 from baselines.registry import load
-from cfp.config import RunConfig
+from cfp.config import RunConfig, Tier
 from cfp.disturbances import Case, make_cases
 from cfp.environments import choose_device, make_env
 from cfp.evaluation import Policy, Result, evaluate, judging_seed
@@ -37,7 +37,7 @@ class Judging:
     """
 
     episodes: int
-    tier: Literal["full", "lite"] | int | tuple[int, int] = "lite"
+    tier: Tier = "lite"
     robustness: Literal["none", "paper", "all"] = "paper"
 
     def cases(self) -> list[Case]:

@@ -10,11 +10,11 @@ import baselines
 import cfp
 import cfp.train
 from baselines import Distill, OpenLoop, PlannerConfig, Shac, distill
-from baselines.dagger import Collector, Dataset, Labels
+from baselines.dagger import Collector, Dataset, Labels, lose
 from baselines.distillation import METRICS
 from baselines.episodes import Episodes
 from baselines.registry import configure
-from baselines.teachers import PolicyTeacher, Teacher, project
+from baselines.teachers import PolicyTeacher, Teacher, project, read_teacher
 from cfp.config import EnvironmentConfig, ReportConfig, to_json
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.files import read_table
@@ -65,6 +65,7 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
     ("changes", "message"),
     [
         ({"share": 1.5}, "share: got 1.5, allowed 0 to 1"),
+        ({"faults": -0.1}, "faults: got -0.1, allowed 0 to 1"),
         ({"updates": 0}, "updates: got 0"),
         ({"student_rate": 0.0}, "student_rate: got 0.0"),
         ({"gate_bias": ()}, "gate_bias: got 0 values"),
@@ -73,6 +74,36 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
 def test_impossible_options_are_named(changes, message):
     with pytest.raises(ConfigError, match=message):
         make(**changes).check()
+
+
+def test_faults_hit_half_of_what_they_may() -> None:
+    torch.manual_seed(0)
+    values = torch.full((400, 3, 16, 16), 7, dtype=torch.uint8)
+    left = (lose(values, 0.2) == 7).float().flatten(1).mean(1)
+    whole = left == 1.0
+    assert 0.4 < whole.float().mean() < 0.6
+    assert left[~whole].mean() == pytest.approx(0.8, abs=0.01)
+    assert bool((values == 7).all()) and lose(values, 0.0) is values
+
+
+def test_student_meets_faults_and_labels_do_not() -> None:
+    config = make(num_envs=2, substeps=5, round=8, steps=64, handover=(32,))
+    rounds = {}
+    for share in (0.0, 0.9):
+        student = Distill(replace(config, faults=share, share=0.0))
+        student.collector.teacher = Mirror()
+        looks = []
+        with torch.random.fork_rng():
+            torch.manual_seed(1)
+            labels = student.collector.collect(
+                8, 0.0, lambda seen, looks=looks: (looks.append(seen), seen[:, 1:, ::8, ::8] / 255)[1]
+            )
+        rounds[share] = labels, torch.cat(looks)
+    (clean, seen), (faulty, blind) = rounds[0.0], rounds[0.9]
+    assert torch.equal(clean.observations[:2], faulty.observations[:2]) and torch.equal(clean.observations, seen)
+    assert (blind == 0).float().mean() > (seen == 0).float().mean() + 0.2
+    assert not torch.equal(faulty.observations, clean.observations), "lost actions lead elsewhere"
+    assert torch.equal(faulty.actions, Mirror().act(student.env, faulty.observations))
 
 
 def test_student_does_as_the_teacher_in_a_closed_loop():
@@ -245,7 +276,8 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch):
     [
         ("shapematch", "gradient", "T", "teacher: got a policy for the target T, allowed star"),
         ("kick", "gradient", None, "teacher: got a policy for kick, allowed run"),
-        ("run", "mpc", None, "teacher: got the record of one planned episode, allowed mpc itself"),
+        ("run", "mpc", None, "teacher: got the record of one planned episode"),
+        ("run", "cem", None, "allowed in run, where every episode starts differently, is mpc itself"),
         ("run", "gradient", "T", "teacher: its target or the student's cannot be read"),
         (None, "", None, "there is no policy"),
     ],
@@ -254,9 +286,18 @@ def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, kind, targ
     path = tmp_path / "policy.safetensors"
     if task:
         config = replace(Distill.preset(task, "quick"), environment=EnvironmentConfig(1, 100, target=target))
-        write_policy(path, {"actions": torch.zeros(3, 2, 8, 8)}, origin(config, kind, 0, 0))
+        record = {"layout": 0} if kind in ("mpc", "cem") else {}
+        write_policy(path, {"actions": torch.zeros(3, 2, 8, 8)}, origin(config, kind, 0, 0) | record)
     folder = tmp_path / "run"
     student = ["--target", "star"] if task == "shapematch" else ["--task", "run"]
     assert distill.main([*TINY, *LESSONS, *student, "--teacher", str(path), "--out", str(folder)]) == 2
     assert message in capsys.readouterr().err
     assert not folder.exists()
+
+
+def test_record_teaches_where_every_episode_starts_alike(tmp_path):
+    config = replace(Distill.preset("grow", "quick"), environment=EnvironmentConfig(1, 100))
+    path = tmp_path / "record.safetensors"
+    write_policy(path, {"actions": torch.ones(3, 2, 8, 8)}, origin(config, "mpc", 0, 0) | {"layout": 0})
+    teacher = read_teacher(path, "grow", config.environment)
+    assert isinstance(teacher, OpenLoop) and len(teacher.actions) == 3

@@ -1,5 +1,6 @@
 """Constants of the matter given at a reset: what each does, how long it holds, and its gradient."""
 
+import math
 from dataclasses import replace
 
 import gymnasium
@@ -382,6 +383,24 @@ def test_bad_physics(physics: object, message: str) -> None:
     assert env.state is before
     env.reset()
     assert_same_bits(everything(env), numbers)
+
+
+def test_matter_too_stiff_for_the_substeps_is_refused() -> None:
+    """By the task's numbers, muscles included; the batch goes on as it was."""
+    env = tiny("run", 2)
+    env.reset(seed=0)
+    before = env.state
+    limit = 1.0 / 128 / math.sqrt(2 * (9000.0 + 50.0 + 45.0) / 2.0)
+    for physics in ({"mu": [9000.0, 650.0]}, {"mu": 650.0, "mass": 0.05}, {"max_actuation": 1e4}, {"lam": 1e4}):
+        message = r"mu, lam, max_actuation and mass must be such that substeps of 0\.0001 s are stable, got matter"
+        with pytest.raises(ValueError, match=message) as raised:
+            env.reset(options={"physics": physics})
+        if "mu" in physics and "mass" not in physics:
+            assert float(str(raised.value).split()[-2]) == pytest.approx(limit, rel=1e-6)
+    assert env.state is before
+    env.reset(options={"physics": {"mu": 3000.0}})
+    with pytest.raises(ValueError, match="are stable, got matter so stiff and light"):
+        tiny(replace(dittogym.make_spec("run"), mu=9000.0))
 
 
 def test_zero_is_allowed_where_it_makes_sense() -> None:

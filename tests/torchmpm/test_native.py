@@ -4,6 +4,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from native_scenes import NAMES, moving, solvers
@@ -11,6 +12,8 @@ from scenes import assert_close, assert_identical, lively, normal, robot
 
 from torchmpm import Body, Grid, ParticleState, Solver, VelocityRule, VonMises
 from torchmpm.backends import compiler_found
+from torchmpm.grid import PAD
+from torchmpm.native import pack
 
 pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
 
@@ -134,29 +137,6 @@ def test_an_element_of_a_batch_is_the_same_alone() -> None:
         assert_identical(alone, together[i])
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e30, -1e30])
-@pytest.mark.parametrize("name", ["x", "v", "C", "F", "Jp", "actuation", "origin"])
-def test_a_broken_element_harms_no_other(name: str, value: float) -> None:
-    """Not by a bit, wherever the number is; and it stays broken, it is not hidden."""
-    state, field, origin = moving(90, 3)
-    solver = replace(solvers(90, 3)["three bodies"], backend="native")
-    sound = solver.step(state, field, substeps=15, origin=origin)
-    given = {"actuation": field, "origin": origin} | {n: getattr(state, n) for n in ("x", "v", "C", "F", "Jp")}
-    broken = given[name].clone()
-    broken[1].view(-1)[:: 5 if name != "origin" else 1] = value
-    given[name] = broken
-    result = solver.step(
-        ParticleState(*(given[n] for n in ("x", "v", "C", "F", "Jp"))),
-        given["actuation"],
-        substeps=15,
-        origin=given["origin"],
-    )
-    for i in (0, 2):
-        assert_identical(result[i], sound[i])
-    if name in ("v", "C", "F") and abs(value) != 1e30:
-        assert not all(plane.isfinite().all() for plane in result[1].planes())
-
-
 def test_lower_end_of_the_window() -> None:
     """There the weights are extrapolated, and nodes of negative mass arise: few substeps stay comparable."""
     state = lively(200, 2, corner=(0.0, -0.1))
@@ -191,6 +171,31 @@ def test_unsupported_scenes_are_named() -> None:
     rules = (VelocityRule("-y"),) * 300
     with pytest.raises(ValueError, match="at most 254 velocity rules, got 300"):
         robot(10, rules=rules, backend="native").step(lively(10))
+
+
+def test_sizes_beyond_the_kernels_addresses_are_refused() -> None:
+    """Eight numbers of each node of a simulation, and its particles, must have places below 2^31."""
+    assert 8 * (pack.MAX_RESOLUTION + 2 * PAD) ** 2 < 2**31
+    cpu, double = torch.device("cpu"), torch.float64
+    wide = robot(1, grid=Grid(pack.MAX_RESOLUTION + 1), dt=1e-9)
+    many = robot(pack.MAX_PARTICLES + 1)
+    assert pack.unsupported(wide, double, cpu) == "it takes at most 16,000 nodes per axis, got 16,001"
+    assert "at most 1,073,741,824 particles a simulation, got 1,073,741,825" in str(pack.unsupported(many, double, cpu))
+    assert pack.unsupported(robot(pack.MAX_PARTICLES, grid=Grid(pack.MAX_RESOLUTION), dt=1e-9), double, cpu) is None
+
+
+@pytest.mark.slow
+def test_addresses_of_a_large_batch() -> None:
+    """More than 2^31 numbers in a tensor: the last simulation feels its own field. Zeros not written take no room."""
+    batch, nodes = 66_000, 128
+    field = torch.from_numpy(np.zeros((batch, 2, nodes, nodes), np.float32))
+    field[-1] = 30.0 * torch.sin(torch.arange(nodes) / 3.0)
+    assert field[-1, 0, 0, 0].data_ptr() - field.data_ptr() > 4 * 2**31
+    solver = robot(2, grid=Grid(nodes), rules=(), gravity=(0.0, 0.0), backend="native")
+    state = ParticleState.at_rest(torch.tensor([[0.5, 0.5], [0.505, 0.502]]).expand(batch, 2, 2))
+    result = solver.step(state, field, substeps=5)
+    assert_identical(result[-1], solver.step(state[-1], field[-1:], substeps=5))
+    assert (result.v[-1] != 0).any() and (result.v[:-1] == 0).all()
 
 
 def test_grains_pulled_apart_for_ever() -> None:

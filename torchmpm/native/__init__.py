@@ -55,18 +55,16 @@ def step(
 
     Args:
         solver: The solver.
-        state: Where the particles are.
+        state: Where the particles are, at least one simulation.
         actuation: (B, 2, G, G) or ``None``.
         origin: (B, 2).
-        substeps: Number of substeps, not negative.
+        substeps: Number of substeps, at least 1.
         segment: With gradients, at most so many substeps are taped at once.
         mass_epsilon: Added to the mass of a node before the division, kg.
 
     Raises:
         ValueError: There is no compiler, or it failed.
     """
-    if substeps == 0:
-        return state
     origin = origin.contiguous()
     table, widths = pack.values(solver, state.Jp)
     field = None if actuation is None else actuation.contiguous()

@@ -14,6 +14,8 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+import torch
+
 _SOURCES = Path(__file__).parent
 #: Not -ffast-math: it lets compilers assume that there is no NaN.
 _FLAGS = (
@@ -71,9 +73,11 @@ _forked = False
 
 
 def _after_fork() -> None:
+    """Torch, too, would wait for ever for threads that a forked process does not have; with one it asks for none."""
     global _forked
     _forked = True
     thread_pool.cache_clear()
+    torch.set_num_threads(1)
 
 
 os.register_at_fork(after_in_child=_after_fork)

@@ -31,6 +31,9 @@ _numbers: WeakKeyDictionary[Solver, dict[tuple[torch.dtype, torch.device], tuple
 HEAD, BODY_NUMBERS, RULE_NUMBERS = 9, 8, 8
 #: A node remembers its rule in one byte.
 MAX_RULES = 254
+#: Numbers of a node, at most eight, and particles of one simulation have addresses of 32 bits within it. Those of all
+#: simulations together have 64.
+MAX_RESOLUTION, MAX_PARTICLES = 16_000, 2**30
 
 
 def unsupported(solver: Solver, dtype: torch.dtype, device: torch.device) -> str | None:
@@ -51,6 +54,10 @@ def unsupported(solver: Solver, dtype: torch.dtype, device: torch.device) -> str
             return f"it knows the materials {names}, a body has {type(body.material).__name__}"
     if len(solver.rules) > MAX_RULES:
         return f"it takes at most {MAX_RULES} velocity rules, got {len(solver.rules)}"
+    if solver.grid.resolution > MAX_RESOLUTION:
+        return f"it takes at most {MAX_RESOLUTION:,} nodes per axis, got {solver.grid.resolution:,}"
+    if solver.num_particles > MAX_PARTICLES:
+        return f"it takes at most {MAX_PARTICLES:,} particles a simulation, got {solver.num_particles:,}"
     return None
 
 

@@ -17,9 +17,9 @@ H, INVERSE_H, DT, MARGIN, EXTENT, DAMPING, MASS_EPSILON, STRETCH_FLOOR, LARGEST_
 
 
 @triton.jit
-def read_values(values, row, at, mask):
-    """The eight values of particles whose columns are ``at``; ``row`` is the distance between two rows of the table."""
-    first = values + at
+def read_values(values, values_batch, columns, at, mask):
+    """The eight values of particles that stand at ``at`` in each row of their table (8, values_batch, columns)."""
+    first, row = values + at, values_batch.to(tl.int64) * columns
     mass, factor = tl.load(first, mask, other=1.0), tl.load(first + row, mask, other=1.0)
     mu2, lam = tl.load(first + 2 * row, mask, other=1.0), tl.load(first + 3 * row, mask, other=1.0)
     s0, s1 = tl.load(first + 4 * row, mask, other=1.0), tl.load(first + 5 * row, mask, other=1.0)

@@ -99,7 +99,7 @@ def particles_pass(
         store_matrix(now + 4 * stride + at, stride, c0, c1, c2, c3, kept)
     if LEAVE:
         place = values_at(values, element, k, column, columns, values_batch, VARYING)
-        mass, factor, mu2, lam, s0, s1, s2, s3 = read_values(values, values_batch * columns, place, valid)
+        mass, factor, mu2, lam, s0, s1, s2, s3 = read_values(values, values_batch, columns, place, valid)
         f0, f1, f2, f3 = load_matrix(now + 8 * stride + at, stride, valid)
         Jp = tl.load(now + 12 * stride + at, valid, other=1.0)
         pull_x, pull_y = tl.zeros_like(x), tl.zeros_like(x)

@@ -1,0 +1,93 @@
+"""Long runs under random actions: memory, speed, and whether numbers stay numbers, as a CSV file.
+
+`OMP_NUM_THREADS=1 python benchmarks/soak.py --out soak.csv` takes 100,000 environment steps of RUN's lite tier in a
+batch of 16; ended episodes start anew. With `--endless --robots 1 --particles 20 --substeps 10000 --steps 86400` one
+episode goes on for 24 hours of simulated time. Speed is per second of processor time: other programs count for little.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import tyro
+
+import dittogym  # noqa: F401  registers the environments
+from cfp.files import Table
+from torchmpm import diagnostics
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to run, and for how long."""
+
+    out: Path
+    """CSV file; rows are added."""
+    task: str = "run"
+    """Task, at its coarse resolution."""
+    robots: int = 16
+    """Simulations in the batch."""
+    particles: str = "lite"
+    """"lite", "full", or the number of the robot's particles."""
+    substeps: int = 100
+    """Of 0.1 ms, in a step."""
+    steps: int = 100_000
+    """Steps of all robots together."""
+    rows: int = 50
+    """Lines of the table."""
+    endless: bool = False
+    """Nothing is ever reset: one episode."""
+
+
+def resident() -> float:
+    """Memory of this process, MiB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def main(options: Options) -> None:
+    """Step, count, and write a row now and then."""
+    env = gymnasium.make_vec(
+        f"dittogym/{options.task}-coarse-v0",
+        num_envs=options.robots,
+        vectorization_mode="vector_entry_point",
+        autoreset_mode="Disabled" if options.endless else "SameStep",
+        particles=int(options.particles) if options.particles.isdecimal() else options.particles,
+        substeps=options.substeps,
+    )
+    env.reset(seed=0)
+    env.step(np.zeros(env.action_space.shape, np.float32))  # compiles and loads
+    env.reset(seed=0)
+    draw, table = np.random.default_rng(0), Table(options.out)
+    calls = -(-options.steps // options.robots)
+    ends = np.linspace(0, calls, options.rows + 1).astype(int)
+    for first, last in itertools.pairwise(ends):
+        episodes = failed = broken = 0
+        start = time.process_time()
+        for _ in range(first, last):
+            action = draw.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
+            _, rewards, terminated, truncated, info = env.step(action)
+            episodes += 0 if options.endless else int((terminated | truncated).sum())
+            failed += int(np.count_nonzero(info["reward_terms"]["failure"]))
+            broken += int(np.count_nonzero(~np.isfinite(rewards)) + (~diagnostics.finite(env.unwrapped.state)).sum())
+        seconds = time.process_time() - start
+        row = {
+            "step": int(last) * options.robots,
+            "simulated (h)": f"{last * options.substeps * env.unwrapped.torch_env.model.solver.dt / 3600:.4g}",
+            "steps/s": f"{(last - first) * options.robots / seconds:.4g}",
+            "memory (MiB)": f"{resident():.1f}",
+            "episodes ended": episodes,
+            "failed": failed,
+            "not finite": broken,
+        }
+        table.add(row)
+        print(" ".join(f"{name} {value}" for name, value in row.items()), flush=True)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

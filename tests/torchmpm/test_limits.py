@@ -1,0 +1,183 @@
+"""Scenes at the limits: ends of the window, one cell, inversion, speed, nothing at all; and failures, alone."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import scenes
+import torch
+from native_scenes import moving, solvers
+from scenes import GRID, assert_close, assert_identical, generator, lively, normal, positions, robot
+
+from torchmpm import Body, Elastic, ParticleState, Solver, diagnostics, estimate_memory
+
+pytestmark = pytest.mark.usefixtures("backend")
+
+H, MARGIN, SIZE = GRID.h, GRID.margin, 1.0
+FREE = {"rules": (), "gravity": (0.0, 0.0)}
+
+
+def free(count: int, **changes: object) -> Solver:
+    """A robot in free space."""
+    return robot(count, **{**FREE, "backend": scenes.BACKEND, **changes})
+
+
+def placed(x: torch.Tensor, speed: float = 0.5, seed: int = 0) -> ParticleState:
+    """Undeformed particles with random velocities."""
+    state = ParticleState.at_rest(x)
+    return replace(state, v=speed * normal(*x.shape, seed=seed))
+
+
+# --- the window -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("across", [0.3, 0.97, 1.05], ids=["inside", "at the top", "beyond the top"])
+@pytest.mark.parametrize("edge", ["left", "right"])
+def test_ends_of_the_window_in_x(edge: str, across: float) -> None:
+    """Up to the margin a particle rests as it is, from the next number on it takes part."""
+    outside = MARGIN if edge == "left" else SIZE - MARGIN
+    inside = math.nextafter(outside, 0.5)
+    x = torch.tensor([[[outside, across], [inside, across]]], dtype=torch.float64)
+    state = placed(x)
+    result = free(2).step(state)
+    assert_identical(part(result, 0), part(state, 0))
+    assert (result.C[0, 1] != 0).any() or (across > 1 and (result.v[0, 1] == 0).all())
+    assert diagnostics.finite(result).all()
+
+
+def part(state: ParticleState, k: int) -> ParticleState:
+    return ParticleState(*(getattr(state, name)[:, k : k + 1] for name in ("x", "v", "C", "F", "Jp")))
+
+
+@pytest.mark.parametrize("corner", [(i, j) for i in (0, 1, 2) for j in (0, 1, 2) if (i, j) != (1, 1)])
+def test_matter_at_every_edge(corner: tuple[int, int]) -> None:
+    """Over the upper ends by a cell and on its way out, or at the lower ends and on its way in: nothing gets faster.
+
+    Below half a cell from the lower ends weights are extrapolated: see the lower end of the window in test_native.
+    """
+    places = torch.tensor([1.5 * H, 0.5, SIZE], dtype=torch.float64)
+    numbers = torch.rand(1, 60, 2, generator=generator(1), dtype=torch.float64)
+    x = places[list(corner)] + H * (2 * numbers - 1)
+    upwards = torch.tensor([0.5 if c != 1 else 0.0 for c in corner], dtype=torch.float64)
+    state = replace(ParticleState.at_rest(x), v=upwards.expand_as(x))
+    result = free(60).step(state, substeps=20)
+    assert diagnostics.finite(result).all()
+    assert result.v.abs().max() <= 0.5 * (1 + 1e-6)
+
+
+# --- few places, few particles --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("spread", [0.0, 1e-12, 0.5], ids=["one point", "nearly one point", "one cell"])
+def test_all_particles_in_one_cell(spread: float) -> None:
+    """Momentum stays; from one point all go the same way."""
+    x = 0.5 + 0.25 * H + spread * H * torch.rand(1, 200, 2, generator=generator(2), dtype=torch.float64)
+    state, solver = placed(x), free(200)
+    result = solver.step(state, 40.0 * normal(1, 2, 16, 16, seed=3), substeps=20)
+    assert diagnostics.finite(result).all()
+    torch.testing.assert_close(
+        diagnostics.momentum(solver, result), diagnostics.momentum(solver, state), rtol=1e-9, atol=1e-9
+    )
+    if spread < 0.1:
+        torch.testing.assert_close(result.x, state.x + 20 * 1e-4 * state.v.mean(1, keepdim=True), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["elastic", "von Mises", "soil"])
+@pytest.mark.parametrize("kind", ["inverted", "flat", "point"])
+def test_inverted_and_collapsed_elements(name: str, kind: str) -> None:
+    """Numbers and momentum stay, and forces bounded: no particle is shot away."""
+    solver, state = replace(solvers(60, 1)[name], rules=(), gravity=(0.0, 0.0), backend=scenes.BACKEND), lively(60)
+    F = state.F.clone()
+    F[:, ::2] = {"inverted": F[:, ::2].flip(-1), "flat": torch.ones(2, 2).double(), "point": 0.0 * F[:, ::2]}[kind]
+    state = replace(state, F=F)
+    result = solver.step(state, substeps=50)
+    assert diagnostics.finite(result).all()
+    momenta = [diagnostics.momentum(solver, s) for s in (state, result)]
+    torch.testing.assert_close(*momenta, rtol=1e-8, atol=1e-8)
+    assert result.v.abs().max() < 20.0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("speed", [1e4, 1e8, 1e15])
+def test_huge_velocities(speed: float, dtype: torch.dtype) -> None:
+    """Whoever leaves the window in x rests where it got to; all numbers stay numbers."""
+    state = placed(positions(50), speed).to(dtype)
+    solver = free(50)
+    once = solver.step(state)
+    result = solver.step(once, substeps=20)
+    assert diagnostics.finite(result).all()
+    left = ~GRID.contains(once.x[..., 0], torch.zeros(1, 1, dtype=dtype))
+    assert left.any()
+    for name in ("x", "v", "C", "F"):
+        assert torch.equal(getattr(result, name)[left], getattr(once, name)[left]), name
+
+
+# --- nothing --------------------------------------------------------------------------------------------------------
+
+
+def test_an_empty_batch_stays_empty() -> None:
+    state = lively(20, 2)[:0]
+    result = robot(20).step(state, torch.zeros(0, 2, 16, 16, dtype=torch.float64), substeps=3)
+    assert result.x.shape == (0, 20, 2) and result.F.shape == (0, 20, 2, 2)
+    assert diagnostics.finite(result).shape == (0,)
+    with pytest.raises(ValueError, match="the state's batch size must be at least 1, got 0"):
+        estimate_memory(robot(20), state, substeps=3)
+    with pytest.raises(ValueError, match="state has 0 particles, the solver's bodies 20"):
+        robot(20).step(ParticleState.at_rest(torch.zeros(1, 0, 2)))
+
+
+# --- failures -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30, -1e30])
+@pytest.mark.parametrize("name", ["x", "v", "C", "F", "Jp", "actuation", "origin"])
+def test_a_broken_element_harms_no_other(name: str, value: float) -> None:
+    """Not by a bit, wherever the number is; and it stays broken, it is not hidden."""
+    state, field, origin = moving(90, 3)
+    solver = replace(solvers(90, 3)["three bodies"], backend=scenes.BACKEND)
+    sound = solver.step(state, field, substeps=15, origin=origin)
+    given = {"actuation": field, "origin": origin} | {n: getattr(state, n) for n in ("x", "v", "C", "F", "Jp")}
+    broken = given[name].clone()
+    broken[1].view(-1)[:: 5 if name != "origin" else 1] = value
+    given[name] = broken
+    result = solver.step(
+        ParticleState(*(given[n] for n in ("x", "v", "C", "F", "Jp"))),
+        given["actuation"],
+        substeps=15,
+        origin=given["origin"],
+    )
+    for i in (0, 2):
+        assert_identical(result[i], sound[i])
+    if name in ("v", "C", "F") and abs(value) != 1e30:
+        assert not all(plane.isfinite().all() for plane in result[1].planes())
+
+
+@pytest.mark.parametrize("value", [math.nan, 1e30])
+@pytest.mark.parametrize("name", ["x", "v", "F"])
+def test_gradients_of_a_broken_element_harm_no_other(name: str, value: float) -> None:
+    solver = replace(solvers(30, 3)["three bodies"], backend=scenes.BACKEND)
+    gradients = []
+    for given in (None, value):
+        state, field, origin = moving(30, 3)
+        state, field = state.clone(), field.requires_grad_()
+        if given is not None:
+            getattr(state, name)[1, ::5] = given
+        v = state.v.requires_grad_()
+        final = solver.step(replace(state, v=v), field, substeps=5, origin=origin)
+        gradients.append(torch.autograd.grad(final.x.square().sum() + final.F.square().sum(), (v, field)))
+    for sound, beside in zip(*gradients, strict=True):
+        assert torch.equal(sound[[0, 2]], beside[[0, 2]]) and sound[[0, 2]].abs().max() > 0
+
+
+def test_a_simulation_that_flies_apart_harms_no_other() -> None:
+    """Beyond its largest stable substep one of three explodes."""
+    mu = torch.tensor([300.0, 3e7, 300.0], dtype=torch.float64)
+    body = Body(40, Elastic(mu, 100.0), mass=2.0)
+    solver = Solver(GRID, (body,), gravity=(0.0, -9.0), backend=scenes.BACKEND, allow_unstable=True)
+    state = lively(40, 3)
+    together = solver.step(state, substeps=60)
+    speed = together.v.abs().amax((1, 2))
+    assert not speed[1] < 1e3 and (speed[[0, 2]] < 10).all()
+    for i in (0, 2):
+        alone = replace(solver, bodies=(replace(body, material=Elastic(300.0, 100.0)),)).step(state[i], substeps=60)
+        assert_close(together[i], alone, 1e-12)

@@ -1,0 +1,230 @@
+"""Laws that hold for any scene: balances, symmetries, Galilean invariance, independence of a batch's elements.
+
+Hypothesis draws the scenes: bodies of all materials, from one particle up, windows, gravity, damping, rules, muscles.
+"""
+
+from dataclasses import dataclass, replace
+
+import pytest
+import scenes
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import assert_close, assert_identical, generator
+from torch import Tensor
+
+from torchmpm import Body, Elastic, Grid, ParticleState, Soil, Solver, VelocityRule, VonMises, diagnostics
+from torchmpm.backends import compiler_found
+
+pytestmark = pytest.mark.usefixtures("backend")
+
+SUBSTEPS = 4
+FREE = {"rules": (), "damping": 1.0}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Case:
+    """What a solver takes: all particles well inside the window."""
+
+    solver: Solver
+    state: ParticleState
+    actuation: Tensor
+    origin: Tensor
+
+    def run(self, substeps: int = SUBSTEPS) -> ParticleState:
+        solver = replace(self.solver, backend=scenes.BACKEND)
+        return solver.step(self.state, self.actuation, substeps=substeps, origin=self.origin)
+
+
+MATERIAL = st.sampled_from(
+    [Elastic(300.0, 80.0), VonMises(500.0, 50.0, 60.0), VonMises(200.0, 300.0, 1.0), Soil(400.0, 250.0, 0.05, 0.02)]
+)
+#: Those that know no world axes: soil drops small shears along its own axes and a square grid's, so it stays out.
+BODY = st.builds(
+    Body, st.integers(1, 12), MATERIAL, st.floats(0.5, 5.0), st.floats(0.3, 2.0), st.booleans()
+)  # count, material, mass, volume, muscle
+END = st.none() | st.integers(-2, 20)
+RANGE = st.tuples(END, END).map(lambda ends: ends if None in ends else tuple(sorted(ends)))
+RULE = st.builds(
+    VelocityRule,
+    st.sampled_from(["+x", "-x", "+y", "-y"]),
+    RANGE,
+    RANGE,
+    st.sampled_from([0.0, float("inf")]),
+    st.just("window"),
+)
+
+
+@st.composite
+def cases(draw: st.DrawFn, **options: object) -> Case:
+    """Random scenes; ``options`` of the solver are as given."""
+    bodies = tuple(draw(st.lists(BODY, min_size=1, max_size=3)))
+    batch, resolution = draw(st.integers(1, 3)), draw(st.integers(10, 20))
+    grid = Grid(resolution, spacing=draw(st.sampled_from([None, 0.05])))
+    dials = {
+        "gravity": draw(st.tuples(st.floats(-10.0, 10.0), st.floats(-10.0, 10.0))),
+        "damping": draw(st.sampled_from([1.0, 0.999, 0.9])),
+        "rules": tuple(draw(st.lists(RULE, max_size=4))),
+    }
+    solver = Solver(grid, bodies, **{**dials, **options})
+    noise = generator(draw(st.integers(0, 10**6)))
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=noise, dtype=torch.float64)
+
+    count, identity = solver.num_particles, torch.eye(2, dtype=torch.float64)
+    spread = torch.rand(batch, count, 2, generator=noise, dtype=torch.float64)
+    origin = normal(batch, 2)
+    state = ParticleState(
+        x=origin[:, None] + grid.h * (3.0 + (resolution - 7.0) * spread),
+        v=normal(batch, count, 2),
+        C=5.0 * normal(batch, count, 2, 2),
+        F=identity + draw(st.sampled_from([0.0, 0.05, 0.3])) * normal(batch, count, 2, 2),
+        Jp=1.0 + 0.02 * normal(batch, count),
+    )
+    return Case(solver, state, 40.0 * normal(batch, 2, resolution, resolution), origin)
+
+
+def examples(number: int):
+    """As many for the fast backend; half as many for the slow one would be drawn by another test."""
+    return settings(max_examples=number)
+
+
+# --- balances -------------------------------------------------------------------------------------------------------
+
+
+@examples(15)
+@given(cases())
+def test_momentum_changes_by_the_impulses(case: Case) -> None:
+    """Of gravity, damping and rules; muscles and inner forces add none; mass stays."""
+    solver = replace(case.solver, backend=scenes.BACKEND)
+    after = case.run(1)
+    change = diagnostics.momentum(solver, after) - diagnostics.momentum(solver, case.state)
+    impulses = diagnostics.impulses(solver, case.state, case.actuation, case.origin)
+    size = (diagnostics.masses(solver, case.state)[..., None] * case.state.v.abs()).sum((1, 2)).max().item()
+    torch.testing.assert_close(change, sum(impulses.values()), rtol=1e-8, atol=1e-8 * (1.0 + size))
+    assert torch.equal(diagnostics.mass(solver, after), diagnostics.mass(solver, case.state))
+
+
+@examples(15)
+@given(cases(**FREE))
+def test_gravity_adds_its_share_of_momentum(case: Case) -> None:
+    """g t m, whatever matter does inside, until a wall is reached."""
+    change = diagnostics.momentum(case.solver, case.run()) - diagnostics.momentum(case.solver, case.state)
+    mass, seconds = diagnostics.mass(case.solver, case.state), SUBSTEPS * case.solver.dt
+    weight = mass[:, None] * torch.tensor(case.solver.gravity, dtype=torch.float64)
+    torch.testing.assert_close(change, seconds * weight, rtol=1e-7, atol=1e-7 * mass.max().item())
+
+
+# --- symmetries -----------------------------------------------------------------------------------------------------
+
+
+def turned_vector(v: Tensor, Q: Tensor) -> Tensor:
+    return v @ Q.T
+
+
+def transformed(case: Case, Q: Tensor, rules: tuple[VelocityRule, ...], field: Tensor) -> Case:
+    """The scene under an orthogonal map of space about the middle of the nodes; material axes go along."""
+    gravity = tuple((Q @ torch.tensor(case.solver.gravity, dtype=torch.float64)).tolist())
+    solver = replace(case.solver, gravity=gravity, rules=rules)
+    return Case(solver, image(case, case.state, Q), field, case.origin)
+
+
+def image(case: Case, state: ParticleState, Q: Tensor) -> ParticleState:
+    """A state under the same map."""
+    grid = case.solver.grid
+    middle = case.origin[:, None] + 0.5 * (grid.resolution - 1) * grid.h
+    x, v = middle + (state.x - middle) @ Q.T, state.v @ Q.T
+    return ParticleState(x, v, Q @ state.C @ Q.T, Q @ state.F @ Q.T, state.Jp)
+
+
+def nodes(rule: VelocityRule, last: int, swap: bool, flip_i: bool) -> dict[str, tuple[int | None, int | None]]:
+    """Ranges of a rule after nodes (i, j) became (j, i) if ``swap``, and then (last - i, j) if ``flip_i``."""
+    i, j = (rule.j, rule.i) if swap else (rule.i, rule.j)
+    if flip_i:
+        i = tuple(None if end is None else last - end for end in reversed(i))
+    return {"i": i, "j": j}
+
+
+QUARTER = torch.tensor([[0.0, -1.0], [1.0, 0.0]], dtype=torch.float64)
+MIRROR = torch.tensor([[-1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)
+
+
+@examples(20)
+@given(cases())
+def test_a_quarter_turn(case: Case) -> None:
+    """Everything turns to the left, material axes too, so the muscles' two actuations change places."""
+    last = case.solver.grid.resolution - 1
+    directions = {"+x": "+y", "+y": "-x", "-x": "-y", "-y": "+x"}
+    rules = tuple(
+        replace(rule, direction=directions[rule.direction], **nodes(rule, last, swap=True, flip_i=True))
+        for rule in case.solver.rules
+    )
+    field = torch.rot90(case.actuation, 1, (2, 3)).flip(1)
+    assert_close(transformed(case, QUARTER, rules, field).run(), image(case, case.run(), QUARTER), 1e-9)
+
+
+@examples(20)
+@given(cases())
+def test_a_mirror(case: Case) -> None:
+    """Left becomes right; the muscles act along the same axes."""
+    last = case.solver.grid.resolution - 1
+    directions = {"+x": "-x", "-x": "+x", "+y": "+y", "-y": "-y"}
+    rules = tuple(
+        replace(rule, direction=directions[rule.direction], **nodes(rule, last, swap=False, flip_i=True))
+        for rule in case.solver.rules
+    )
+    assert_close(transformed(case, MIRROR, rules, case.actuation.flip(2)).run(), image(case, case.run(), MIRROR), 1e-9)
+
+
+@examples(15)
+@given(cases(), st.integers(-30, 30), st.integers(-30, 30))
+def test_a_shift_of_the_world(case: Case, across: int, up: int) -> None:
+    """By whole cells, window and all."""
+    offset = case.solver.grid.h * torch.tensor([[float(across), float(up)]], dtype=torch.float64)
+    there = replace(case, state=replace(case.state, x=case.state.x + offset[:, None]), origin=case.origin + offset)
+    result = there.run()
+    assert_close(replace(result, x=result.x - offset[:, None]), case.run(), 1e-9)
+
+
+@examples(15)
+@given(cases(**FREE), st.floats(-50.0, 50.0), st.floats(-50.0, 50.0))
+def test_uniform_motion_goes_unnoticed(case: Case, across: float, up: float) -> None:
+    """In a window that goes along: to 1e-7, for the 1e-10 kg of each node stay behind."""
+    speed = torch.tensor([across, up], dtype=torch.float64)
+    moving, resting = replace(case, state=replace(case.state, v=case.state.v + speed)), case
+    for k in range(1, SUBSTEPS + 1):
+        way = k * case.solver.dt * speed
+        moving = replace(moving, state=moving.run(1), origin=case.origin + way)
+        resting = replace(resting, state=resting.run(1))
+    back = replace(moving.state, x=moving.state.x - way, v=moving.state.v - speed)
+    assert_close(back, resting.state, 1e-7)
+
+
+# --- batches --------------------------------------------------------------------------------------------------------
+
+
+@examples(15)
+@given(cases(), st.randoms(use_true_random=False))
+def test_elements_of_a_batch_do_not_know_each_other(case: Case, random) -> None:
+    """Each as if alone, in any order: natively to the last bit, else to rounding."""
+    order = list(range(case.state.batch_size))
+    random.shuffle(order)
+    shuffled = Case(case.solver, case.state[order], case.actuation[order], case.origin[order]).run()
+    together = case.run()
+    for place, i in enumerate(order):
+        one = slice(i, i + 1)
+        alone = Case(case.solver, case.state[one], case.actuation[one], case.origin[one]).run()
+        for other in (together[i], shuffled[place]):
+            if scenes.BACKEND == "native":
+                assert_identical(other, alone)
+            else:
+                assert_close(other, alone, 1e-11)
+
+
+@examples(25)
+@given(cases())
+def test_backends_agree(case: Case) -> None:
+    if not compiler_found() or scenes.BACKEND == "native":
+        return
+    assert_close(replace(case, solver=replace(case.solver, backend="native")).run(), case.run(), 1e-9)
