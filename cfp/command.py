@@ -141,8 +141,13 @@ def main(program: Program, arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    except MemoryError as error:
-        print(f"error: not enough memory for buffer_size, num_envs or particles ({error})", file=sys.stderr)
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "allocate memory" not in str(error):  # torch's word for the same
+            raise
+        print(
+            f"error: not enough memory: take fewer num_envs, particles or a smaller buffer_size ({error})",
+            file=sys.stderr,
+        )
         return 1
     return 0
 

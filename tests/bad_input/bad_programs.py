@@ -77,6 +77,20 @@ TRAIN = [
     training("a policy of another task", "--start-from run", "start_from: got a policy for run, allowed shapematch"),
     training("an algorithm of baselines", "--algo shac", "algo: got 'shac', allowed 'cfp'; python -m baselines.train"),
     Case(
+        "train with more robots than memory",
+        command(cfp.train.main, TINY + NEW + "--num-envs 999999999999"),
+        ("not enough memory: take fewer num_envs",),
+        Refused,
+        leaves="new",
+    ),
+    Case(
+        "train with a memory of years",
+        command(cfp.train.main, TINY + NEW + "--buffer-size 99999999999999"),
+        ("not enough memory", "a smaller buffer_size"),
+        Refused,
+        leaves="new",
+    ),
+    Case(
         "train into a file",
         prepared(lambda desk: desk.file("new", "mine"), command(cfp.train.main, TINY + NEW)),
         ("out: new is a file, allowed is a folder",),
