@@ -56,11 +56,11 @@ $(TRITON_STAMP): $(STAMP)
 test-gpu-kernels: $(TRITON_STAMP)  ## tests of the CUDA kernels: on a GPU, else in an interpreter and a compiler
 	$(BIN)/python -m pytest -m "" $(addprefix tests/torchmpm/test_cuda_,kernels.py graphs.py compilation.py)
 
-# In an environment of its own: .venv holds the newest versions.
+# In an environment of its own: .venv holds the newest versions. Old versions use what new ones of others deprecate.
 test-oldest:  ## fast tests with the oldest versions of all dependencies but torch
 	@test -x .venv-oldest/bin/python || $(PYTHON) -m venv .venv-oldest
 	@.venv-oldest/bin/python -m pip install -qq --disable-pip-version-check -c constraints-oldest.txt $(PIP_FLAGS) -e ".[dev,video]"
-	.venv-oldest/bin/python -m pytest
+	.venv-oldest/bin/python -m pytest -W ignore::DeprecationWarning -W ignore::pytest.PytestUnraisableExceptionWarning
 
 coverage: install  ## fast tests, and which lines and branches of the four packages they miss
 	$(BIN)/python -m pytest --cov --cov-report=term
