@@ -11,7 +11,7 @@ DOCS_STAMP := .venv/.stamp-docs
 DEMO := runs/demo
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all test-gpu-kernels lint docs bench clean
+.PHONY: help install demo test test-all test-gpu-kernels test-oldest coverage lint docs bench clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1: /p' Makefile
@@ -33,9 +33,9 @@ $(DOCS_STAMP): $(STAMP)
 
 # Threads that wait for each other by spinning stall for seconds as soon as another program wants a core. For
 # benchmarks, which have the machine to themselves, spinning is faster.
-demo test test-all test-gpu-kernels: export OMP_WAIT_POLICY ?= PASSIVE
+demo test test-all test-gpu-kernels test-oldest coverage: export OMP_WAIT_POLICY ?= PASSIVE
 # A short spin before they sleep: without it updates of the networks take a third longer.
-demo test test-all test-gpu-kernels: export GOMP_SPINCOUNT ?= 10000
+demo test test-all test-gpu-kernels test-oldest coverage: export GOMP_SPINCOUNT ?= 10000
 
 demo: install  ## train a small policy on SHAPE MATCH, with a video and a learning curve at the end
 	$(BIN)/python -m cfp.train --task shapematch --preset quick --seed 0 --out $(DEMO) --resume
@@ -55,6 +55,15 @@ $(TRITON_STAMP): $(STAMP)
 
 test-gpu-kernels: $(TRITON_STAMP)  ## tests of the CUDA kernels: on a GPU, else in an interpreter and a compiler
 	$(BIN)/python -m pytest -m "" $(addprefix tests/torchmpm/test_cuda_,kernels.py graphs.py compilation.py)
+
+# In an environment of its own: .venv holds the newest versions. Old versions use what new ones of others deprecate.
+test-oldest:  ## fast tests with the oldest versions of all dependencies but torch
+	@test -x .venv-oldest/bin/python || $(PYTHON) -m venv .venv-oldest
+	@.venv-oldest/bin/python -m pip install -qq --disable-pip-version-check -c constraints-oldest.txt $(PIP_FLAGS) -e ".[dev,video]"
+	.venv-oldest/bin/python -m pytest -W ignore::DeprecationWarning -W ignore::pytest.PytestUnraisableExceptionWarning
+
+coverage: install  ## fast tests, and which lines and branches of the four packages they miss
+	$(BIN)/python -m pytest --cov --cov-report=term
 
 lint: install  ## style, formatting, types
 	$(BIN)/ruff check .

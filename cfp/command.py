@@ -66,7 +66,8 @@ class _Choice:
     algo: str | None = None
     task: str | None = None
     preset: str | None = None
-    seed: int | None = None
+    seed: str | None = None
+    """Text, so that what is no number is left to the second reading, which says so better."""
     out: Path | None = None
     resume: bool = False
     config: Path | None = None
@@ -81,7 +82,8 @@ def parse(program: Program, arguments: Sequence[str]) -> Command:
     """
     choice, _ = tyro.cli(_Choice, args=list(arguments), return_unknown_args=True, add_help=False, console_outputs=False)
     fresh, base = True, program.configure(_values(choice))
-    folder = choice.out or _default_folder(base if choice.seed is None else replace(base, seed=choice.seed))
+    seed = int(choice.seed) if choice.seed and choice.seed.isdecimal() else base.seed
+    folder = choice.out or _default_folder(replace(base, seed=seed))
     if choice.resume and (folder / "config.json").exists():
         fresh, base = False, read_config(folder, program.configure)
     command: Command = tyro.cli(
@@ -139,8 +141,13 @@ def main(program: Program, arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    except MemoryError as error:
-        print(f"error: not enough memory for buffer_size, num_envs or particles ({error})", file=sys.stderr)
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "allocate memory" not in str(error):  # torch's word for the same
+            raise
+        print(
+            f"error: not enough memory: take fewer num_envs, particles or a smaller buffer_size ({error})",
+            file=sys.stderr,
+        )
         return 1
     return 0
 

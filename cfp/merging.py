@@ -9,6 +9,15 @@ from typing import Any, Literal
 
 from cfp.errors import ConfigError
 
+_KINDS: dict[Any, str] = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: "text",
+    dict: "an object with named values",
+    type(None): "null",
+}
+
 
 def merge(base: Any, values: Any, path: str = "") -> Any:
     """Put JSON values over a dataclass, recursively.
@@ -61,18 +70,17 @@ def _convert(value: Any, kind: Any, where: str) -> Any:
         return float(value)
     elif isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
         return value
-    raise ConfigError(f"{where}: got {value!r}, allowed {_words(kind)}")
+    raise ConfigError(f"{where}: got {value!r}, allowed {words(kind)}")
 
 
-def _words(kind: Any) -> str:
+def words(kind: Any) -> str:
     """A field's type for people who write JSON."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is Literal:
         return " or ".join(map(repr, arguments))
     if origin is tuple:
         count = "a list" if arguments[-1] is Ellipsis else f"a list of {len(arguments)}"
-        return f"{count}, each {_words(arguments[0])}"
+        return f"{count}, each {words(arguments[0])}"
     if arguments:
-        return " or ".join(map(_words, arguments))
-    words = {int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "null"}
-    return words[kind]
+        return " or ".join(map(words, arguments))
+    return _KINDS[kind]

@@ -18,6 +18,7 @@ from cfp.actor import Actor, ActorSpec
 from cfp.config import LARGEST_SEED, Config, EnvironmentConfig, RunConfig, merge
 from cfp.errors import CheckpointError, ConfigError
 from cfp.files import parse_json, write_atomically, write_json
+from cfp.merging import words
 from cfp.policy import ActorPolicy
 from dittogym.geometry import NODES
 
@@ -36,6 +37,8 @@ _DESCRIBED: dict[str, tuple[type, int | None, int]] = {
     "layout": (int, 0, LARGEST_SEED),
 }
 """What every description holds (some have no layout): type, least and largest value."""
+REASON = 300
+"""Characters of an error of torch that are shown: it lists every layer."""
 SHIPPED = Path(__file__).parent / "policies"
 """Policies that come with the package, by name."""
 
@@ -152,7 +155,7 @@ def _checked(description: Any) -> dict[str, Any]:
             continue
         wrong = type(value) is not kind  # a truth value is no number here
         if wrong or (least is not None and not least <= value <= most):
-            allowed = kind.__name__ if least is None else f"{least} to {most}"
+            allowed = words(kind) if least is None else f"{least} to {most}"
             raise ConfigError(f"{name}: got {value!r}, allowed {allowed}")
     merge(EnvironmentConfig(), description["environment"], "environment")
     return description
@@ -168,7 +171,7 @@ def fitting(path: str | Path) -> Iterator[None]:
     try:
         yield
     except (KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        reason = " ".join(str(error).split())[:REASON] or type(error).__name__
         raise CheckpointError(f"{policy_file(path)}: weights and description do not fit ({reason})") from error
 
 

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from PIL import Image
 
-#: Pixels of the largest picture that is read from a file: it takes 0.8 GB at most.
-LARGEST = 2**26
+#: Pixels of the largest picture that is read from a file, 4096 x 4096.
+LARGEST = 2**24
 #: The path of an image file, or an array.
 PictureLike: TypeAlias = "str | os.PathLike[str] | np.ndarray"
 
@@ -78,4 +78,6 @@ def _grey(image: np.ndarray, name: str) -> np.ndarray:
     if image.ndim == 2:
         return image
     grey = cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_BGR2GRAY)
-    return (grey * (image[..., 3] / 255.0)).astype(np.uint8) if image.shape[2] == 4 else grey
+    if image.shape[2] == 3:
+        return grey
+    return (grey.astype(np.uint16) * image[..., 3] // 255).astype(np.uint8)

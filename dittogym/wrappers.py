@@ -56,7 +56,7 @@ def observation_resolution(env: AnyEnv, size: int) -> Any:
     return gymnasium.wrappers.TransformObservation(env, reduce, small)
 
 
-class _VectorObservation(VectorWrapper[Any, Any, Any]):
+class _VectorObservation(VectorWrapper):
     """Like Gymnasium's ``TransformObservation``, which refuses environments that reset in the same step."""
 
     def __init__(

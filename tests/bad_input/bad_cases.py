@@ -106,7 +106,7 @@ def command(main: Callable[[list[str]], int], arguments: str) -> Callable[[Desk]
         printed = io.StringIO()
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(printed):
             try:
-                code = main(arguments.format(folder=desk.folder).split())
+                code = main([word.format(folder=desk.folder) for word in arguments.split()])
             except SystemExit as error:
                 code = error.code
         if code:

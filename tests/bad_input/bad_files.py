@@ -53,7 +53,7 @@ IMAGES = [
     target("of zero pixels", png(0, 5), "cannot be read as an image"),
     target("all white", picture(np.full((64, 64), 255)), "pixels of the shape and of the ground, got 4096 of 4096"),
     target("all black", picture(np.zeros((64, 64))), "pixels of the shape and of the ground, got 0 of 4096"),
-    target("that would fill the memory", png(10_000, 10_000), "at most 67108864 pixels, got 10000 x 10000"),
+    target("that would fill the memory", png(10_000, 10_000), "at most 16777216 pixels, got 10000 x 10000"),
     target("that would fill it twice", png(30_000, 30_000), "cannot be read as an image", "900000000 pixels"),
     target("that would fill any memory", png(2**31 - 1, 2**31 - 1), "cannot be read as an image"),
 ]
@@ -113,13 +113,17 @@ POLICIES = [
     policy("with a list for a description", "without a", content=header({"__metadata__": {"cfp-policy": "[1]"}})),
     policy("of another version", "description of version 1", changes={"version": 2}),
     policy("of another kind", "kind 'mpc', allowed 'cfp'", changes={"kind": "mpc"}),
-    policy("of a task by number", "task: got 3, allowed str", changes={"task": 3}),
+    policy("of a task by number", "task: got 3, allowed text", changes={"task": 3}),
     policy("of no grid", "resolution: got 0, allowed 1 to 128", changes={"resolution": 0}),
     policy("of a grid of True", "resolution: got True, allowed 1 to 128", changes={"resolution": True}),
     policy("of stage -1", "stage: got -1, allowed 1 to", changes={"stage": -1}),
-    policy("that is maybe deterministic", "deterministic: got 'yes', allowed bool", changes={"deterministic": "yes"}),
+    policy(
+        "that is maybe deterministic",
+        "deterministic: got 'yes', allowed true or false",
+        changes={"deterministic": "yes"},
+    ),
     policy("for a layout by name", "layout: got 'x', allowed 0 to", changes={"layout": "x"}),
-    policy("for no environment", "environment: got None, allowed dict", changes={"environment": None}),
+    policy("for no environment", "environment: got None, allowed an object", changes={"environment": None}),
     policy("for an unknown environment", "environment.colour: no such option", changes={"environment": {"colour": 1}}),
     policy("without a network", "do not fit", changes={"network": {}}),
     policy("with an unknown network", "do not fit", "'colour'", changes={"network": {"colour": 1}}),
@@ -133,9 +137,13 @@ POLICIES = [
     ),
     policy("with another ladder", "do not fit", changes={"network": {"resolutions": [16]}}),
     policy("of NaN", "weights that are NaN or infinite", weights=first(lambda tensor: tensor * float("nan"))),
-    policy("of other shapes", "do not fit", weights=first(lambda tensor: tensor[..., :1])),
-    policy("with a tensor too many", "do not fit", weights=lambda tensors: {**tensors, "extra": torch.zeros(1)}),
-    policy("with a tensor too few", "do not fit", weights=lambda tensors: dict(list(tensors.items())[1:])),
+    policy("of other shapes", "do not fit", "size mismatch", weights=first(lambda tensor: tensor[..., :1])),
+    policy(
+        "with a tensor too many", "do not fit", "extra", weights=lambda tensors: {**tensors, "extra": torch.zeros(1)}
+    ),
+    policy(
+        "with a tensor too few", "do not fit", "Missing key", weights=lambda tensors: dict(list(tensors.items())[1:])
+    ),
     policy(
         "of shac with a mile of inputs",
         "do not fit",

@@ -19,14 +19,17 @@ def main() -> None:
     }
     with tempfile.TemporaryDirectory() as place:
         trained = make_trained(Path(place) / "trained")
+        clear = 0
         for title, cases in parts.items():
             print(f"\n## {title}\n\n| case | error | message |\n| --- | --- | --- |")
             for number, case in enumerate(cases):
                 folder = Path(place) / f"{title}-{number}"
                 folder.mkdir()
                 os.chdir(folder)
-                message = case.message(Desk(folder, trained)).replace("|", "\\|")
-                print(f"| {case.name} | {case.error.__name__} | {message} |")
+                message = case.message(Desk(folder, trained))
+                clear += all(words in message for words in case.words)
+                print("|", " | ".join((case.name, case.error.__name__, message.replace("|", "\\|"))), "|")
+        print(f"\n{clear} of {sum(map(len, parts.values()))} name the argument, what was given and what is allowed.")
 
 
 if __name__ == "__main__":

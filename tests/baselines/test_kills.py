@@ -59,11 +59,11 @@ def test_killed_training_ends_like_one_that_was_left_alone(algo, tmp_path):
     while kills < KILLS or lives == 0:
         folder, finished = tmp_path / f"killed{lives}", False
         while not finished:
-            process = begin(algo, folder)
-            if kills < KILLS:
-                time.sleep(chance.uniform(0.0, SPAN))
-                process.kill()
-            finished = process.wait() == 0
+            with begin(algo, folder) as process:
+                if kills < KILLS:
+                    time.sleep(chance.uniform(0.0, SPAN))
+                    process.kill()
+                finished = process.wait() == 0
             kills += not finished
             assert finished or process.returncode == -9
             seen = check_whole(folder)

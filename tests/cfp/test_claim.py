@@ -53,3 +53,13 @@ def test_new_folder_goes_again_if_nothing_was_written(tmp_path):
     with claim(tmp_path / "full"):
         (tmp_path / "full" / "file").touch()
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["file"]
+
+
+def test_lock_that_is_a_link_is_not_written_through(tmp_path):
+    mine, folder = tmp_path / "mine.txt", tmp_path / "run"
+    mine.write_text("precious")
+    folder.mkdir()
+    (folder / ".lock").symlink_to(mine)
+    with pytest.raises(OSError, match=r"\.lock"), claim(folder):
+        pass
+    assert mine.read_text() == "precious"

@@ -1,5 +1,6 @@
 import errno
 import json
+from pathlib import Path
 
 import pytest
 
@@ -52,3 +53,22 @@ def test_progress_leaves_out_what_is_excluded(tmp_path):
     writer = ProgressTable(Table(tmp_path / "p.csv"))
     writer.write({"b": 1.0, "time/speed": 3.0}, {"b": ("",), "time/speed": ("csv",)}, step=5)
     assert read_table(tmp_path / "p.csv") == [{"step": "5", "b": "1.0"}]
+
+
+def test_links_in_a_folder_of_a_stranger_are_not_written_through(tmp_path):
+    mine, folder = tmp_path / "mine.txt", tmp_path / "run"
+    mine.write_text("precious")
+    folder.mkdir()
+    for name in ("config.json", "config.json.part"):
+        (folder / name).symlink_to(mine)
+    write_json(folder / "config.json", {"a": 1})
+    assert mine.read_text() == "precious"
+    assert json.loads((folder / "config.json").read_text()) == {"a": 1}
+
+
+def test_row_that_no_longer_fits_names_the_file(tmp_path, monkeypatch):
+    table = Table(tmp_path / "t.csv")
+    table.add({"step": 1})
+    table.path = Path("/dev/full")
+    with pytest.raises(OSError, match="No space left on device: '/dev/full'"):
+        table.add({"step": 2})

@@ -125,3 +125,17 @@ def test_batch_has_no_repetition_and_keeps_rows_together():
     expected = ((row % 2 == 0) & ~limit & (row > 0)).float()
     assert (batch.dones[row > 0, 0] == expected[row > 0]).all()
     assert len(ring.sample(20).rewards) == 20
+
+
+def test_pruning_deletes_chunks_only(tmp_path):
+    """The folder of a stranger's run may be a link to one of mine."""
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "thesis.tex").write_text("precious")
+    (tmp_path / "replay").symlink_to(mine)
+    ring, archive = make_ring(), ReplayArchive(tmp_path / "replay", 0)
+    fill(ring, 0, 4)
+    chunks = archive.save(ring, 4)
+    (mine / "level1-000000000-000000002.npz").touch()
+    archive.prune()
+    assert sorted(path.name for path in mine.iterdir()) == [chunks[0]["file"], "thesis.tex"]

@@ -153,8 +153,6 @@ assert torchmpm.diagnostics.finite(after).all()
 
 # ... and what they forbid is found.
 with pytest.raises(WRONG):
-    ParticleState.at_rest(torch.zeros(2))
-with pytest.raises(WRONG):
     state.where(torch.tensor([1.0, 0.0]), after)
 with pytest.raises(WRONG):
     solver.step(state, torch.ones(2, 2, 16, 15))
