@@ -73,7 +73,7 @@ def preset(task: str, name: str = "quick") -> Config:
         raise ConfigError(f"task: got {task!r}, allowed {', '.join(dittogym.TASKS)}")
     allowed = typing.get_args(Preset) if task in TASKS else ("quick",)
     if name not in allowed:
-        raise ConfigError(f"preset: got {name!r}, allowed for {task} {', '.join(allowed)}")
+        raise ConfigError(f"preset: got {name!r}, allowed {', '.join(allowed)} for {task}")
     numbers = TASKS[task] if task in TASKS else _own_numbers(task)
     paper = Config(
         task=task,

@@ -33,7 +33,7 @@ def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):
     config.check()
     assert (config.task, config.resolutions) == ("hop", (4, 32))
     assert replace(config, task="run", resolutions=(8, 16)) == preset("run")
-    with pytest.raises(ConfigError, match="preset: got 'paper', allowed for hop quick"):
+    with pytest.raises(ConfigError, match="preset: got 'paper', allowed quick for hop"):
         preset("hop", "paper")
 
 
@@ -111,7 +111,7 @@ def test_numbers_out_of_range_are_named(group, changes, message):
         ({"environment": {"dtype": "float16"}}, "dtype: got 'float16'"),
         ({"environment": {"particles": [1, 2, 3]}}, "particles"),
         ({"task": "jump"}, "task: got 'jump', allowed shapematch, run"),
-        ({"preset": "slow"}, "preset: got 'slow', allowed for shapematch quick, paper"),
+        ({"preset": "slow"}, "preset: got 'slow', allowed quick, paper for shapematch"),
     ],
 )
 def test_wrong_json_is_named(values, message):
