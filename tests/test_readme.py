@@ -56,7 +56,11 @@ PAGES = {
 }
 
 
-@pytest.mark.parametrize("page", PAGES)
+SLOW = {"docs/develop/adding.md"}
+"""Pages with programs that take a minute."""
+
+
+@pytest.mark.parametrize("page", [pytest.param(p, marks=[pytest.mark.slow] * (p in SLOW)) for p in PAGES])
 def test_examples_run_with_checked_annotations(page: str, tmp_path: Path) -> None:
     done = run("\n".join([CHECKED, examples(page), *PAGES[page]]), tmp_path)
     assert done.returncode == 0, done.stderr

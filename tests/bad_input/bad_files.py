@@ -92,7 +92,12 @@ SHIPPED = (cfp.weights.SHIPPED / "run.safetensors").read_bytes()
 HUGE = {"x": {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 2**42]}}
 
 POLICIES = [
-    Case("policy missing", lambda desk: cfp.load("nobody"), ("nobody.safetensors", "shipped (run, "), CheckpointError),
+    Case(
+        "policy missing",
+        lambda desk: cfp.load("nobody"),
+        ("nobody.safetensors", "shipped (grow, run, "),
+        CheckpointError,
+    ),
     Case(
         "policy in an empty folder",
         lambda desk: cfp.load(desk.folder),

@@ -132,7 +132,7 @@ OTHERS = [
     distilling("no labels", "--capacity 0", "capacity: got 0, allowed 1 or more"),
     evaluating("nothing", "", "policy: got None and the folder None, allowed is one of the two"),
     evaluating("a folder that is not there", "{folder}/none", "none: there is no run (no config.json)"),
-    evaluating("an unknown policy", "--policy alchemy", "none of that name is shipped (run, "),
+    evaluating("an unknown policy", "--policy alchemy", "none of that name is shipped (grow, run, "),
     evaluating("no episodes", "--policy run --episodes 0", "episodes: got 0, allowed 1 or more"),
     evaluating("with seed -1", "--policy run --seed -1", "seed: got -1, allowed 0 to"),
     evaluating("with noise maybe", "--policy run --noise maybe", "'maybe'", "--noise", "without"),

@@ -279,7 +279,7 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch):
         ("run", "mpc", None, "teacher: got the record of one planned episode"),
         ("run", "cem", None, "allowed in run, where every episode starts differently, is mpc itself"),
         ("run", "gradient", "T", "teacher: its target or the student's cannot be read"),
-        (None, "", None, "allowed mpc, shac, gradient, run, shapematch"),
+        (None, "", None, "allowed mpc, shac, gradient, grow, run, shapematch"),
     ],
 )
 def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, kind, target, message):

@@ -85,7 +85,11 @@ def test_every_algorithm_is_tried_here():
     assert set(TINY) == set(baselines.ALGORITHMS)
 
 
-@pytest.fixture(scope="module", params=TINY)
+LARGE = {"gnn-64", "transformer-64"}
+"""The same programs as with 16 segments, and several times slower."""
+
+
+@pytest.fixture(scope="module", params=[pytest.param(a, marks=[pytest.mark.slow] * (a in LARGE)) for a in TINY])
 def finished(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param) / "whole"
     assert run(request.param, folder) == 0

@@ -59,7 +59,7 @@ def assert_same(first, second, path="state"):
         assert first == second, path
 
 
-@pytest.mark.parametrize("stop", [8, 22, 50])
+@pytest.mark.parametrize("stop", [8, *(pytest.param(late, marks=pytest.mark.slow) for late in (22, 50))])
 def test_resumed_training_equals_uninterrupted_training_to_the_last_bit(tmp_path, stop):
     checkpoint = Checkpoint(tmp_path)
 
