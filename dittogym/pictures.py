@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from PIL import Image
 
-#: Pixels of the largest picture that is read from a file, 4096 x 4096.
-LARGEST = 2**24
+#: Pixels of the largest picture that is read from a file, 2048 x 2048: a body drawn in one may take 240 bytes for each.
+LARGEST = 2**22
 #: The path of an image file, or an array.
 PictureLike: TypeAlias = "str | os.PathLike[str] | np.ndarray"
 

@@ -53,7 +53,7 @@ IMAGES = [
     target("of zero pixels", png(0, 5), "cannot be read as an image"),
     target("all white", picture(np.full((64, 64), 255)), "pixels of the shape and of the ground, got 4096 of 4096"),
     target("all black", picture(np.zeros((64, 64))), "pixels of the shape and of the ground, got 0 of 4096"),
-    target("that would fill the memory", png(10_000, 10_000), "at most 16777216 pixels, got 10000 x 10000"),
+    target("that would fill the memory", png(10_000, 10_000), "at most 4194304 pixels, got 10000 x 10000"),
     target("that would fill it twice", png(30_000, 30_000), "cannot be read as an image", "900000000 pixels"),
     target("that would fill any memory", png(2**31 - 1, 2**31 - 1), "cannot be read as an image"),
 ]
