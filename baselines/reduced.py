@@ -44,7 +44,7 @@ class Reduced:
         """
 
         def pick(value: Tensor) -> Tensor:
-            return torch.stack([element[index] for element, index in zip(value, self.chosen, strict=True)])
+            return value[torch.arange(len(value), device=value.device)[:, None], self.chosen]
 
         physics = {
             name: pick(value) if name in PER_PARTICLE and value.ndim == 2 else value
