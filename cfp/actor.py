@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -60,12 +60,6 @@ class ActorSpec:
     def action_size(self) -> int:
         """Rows and columns of the executed action: a plain actor's own grid, else what is blended."""
         return self.patch if self.patch and len(self.resolutions) > 1 else self.resolutions[-1]
-
-    @classmethod
-    def from_json(cls, values: dict[str, Any]) -> ActorSpec:
-        """Undo ``dataclasses.asdict`` after a trip through JSON, which has lists for tuples."""
-        plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        return cls(**plain)
 
     def __post_init__(self) -> None:
         """Check the lengths and the resolutions."""

@@ -19,6 +19,7 @@ from cfp.config import LARGEST_SEED, Config, EnvironmentConfig, RunConfig, merge
 from cfp.errors import CheckpointError, ConfigError
 from cfp.files import parse_json, write_atomically, write_json
 from cfp.merging import words
+from cfp.networks import RESOLUTIONS
 from cfp.policy import ActorPolicy
 from dittogym.geometry import NODES
 
@@ -207,7 +208,8 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
     if description["kind"] != KIND:
         raise CheckpointError(f"{policy_file(path)}: got a policy of kind {description['kind']!r}, allowed {KIND!r}")
     with fitting(path):
-        policy = ActorPolicy(ActorSpec.from_json(description["network"]), description["deterministic"])
+        spec = merge(ActorSpec(resolutions=RESOLUTIONS[:1]), description["network"], "network")
+        policy = ActorPolicy(spec, description["deterministic"])
         policy.actor.load_state_dict(tensors)
     policy.description = description
     policy.to(device)

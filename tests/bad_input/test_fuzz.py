@@ -5,7 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 import baselines
@@ -115,14 +115,18 @@ def test_pictures_of_any_bytes(kind, tmp_path_factory, cuts, changes):
         assert target.shape == (64, 64) and target.dtype == bool
 
 
+CONFIG = Config(resolutions=(4, 8))
+OF_OTHERS = {"inputs": 10, "noise": 0.1, "features": {}, "nodes": {"count": 16, "graph": True}}
+DESCRIPTION = json.loads(json.dumps(describe(CONFIG, 0, 7))) | OF_OTHERS
+
+
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
-    """A valid policy: path, bytes, description, weights."""
-    config = Config(resolutions=(4, 8))
-    actor, description = build_actor(config.actor_spec(0)), describe(config, 0, 7)
+    """A valid policy: path, bytes, weights."""
+    actor = build_actor(CONFIG.actor_spec(0))
     path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
-    save_policy(path, actor, description)
-    return path, path.read_bytes(), json.loads(json.dumps(description)), actor
+    save_policy(path, actor, DESCRIPTION)
+    return path, path.read_bytes(), actor
 
 
 def loaded(path):
@@ -137,18 +141,19 @@ def loaded(path):
 @FUZZ
 @given(cuts=CUTS, changes=CHANGES)
 def test_policies_of_any_bytes(policy, cuts, changes):
-    path, content, _, _ = policy
+    path, content, _ = policy
     path.write_bytes(damaged(content, cuts, changes))
     loaded(path)
 
 
 @FUZZ
-@given(data=st.data())
-def test_policies_of_any_description(policy, data):
-    path, _, description, actor = policy
-    kind = data.draw(st.sampled_from(sorted(ALGORITHMS)))
-    own = {"inputs": 10, "noise": 0.1, "features": {}, "nodes": {"count": 16, "graph": True}}
-    description = {**description, **own, "kind": data.draw(st.sampled_from([kind, "cfp"]))}
-    description = replaced(description, data.draw(st.sampled_from(sorted(paths(description)))), data.draw(JSON))
-    save_policy(path, actor, description)
+@given(
+    kind=st.sampled_from(["cfp"] * len(ALGORITHMS) + sorted(ALGORITHMS)),
+    place=st.sampled_from(sorted(paths(DESCRIPTION))),
+    value=JSON,
+)
+@example(kind="cfp", place=("network",), value=[])
+def test_policies_of_any_description(policy, kind, place, value):
+    path, _, actor = policy
+    save_policy(path, actor, replaced(DESCRIPTION | {"kind": kind}, place, value))
     loaded(path)
