@@ -9,6 +9,9 @@ STAMP := .venv/.stamp-install
 TRITON_STAMP := .venv/.stamp-triton
 DOCS_STAMP := .venv/.stamp-docs
 DEMO := runs/demo
+# Each takes up to 1 GB of memory. A process that has done its own tests takes some of another.
+TEST_PROCESSES ?= 2
+PYTEST := -m pytest -n $(TEST_PROCESSES) --dist worksteal
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-all test-gpu-kernels test-oldest coverage lint docs bench clean
@@ -42,10 +45,10 @@ demo: install  ## train a small policy on SHAPE MATCH, with a video and a learni
 	@echo "Video: $(DEMO)/video.mp4   Learning curve: $(DEMO)/curve.png"
 
 test: install  ## fast tests
-	$(BIN)/python -m pytest
+	$(BIN)/python $(PYTEST)
 
 test-all: install  ## all tests, slow ones and those for CUDA included
-	$(BIN)/python -m pytest -m ""
+	$(BIN)/python $(PYTEST) -m ""
 
 # torch's builds for CUDA bring Triton along, in a version of their choice.
 $(TRITON_STAMP): $(STAMP)
@@ -60,10 +63,10 @@ test-gpu-kernels: $(TRITON_STAMP)  ## tests of the CUDA kernels: on a GPU, else 
 test-oldest:  ## fast tests with the oldest versions of all dependencies but torch
 	@test -x .venv-oldest/bin/python || $(PYTHON) -m venv .venv-oldest
 	@.venv-oldest/bin/python -m pip install -qq --disable-pip-version-check -c constraints-oldest.txt $(PIP_FLAGS) -e ".[dev,video]"
-	.venv-oldest/bin/python -m pytest -W ignore::DeprecationWarning -W ignore::pytest.PytestUnraisableExceptionWarning
+	.venv-oldest/bin/python $(PYTEST) -W ignore::DeprecationWarning -W ignore::pytest.PytestUnraisableExceptionWarning
 
 coverage: install  ## fast tests, and which lines and branches of the four packages they miss
-	$(BIN)/python -m pytest --cov --cov-report=term
+	$(BIN)/python $(PYTEST) --cov --cov-report=term
 
 lint: install  ## style, formatting, types
 	$(BIN)/ruff check .

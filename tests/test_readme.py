@@ -56,7 +56,7 @@ PAGES = {
 }
 
 
-SLOW = {"docs/develop/adding.md"}
+SLOW = {"docs/own.md", "docs/develop/adding.md"}
 """Pages with programs that take a minute."""
 
 
