@@ -37,11 +37,6 @@ class Cost:
     memory: int | None
     device: str
 
-    @property
-    def speed(self) -> float:
-        """Environment steps per second."""
-        return self.steps / self.seconds
-
 
 @dataclass(frozen=True)
 class Found:
@@ -89,6 +84,17 @@ class Group:
     def scores(self) -> list[float]:
         """Mean returns of the runs that were judged."""
         return [run.score for run in self.runs if run.score is not None]
+
+    @property
+    def costs(self) -> list[Cost]:
+        """Of the runs of which a session has ended in order."""
+        return [run.cost for run in self.runs if run.cost is not None]
+
+    @property
+    def speed(self) -> float | None:
+        """Environment steps per second of all these sessions together, without evaluations; None without any."""
+        costs = self.costs
+        return sum(cost.steps for cost in costs) / sum(cost.seconds for cost in costs) if costs else None
 
     @property
     def curves(self) -> list[Curve]:

@@ -60,20 +60,28 @@ def _mark(group: Group) -> str:
     return MARKS.get(group.sees, OTHER[1])
 
 
-def curves(groups: Sequence[Group]) -> Figure:
-    """Evaluations while training: interquartile mean over seeds and its 95 % bootstrap band."""
-    colours, shown = _colours(groups), [group for group in groups if group.curves]
+def curves(groups: Sequence[Group], *, minutes: bool = False) -> Figure:
+    """Evaluations while training: interquartile mean over seeds and its 95 % bootstrap band.
+
+    Args:
+        groups: All.
+        minutes: Over the time of training at each group's mean speed, in place of environment steps.
+    """
+    colours = _colours(groups)
+    shown = [group for group in groups if group.curves and (group.speed or not minutes)]
     figure, panels = _panels(list(dict.fromkeys(group.task for group in shown)), 3.4, _legend(groups))
     for group in shown:
         axes, (steps, values) = panels[group.task], common_curve(group.curves)
         colour = colours[group.label]
         mean = interquartile_mean(values)
+        if minutes and group.speed:
+            steps = steps / group.speed / 60
         axes.plot(steps, mean, _mark(group), linestyle=_line(group), color=colour, markersize=3, linewidth=1.5)
         band = bootstrap([values], repeats=BAND_REPEATS)
         if band is not None:
             axes.fill_between(steps, *band, color=colour, alpha=0.15, linewidth=0)
     for axes in panels.values():
-        axes.set(xlabel="environment steps", ylabel="return of an evaluation")
+        axes.set(xlabel="minutes of training" if minutes else "environment steps", ylabel="return of an evaluation")
     return figure
 
 

@@ -77,6 +77,9 @@ def _draw(folder: Path, groups: Sequence[Group], robustness: Table) -> dict[str,
         made["returns"] = pictures.returns(groups), ("returns.png", "Returns", words)
     if any(each.curves for each in groups):
         made["efficiency"] = pictures.curves(groups), ("curves.png", "Learning curves", _curve_words(groups))
+    if any(each.curves and each.speed for each in groups):
+        words = "The same over the time of training, without that of evaluations, at the mean speed over seeds."
+        made["cost"] = pictures.curves(groups, minutes=True), ("minutes.png", "Learning curves over time", words)
     if any(row["ratio"] is not None for row in robustness.rows):
         words = "Mean over seeds and their range; black: the paper's CFP."
         made["robustness"] = pictures.robustness(groups, robustness.rows), ("robustness.png", "Robustness", words)

@@ -184,11 +184,9 @@ def cost_table(groups: Sequence[Group]) -> Table:
     """Time and memory of training."""
     rows = []
     for group in groups:
-        costs = [run.cost for run in group.runs if run.cost is not None]
-        if not costs:
+        costs, speed, config = group.costs, group.speed, group.runs[0].job.config
+        if speed is None:
             continue
-        config = group.runs[0].job.config
-        speed = sum(cost.steps for cost in costs) / sum(cost.seconds for cost in costs)
         memories = [cost.memory / 2**20 for cost in costs if cost.memory]
         theirs = paper.COST.get(group.label, (None, None)) if group.task == "run" else (None, None)
         rows.append(

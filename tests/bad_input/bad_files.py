@@ -131,7 +131,9 @@ POLICIES = [
     policy("for no environment", "environment: got None, allowed an object", changes={"environment": None}),
     policy("for an unknown environment", "environment.colour: no such option", changes={"environment": {"colour": 1}}),
     policy("without a network", "do not fit", changes={"network": {}}),
-    policy("with an unknown network", "do not fit", "network.colour: no such option", changes={"network": {"colour": 1}}),
+    policy(
+        "with an unknown network", "do not fit", "network.colour: no such option", changes={"network": {"colour": 1}}
+    ),
     policy("with a grid of 7", "resolution: got 7, allowed 4, 8", changes={"network": {"resolutions": [7]}}),
     policy("with grids in a text", "do not fit", changes={"network": {"resolutions": "8, 16"}}),
     policy(

@@ -7,7 +7,9 @@ from html.parser import HTMLParser
 
 import pytest
 
+from baselines.compare import pictures
 from baselines.compare.__main__ import main
+from baselines.compare.collect import find_runs, group
 from baselines.compare.judging import Judging
 from baselines.compare.plan import Plan, make_jobs
 from cfp.config import to_json
@@ -149,6 +151,14 @@ def test_paper_s_returns_stand_beside_ours(report):
     assert (row["ours"], row["paper"], row["band"], row["paper_steps"]) == ("4050.0", "8650", "420", "550000")
 
 
+def test_curves_over_time_end_with_the_training(report):
+    labels = ["cfp", "shac", "shac-image"]
+    jobs = make_jobs(Plan(**PLAN), ["run", "slot"], labels, [0, 1], report / "runs")
+    judging = Judging(2)
+    axes = pictures.curves(group(find_runs(jobs, judging, judging)), minutes=True).axes[0]
+    assert [line.get_xdata().tolist() for line in axes.lines] == [pytest.approx([50 / 60, 100 / 60])] * 3
+
+
 def test_failures_are_named(report):
     row = find(rows(report, "runs"), run="shac-image-slot-quick-1")
     assert (row["state"], row["error"]) == ("failed", "NonFiniteError: a loss | is not finite")
@@ -158,7 +168,7 @@ def test_failures_are_named(report):
 
 def test_page_shows_only_files_beside_it(report):
     page = (report / "index.html").read_text()
-    for name in ("curves.png", "returns.png", "robustness.png", "returns.csv", "cost.csv"):
+    for name in ("curves.png", "minutes.png", "returns.png", "robustness.png", "returns.csv", "cost.csv"):
         assert f'"{name}"' in page and (report / name).stat().st_size > 0
     assert "http" not in page
     balance = TagBalance()
