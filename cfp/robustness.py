@@ -50,6 +50,9 @@ class Command:
     """mu, yield stress and gravity are tried at 1 - shift and 1 + shift times their value."""
     friction: tuple[float, ...] = (0.0, 0.5, math.inf)
     """Coulomb coefficients of the floor; inf sticks. The task's own is left out."""
+    cases: tuple[str, ...] = ()
+    """Try only cases whose names hold one of these words, such as "dropout", beside the unperturbed one; all if not
+    given."""
     seed: int | None = None
     """Seed of layouts and noise; the run's own if not given."""
     device: str = "auto"
@@ -71,6 +74,18 @@ class Command:
             raise ConfigError(f"noise: got {self.noise}, allowed more than 0")
         if not all(value >= 0 for value in self.friction):
             raise ConfigError(f"friction: got {self.friction}, allowed 0 or more, inf sticks")
+
+
+def choose(cases: Sequence[Case], words: Sequence[str]) -> list[Case]:
+    """The first case, and those whose names hold one of the words; all cases without words.
+
+    Raises:
+        ConfigError: No name holds one of them.
+    """
+    for word in words:
+        if not any(word in case.name for case in cases[1:]):
+            raise ConfigError(f"cases: got {word!r}, allowed words of {', '.join(case.name for case in cases[1:])}")
+    return [*cases[:1], *(case for case in cases[1:] if not words or any(word in case.name for word in words))]
 
 
 def report(config: RunConfig, policy: Policy, cases: Sequence[Case], episodes: int) -> list[Result]:
@@ -160,8 +175,9 @@ def run(program: Program, command: Command) -> str:
         CFPError: An option is wrong, there is no run, it has no policy yet, or a file is damaged.
     """
     command.check()
-    config, policies = open_run(program, command.folder, command.device, command.seed)
     cases = make_cases(command.dropout, command.noise, command.latency, command.shift, command.friction)
+    cases = choose(cases, command.cases)
+    config, policies = open_run(program, command.folder, command.device, command.seed)
     results = report(config, list(policies.values())[-1], cases, command.episodes)
     rows, path = to_rows(results), command.folder / "robustness"
     table = to_markdown(config, rows)

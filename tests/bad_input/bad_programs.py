@@ -139,6 +139,12 @@ OTHERS = [
     evaluating("no particles", "--policy run --particles 0", "particles must be at least 1", "got 0"),
     evaluating("an empty folder", "{folder}", "there is no run", main=baselines.evaluate.main),
     evaluating("a disturbed nothing", "{folder}", "there is no run", main=baselines.robustness.main),
+    evaluating(
+        "under an earthquake",
+        "{folder} --cases earthquake",
+        "cases: got 'earthquake', allowed words of action dropout 20%",
+        main=baselines.robustness.main,
+    ),
     comparing("unknown tasks", "--tasks swim", "task: got 'swim'"),
     comparing("unknown algorithms", "--algos alchemy", "algo: got 'alchemy', allowed cfp"),
     comparing("a seed twice", "--seeds 1 1", "seeds: got 1 1, allowed one or more, each once"),

@@ -134,6 +134,13 @@ def test_command_writes_table_and_plot(folder, capsys):
     assert robustness.to_rows(again) == rows[:4]
 
 
+def test_cases_are_chosen_by_words():
+    chosen = robustness.choose(make_cases(), ["dropout", "mu x 0.8"])
+    names = ["unperturbed", "action dropout 20%", "observation dropout 20%", "mu x 0.8"]
+    assert [case.name for case in chosen] == names
+    assert robustness.choose(make_cases(), []) == make_cases()
+
+
 def test_ratios_need_a_positive_return():
     rows = robustness.to_rows([Result("unperturbed", 8, (-2.0, -1.0)), Result("noise", 8, (-4.0, -3.0))])
     assert [row["ratio"] for row in rows] == [None, None]
