@@ -7,7 +7,7 @@ from pathlib import Path
 
 from baselines.algorithm import AlgorithmRun
 from baselines.distillation import Distill, DistillConfig
-from baselines.teachers import read_teacher
+from baselines.teachers import PHYSICS, read_teacher
 from cfp.config import RunConfig
 from cfp.errors import CheckpointError, ConfigError
 from cfp.estimate import Cost
@@ -76,7 +76,10 @@ class DistillRun(AlgorithmRun):
         if self.config.teacher in TRAINED and not self.teacher.exists():
             school = self._school()
             print(f"training the teacher first: {self.config.teacher} -> {school.folder}")
-            school.train()
+            try:
+                school.train()
+            finally:
+                self.judging += school.judging
             copy_policy(school.folder / "policy.safetensors", self.teacher)
         super().train()
 
@@ -94,6 +97,7 @@ class DistillRun(AlgorithmRun):
 
         config = self.config
         chosen = configure({"algo": config.teacher, "task": config.task})
-        environment = replace(chosen.environment, target=config.environment.target)
+        same = {name: getattr(config.environment, name) for name in (*PHYSICS, "dtype", "backend", "target")}
+        environment = replace(chosen.environment, **same)
         chosen = replace(chosen, seed=config.seed, device=config.device, environment=environment)
         return open_run(chosen, self.folder / "teacher", True, self.signals)

@@ -206,6 +206,10 @@ class Distill(Algorithm):
         policy.actor.load_state_dict(self.actor.state_dict())
         return policy.to(self.env.device)
 
+    def attached(self, env: Any) -> ActorPolicy:
+        """What has been learned so far, which looks at images only: built once, not in every step."""
+        return self.policy
+
     def learn(self, total_timesteps: int, callback: Callback) -> Distill:
         """Do as many rounds as cover the steps.
 

@@ -25,8 +25,9 @@ FINAL_RATE = 0.1
 """Share of the learning rate that is left at the end of its cosine."""
 SPIKE, MEMORY = 3.0, 0.9
 """A step's gradient is clipped to this many times its usual norm, which is averaged with this momentum."""
-RISE, SLOWER = 1.1, 0.7
-"""An iteration whose loss is this many times the best one is undone, and the learning rate falls by this factor."""
+RISE, SLOWER = 0.1, 0.7
+"""An iteration whose loss exceeds the best one by this share of it is undone, and the learning rate falls by this
+factor."""
 PATIENCE = 10
 """Failed iterations in a row after which training gives up."""
 
@@ -179,13 +180,14 @@ class Gradient(Algorithm):
         cosine = 0.5 * (1.0 + math.cos(math.pi * progress))
         rate = self.slower * self.rate * (FINAL_RATE + (1.0 - FINAL_RATE) * cosine)
         self.adam.param_groups[0]["lr"] = rate
-        if self.phase != (phase := int(progress * len(self.config.blur))):
+        phase = self.objective.phase(progress)
+        if phase != self.phase:
             self._return_to_best()
             self.best_loss, self.phase = math.inf, phase
         loss, total, gradient = self._episode(progress)
         scalars: dict[str, float | None] = {"train/learning_rate": rate, "train/loss": loss, "train/return": total}
         finite = math.isfinite(loss) and bool(torch.isfinite(gradient).all())
-        if finite and loss <= RISE * self.best_loss:
+        if finite and loss <= self.best_loss + RISE * abs(self.best_loss):
             if loss < self.best_loss:
                 self.best_loss, self.best = loss, self.theta.detach().clone()
             scalars["train/gradient_norm"] = float(gradient.norm())

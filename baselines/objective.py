@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -11,8 +11,15 @@ from torch import Tensor
 from dittogym import TorchEnv
 from dittogym.soft import soft_silhouette
 
-Objective = Callable[[TorchEnv, Tensor, float], Tensor]
-"""From the environment after a step, its reward (B,) and the progress of training (0 to 1) to a loss (B,)."""
+
+class Objective(Protocol):
+    """What is minimised."""
+
+    def phase(self, progress: float) -> int:
+        """Number of the form that the loss has at a progress of training (0 to 1); between forms losses differ."""
+
+    def __call__(self, env: TorchEnv, reward: Tensor, progress: float) -> Tensor:
+        """Loss (B,) of the environment after a step with its reward (B,)."""
 
 
 def make_objective(env: TorchEnv, blur: tuple[float, ...]) -> Objective:
@@ -23,14 +30,21 @@ def make_objective(env: TorchEnv, blur: tuple[float, ...]) -> Objective:
         blur: For a task with a target picture, see `SilhouetteLoss`.
     """
     if env.spec.target is None:
-        return negative_reward
+        return NegativeReward()
     target = torch.as_tensor(env.spec.target, device=env.device, dtype=env.dtype)
     return SilhouetteLoss(target, tuple(gaussian(sigma, len(target)).to(target) for sigma in blur))
 
 
-def negative_reward(env: TorchEnv, reward: Tensor, progress: float) -> Tensor:
+class NegativeReward:
     """The task's own reward, where it is smooth enough."""
-    return -reward
+
+    def phase(self, progress: float) -> int:
+        """The same from beginning to end."""
+        return 0
+
+    def __call__(self, env: TorchEnv, reward: Tensor, progress: float) -> Tensor:
+        """Loss (B,)."""
+        return -reward
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +61,13 @@ class SilhouetteLoss:
     target: Tensor
     blurs: tuple[Tensor, ...]
 
+    def phase(self, progress: float) -> int:
+        """Which blur is used."""
+        return min(int(progress * len(self.blurs)), len(self.blurs) - 1)
+
     def __call__(self, env: TorchEnv, reward: Tensor, progress: float) -> Tensor:
         """Loss (B,) of the present state; the reward counts pixels and has no gradient."""
-        blur = self.blurs[min(int(progress * len(self.blurs)), len(self.blurs) - 1)]
+        blur = self.blurs[self.phase(progress)]
         silhouette = soft_silhouette(env.soft_observation())
         return (blur @ (silhouette - self.target) @ blur.T).abs().mean((1, 2))
 

@@ -226,8 +226,12 @@ def _spread(mask: Tensor) -> Tensor:
 
 
 def _clipped(gradient: Tensor, limit: float) -> Tensor:
-    """Limit the norm of each control step of a gradient (T, B, 2, R, R) to ``limit`` medians over the steps."""
+    """Limit the norm of each control step of a gradient (T, B, 2, R, R) to ``limit`` medians over the steps.
+
+    Steps after the end of an episode have no gradient and do not count.
+    """
     norm = gradient.flatten(2).norm(dim=2)
-    largest = limit * norm.median(0).values
+    middle = (norm > 0).sum(0) // 2
+    largest = limit * norm.sort(0, descending=True).values.gather(0, middle[None])
     scale = torch.where(norm > largest, largest / norm, 1.0)
     return gradient * scale[:, :, None, None, None]

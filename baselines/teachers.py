@@ -20,6 +20,9 @@ from cfp.weights import read_policy
 from dittogym import TorchEnv, make_spec
 from dittogym.action import Layout, bicubic_matrix, to_grid_layout
 
+PHYSICS = ("substeps", "variant")
+"""Options of the environment that change what actions do."""
+
 
 class Teacher(ABC):
     """Says what should be done in the present states of an environment.
@@ -153,6 +156,9 @@ def read_teacher(path: str | Path, task: str, environment: EnvironmentConfig) ->
     if description["task"] != task:
         raise ConfigError(f"teacher: got a policy for {description['task']}, allowed {task}")
     theirs = EnvironmentConfig(**description["environment"])
+    for name in PHYSICS:
+        if (given := getattr(theirs, name)) != (allowed := getattr(environment, name)):
+            raise ConfigError(f"teacher: got a policy for {name} {given}, allowed {allowed}")
     try:
         one, other = (np.asarray(make_spec(task, **own.task_options()).target) for own in (theirs, environment))
     except (ValueError, TypeError, OSError) as error:

@@ -18,6 +18,7 @@ from cfp.errors import CFPError, ConfigError, NonFiniteError
 from cfp.estimate import estimate
 from cfp.evaluation import Policy
 from cfp.files import read_json
+from cfp.merging import merge
 from cfp.process import Stopped, StopSignals, keep_memory
 from cfp.run import Run, holds_run, read_config
 
@@ -86,6 +87,8 @@ def parse(program: Program, arguments: Sequence[str]) -> Command:
     folder = choice.out or _default_folder(replace(base, seed=seed))
     if choice.resume and (folder / "config.json").exists():
         fresh, base = False, read_config(folder, program.configure)
+        if choice.config is not None:  # what differs from the run is refused, not left out
+            base = merge(base, _values(choice))
     command: Command = tyro.cli(
         Command,
         prog=f"python -m {program.package}.train",

@@ -67,8 +67,10 @@ def open_run(
         raise CheckpointError(f"{folder}: no policy has been written yet")
     policies = {name: program.load(path) for name, path in files.items()}
     for (name, policy), path in zip(policies.items(), files.values(), strict=True):
-        found = policy.description["task"], policy.description["resolution"]
-        wanted = config.task, config.resolution(policy.description["stage"] - 1)
+        found, stage = (policy.description["task"], policy.description["resolution"]), policy.description["stage"]
+        if stage > len(config.ends()):
+            raise CheckpointError(f"{path}: got a policy of stage {stage}, allowed 1 to {len(config.ends())}")
+        wanted = config.task, config.resolution(stage - 1)
         if found != wanted:
             given, allowed = (f"{task} on a grid of {grid}" for task, grid in (found, wanted))
             raise CheckpointError(f"{path}: got a policy for {given}, allowed in {name} of this run is {allowed}")
@@ -114,9 +116,9 @@ def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> 
     keep_memory()
     try:
         print(run(program, tyro.cli(Command, prog=f"python -m {program.package}.evaluate", args=arguments)))
-    except CFPError as error:
+    except (CFPError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return 2
+        return 2 if isinstance(error, CFPError) else 1
     return 0
 
 

@@ -150,8 +150,9 @@ def evaluate(
 ) -> Result:
     """Run episodes without learning.
 
-    Neither the environments of a training run nor torch's generator are touched, and the same seed gives the same
-    episodes: element i of the batch starts from layout ``seed + i``.
+    Neither the environments of a training run nor torch's generator are touched. The same seed gives the same episodes,
+    element i of the batch starts from layout ``seed + i``; with reference parity, whose resets show what was before,
+    only in environments that have just been made.
 
     Args:
         name: Of the policy, for the result.
@@ -200,20 +201,19 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, no
     """
     coarsest = config.resolution(0)
     seed = judging_seed(config)
-    env = make_env(config, coarsest, episodes)
     untrained = {"zero action": ZeroPolicy(coarsest), "random action": RandomPolicy(coarsest, config.seed)}
-    results = [
-        evaluate(name, policy, env, episodes, deterministic=True, seed=seed) for name, policy in untrained.items()
-    ]
+
+    def judged(name: str, policy: Policy | ZeroPolicy | RandomPolicy, deterministic: bool) -> Result:
+        env = make_env(config, policy.resolution, episodes)
+        return evaluate(name, policy, env, episodes, deterministic=deterministic, seed=seed)
+
+    results = [judged(name, policy, True) for name, policy in untrained.items()]
     for name, trained in policies.items():
-        if env.action_space.shape != (2, trained.resolution, trained.resolution):
-            env = make_env(config, trained.resolution, episodes)
         deterministic = trained.deterministic_by_default if noise == "default" else noise == "without"
         grid = trained.description.get("resolution", trained.resolution)
         for quiet in (False, True) if noise == "both" else (deterministic,):
             label = f"{name}, {'mean' if quiet else 'noisy'}" if noise == "both" else name
-            result = evaluate(label, trained, env, episodes, deterministic=quiet, seed=seed)
-            results.append(replace(result, resolution=grid))
+            results.append(replace(judged(label, trained, quiet), resolution=grid))
         if "layout" in trained.description:
             alone, own = make_env(config, trained.resolution, 1), trained.description["layout"]
             results.append(evaluate("  own layout", trained, alone, 1, deterministic=deterministic, seed=own))

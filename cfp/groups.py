@@ -137,8 +137,9 @@ class LearningConfig:
         Raises:
             ConfigError: Naming the option, what was given and what is allowed.
         """
+        if self.batch_size < 2:  # rewards are divided by their deviation in the batch
+            raise ConfigError(f"batch_size: got {self.batch_size}, allowed 2 or more")
         at_least_one(
-            batch_size=self.batch_size,
             buffer_size=self.buffer_size,
             gradient_steps=self.gradient_steps,
             update_start=self.update_start,

@@ -136,9 +136,12 @@ class Losses:
         self.actor_loss = prepare(self._in_precision(actor_loss))
 
     def prepare(self, observation: Tensor) -> Tensor:
-        """Normalise uint8 observations (B, 3, 64, 64) once for all networks of an update, in their precision."""
+        """Normalise uint8 observations (B, 3, 64, 64) once for all networks of an update, in their precision.
+
+        Numbers of other kinds keep theirs: some are codes, in which every bit counts.
+        """
         image = normalise_image(observation)
-        return image.bfloat16() if self.bfloat16 else image
+        return image.bfloat16() if self.bfloat16 and observation.dtype == torch.uint8 else image
 
     def _in_precision(self, function: Function) -> Function:
         @functools.wraps(function)

@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from cfp.books import Books
 from cfp.config import RunConfig, to_json
 from cfp.environments import choose_device, make_env
-from cfp.errors import CheckpointError, ConfigError
+from cfp.errors import CFPError, CheckpointError, ConfigError
 from cfp.estimate import Cost
 from cfp.evaluation import Policy, Result, compare, evaluate, format_table, to_rows
 from cfp.files import ProgressTable, Table, copy_atomically, read_json, read_table, write_json
@@ -205,13 +205,15 @@ class Run(ABC):
     def _train(self) -> None:
         ends, previous = self.config.ends(), None
         for level in range(self.position.level, len(ends)):
-            model = self.make_model(level)
+            model = self._first_model(level) if previous is None else self.make_model(level)
             if previous is not None:
                 self.inherit(model, previous)
             if self.state is not None:
                 self.restore(model, self.state)
                 self.state = None
             left = ends[level] - self.position.offset - model.num_timesteps
+            if left > 0:  # what was written at an earlier end is not true any more
+                (self.folder / "results.json").unlink(missing_ok=True)
             if left > 0 and not self._plateau(level):
                 books, early = self._books(level, model), False
                 try:
@@ -230,6 +232,15 @@ class Run(ABC):
                     copy_policy(newest, self.folder / f"stage{level + 1}.safetensors")
                 self.position = Position(level + 1, self.position.offset + model.num_timesteps)
 
+    def _first_model(self, level: int) -> Any:
+        """The model that this session begins with; options that it refuses leave no run behind."""
+        try:
+            return self.make_model(level)
+        except CFPError:
+            if self.state is None:
+                (self.folder / "config.json").unlink()
+            raise
+
     def _plateau(self, level: int) -> bool:
         """Whether the best evaluation of a stage is as many evaluations ago as the run is patient."""
         means = [float(row["mean"]) for row in self.evaluations.rows if int(row["stage"]) == level + 1]
@@ -239,7 +250,6 @@ class Run(ABC):
     def _books(self, level: int, model: PolicyPredictor) -> Books:
         config = self.config
         seed, episodes = config.evaluation(level)
-        env = make_env(config, config.action_size(level), episodes)
         rows = read_table(self.folder / "evaluations.csv")
         best = max((float(row["mean"]) for row in rows if int(row["stage"]) == level + 1), default=-math.inf)
 
@@ -247,6 +257,7 @@ class Run(ABC):
             nonlocal best
             begun = time.perf_counter()
             deterministic = config.report.eval_deterministic
+            env = make_env(config, config.action_size(level), episodes)
             result = evaluate("", model, env, episodes, deterministic=deterministic, seed=seed)
             row: dict[str, Any] = {"step": step, "stage": level + 1, "episodes": episodes}
             row |= {"mean": result.mean, "std": result.std}

@@ -57,6 +57,7 @@ def bicubic(image: Tensor, size: int, align_corners: bool = False) -> Tensor:
 
 
 @functools.lru_cache(maxsize=64)
+@torch.inference_mode(False)  # what is kept must serve gradients later
 def bicubic_matrix(before: int, after: int, align_corners: bool, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Matrix (after, before) of one-dimensional interpolation, read off PyTorch's own on unit vectors."""
     basis = torch.eye(before, dtype=torch.float64)[:, None, :, None].expand(-1, -1, -1, before)
@@ -95,6 +96,7 @@ def place(field: Tensor, centre: Tensor, nodes: int) -> Tensor:
 
 
 @functools.lru_cache(maxsize=16)
+@torch.inference_mode(False)
 def _patch_ids(patch: int, nodes: int, device: torch.device) -> Tensor:
     """Where a patch in the corner of the window has its nodes among all of them, (P P)."""
     along = torch.arange(patch, device=device)

@@ -22,6 +22,8 @@ from torchmpm.state import choose
 
 #: Terms that the engine adds to those of a task.
 RESERVED = {"split", "action", "alive", "failure"}
+#: What it puts into ``info`` itself.
+RESERVED_INFO = {"com", "split", "finite", "object_com", "reward_terms", "is_success", "true_reward"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +121,7 @@ class Model:
 
 
 @functools.lru_cache(maxsize=64)
+@torch.inference_mode(False)  # what is kept must serve gradients later
 def _per_particle(
     counts: tuple[int, ...], values: tuple[float, ...] | tuple[bool, ...], device: torch.device
 ) -> Tensor:
@@ -286,7 +289,8 @@ def judge(
         soft: Smooth terms, from the soft observation; then only the terms of the outcome mean anything.
 
     Raises:
-        ValueError: The task returns a term under a name of :data:`RESERVED`, or one that is not of shape (B,).
+        ValueError: The task returns a term under a name of :data:`RESERVED`, info under one of :data:`RESERVED_INFO`,
+            something that is not of shape (B,), or another memory than it remembers.
         TypeError: The task returns something else.
 
     Returns:
@@ -297,16 +301,8 @@ def judge(
     weights = spec.weights
     now = measure(state.particles, model.robot)
     own = spec.judge(_moment(model, state, now, observation, soft), weights)
-    if not isinstance(own, Outcome):
-        raise TypeError(f"judge of task {spec.name!r} must return an Outcome, got {type(own).__name__}")
-    for name, term in own.terms.items():
-        if not isinstance(term, Tensor) or term.shape != now.split.shape:
-            found = f"a tensor of shape {tuple(term.shape)}" if isinstance(term, Tensor) else type(term).__name__
-            raise ValueError(f"judge of task {spec.name!r} must return terms of shape (B,), got {found} for {name!r}")
-    finite = intact(model, state)
-    terms = dict(own.terms)
-    if taken := RESERVED & terms.keys():
-        raise ValueError(f"judge of task {spec.name!r} must not return the engine's own terms, got {sorted(taken)}")
+    _check_outcome(spec, own, state)
+    finite, terms = intact(model, state), dict(own.terms)
     terminated = torch.zeros_like(finite) if own.terminated is None else own.terminated
     if spec.split_limit is not None:
         penalty, torn = split_penalty(now.split, spec.split_limit, soft=soft)
@@ -317,12 +313,40 @@ def judge(
     terms["alive"] = torch.full_like(now.split, weights.alive)
     terms = dict(zip(terms, torch.where(finite, torch.stack(tuple(terms.values())), 0.0).unbind(), strict=True))
     terms["failure"] = torch.where(finite, 0.0, FAILURE_REWARD).to(now.split)
-    info = {"com": now.com, "split": now.split, "finite": finite, **own.info}
-    if now.object_com is not None:
-        info["object_com"] = now.object_com
+    info = {**averages(model, state, now), **own.info}
     success = own.success & finite if own.success is not None else None
     state = state if own.memory is None else replace(state, memory=own.memory)
     return state, Outcome(terms, terminated | ~finite, success, info)
+
+
+def _check_outcome(spec: TaskSpec, own: Outcome, state: EnvState) -> None:
+    """Refuse what a task must not return, see :func:`judge`."""
+    if not isinstance(own, Outcome):
+        raise TypeError(f"judge of task {spec.name!r} must return an Outcome, got {type(own).__name__}")
+    if taken := RESERVED & own.terms.keys():
+        raise ValueError(f"judge of task {spec.name!r} must not return the engine's own terms, got {sorted(taken)}")
+    if taken := RESERVED_INFO & own.info.keys():
+        raise ValueError(f"judge of task {spec.name!r} must not return the engine's own info, got {sorted(taken)}")
+    answers = {name: value for name in ("terminated", "success") if (value := getattr(own, name)) is not None}
+    for name, value in {**own.terms, **answers}.items():
+        wanted = f"{name} as bool" if name in answers else "terms"
+        found = f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+        fits = isinstance(value, Tensor) and value.shape == state.steps.shape
+        if not fits or (name in answers and value.dtype != torch.bool):
+            raise ValueError(
+                f"judge of task {spec.name!r} must return {wanted} of shape (B,), got {found} for {name!r}"
+            )
+    if own.memory is not None and own.memory.keys() != state.memory.keys():
+        raise ValueError(
+            f"judge of task {spec.name!r} must return the memory that remember gives, {sorted(state.memory)}, got "
+            f"{sorted(own.memory)}"
+        )
+
+
+def averages(model: Model, state: EnvState, now: Measurement) -> dict[str, Tensor]:
+    """What ``info`` holds in every task, of a moment and its :func:`dittogym.reward.measure`, by name."""
+    info = {"com": now.com, "split": now.split, "finite": intact(model, state)}
+    return info if now.object_com is None else {**info, "object_com": now.object_com}
 
 
 def intact(model: Model, state: EnvState) -> Tensor:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from dittogym.spec import TaskSpec
+from dittogym.tasks import make_spec
 from dittogym.torch_env import Snapshot, TorchEnv
 from torchmpm import ParticleState
 
@@ -48,8 +49,8 @@ def as_image(observation: torch.Tensor) -> np.ndarray:
 
 
 def as_numpy(info: dict[str, Any]) -> dict[str, Any]:
-    """Tensors of an ``info`` as arrays with a leading B, nested dictionaries included."""
-    return {k: as_numpy(v) if isinstance(v, dict) else v.detach().cpu().numpy() for k, v in info.items()}
+    """Tensors of an ``info`` as arrays of their own with a leading B, nested dictionaries included."""
+    return {k: as_numpy(v) if isinstance(v, dict) else v.detach().cpu().numpy().copy() for k, v in info.items()}
 
 
 def element(info: dict[str, Any], index: int) -> dict[str, Any]:
@@ -61,6 +62,11 @@ def element(info: dict[str, Any], index: int) -> dict[str, Any]:
         else:
             picked[key] = value[index].item() if value[index].ndim == 0 else value[index]
     return picked
+
+
+def registered_horizon(task: str | TaskSpec) -> int:
+    """Steps after which an episode of a task ends without options, which is the time limit of its ids."""
+    return make_spec(task).horizon
 
 
 class Env(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -94,6 +100,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
                 "gymnasium.make_vec(..., vectorization_mode='vector_entry_point') or dittogym.TorchEnv"
             )
         self.torch_env = TorchEnv(task, 1, **options)
+        self._own_limit = self.torch_env.spec.horizon != registered_horizon(task)
         self.observation_space, self.action_space = spaces(self.torch_env)
         self.render_mode, self.render_muscles = render_mode, render_muscles
         self._screen = None
@@ -137,7 +144,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         with torch.no_grad():
             batch = as_tensor(action, self.torch_env, single=True)
             observation, reward, terminated, truncated, info = self.torch_env.step(batch)
-            if self.spec is not None:
+            if self.spec is not None and not self._own_limit:
                 truncated = torch.zeros_like(truncated)  # made by Gymnasium, whose TimeLimit wrapper does it
         self._show()
         picked = element(as_numpy(info), 0)

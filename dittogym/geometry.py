@@ -94,9 +94,9 @@ def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True) -> O
     Raises:
         ValueError: A range is none, or the box is narrower than four nodes, so that its faces would overlap.
     """
-    for name, given in (("i", i), ("j", j)):
+    for axis, given in (("i", i), ("j", j)):
         if not isinstance(given, tuple) or len(given) != 2 or not {type(end) for end in given} <= {int, type(None)}:
-            raise ValueError(f"{name} must be a range (low, high) of node indices, got {given!r}")
+            raise ValueError(f"{axis} must be a range (low, high) of node indices, got {given!r}")
     if None in i:
         raise ValueError(f"i must have both ends, got {i!r}")
     (left, right), (low, high) = i, j

@@ -163,11 +163,11 @@ class Layouts:
                 stacked[i] = samplers[i].draw()
             positions = torch.as_tensor(stacked).to(like)
         else:
-            return self._positions
+            return self._positions.clone()
         if self._positions is not None:
             positions = choose(torch.as_tensor(mask, device=like.device), positions, self._positions)
         # Gradients in given positions reach back to this reset only, not to the one that uses them next.
-        self._samplers, self._positions = samplers, positions.detach()
+        self._samplers, self._positions = samplers, positions.detach().clone()
         return positions
 
     def _given(self, given: Any, like: Tensor) -> Tensor:
@@ -177,13 +177,13 @@ class Layouts:
             raise ValueError(f"positions must be numbers, got {given!r}") from error
         if positions.is_complex():
             raise ValueError(f"positions must be real, got {positions.dtype}")
-        positions = positions.to(like)
+        positions = positions.to(like, copy=True)
         shape = (sum(self._counts), 2)
         if tuple(positions.shape) not in (shape, (self._num_envs, *shape)):
             raise ValueError(
                 f"positions must have shape {shape} or {(self._num_envs, *shape)}, got {tuple(positions.shape)}"
             )
-        positions = positions.expand(self._num_envs, *shape)
+        positions = positions.expand(self._num_envs, *shape).contiguous()
         origin = window_origin(self._spec, positions[:, : self._counts[0]].mean(1))
         height = positions[..., 1] - origin[:, 1:2]
         inside = Grid().contains(positions[..., 0], origin[:, 0:1]) & (height > 0) & (height < 1)

@@ -88,6 +88,7 @@ def draw_boxes(boxes: Sequence[Box], origin: Tensor, row: Tensor, column: Tensor
 
 
 @functools.lru_cache(maxsize=64)
+@torch.inference_mode(False)  # what is kept must serve gradients later
 def draw_boxes_once(
     boxes: tuple[Box, ...], origin: tuple[float, float], row: int, column: int, dtype: torch.dtype, device: torch.device
 ) -> Background | None:

@@ -54,7 +54,7 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
             raise ValueError(f"physics[{name!r}] must be numbers, got {value!r}") from error
         if tensor.is_complex():
             raise ValueError(f"physics[{name!r}] must be real, got {tensor.dtype}")
-        tensor = tensor.to(like)
+        tensor = tensor.to(like, copy=True)
         own = (2,) if name == "gravity" else ()
         allowed_shapes = [own, (batch, *own), *([(batch, particles)] if name in PER_PARTICLE else [])]
         if tuple(tensor.shape) not in allowed_shapes:

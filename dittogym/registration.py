@@ -18,11 +18,12 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
     Args:
         task: Its name; the ids are ``{namespace}/{task}-coarse-v{version}`` and ``{namespace}/{task}-fine-v{version}``.
         make: Returns the specification; its keyword arguments, which need defaults, become options of the environment.
+            Where one of them lengthens the horizon, ``gymnasium.make`` needs ``max_episode_steps`` beside it.
         namespace: Of the ids.
         version: To be raised with every change of behaviour.
 
     Raises:
-        ValueError: Another task has this name, a name is not one word, or the version is negative.
+        ValueError: Another function's task has this name, a name is not one word, or the version is negative.
         TypeError: ``make`` is no function, or does not return a :class:`dittogym.TaskSpec`.
     """
     if not isinstance(task, str) or re.fullmatch(r"\w+", task) is None:
@@ -35,17 +36,25 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
     spec = make()
     if not isinstance(spec, TaskSpec):
         raise TypeError(f"make must return a TaskSpec, got {type(spec).__name__}")
-    if TASKS.get(task, make) is not make:
+    if _source(TASKS.get(task, make)) != _source(make):  # of local functions many have the same name
         raise ValueError(f"task must be a new name, got {task!r}, which is taken")
     for resolution in ("coarse", "fine"):
+        name = f"{namespace}/{task}-{resolution}-v{version}"
+        gymnasium.registry.pop(name, None)  # Gymnasium warns of ids that are replaced
         gymnasium.register(
-            id=f"{namespace}/{task}-{resolution}-v{version}",
+            id=name,
             entry_point="dittogym.env:Env",
             vector_entry_point="dittogym.vector:BatchEnv",
             max_episode_steps=spec.horizon,
             kwargs={"task": task, "resolution": resolution},
         )
     TASKS[task] = make
+
+
+def _source(make: Callable[..., TaskSpec]) -> object:
+    """Where a function was written: one that a notebook's cell defines anew is the same."""
+    name = getattr(make, "__qualname__", "<")
+    return make if "<" in name else (make.__module__, name)
 
 
 def register_all() -> None:

@@ -47,7 +47,6 @@ def frame(model: Model, state: EnvState, index: int, field: Tensor | None, size:
 
     Raises:
         IndexError: ``index`` is not in the batch.
-        IndexError: There is no such element.
         ValueError: ``size`` is below 16 or above 8192.
     """
     if not isinstance(index, int) or not 0 <= index < len(state.steps):

@@ -222,6 +222,9 @@ class TaskSpec:
         for name in ("coarse", "fine"):
             checks.whole(name, getattr(self, name), 1, self.patch)
         checks.instance("robot", self.robot, Body)
+        for name in ("material", "lite"):
+            if (given := getattr(self.robot, name)) is not None:
+                raise ValueError(f"robot.{name} must be None, it follows from the task, got {given!r}")
         checks.instances("objects", self.objects, Body)
         if len(self.objects) > 1:
             raise ValueError(f"objects must be at most one body, got {len(self.objects)}")

@@ -174,11 +174,14 @@ class TorchEnv:
     @property
     def env_state(self) -> EnvState:
         """Everything that moves, for :mod:`dittogym.dynamics`; see also :meth:`save`."""
-        return self._moment()[0]
+        if self._env_state is None:
+            raise RuntimeError("call reset() first: the environment has no state yet")
+        return self._env_state
 
     @env_state.setter
     def env_state(self, value: EnvState) -> None:
-        self._env_state = value
+        checks.instance("env_state", value, EnvState)
+        self._env_state, self._observation, self._field = value, None, None
 
     @property
     def generators(self) -> dict[int, dict[str, Tensor]]:
@@ -198,9 +201,10 @@ class TorchEnv:
         return self.env_state.particles
 
     def _moment(self) -> tuple[EnvState, Tensor]:
-        if self._env_state is None or self._observation is None:
-            raise RuntimeError("call reset() first: the environment has no state yet")
-        return self._env_state, self._observation
+        state = self.env_state
+        if self._observation is None:  # the state was assigned
+            self._observation = dynamics.observe(self.model, state)
+        return state, self._observation
 
     def detach(self) -> None:
         """Cut the autograd graph: gradients do not reach back beyond this moment."""
@@ -291,12 +295,12 @@ class TorchEnv:
             kept = merged(self.spec, physics, old.physics, ~mask, self._like)
             fresh = replace(fresh, physics=kept).where(mask, replace(old, physics=kept))
         # Gradients in these constants reach back to this reset only, not to those before it.
-        self._physics = {name: value.detach() for name, value in physics.items()}
+        self._physics = {name: value.detach().clone() for name, value in physics.items()}
         self._env_state, self._field = fresh, None
         if self._observation is None or not self._stale:
             self._observation = dynamics.observe(self.model, fresh)
         now = measure(self.state, self.model.robot)
-        info = {"com": now.com, "split": now.split, "finite": dynamics.intact(self.model, fresh)}
+        info = dynamics.averages(self.model, fresh, now)
         return self._observation, {name: value.detach() for name, value in info.items()}
 
     def step(self, action: Tensor, *, soft: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:

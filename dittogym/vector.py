@@ -9,7 +9,7 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from dittogym.env import RENDER_FPS, RENDER_MODES, as_image, as_numpy, as_tensor, spaces
+from dittogym.env import RENDER_FPS, RENDER_MODES, as_image, as_numpy, as_tensor, registered_horizon, spaces
 from dittogym.spec import TaskSpec
 from dittogym.torch_env import Snapshot, TorchEnv
 from torchmpm import ParticleState, checks
@@ -58,7 +58,9 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.torch_env = TorchEnv(task, num_envs, **options)
         self.num_envs, self.render_mode, self.render_muscles = num_envs, render_mode, render_muscles
-        self._horizon = max_episode_steps or self.torch_env.spec.horizon
+        own, usual = self.torch_env.spec.horizon, registered_horizon(task)
+        # Gymnasium hands on the limit of the id, whatever the options say.
+        self._horizon = own if max_episode_steps in (None, usual) else max_episode_steps
         self.single_observation_space, self.single_action_space = spaces(self.torch_env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -86,7 +88,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         observation, info = self.torch_env.reset(seed=seed, options=options)
         mask = (options or {}).get("reset_mask")
         self._ended = np.zeros(self.num_envs, dtype=bool) if mask is None else self._ended & ~np.asarray(mask)
-        return observation.cpu().numpy(), _with_masks(as_numpy(info), np.ones(self.num_envs, dtype=bool))
+        return as_image(observation), _with_masks(as_numpy(info), np.ones(self.num_envs, dtype=bool))
 
     @torch.no_grad()
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -99,19 +101,22 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             Observations (B, 3, 64, 64) uint8, rewards (B,) float64, terminated and truncated (B,) bool, ``info``.
         """
         fresh = self._ended.copy()
-        observation, reward, terminated, _, raw = self.torch_env.step(as_tensor(actions, self.torch_env))
+        action = as_tensor(actions, self.torch_env)
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:  # whatever they hold
+            action = action.masked_fill(torch.as_tensor(fresh, device=action.device)[:, None, None, None], 0.0)
+        observation, reward, terminated, _, raw = self.torch_env.step(action)
         info = as_numpy(raw)
         rewards, ends = reward.double().cpu().numpy(), terminated.cpu().numpy()
         limits = (self.torch_env.env_state.steps >= self._horizon).cpu().numpy()
         observations = as_image(observation)
         if self.autoreset_mode is AutoresetMode.DISABLED:
-            self._ended = fresh | ends | limits
             return observations, rewards, ends, limits, _with_masks(info, np.ones(self.num_envs, dtype=bool))
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             self._ended = (ends | limits) & ~fresh
             if fresh.any():
-                observations, _ = self._restart(fresh)
+                observations, start = self._restart(fresh)
                 rewards, ends, limits = rewards * ~fresh, ends & ~fresh, limits & ~fresh
+                return observations, rewards, ends, limits, _restarted(info, start, fresh)
             return observations, rewards, ends, limits, _with_masks(info, ~fresh)
         done = ends | limits
         result = _with_masks(info, np.ones(self.num_envs, dtype=bool))
@@ -121,10 +126,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 final[i] = observations[i]
             last = {"final_obs": final, "_final_obs": done, "final_info": _with_masks(info, done), "_final_info": done}
             observations, start = self._restart(done)
-            result = {**result, **last}
-            for name, value in start.items():
-                shape = (-1, *[1] * (value.ndim - 1))
-                result[name] = np.where(done.reshape(shape), value, result[name])
+            result = _restarted(info, start, done) | last
         return observations, rewards, ends, limits, result
 
     def _restart(self, mask: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
@@ -156,6 +158,15 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if self.render_mode is None:
             return None
         return tuple(self.torch_env.render(i, muscles=self.render_muscles) for i in range(self.num_envs))
+
+
+def _restarted(info: dict[str, Any], start: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
+    """Info of a step in which some elements (B,) began anew: theirs is that of the reset, without what a step adds."""
+    result = _with_masks(info, ~mask)
+    for name, value in start.items():
+        result[name] = np.where(mask.reshape(-1, *[1] * (value.ndim - 1)), value, info[name])
+        result["_" + name] = np.ones_like(mask)
+    return result
 
 
 def _with_masks(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:

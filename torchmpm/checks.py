@@ -43,7 +43,7 @@ def number(name: str, value: Any, *, least: float | None = None, above: float | 
 
 
 def value(name: str, given: Any, *, least: float | None = None, above: float | None = None) -> None:
-    """Check what may be a number or a tensor; what a tensor holds is not looked at, which would stall a GPU.
+    """Check what may be a number or a tensor; what a tensor holds is left to :meth:`torchmpm.Solver.stable_dt`.
 
     Raises:
         ValueError: See `number`.

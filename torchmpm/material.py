@@ -225,17 +225,20 @@ class Elastic:
 
     Attributes:
         mu: Second Lame parameter (shear modulus), Pa.
-        lam: First Lame parameter, Pa.
+        lam: First Lame parameter, Pa; negative for a negative Poisson's ratio, but not below -mu.
 
     Raises:
-        ValueError: A value is negative.
+        ValueError: ``mu`` is negative, or ``lam`` below -mu.
     """
 
     mu: Value
     lam: Value
 
     def __post_init__(self) -> None:
-        _check_not_negative(self, "mu", "lam")
+        _check_not_negative(self, "mu")
+        checks.value("lam", self.lam)
+        if not isinstance(self.mu, Tensor) and not isinstance(self.lam, Tensor) and self.lam < -self.mu:
+            raise ValueError(f"lam must be at least -mu, {-self.mu}, got {self.lam}")
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
         """Nothing flows: the planes (B, N) of the trial ``F``, and ``Jp`` (B, N), are kept."""
@@ -252,9 +255,14 @@ class Elastic:
     def stiffness(self) -> Value:
         """Largest stress per strain in undeformed matter, Pa: 2 (mu + lam), that of a change of volume.
 
-        A number, or where the constants are tensors one of shape (), (B, 1) or (B, N).
+        Of shear, 2 mu, where lam is negative. A number, or where the constants are tensors one of shape (), (B, 1) or
+        (B, N).
         """
-        return 2.0 * (spread(self.mu) + spread(self.lam))
+        mu, lam = spread(self.mu), spread(self.lam)
+        if isinstance(mu, Tensor) or isinstance(lam, Tensor):
+            mu, lam = (torch.as_tensor(value, dtype=torch.float64) for value in (mu, lam))
+            return 2.0 * torch.where(lam < -mu, -torch.inf, mu + lam.clamp_min(0.0))
+        return 2.0 * (mu + max(lam, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,12 +276,16 @@ class VonMises(Elastic):
         mu: Second Lame parameter, Pa.
         lam: First Lame parameter, Pa.
         yield_stress: von Mises yield stress, Pa; the deviatoric strain at yield is ``yield_stress / (2 mu)``.
+
+    Raises:
+        ValueError: ``mu`` is not positive, ``lam`` below -mu, or the yield stress negative.
     """
 
     yield_stress: Value
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        checks.value("mu", self.mu, above=0.0)  # strains at yield are counted in it
         _check_not_negative(self, "yield_stress")
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:

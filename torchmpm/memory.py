@@ -87,7 +87,8 @@ def estimate_memory(
         backward: With a gradient; else only what one step needs without.
 
     Raises:
-        ValueError: A number is below 1, or the solver cannot run such a state.
+        ValueError: A number is below 1, the solver cannot run such a state, or it would run it natively on CUDA, whose
+            memory is not known beforehand.
     """
     batch = state.batch_size if isinstance(state, ParticleState) else state[0]
     for name, number in (("substeps", substeps), ("env_steps", env_steps), ("the state's batch size", batch)):
@@ -95,6 +96,8 @@ def estimate_memory(
     share = _occupied(solver, state)
     state = _empty(solver, state)
     if runs_native(solver, state):
+        if state.device.type != "cpu":
+            raise ValueError(f"state must be on the CPU for the memory of backend 'native', got {state.device}")
         return _native(solver, state, substeps, segment, env_steps, backward, share)
     if not backward:
         return _rehearsed(solver, state, 2, False)

@@ -173,7 +173,7 @@ class Solver:
             actuation: Of the muscles, Pa; a number or a tensor of shape (), (B,) or (B, count).
 
         Raises:
-            ValueError: Shapes of a body's values do not go together.
+            ValueError: Shapes of a body's values do not go together, or they are not finite or have a wrong sign.
         """
         rates = [0.0]
         for k, body in enumerate(self.bodies):
@@ -182,7 +182,13 @@ class Solver:
                 rate = (body.material.stiffness() + 2.0 * pull) * spread(body.volume) / spread(body.mass)
             except RuntimeError as error:
                 raise ValueError(f"values of bodies[{k}] must have shapes that go together: {error}") from error
-            rates.append(float(rate.max()) if isinstance(rate, Tensor) else rate)
+            rate = torch.as_tensor(rate, dtype=torch.float64)
+            if not bool(((rate >= 0) & torch.isfinite(rate)).all()):
+                raise ValueError(
+                    f"values of bodies[{k}] must be finite, its mass and volume positive and its stiffness not "
+                    f"negative, got stiffness x volume / mass from {rate.min().item():g} to {rate.max().item():g}"
+                )
+            rates.append(float(rate.max()))
         fastest = math.sqrt(max(rates))
         return self.grid.h / fastest if fastest > 0 else math.inf
 
@@ -213,13 +219,15 @@ class Solver:
             The new state, differentiable in state, actuation, origin, material values, masses, volumes and gravity.
 
         Raises:
-            ValueError: Shapes, dtypes or devices do not fit together, or the native backend was chosen and cannot run
-                this.
+            ValueError: Shapes, dtypes or devices do not fit together, there is an actuation and no muscle, or the
+                native backend was chosen and cannot run this.
             TypeError: The state, the actuation or the origin is something else.
         """
         checks.instance("state", state, ParticleState)
         check_repetition(substeps, segment, "substeps")
         origin = self.check(state, actuation, origin)
+        if actuation is not None and not any(body.muscle for body in self.bodies):
+            raise ValueError("actuation must be None where no body has muscle=True, got a field that nothing feels")
         if substeps == 0 or state.batch_size == 0:
             return state
         if runs_native(self, state):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -129,7 +130,8 @@ class ParticleState:
         Raises:
             IndexError: There is no such batch element.
         """
-        if isinstance(index, int):
+        if isinstance(index, Integral):
+            index = int(index)
             if not -self.batch_size <= index < self.batch_size:
                 raise IndexError(f"index {index} is out of range for a batch of {self.batch_size}")
             index = slice(index, index + 1 or None)

@@ -23,7 +23,7 @@ from cfp.config import Preset, Tier
 from cfp.errors import CFPError, ConfigError
 from cfp.process import StopSignals, keep_memory
 
-PATIENCE = {"local": 30.0, "ray": 300.0}
+PATIENCE, CLUSTER_PATIENCE = 30.0, 300.0
 """Seconds to wait for another process that holds a run folder; file servers take a while to give up a lost machine."""
 
 
@@ -141,7 +141,8 @@ def compare(command: Command) -> int:
 def _carry_out(command: Command, jobs: Sequence[Job], signals: StopSignals) -> dict[int, str]:
     """Do all runs; returns how each ended."""
     general, slot = command.judging()
-    patience = PATIENCE[command.executor]
+    alone = command.executor == "local" and command.only is None  # else the same folder is seen by other machines
+    patience = PATIENCE if alone else CLUSTER_PATIENCE
     works = [describe(job, slot if job.config.task == "slot" else general, patience) for job in jobs]
     resources = Resources(command.cpus_per_run, command.gpus_per_run, command.retries)
     outcomes: dict[int, str] = {}

@@ -17,7 +17,9 @@ from cfp.state_file import flatten
 
 IRRELEVANT = ("device", "environment.backend", "report.video", "report.checkpoint_every", "report.log_every")
 """Options that change neither what a run learns nor which policy it keeps."""
-SAME_TASK = ("substeps", "dtype", "parity", "resample", "target")
+FOR_ALL = {"task", "seed", "preset", "device"}
+"""Options that the command line gives to all runs, or by which it tells them apart."""
+SAME_TASK = ("substeps", "dtype", "parity", "resample", "target", "variant")
 """Options of the environment in which algorithms that are compared in a task must agree."""
 
 
@@ -48,7 +50,8 @@ class Job:
     @property
     def finished(self) -> bool:
         """Whether it has been trained to its end, here or by ``python -m baselines.train``."""
-        return bool(read_sessions(self.folder)["finished"]) or (self.folder / "results.json").exists()
+        noted = read_sessions(self.folder)["finished"]
+        return noted in (True, self.config.ends()[-1]) or (self.folder / "results.json").exists()
 
     @property
     def state(self) -> str:
@@ -61,7 +64,7 @@ class Job:
 
 
 def read_sessions(folder: Path) -> dict[str, Any]:
-    """``sessions.json``: whether the run is finished, and what each session that ended in order did."""
+    """``sessions.json``: the step at which the run was finished or false, and each session that ended in order."""
     path = folder / "sessions.json"
     if not path.exists():
         return {"finished": False, "sessions": []}
@@ -100,9 +103,16 @@ class Plan:
         if not set(values) <= {"common", "tasks", "algos"}:
             raise ConfigError(f"plan: {path} holds {', '.join(values)}, allowed an object with common, tasks, algos")
         groups = values | {f"{part}.{name}": own for part in ("tasks", "algos") for name, own in _items(values, part)}
+        for name, own in _items(values, "algos"):
+            special = own.get("tasks", {}) if isinstance(own, dict) else {}
+            groups[f"algos.{name}.tasks"] = special
+            groups |= {f"algos.{name}.tasks.{task}": given for task, given in _items({"tasks": special}, "tasks")}
+        named = {"tasks", "algos", *(f"algos.{name}.tasks" for name, _ in _items(values, "algos"))}
         for name, options in groups.items():
             if not isinstance(options, dict):
                 raise ConfigError(f"plan: {name}: got {options!r}, allowed an object with named values")
+            for taken in sorted(FOR_ALL & set(options) if name not in named else ()):
+                raise ConfigError(f"plan: {name}: got {taken}, allowed are options that the command line does not give")
         return cls(**values)
 
     def options(self, label: str, task: str) -> dict[str, Any]:

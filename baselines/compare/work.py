@@ -104,7 +104,8 @@ def _train(config: RunConfig, folder: Path, signals: StopSignals, alone: bool) -
         session = {"from": begun, "to": run.step, "seconds": seconds, "judging": run.judging, "memory": None}
         session |= {"memory": peak_memory() if alone else None, "device": choose_device(config.device)}
         session |= {"host": socket.gethostname(), "process": os.getpid(), "finished": whole}
-        write_json(folder / "sessions.json", {"finished": whole, "sessions": [*there["sessions"], session]})
+        finished = config.ends()[-1] if whole else False
+        write_json(folder / "sessions.json", {"finished": finished, "sessions": [*there["sessions"], session]})
 
 
 def _stop_with_parent() -> None:

@@ -107,6 +107,26 @@ def test_same_step_autoreset() -> None:
     assert "final_obs" not in rows[4][4] and not rows[4][3].any()
 
 
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
+def test_info_of_a_new_episode_is_that_of_its_reset(mode: str) -> None:
+    vector = gymnasium.make_vec(
+        "dittogym/kick-coarse-v0",
+        num_envs=2,
+        vectorization_mode="vector_entry_point",
+        autoreset_mode=mode,
+        max_episode_steps=2,
+        **SMALL,
+    )
+    _, start = vector.reset(seed=0)
+    action = np.ones(vector.action_space.shape, np.float32)
+    info = [vector.step(action)[-1] for _ in range(3)][1 if mode == "SameStep" else 2]
+    for name in start:
+        assert np.array_equal(info[name], start[name]), name
+    assert {"com", "object_com", "finite", "split"} <= set(start)
+    assert info["_com"].all() and info["_object_com"].all()
+    assert not info["_reward_terms"].any() and not info["reward_terms"]["_alive"].any()
+
+
 def test_next_step_autoreset() -> None:
     rows = episode(make_vec(autoreset_mode=AutoresetMode.NEXT_STEP, max_episode_steps=3), 5)
     assert rows[3][3].all() and not np.array_equal(rows[3][0], rows[0][0])

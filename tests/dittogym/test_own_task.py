@@ -15,6 +15,7 @@ import dittogym
 from dittogym.geometry import ceiling, floor
 from dittogym.shapes import Disc, Rectangle
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights
+from torchmpm import Elastic
 
 
 @pytest.fixture(autouse=True)
@@ -215,3 +216,58 @@ def test_a_longer_limit_than_the_horizon() -> None:
     own = dittogym.Env("shapematch", particles=20, substeps=1)
     own.reset(seed=0)
     assert [own.step(np.zeros(own.action_space.shape, np.float32))[3] for _ in range(30)] == [False] * 29 + [True]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"terminated": torch.zeros(2, 2, dtype=torch.bool)}, r"terminated as bool of shape \(B,\), got torch.bool of"),
+        ({"success": torch.zeros(2)}, r"success as bool of shape \(B,\), got torch.float32 of shape \(2,\)"),
+        (
+            {"terms": {"high": torch.zeros(3)}},
+            r"terms of shape \(B,\), got torch.float32 of shape \(3,\) for 'high'",
+        ),
+        ({"terms": {"alive": torch.zeros(2)}}, r"must not return the engine's own terms, got \['alive'\]"),
+        ({"info": {"com": torch.zeros(2)}}, r"must not return the engine's own info, got \['com'\]"),
+        ({"memory": {"best": torch.zeros(2)}}, r"the memory that remember gives, \['first'\], got \['best'\]"),
+    ],
+)
+def test_a_judgement_that_would_do_harm_later_is_refused(changes: dict, message: str) -> None:
+    def judge(moment: Moment, weights: Weights) -> Outcome:
+        return height(moment, weights)._replace(**changes)
+
+    spec = dataclasses.replace(hop(), judge=judge, remember=lambda moment: {"first": moment.now.com})
+    env = tiny(spec, 2)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        env.step(actions(env, 1)[0])
+
+
+def test_a_horizon_among_the_options_holds_through_gymnasium() -> None:
+    dittogym.register("hop", hop)
+    single = gymnasium.make("dittogym/hop-coarse-v0", horizon=3, **SMALL)
+    batch = gymnasium.make_vec(
+        "dittogym/hop-coarse-v0", num_envs=2, vectorization_mode="vector_entry_point", horizon=3, **SMALL
+    )
+    single.reset(seed=0)
+    batch.reset(seed=0)
+    ends = [single.step(np.zeros((2, 4, 4), np.float32))[3] for _ in range(3)]
+    assert ends == [False, False, True]
+    assert [batch.step(np.zeros((2, 2, 4, 4), np.float32))[3].tolist() for _ in range(3)][2] == [True, True]
+
+
+def test_a_function_that_is_written_anew_takes_the_place_of_the_old_one() -> None:
+    cell = "def jump(): return dittogym.spec.TaskSpec(**{**vars(hop()), 'horizon': %d})"
+    for horizon in (40, 20):
+        names = {"dittogym": dittogym, "hop": hop, "__name__": "notebook"}
+        exec(cell % horizon, names)
+        dittogym.register("jump", names["jump"])
+    assert gymnasium.spec("dittogym/jump-coarse-v0").max_episode_steps == 20
+    assert tiny("jump").spec.horizon == 20
+
+
+def test_what_a_robot_cannot_have_is_refused() -> None:
+    for name, value in (("material", Elastic(1.0, 1.0)), ("lite", 100)):
+        body = dataclasses.replace(hop().robot, **{name: value})
+        with pytest.raises(ValueError, match=f"robot.{name} must be None"):
+            dataclasses.replace(hop(), robot=body)

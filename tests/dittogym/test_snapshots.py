@@ -322,3 +322,19 @@ def test_returned_pictures_are_the_users() -> None:
     first = observation.copy()
     observation[:] = 0
     assert np.array_equal(env.load(env.save()), first)
+
+
+@torch.no_grad()
+def test_a_state_that_is_assigned_brings_its_own_picture() -> None:
+    env, other = tiny("run"), tiny("run")
+    env.reset(seed=0)
+    moved = env.step(actions(env, 1)[0])[0]
+    other.env_state = env.env_state  # of an environment that was never reset
+    assert torch.equal(other.save().observation, env.save().observation) and torch.equal(
+        other.save().observation, moved
+    )
+    env.reset(seed=0)
+    env.env_state = other.env_state
+    assert torch.equal(env.save().observation, moved)
+    with pytest.raises(TypeError, match="env_state must be a EnvState, got None"):
+        env.env_state = None

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import GRID, generator, normal, positions
 
-from torchmpm import Body, Elastic, ParticleState, Soil, Solver, VonMises
+from torchmpm import Body, Elastic, ParticleState, Soil, Solver, VonMises, lame
 from torchmpm.backends import compiler_found
 from torchmpm.linalg import Mat2
 from torchmpm.muscle import muscle_stress
@@ -114,3 +114,31 @@ def test_shapes_that_do_not_go_together() -> None:
     odd = Body(5, Elastic(torch.ones(2), 1.0), mass=torch.ones(3))
     with pytest.raises(ValueError, match=r"values of bodies\[1\] must have shapes that go together"):
         Solver(GRID, (Body(5, Elastic(1.0, 1.0)), odd))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"material": Elastic(torch.tensor(math.nan), 50.0)},
+        {"material": Elastic(torch.tensor([1.0, -100.0]), 50.0)},
+        {"material": Elastic(torch.tensor(10.0), torch.tensor(-20.0))},
+        {"mass": torch.tensor(-1.0)},
+        {"mass": torch.tensor(0.0)},
+        {"volume": torch.tensor(math.inf)},
+    ],
+)
+def test_tensors_that_mean_nothing_are_refused(values: dict) -> None:
+    body = Body(**{"count": 2, "material": Elastic(MU, LAM), **values})
+    with pytest.raises(ValueError, match=r"values of bodies\[0\] must be finite, its mass and volume positive"):
+        Solver(GRID, (body,))
+
+
+def test_matter_that_widens_when_it_is_pulled() -> None:
+    mu, lam = lame(1000.0, -0.2)
+    assert lam < 0
+    material, one = Elastic(mu, lam), torch.ones(1, 1, dtype=torch.float64)
+    slope = largest_slope(lambda F: material.stress(F, one))
+    assert material.stiffness() == pytest.approx(slope, rel=1e-12)
+    assert Elastic(torch.tensor(mu), torch.tensor(lam)).stiffness().item() == pytest.approx(slope, rel=1e-6)
+    with pytest.raises(ValueError, match=r"lam must be at least -mu, -1\.0, got -1\.5"):
+        Elastic(1.0, -1.5)

@@ -106,6 +106,8 @@ def values(solver: Solver, like: Tensor) -> tuple[Tensor, list[int]]:
     widths = [table.shape[2] for table in tables]
     result = torch.cat([table.expand(-1, batch, -1) for table in tables], dim=2).contiguous(), widths
     if plain:
+        with torch.inference_mode(False):  # what is kept must serve gradients later
+            result = result[0].clone(), widths
         _numbers.setdefault(solver, {})[like.dtype, like.device] = result
     return result
 

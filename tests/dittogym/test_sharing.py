@@ -1,0 +1,90 @@
+"""What a user holds is his own: changing it changes neither the environment nor its next resets."""
+
+import numpy as np
+import pytest
+import torch
+from tiny import SMALL, tiny
+
+from dittogym.env import Env
+from dittogym.vector import BatchEnv
+
+
+def start(env) -> torch.Tensor:
+    env.reset()
+    return env.state.x.clone()
+
+
+def test_a_state_that_is_changed_in_place() -> None:
+    env = tiny("run", 2)
+    env.reset(seed=0)
+    first = start(env)
+    env.state.x.add_(0.01)
+    assert torch.equal(start(env), first)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_positions_that_are_changed_afterwards(dtype: type) -> None:
+    env = tiny("run", 2)
+    env.reset(seed=0)
+    given = env.state.x[0].numpy().astype(dtype)
+    env.reset(options={"positions": given})
+    first = env.state.x.clone()
+    given += 0.02
+    assert torch.equal(env.state.x, first) and torch.equal(start(env), first)
+
+
+def test_constants_that_are_changed_afterwards() -> None:
+    env, mu = tiny("run", 2), torch.tensor([500.0, 600.0])
+    env.reset(seed=0, options={"physics": {"mu": mu}})
+    mu *= 0.5
+    assert env.env_state.physics["mu"].tolist() == [500, 600]
+    env.reset()
+    assert env.env_state.physics["mu"].tolist() == [500, 600]
+
+
+def test_gradients_still_reach_positions_and_constants() -> None:
+    env = tiny("run", 1)
+    env.reset(seed=0)
+    x, mu = env.state.x[0].clone().requires_grad_(), torch.tensor(500.0, requires_grad=True)
+    env.reset(options={"positions": x, "physics": {"mu": mu}})
+    reward = env.step(torch.full((1, *env.action_shape), 0.5))[1]
+    for gradient in torch.autograd.grad(reward.sum(), (x, mu)):
+        assert gradient.isfinite().all() and gradient.abs().max() > 0
+
+
+def test_images_and_infos_that_are_written_to() -> None:
+    batch = BatchEnv("catch", 2, **SMALL)
+    image, _ = batch.reset(seed=0)
+    seen = image.copy()
+    image[:] = 7
+    assert np.array_equal(batch.save().observation.numpy(), seen)
+    single = Env("catch", **SMALL)
+    for env, shape in ((batch, (2, 2, 8, 8)), (single, (2, 8, 8))):
+        env.reset(seed=0)
+        info = env.step(np.zeros(shape, np.float32))[-1]
+        before = env.torch_env.env_state.memory["object_com"].clone()
+        info["object_com"][:] = 9.0
+        assert torch.equal(env.torch_env.env_state.memory["object_com"], before)
+
+
+def test_an_action_that_is_ignored_stays_as_it_was() -> None:
+    env = BatchEnv("run", 2, autoreset_mode="NextStep", max_episode_steps=1, **SMALL)
+    env.reset(seed=0)
+    action = np.full(env.action_space.shape, 0.5, np.float32)
+    env.step(action)
+    action[0] = np.nan  # of an element that begins anew
+    env.step(np.full_like(action, np.nan))
+    assert np.isnan(action[0]).all() and (action[1] == 0.5).all()
+
+
+@pytest.mark.parametrize("backend", ["eager", "native"])
+def test_an_evaluation_without_gradients_leaves_later_ones_whole(backend: str) -> None:
+    env = tiny("obstacle", 1, backend=backend, resolution=7)
+    drive = torch.full((1, *env.action_shape), 0.5)
+    with torch.inference_mode():
+        env.reset(seed=0)
+        env.step(drive)
+    env.reset(seed=0)
+    drive.requires_grad_()
+    env.step(drive)[1].sum().backward()
+    assert drive.grad.isfinite().all() and drive.grad.abs().max() > 0
