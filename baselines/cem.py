@@ -13,6 +13,7 @@ from torch import Tensor
 from baselines.mpc import MPC, PlannedConfig, planned
 from baselines.planner import PlanConfig, PlannerBase
 from baselines.rollout import Judge, judge_true
+from cfp.config import positive
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
 from dittogym.action import Layout, bicubic
@@ -41,7 +42,7 @@ class CEMPlannerConfig(PlanConfig):
     def check(self) -> None:
         """Check what the types cannot, see `PlanConfig.check`."""
         super().check()
-        self._check_positive("iterations", "deviation", "cells")
+        positive(iterations=self.iterations, deviation=self.deviation, cells=self.cells)
         if not 2 <= self.elites <= self.candidates:
             raise ConfigError(f"elites: got {self.elites}, allowed 2 to the candidates, {self.candidates}")
         for name in ("persistence", "inertia"):

@@ -22,9 +22,9 @@ from baselines.episodes import Episodes
 from baselines.planner import PlannerConfig
 from baselines.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
 from cfp.actor import build_actor
-from cfp.config import EnvironmentConfig, LadderConfig, RunConfig, Tier, at_least_one
+from cfp.config import EnvironmentConfig, LadderConfig, RunConfig, Tier, at_least_one, positive, share
 from cfp.environments import make_torch_env
-from cfp.errors import ConfigError, NonFiniteError
+from cfp.errors import NonFiniteError
 from cfp.policy import ActorPolicy
 from cfp.weights import KIND, load, save_policy
 from dittogym import make_spec
@@ -104,12 +104,8 @@ class DistillConfig(LadderConfig):
             age=self.age,
             layouts=self.layouts,
         )
-        for name in ("student_rate", "max_grad_norm"):
-            if getattr(self, name) <= 0:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed more than 0")
-        for name in ("share", "faults"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed 0 to 1")
+        positive(student_rate=self.student_rate, max_grad_norm=self.max_grad_norm)
+        share(share=self.share, faults=self.faults)
 
 
 class Distill(Algorithm):

@@ -15,7 +15,7 @@ import cfp
 from baselines.algorithm import Algorithm, Callback, Grid, GridConfig, Sees, grid_size
 from baselines.objective import make_objective
 from baselines.open_loop import OpenLoop
-from cfp.config import EnvironmentConfig, ReportConfig, RunConfig, Tier, at_least_one
+from cfp.config import EnvironmentConfig, ReportConfig, RunConfig, Tier, at_least_one, not_negative, positive
 from cfp.environments import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from dittogym import make_spec
@@ -90,12 +90,8 @@ class GradientConfig(GridConfig):
         """Check what the types cannot, see `RunConfig.check`."""
         super().check()
         at_least_one(iterations=self.iterations)
-        for name in ("window", "polish"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed 0 or more")
-        for name in ("learning_rate", "polish_rate"):
-            if getattr(self, name) <= 0:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed more than 0")
+        not_negative(window=self.window, polish=self.polish)
+        positive(learning_rate=self.learning_rate, polish_rate=self.polish_rate)
         if not self.blur or min(self.blur) < 0:
             raise ConfigError(f"blur: got {self.blur}, allowed are one or more numbers of 0 or more")
 

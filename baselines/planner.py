@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from baselines.rollout import Judge, Judgement, judge, rollout
+from cfp.config import not_negative, positive
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
 from dittogym.action import Layout
@@ -43,14 +44,7 @@ class PlanConfig:
         """
         if not 1 <= self.commit <= self.horizon:
             raise ConfigError(f"commit: got {self.commit}, allowed 1 to the horizon, {self.horizon}")
-        for name in ("noise", "forgone", "margin"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed 0 or more")
-
-    def _check_positive(self, *names: str) -> None:
-        for name in names:
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed more than 0")
+        not_negative(noise=self.noise, forgone=self.forgone, margin=self.margin)
 
 
 @dataclass(frozen=True)
@@ -67,7 +61,7 @@ class PlannerConfig(PlanConfig):
     def check(self) -> None:
         """Check what the types cannot, see `PlanConfig.check`."""
         super().check()
-        self._check_positive("iterations", "learning_rate", "clip")
+        positive(iterations=self.iterations, learning_rate=self.learning_rate, clip=self.clip)
 
 
 Config = TypeVar("Config", bound=PlanConfig)

@@ -16,7 +16,7 @@ from baselines.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.features import StateFeatures
 from baselines.shac_rollout import Rollout, Window
 from baselines.training_reward import RewardConfig
-from cfp.config import EnvironmentConfig, ReportConfig, RunConfig, Tier, at_least_one
+from cfp.config import EnvironmentConfig, ReportConfig, RunConfig, Tier, at_least_one, not_negative, positive, share
 from cfp.environments import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.evaluation import Policy
@@ -110,15 +110,9 @@ class ShacConfig(GridConfig):
         )
         if self.start_from is not None and self.sees != "image":
             raise ConfigError(f"start_from: got a policy, allowed with sees 'image', got {self.sees!r}")
-        for name in ("gamma", "td_lambda", "tau"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed 0 to 1")
-        for name in ("learning_rate", "max_grad_norm"):
-            if getattr(self, name) <= 0:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed more than 0")
-        for name, value in (("noise", self.noise), ("integrity", self.reward.integrity)):
-            if value < 0:
-                raise ConfigError(f"{name}: got {value}, allowed 0 or more")
+        share(gamma=self.gamma, td_lambda=self.td_lambda, tau=self.tau)
+        positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
+        not_negative(noise=self.noise, integrity=self.reward.integrity)
 
 
 class Shac(Algorithm):

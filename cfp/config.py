@@ -17,7 +17,8 @@ from cfp.groups import ReportConfig as ReportConfig
 from cfp.groups import Tier as Tier
 from cfp.groups import at_least_one as at_least_one
 from cfp.groups import not_negative as not_negative
-from cfp.groups import positive
+from cfp.groups import positive as positive
+from cfp.groups import share as share
 from cfp.merging import merge as merge
 from cfp.networks import RESOLUTIONS
 from dittogym import TASKS, make_spec

@@ -11,7 +11,7 @@ from pathlib import Path
 import tyro
 
 from cfp.command import Program
-from cfp.config import RunConfig, Tier
+from cfp.config import RunConfig, Tier, at_least_one
 from cfp.errors import CFPError, CheckpointError, ConfigError
 from cfp.evaluation import Noise, Policy, compare, format_table, to_rows
 from cfp.process import keep_memory
@@ -93,8 +93,7 @@ def run(program: Program, command: Command) -> str:
     Raises:
         CFPError: There is no run, it has no policy yet, or a file is damaged.
     """
-    if command.episodes < 1:
-        raise ConfigError(f"episodes: got {command.episodes}, allowed 1 or more")
+    at_least_one(episodes=command.episodes)
     if (command.folder is None) == (command.policy is None):
         raise ConfigError(f"policy: got {command.policy!r} and the folder {command.folder}, allowed is one of the two")
     if command.folder is not None:

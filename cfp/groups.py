@@ -49,6 +49,17 @@ def positive(**numbers: float) -> None:
             raise ConfigError(f"{name}: got {value}, allowed more than 0")
 
 
+def share(**numbers: float) -> None:
+    """Check shares by name.
+
+    Raises:
+        ConfigError: One is not between 0 and 1, ends included.
+    """
+    for name, value in numbers.items():
+        if not 0 <= value <= 1:
+            raise ConfigError(f"{name}: got {value}, allowed 0 to 1")
+
+
 @dataclass(frozen=True)
 class EnvironmentConfig:
     """Where the robot lives: options of `dittogym.TorchEnv`."""
@@ -144,9 +155,7 @@ class LearningConfig:
             gradient_steps=self.gradient_steps,
             update_start=self.update_start,
         )
-        for name in ("gamma", "tau", "reward_momentum"):
-            if not 0 <= (share := getattr(self, name)) <= 1:
-                raise ConfigError(f"{name}: got {share}, allowed 0 to 1")
+        share(gamma=self.gamma, tau=self.tau, reward_momentum=self.reward_momentum)
         positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
         if self.actor_rate is not None:
             positive(actor_rate=self.actor_rate)

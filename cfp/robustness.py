@@ -15,7 +15,7 @@ import tyro
 from matplotlib.figure import Figure
 
 from cfp.command import Program
-from cfp.config import RunConfig
+from cfp.config import RunConfig, at_least_one
 from cfp.disturbances import Case, applies, disturbed_env, make_cases
 from cfp.errors import CFPError, ConfigError
 from cfp.evaluate import open_run
@@ -64,9 +64,7 @@ class Command:
         Raises:
             ConfigError: Naming the option, what was given and what is allowed.
         """
-        for name in ("episodes", "latency"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed 1 or more")
+        at_least_one(episodes=self.episodes, latency=self.latency)
         for name in ("dropout", "shift"):
             if not 0 < getattr(self, name) < 1:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, allowed between 0 and 1")

@@ -106,7 +106,10 @@ def measure(particles: ParticleState, robot: int) -> Measurement:
     x, v = particles.x, particles.v
     com = x[:, :robot].mean(1)
     variance = (x[:, :robot] - com[:, None]).square().mean(1)  # several times faster than Tensor.var
-    bodies = [com, v[:, :robot].mean(1), variance.sum(-1).sqrt()]
+    spread = variance.sum(-1)
+    alone = spread == 0  # a single particle: no slope, and none is divided by
+    split = torch.where(alone, 0.0, torch.where(alone, 1.0, spread).sqrt())
+    bodies = [com, v[:, :robot].mean(1), split]
     if robot < x.shape[1]:
         bodies += [x[:, robot:].mean(1), v[:, robot:].mean(1)]
     return Measurement(*bodies)

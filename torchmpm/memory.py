@@ -22,7 +22,7 @@ from torchmpm.solver import MASS_EPSILON, Solver
 from torchmpm.state import ParticleState
 
 #: Component planes of a state.
-ROWS = 13
+PLANES = 13
 
 
 class PeakMemory(TorchDispatchMode):
@@ -156,11 +156,11 @@ def _empty(solver: Solver, state: ParticleState | tuple[int, int, torch.dtype]) 
     batch, count, dtype = state
     if count != solver.num_particles:
         raise ValueError(f"state has {count} particles, the solver's bodies {solver.num_particles}")
-    return ParticleState.from_stack(torch.empty(ROWS, batch, count, dtype=dtype))
+    return ParticleState.from_stack(torch.empty(PLANES, batch, count, dtype=dtype))
 
 
 def _state_bytes(state: ParticleState) -> int:
-    return ROWS * state.batch_size * state.num_particles * state.x.element_size()
+    return PLANES * state.batch_size * state.num_particles * state.x.element_size()
 
 
 def _field_bytes(solver: Solver, state: ParticleState) -> int:
@@ -193,7 +193,7 @@ def _rehearsed(solver: Solver, state: ParticleState, substeps: int, backward: bo
     assert scene.actuation is not None
     gc.collect()  # a collection in between would let go of memory that is counted
     with FakeTensorMode(allow_non_fake_inputs=True), torch.set_grad_enabled(backward):
-        planes = tuple(empty((batch, count), requires_grad=backward) for _ in range(ROWS))
+        planes = tuple(empty((batch, count), requires_grad=backward) for _ in range(PLANES))
         field = empty(scene.actuation.shape, requires_grad=backward)
         run = substep_function(replace(solver, backend="eager"), replace(scene, actuation=field))
         with PeakMemory() as memory:
@@ -221,7 +221,7 @@ def _native(
     backward: bool,
     share: float,
 ) -> int:
-    planes = state.x.new_empty(ROWS, state.batch_size, state.num_particles)
+    planes = state.x.new_empty(PLANES, state.batch_size, state.num_particles)
     length = min(substeps, ops.tape_limit(planes, solver.grid.width, segment)) if backward else substeps
     scratch = _scratch_bytes(solver, state, length, backward)
     if not backward:
@@ -231,7 +231,7 @@ def _native(
     scratch -= int((1.0 - share) * 3 * solver.grid.width**2 * state.x.element_size() * length * teams)
     # Alive at once in a backward pass: every call's start, one result, and derivatives in both on their way.
     calls = env_steps * -(-substeps // length)
-    values_bar = 8 * _state_bytes(state) // ROWS if _differentiates_values(solver) else 0
+    values_bar = 8 * _state_bytes(state) // PLANES if _differentiates_values(solver) else 0
     derivatives = 3 * _state_bytes(state) + values_bar
     return scratch + (calls + 1) * _state_bytes(state) + derivatives + env_steps * _field_bytes(solver, state)
 
@@ -250,7 +250,7 @@ def _scratch_bytes(solver: Solver, state: ParticleState, substeps: int, backward
         values, widths = pack.values(solver, state.Jp)
     description = pack.description(solver, widths, MASS_EPSILON)
     field, origin, shift = empty(batch, 2, nodes, nodes), empty(batch, 2), torch.empty(batch, 2, dtype=torch.int64)
-    planes = empty(ROWS, batch, count)
+    planes = empty(PLANES, batch, count)
     call = ops._call(planes, field, origin, origin, values, shift, description, substeps)
     call.result = call.result_bar = call.planes_bar = call.field_bar = planes.data_ptr()
     call.origin_bar = call.gravity_bar = origin.data_ptr()

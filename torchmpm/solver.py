@@ -148,7 +148,7 @@ class Solver:
         checks.number("dt", self.dt, above=0.0)
         if self.backend not in BACKENDS:
             raise ValueError(f"backend must be one of {BACKENDS}, got {self.backend!r}")
-        if self.backend in ("compile", "native") and not compiler_found():
+        if self.backend in ("compile", "native") and not compiler_found() and not torch.cuda.is_available():
             raise ValueError(f"backend {self.backend!r} {NO_COMPILER}")
         if not self.allow_unstable and self.dt > (limit := self.stable_dt()):
             raise ValueError(

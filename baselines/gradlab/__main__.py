@@ -18,6 +18,7 @@ from tqdm import tqdm
 from baselines.gradlab.measure import NoGradientError, Probe, Smoothing, measure
 from baselines.gradlab.report import format_table, write
 from baselines.rollout import judge
+from cfp.config import positive
 from cfp.environments import choose_device
 from cfp.errors import CFPError, ConfigError
 from dittogym import TorchEnv
@@ -76,9 +77,7 @@ class Lab:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, allowed {least} or more")
         if self.samples < 4 or self.samples % 2:
             raise ConfigError(f"samples: got {self.samples}, allowed an even number, 4 or more")
-        for name in ("sigma", "amplitude"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed more than 0")
+        positive(sigma=self.sigma, amplitude=self.amplitude)
         growing = all(early < late for early, late in pairwise((0, *self.horizons)))
         if not self.horizons or not growing:
             raise ConfigError(f"horizons: got {self.horizons}, allowed are growing numbers from 1")

@@ -49,6 +49,7 @@ TRAIN = [
     training("a seed by name", "--seed x", "Error parsing --seed: invalid literal for int()", "'x'"),
     training("seed -1", "--seed -1", "seed: got -1, allowed 0 to 2147483647"),
     training("a seed of ten digits", "--seed 9999999999", "seed: got 9999999999, allowed 0 to 2147483647"),
+    training("batches of one", "--batch-size 1", "batch_size: got 1, allowed 2 or more"),
     training("no steps", "--steps 0", "steps: got 0, allowed 1 or more"),
     training("steps and a half", "--steps 1.5", "Error parsing --steps", "'1.5'"),
     training(
@@ -161,6 +162,14 @@ OTHERS = [
     planned("of other parts", {"colour": 1}, "holds colour, allowed an object with common, tasks, algos"),
     planned("with a part of nothing", {"common": None}, "plan: common: got None, allowed an object"),
     planned("with a task of nothing", {"tasks": {"shapematch": 3}}, "plan: tasks.shapematch: got 3, allowed an object"),
+    planned("with a seed of its own", {"common": {"seed": 5}}, "plan: common: got seed, allowed are options that"),
+    planned("with another task", {"algos": {"cfp": {"task": "run"}}}, "plan: algos.cfp: got task, allowed are options"),
+    planned("with tasks of a number", {"algos": {"cfp": {"tasks": 3}}}, "plan: algos.cfp.tasks: got 3, allowed an obj"),
+    planned(
+        "with a device in a task",
+        {"algos": {"cfp": {"tasks": {"run": {"device": "cpu"}}}}},
+        "plan: algos.cfp.tasks.run: got device, allowed are options",
+    ),
     planned("with unknown options", {"common": {"colour": 1}}, "cfp on shapematch: colour: no such option"),
 ]
 

@@ -233,7 +233,7 @@ def test_loss_that_is_not_finite_ends_the_training():
 
 
 TINY = (
-    "--task shapematch --particles 100 --substeps 1 --num-envs 2 --resolutions 4 8 --eval-episodes 2 "
+    "--task shapematch --particles 100 --substeps 4 --num-envs 2 --resolutions 4 8 --eval-episodes 2 "
     "--no-video --device cpu --backend eager --checkpoint-every 20"
 ).split()
 LESSONS = "--tier 100 --steps 32 --handover 16 --round 4 --updates 2 --batch-size 4 --eval-every 0".split()
@@ -285,7 +285,7 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch):
 def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, kind, target, message):
     path = tmp_path / "policy.safetensors"
     if task:
-        config = replace(Distill.preset(task, "quick"), environment=EnvironmentConfig(1, 100, target=target))
+        config = replace(Distill.preset(task, "quick"), environment=EnvironmentConfig(1, 100, 4, target=target))
         record = {"layout": 0} if kind in ("mpc", "cem") else {}
         write_policy(path, {"actions": torch.zeros(3, 2, 8, 8)}, origin(config, kind, 0, 0) | record)
     folder = tmp_path / "run"

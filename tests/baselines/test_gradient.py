@@ -134,6 +134,19 @@ def test_iteration_that_breaks_the_robot_is_undone(monkeypatch, loss):
         algorithm.learn(30 * 20, lambda _: None)
 
 
+def test_better_losses_below_zero_are_kept(monkeypatch):
+    algorithm, losses = Gradient(make("run", substeps=1)), iter([-3.0, -3.05, -2.8, -3.1, -2.6])
+    monkeypatch.setattr(algorithm, "_episode", lambda progress: (next(losses), 0.0, torch.ones_like(algorithm.theta)))
+    failed = [algorithm._iterate()["train/failed"] for _ in range(5)]
+    assert failed == [0, 0, 0, 0, 1] and algorithm.best_loss == -3.1
+
+
+@pytest.mark.parametrize(("task", "level", "phases"), [("shapematch", 0, 4), ("shapematch", 1, 1), ("run", 0, 1)])
+def test_only_another_blur_begins_anew(task, level, phases):
+    algorithm = Gradient(make(task, polish=1, substeps=1), level)
+    assert len({algorithm.objective.phase(progress / 8) for progress in range(9)}) == phases
+
+
 def test_polish_starts_from_the_actions_of_the_first_stage():
     actions = 0.5 * torch.rand(30, 2, 4, 4, generator=torch.Generator().manual_seed(0)) - 0.25
     algorithm = Gradient(make(polish=1, polish_grid=4, particles=200), 1, OpenLoop(actions))

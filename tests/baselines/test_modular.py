@@ -14,10 +14,11 @@ from baselines.modular import ModularConfig, ModularRun, preset
 from baselines.modular_env import segmented
 from baselines.modular_networks import ModularActor, ModularCritics
 from baselines.modular_policy import SegmentPolicy
-from baselines.nodes import Nodes, pack, places
+from baselines.nodes import Nodes, pack, places, unpack
 from baselines.segments import follow
 from cfp.config import EnvironmentConfig, ReportConfig
 from cfp.errors import CheckpointError, ConfigError
+from cfp.losses import Losses
 from cfp.process import StopSignals
 from cfp.weights import origin
 from dittogym import TorchEnv
@@ -198,3 +199,10 @@ def test_matter_that_flew_off_leaves_finite_what_is_seen(graph):
     field = nodes.act(env, labels, torch.rand(1, 16, 2))
     _, _, _, _, info = env.step(field)
     assert info["finite"].all()
+
+
+def test_only_images_lose_bits_to_bfloat16():
+    losses = Losses(torch.device("cpu"), "bfloat16")
+    edges = torch.rand(2, 16, 32, generator=torch.Generator().manual_seed(0)) < 0.5
+    assert torch.equal(unpack(losses.prepare(pack(edges)), 32), edges.float())
+    assert losses.prepare(torch.zeros(1, 3, 64, 64, dtype=torch.uint8)).dtype == torch.bfloat16

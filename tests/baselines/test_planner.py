@@ -160,6 +160,13 @@ def test_clipping_limits_steps_to_medians() -> None:
     assert (clipped[:, 1] == 0).all()
 
 
+@pytest.mark.parametrize("ends", [1, 2, 3, 8])
+def test_clipping_does_not_count_steps_after_the_end(ends: int) -> None:
+    gradient = torch.zeros(8, 1, 2, 1, 1)
+    gradient[:ends, 0, 0] = 1.0
+    assert torch.equal(_clipped(gradient, 3.0), gradient)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -3,6 +3,7 @@
 import html
 import json
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,12 @@ import pytest
 import cfp
 import dittogym
 from cfp import evaluate, train
+from cfp.actor import ActorSpec
 from cfp.callbacks import StageCallback
+from cfp.evaluation import compare
 from cfp.files import read_table
+from cfp.policy import ActorPolicy
+from cfp.presets import preset
 from cfp.weights import policy_file, shipped
 
 TINY = (
@@ -132,12 +137,15 @@ def test_folder_with_a_run_is_left_alone(finished, capsys):
     assert contents(finished) == before
 
 
-def test_other_options_than_the_checkpoint_s_are_refused(finished, capsys):
+def test_other_options_than_the_checkpoint_s_are_refused(finished, tmp_path, capsys):
     before = contents(finished)
     assert run(finished, "--resume", "--gamma", "0.5") == 2
     assert "gamma: the run was started with" in capsys.readouterr().err
     assert run(finished, "--resume", "--task", "run") == 2
     assert "task: the run was started with 'shapematch', got 'run'" in capsys.readouterr().err
+    (tmp_path / "new.json").write_text('{"learning": {"gamma": 0.5}}')
+    assert train.main(["--out", str(finished), "--resume", "--config", str(tmp_path / "new.json")]) == 2
+    assert "gamma: the run was started with 0.9, got 0.5" in capsys.readouterr().err
     assert contents(finished) == before
 
 
@@ -151,6 +159,27 @@ def test_finished_run_can_be_prolonged(tmp_path):
     assert run(tmp_path / "a", "--steps", "40", "--handover", "20") == 0
     assert train.main(["--out", str(tmp_path / "a"), "--resume", "--steps", "60"]) == 0
     assert read_table(tmp_path / "a" / "progress.csv")[-1]["step"] == "60"
+
+
+def test_results_do_not_outlive_the_steps_they_are_of(tmp_path, monkeypatch):
+    assert run(tmp_path / "a", "--steps", "40", "--handover", "20") == 0
+    assert (tmp_path / "a" / "results.json").exists()
+    on_step = StageCallback._on_step
+    stop = lambda callback: signal.raise_signal(signal.SIGTERM) or on_step(callback)  # noqa: E731
+    monkeypatch.setattr(StageCallback, "_on_step", stop)
+    assert train.main(["--out", str(tmp_path / "a"), "--resume", "--steps", "60"]) == 128 + signal.SIGTERM
+    assert not (tmp_path / "a" / "results.json").exists()
+
+
+def test_evaluation_is_not_haunted_by_the_one_before():
+    """With reference parity a reset shows what was before; the environments of an evaluation have nothing before."""
+    config = replace(preset("shapematch"), seed=3)
+    environment = replace(config.environment, particles=100, substeps=1, num_envs=2, parity="reference")
+    config = replace(config, environment=environment)
+    policy = ActorPolicy(ActorSpec((8,)), True)
+    policy.description = {}
+    once, twice = compare(config, {"a": policy}, 2), compare(config, {"a": policy, "b": policy}, 2)
+    assert once[-1].returns == twice[-2].returns == twice[-1].returns
 
 
 def test_damaged_checkpoint_is_an_error_that_names_it(tmp_path, capsys):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchmpm.native.library import Call, load, thread_pool
-from torchmpm.native.pack import ROWS, body_widths
+from torchmpm.native.pack import VALUES, body_widths
 from torchmpm.rollout import Segment
 
 _REAL = {torch.float32: "float", torch.float64: "double"}
@@ -229,7 +229,7 @@ def _backward_outputs(
         torch.empty_like(field) if wants_field and field is not None else nothing,
         torch.empty_like(origin),
         torch.empty_like(gravity),
-        planes.new_empty(ROWS, *planes.shape[1:]) if wants_values else nothing.clone(),
+        planes.new_empty(VALUES, *planes.shape[1:]) if wants_values else nothing.clone(),
     )
 
 

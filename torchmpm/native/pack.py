@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 #: The materials that the kernels know, in the order of ``enum class Kind``.
 KINDS: tuple[type, ...] = (Elastic, VonMises, Soil)
 #: Rows of the table of values, see ``struct Values`` in ``material.hpp``.
-ROWS = 8
+VALUES = 8
 #: Tables of solvers whose values are all numbers, by dtype and device; they stay the same.
 _numbers: WeakKeyDictionary[Solver, dict[tuple[torch.dtype, torch.device], tuple[Tensor, list[int]]]] = (
     WeakKeyDictionary()
@@ -96,7 +96,7 @@ def values(solver: Solver, like: Tensor) -> tuple[Tensor, list[int]]:
     for body, part in solver.parts():
         rows = _rows(solver, body, like[:, part])
         if all(isinstance(row, (int, float)) for row in rows):
-            tables.append(upload([float(row) for row in rows], like).view(ROWS, 1, 1))
+            tables.append(upload([float(row) for row in rows], like).view(VALUES, 1, 1))
         else:
             plain = False
             planes = [torch.as_tensor(row, dtype=like.dtype, device=like.device) for row in rows]

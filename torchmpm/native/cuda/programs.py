@@ -14,7 +14,7 @@ from torchmpm.native.cuda.grid import ADJOINT, SUMS, node_adjoint, node_velociti
 from torchmpm.native.cuda.step import particles_pass
 from torchmpm.native.cuda.tables import Tables
 from torchmpm.native.cuda.transfer import NOWHERE
-from torchmpm.native.pack import ROWS
+from torchmpm.native.pack import VALUES
 
 #: Particles, or nodes, of a program: one per thread.
 BLOCK = 128
@@ -152,7 +152,7 @@ class Backward(Program):
             torch.empty_like(t) for t in (planes, inputs.origin, inputs.gravity)
         )
         self.field_bar = nothing if inputs.field is None or not wants_field else torch.empty_like(inputs.field)
-        self.values_bar = planes.new_empty(ROWS, *planes.shape[1:]) if wants_values else nothing.clone()
+        self.values_bar = planes.new_empty(VALUES, *planes.shape[1:]) if wants_values else nothing.clone()
 
     def run(self) -> None:
         """Launch everything; allocates nothing."""
