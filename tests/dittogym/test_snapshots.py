@@ -99,7 +99,7 @@ def test_an_ended_element_goes_on_from_a_loaded_moment() -> None:
     env.unwrapped.load(moment, np.array([True, False]))
     observations, rewards, _, truncated, info = env.step(action)
     assert np.array_equal(observations[0], wanted[0][0]) and rewards[0] == wanted[1][0]
-    assert truncated.tolist() == [True, False] and info["_com"].tolist() == [True, False]
+    assert truncated.tolist() == [True, False] and info["_reward_terms"].tolist() == [True, False]
     assert env.unwrapped.torch_env.env_state.steps.tolist() == [3, 0]
 
 

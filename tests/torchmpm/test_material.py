@@ -282,11 +282,13 @@ def test_values_per_simulation_and_particle_equal_separate_materials(shape: tupl
             torch.testing.assert_close(energy[b, n], alone.energy(f, Jp_one)[0, 0], rtol=1e-13, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["mu", "lam", "yield_stress"])
+@pytest.mark.parametrize("name", ["mu", "yield_stress"])
 @pytest.mark.parametrize("value", [-1.0, math.nan])
 def test_negative_values_are_named(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"{name} must not be negative, got {value}"):
         VonMises(**{"mu": MU, "lam": LAM, "yield_stress": YIELD} | {name: value})
+    with pytest.raises(ValueError, match="lam must be finite, got nan"):
+        Elastic(MU, math.nan)
 
 
 def test_lame() -> None:
