@@ -208,7 +208,8 @@ class Solver:
         Args:
             state: Where they are.
             actuation: (B, 2, G, G) muscle actuation in Pa on the nodes of the window, ``[:, 0]`` along material x,
-                indices (i, j) rightwards and upwards; constant during the step. ``None`` for none.
+                indices (i, j) rightwards and upwards; constant during the step, and felt only by bodies with
+                ``muscle=True``. ``None`` for none.
             substeps: Number of substeps.
             origin: (B, 2) lower left corner of the window in the world, m; ``None`` for (0, 0).
             segment: Substeps between checkpoints when gradients are enabled, see :func:`torchmpm.repeated` and
@@ -219,15 +220,13 @@ class Solver:
             The new state, differentiable in state, actuation, origin, material values, masses, volumes and gravity.
 
         Raises:
-            ValueError: Shapes, dtypes or devices do not fit together, there is an actuation and no muscle, or the
-                native backend was chosen and cannot run this.
+            ValueError: Shapes, dtypes or devices do not fit together, or the native backend was chosen and cannot run
+                this.
             TypeError: The state, the actuation or the origin is something else.
         """
         checks.instance("state", state, ParticleState)
         check_repetition(substeps, segment, "substeps")
         origin = self.check(state, actuation, origin)
-        if actuation is not None and not any(body.muscle for body in self.bodies):
-            raise ValueError("actuation must be None where no body has muscle=True, got a field that nothing feels")
         if substeps == 0 or state.batch_size == 0:
             return state
         if runs_native(self, state):

@@ -98,11 +98,6 @@ SOLVER = table(
             lambda: solver(gravity=torch.zeros(3, 2)).step(state()),
             "gravity must have shape (2,) or (1, 2), got (3, 2)",
         ),
-        (
-            "an actuation without muscles",
-            lambda: solver(bodies=(Body(5, VonMises(1.0, 1.0, 1.0)),)).step(state(), torch.zeros(1, 2, 16, 16)),
-            "actuation must be None where no body has muscle=True",
-        ),
         ("negative damping", lambda: solver(damping=-1), "damping must not be negative, got -1"),
         ("dt as text", lambda: solver(dt="1 ms"), "dt must be a number, got '1 ms'"),
         ("dt infinite", lambda: solver(dt=math.inf), "dt must be finite, got inf"),
