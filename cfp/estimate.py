@@ -52,11 +52,12 @@ def estimate(program: Program, config: RunConfig) -> str:
     """
     quiet = replace(config, report=replace(config.report, video=False, video_every=0, wandb="off"))
     with tempfile.TemporaryDirectory() as folder:
-        costs = program.run(quiet, Path(folder) / "run", False, StopSignals()).measure_all()
+        run = program.run(quiet, Path(folder) / "run", False, StopSignals())
+        costs, first = run.measure_all(), run.position.level
     bounds, horizon, episodes = (0, *config.ends()), make_spec(config.task).horizon, config.report.eval_episodes
     lines = [f"{'stage':<8}{'action':>8}{'steps':>11}{'steps/s':>10}{'training':>11}{'evaluations':>13}{'replay':>10}"]
     total = 0.0
-    for level, cost in enumerate(costs):
+    for level, cost in enumerate(costs, first):
         size, steps = config.resolution(level), bounds[level + 1] - bounds[level]
         evaluation = _evaluation_step(config, level) * horizon
         count = 1 + steps // config.report.eval_every if config.report.eval_every else 0

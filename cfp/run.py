@@ -185,9 +185,9 @@ class Run(ABC):
         """Time a few steps and updates of a model that has just been made; what it has learned is spoiled."""
 
     def measure_all(self) -> list[Cost]:
-        """`measure` every stage, each over the untrained policy of the one before."""
+        """`measure` every stage that is to be trained, each over the untrained policy of the one before."""
         costs = []
-        for level in range(len(self.config.ends())):
+        for level in range(self.position.level, len(self.config.ends())):
             model = self.make_model(level)
             self.keep(model, level, 0)
             copy_policy(self.folder / "policy.safetensors", self.folder / f"stage{level + 1}.safetensors")

@@ -39,6 +39,14 @@ def test_replay_of_blended_actions_is_as_small_as_their_parts(tmp_path, capsys, 
         assert line.split()[-2:] == [f"{rows / 2**20:.0f}", "MiB"]
 
 
+def test_dry_run_counts_only_levels_that_will_be_trained(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["--task", "run", "--start-from", "run", "--handover", "70", "--batch-size", "4", "--buffer-size", "60"]
+    assert train.main([*TINY, *arguments, "--dry-run"]) == 0
+    header, stage, time = capsys.readouterr().out.strip().splitlines()[-4:-1]
+    assert header.startswith("stage") and stage.split()[:3] == ["2", "16x16", "80"] and time.startswith("time: about")
+
+
 def test_dry_run_of_another_algorithm(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert baselines_train.main([*TINY[:-2], "--algo", "gradient", "--tier", "100", "--grid", "4", "--dry-run"]) == 0
