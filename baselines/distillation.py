@@ -16,7 +16,7 @@ from torch import nn
 
 import cfp
 from baselines.actor_critic import quieten
-from baselines.algorithm import Algorithm, Callback, Sees
+from baselines.algorithm import Algorithm, Callback, Sees, grid_size
 from baselines.dagger import Collector, Dataset, lose
 from baselines.episodes import Episodes
 from baselines.planner import PlannerConfig
@@ -188,8 +188,7 @@ class Distill(Algorithm):
     def _teacher(self, own: RunConfig, path: Path | None) -> Teacher:
         config, layout = self.config, self.config.environment.layout
         if path is None and config.teacher == "mpc":
-            spec, grid = self.env.spec, config.planner_grid
-            size = {"coarse": spec.coarse, "fine": spec.fine}[grid] if isinstance(grid, str) else grid
+            size = grid_size(config.task, config.planner_grid)
             return PlannerTeacher(make_torch_env(own, size), config.planner, config.seed, layout)
         policy = read_teacher(path or config.teacher, config.task, config.environment)
         theirs = EnvironmentConfig(**policy.description["environment"])

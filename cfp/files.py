@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -112,6 +112,20 @@ def write_text(path: Path, text: str) -> None:
     write_atomically(path, lambda file: file.write(text.encode()))
 
 
+def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> str:
+    """A table as CSV.
+
+    Args:
+        rows: Values by column; other values are left out.
+        columns: In their order.
+    """
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
 class Table:
     """A CSV file that grows row by row, also over several sessions, and can take new columns on the way.
 
@@ -140,14 +154,10 @@ class Table:
             self._rewrite()
             return
         with _named(self.path), open(self.path, "a", newline="") as file:
-            csv.DictWriter(file, self.columns).writerow(text)
+            csv.DictWriter(file, self.columns, lineterminator="\n").writerow(text)
 
     def _rewrite(self) -> None:
-        text = io.StringIO()
-        writer = csv.DictWriter(text, self.columns)
-        writer.writeheader()
-        writer.writerows(self.rows)
-        write_text(self.path, text.getvalue())
+        write_text(self.path, csv_text(self.rows, self.columns))
 
 
 def read_table(path: Path) -> list[dict[str, str]]:

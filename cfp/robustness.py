@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import sys
 from collections.abc import Sequence
@@ -20,7 +18,7 @@ from cfp.disturbances import Case, applies, disturbed_env, make_cases
 from cfp.errors import CFPError, ConfigError
 from cfp.evaluate import open_run
 from cfp.evaluation import Policy, Result, evaluate, judging_seed
-from cfp.files import write_json, write_text
+from cfp.files import csv_text, write_json, write_text
 from cfp.plot import write_figure
 from cfp.process import keep_memory
 from cfp.train import PROGRAM
@@ -124,11 +122,7 @@ def to_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
 
 def to_csv(rows: Sequence[dict[str, Any]]) -> str:
     """The table as CSV."""
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    return csv_text(rows, COLUMNS)
 
 
 def to_markdown(config: RunConfig, rows: Sequence[dict[str, Any]]) -> str:

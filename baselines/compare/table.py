@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
+
+from cfp.files import csv_text
 
 
 @dataclass(frozen=True)
@@ -45,11 +45,7 @@ class Table:
 
     def to_csv(self) -> str:
         """All columns, with raw values."""
-        text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, [column.key for column in self.columns], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(self.rows)
-        return text.getvalue()
+        return csv_text(self.rows, [column.key for column in self.columns])
 
     def to_markdown(self) -> str:
         """Heading, words and table."""

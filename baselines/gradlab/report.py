@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from baselines.gradlab.measure import Row
-from cfp.files import write_atomically, write_json
+from cfp.files import csv_text, write_json, write_text
+from cfp.plot import write_figure
 
 #: Largest error of finite differences, and smallest cosine between precisions, of a gradient that is right.
 DIFFERENCE_LIMIT, COSINE_LIMIT = 0.05, 0.99
@@ -110,20 +108,10 @@ def write(
     ]
     report = {"config": config, "reach": reach, "conclusion": sentence, "horizons": table, "differences": differences}
     write_json(folder / "report.json", report)
-    _write_csv(folder / "horizons.csv", table)
-    _write_csv(folder / "differences.csv", differences)
-    picture = io.BytesIO()
-    FigureCanvasAgg(draw(rows, widths, errors, sentence)).print_png(picture)
-    write_atomically(folder / "gradients.png", lambda file: file.write(picture.getvalue()))
+    for name, listed in (("horizons", table), ("differences", differences)):
+        write_text(folder / f"{name}.csv", csv_text(listed, list(listed[0])))
+    write_figure(folder / "gradients.png", draw(rows, widths, errors, sentence))
     return sentence
-
-
-def _write_csv(path: Path, table: Sequence[dict[str, Any]]) -> None:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(table[0]))
-    writer.writeheader()
-    writer.writerows(table)
-    write_atomically(path, lambda file: file.write(text.getvalue().encode()))
 
 
 def draw(rows: Sequence[Row], widths: Sequence[float], errors: Sequence[Sequence[float]], sentence: str) -> Figure:
