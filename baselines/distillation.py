@@ -202,7 +202,7 @@ class Distill(Algorithm):
         return policy.to(self.env.device)
 
     def attached(self, env: Any) -> ActorPolicy:
-        """What has been learned so far, which looks at images only: built once, not in every step."""
+        """What has been learned so far; it looks at images only, whatever ``env`` is. Built once, not in every step."""
         return self.policy
 
     def learn(self, total_timesteps: int, callback: Callback) -> Distill:

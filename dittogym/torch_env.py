@@ -173,7 +173,12 @@ class TorchEnv:
 
     @property
     def env_state(self) -> EnvState:
-        """Everything that moves, for :mod:`dittogym.dynamics`; see also :meth:`save`."""
+        """Everything that moves, for :mod:`dittogym.dynamics`; see also :meth:`save`. An assignment goes on from there.
+
+        Raises:
+            RuntimeError: Neither reset nor assigned yet.
+            TypeError: What is assigned is something else.
+        """
         if self._env_state is None:
             raise RuntimeError("call reset() first: the environment has no state yet")
         return self._env_state

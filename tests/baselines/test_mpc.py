@@ -12,6 +12,7 @@ from cfp.config import EnvironmentConfig
 from cfp.errors import ConfigError
 from cfp.files import read_table
 from cfp.process import StopSignals
+from cfp.run import holds_run
 
 ENVIRONMENT = EnvironmentConfig(num_envs=1, particles=100, substeps=2)
 CONFIG = MPCConfig(
@@ -30,6 +31,15 @@ def test_record_repeats_the_episode(tmp_path) -> None:
     assert rows["own layout"]["mean"] == pytest.approx(max(evaluated), abs=1e-3)
     record = OpenLoop.load(tmp_path)
     assert 0 < len(record.actions) <= 30 and record.resolution == 4 and record.description["layout"] == 0
+
+
+def test_options_that_only_the_model_can_refuse_leave_the_folder_free(tmp_path, capsys) -> None:
+    options = "--task shapematch --particles 60 --substeps 1 --grid 4 --horizon 2 --commit 2 --iterations 1"
+    arguments = ["--algo", "mpc", *options.split(), "--no-video", "--device", "cpu", "--out", str(tmp_path)]
+    assert train.main([*arguments, "--tier", "61"]) == 2
+    assert "tier: a reduced model must have at most 60 particles" in capsys.readouterr().err
+    assert not holds_run(tmp_path)
+    assert train.main([*arguments, "--tier", "60"]) == 0
 
 
 def test_learning_stops_with_the_episode() -> None:
