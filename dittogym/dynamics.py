@@ -344,7 +344,7 @@ def _check_outcome(spec: TaskSpec, own: Outcome, state: EnvState) -> None:
 
 
 def averages(model: Model, state: EnvState, now: Measurement) -> dict[str, Tensor]:
-    """What ``info`` holds in every task, of a moment and its :func:`dittogym.reward.measure`, by name."""
+    """What ``info`` holds in every task, of a moment and its averages ``now``, by name."""
     info = {"com": now.com, "split": now.split, "finite": intact(model, state)}
     return info if now.object_com is None else {**info, "object_com": now.object_com}
 
