@@ -212,9 +212,8 @@ class Run(ABC):
                 self.restore(model, self.state)
                 self.state = None
             left = ends[level] - self.position.offset - model.num_timesteps
-            if left > 0:  # what was written at an earlier end is not true any more
-                (self.folder / "results.json").unlink(missing_ok=True)
             if left > 0 and not self._plateau(level):
+                (self.folder / "results.json").unlink(missing_ok=True)  # of an earlier end, which is none any more
                 books, early = self._books(level, model), False
                 try:
                     self.learn(model, left, books)

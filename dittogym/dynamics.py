@@ -302,7 +302,8 @@ def judge(
     now = measure(state.particles, model.robot)
     own = spec.judge(_moment(model, state, now, observation, soft), weights)
     _check_outcome(spec, own, state)
-    finite, terms = intact(model, state), dict(own.terms)
+    common, terms = averages(model, state, now), dict(own.terms)
+    finite = common["finite"]
     terminated = torch.zeros_like(finite) if own.terminated is None else own.terminated
     if spec.split_limit is not None:
         penalty, torn = split_penalty(now.split, spec.split_limit, soft=soft)
@@ -313,7 +314,7 @@ def judge(
     terms["alive"] = torch.full_like(now.split, weights.alive)
     terms = dict(zip(terms, torch.where(finite, torch.stack(tuple(terms.values())), 0.0).unbind(), strict=True))
     terms["failure"] = torch.where(finite, 0.0, FAILURE_REWARD).to(now.split)
-    info = {**averages(model, state, now), **own.info}
+    info = {**common, **own.info}
     success = own.success & finite if own.success is not None else None
     state = state if own.memory is None else replace(state, memory=own.memory)
     return state, Outcome(terms, terminated | ~finite, success, info)
@@ -329,10 +330,11 @@ def _check_outcome(spec: TaskSpec, own: Outcome, state: EnvState) -> None:
         raise ValueError(f"judge of task {spec.name!r} must not return the engine's own info, got {sorted(taken)}")
     answers = {name: value for name in ("terminated", "success") if (value := getattr(own, name)) is not None}
     for name, value in {**own.terms, **answers}.items():
-        wanted = f"{name} as bool" if name in answers else "terms"
-        found = f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
         fits = isinstance(value, Tensor) and value.shape == state.steps.shape
         if not fits or (name in answers and value.dtype != torch.bool):
+            wanted = f"{name} as bool" if name in answers else "terms"
+            tensor = isinstance(value, Tensor)
+            found = f"{value.dtype} of shape {tuple(value.shape)}" if tensor else type(value).__name__
             raise ValueError(
                 f"judge of task {spec.name!r} must return {wanted} of shape (B,), got {found} for {name!r}"
             )

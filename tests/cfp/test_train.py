@@ -165,7 +165,11 @@ def test_results_do_not_outlive_the_steps_they_are_of(tmp_path, monkeypatch):
     assert run(tmp_path / "a", "--steps", "40", "--handover", "20") == 0
     assert (tmp_path / "a" / "results.json").exists()
     on_step = StageCallback._on_step
-    stop = lambda callback: signal.raise_signal(signal.SIGTERM) or on_step(callback)  # noqa: E731
+
+    def stop(callback):
+        signal.raise_signal(signal.SIGTERM)
+        return on_step(callback)
+
     monkeypatch.setattr(StageCallback, "_on_step", stop)
     assert train.main(["--out", str(tmp_path / "a"), "--resume", "--steps", "60"]) == 128 + signal.SIGTERM
     assert not (tmp_path / "a" / "results.json").exists()
