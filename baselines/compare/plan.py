@@ -102,17 +102,14 @@ class Plan:
             raise ConfigError(f"plan: {path} cannot be read as JSON ({error})") from error
         if not set(values) <= {"common", "tasks", "algos"}:
             raise ConfigError(f"plan: {path} holds {', '.join(values)}, allowed an object with common, tasks, algos")
-        groups = values | {f"{part}.{name}": own for part in ("tasks", "algos") for name, own in _items(values, part)}
-        for name, own in _items(values, "algos"):
-            special = own.get("tasks", {}) if isinstance(own, dict) else {}
-            groups[f"algos.{name}.tasks"] = special
-            groups |= {f"algos.{name}.tasks.{task}": given for task, given in _items({"tasks": special}, "tasks")}
-        named = {"tasks", "algos", *(f"algos.{name}.tasks" for name, _ in _items(values, "algos"))}
-        for name, options in groups.items():
-            if not isinstance(options, dict):
-                raise ConfigError(f"plan: {name}: got {options!r}, allowed an object with named values")
-            for taken in sorted(FOR_ALL & set(options) if name not in named else ()):
-                raise ConfigError(f"plan: {name}: got {taken}, allowed are options that the command line does not give")
+        _check_options("common", values.get("common", {}))
+        for part in ("tasks", "algos"):
+            for name, options in _group(part, values.get(part, {})).items():
+                own = dict(_group(f"{part}.{name}", options))
+                special = own.pop("tasks", {}) if part == "algos" else {}
+                _check_options(f"{part}.{name}", own)
+                for task, given in _group(f"{part}.{name}.tasks", special).items():
+                    _check_options(f"{part}.{name}.tasks.{task}", given)
         return cls(**values)
 
     def options(self, label: str, task: str) -> dict[str, Any]:
@@ -125,9 +122,15 @@ class Plan:
         return merged
 
 
-def _items(values: dict[str, Any], part: str) -> list[tuple[str, Any]]:
-    own = values.get(part, {})
-    return list(own.items()) if isinstance(own, dict) else []
+def _group(name: str, given: Any) -> dict[str, Any]:
+    if not isinstance(given, dict):
+        raise ConfigError(f"plan: {name}: got {given!r}, allowed an object with named values")
+    return given
+
+
+def _check_options(name: str, given: Any) -> None:
+    for taken in sorted(FOR_ALL & set(_group(name, given))):
+        raise ConfigError(f"plan: {name}: got {taken}, allowed are options that the command line does not give")
 
 
 def _over(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
