@@ -21,23 +21,51 @@ from cfp.weights import policy_file
 
 
 @dataclass(frozen=True)
-class Command:
-    """Evaluate the policies of a run, or a single one, beside zero and random action, on the same particle layouts."""
+class Selection:
+    """Which policies, and where they are evaluated."""
 
     folder: tyro.conf.Positional[Path | None] = None
     """A folder that a training wrote or is writing."""
     policy: str | None = None
     """In place of a folder: a policy file, or the name of a policy that comes with the package."""
     episodes: int = 5
-    """Episodes of each policy."""
-    noise: Noise = "default"
-    """Action noise of the trained policies: with, without, both in rows of their own, or default, as trained."""
+    """Episodes of each row."""
     seed: int | None = None
     """Seed of layouts and noise; the run's own if not given."""
     particles: Tier | None = None
     """Particles: full (the paper's), lite, or counts; the run's own if not given."""
     device: str = "auto"
     """cpu, cuda, or auto."""
+
+    def open(self, program: Program) -> tuple[RunConfig, dict[str, Policy]]:
+        """Options to evaluate with, and policies by stage, the newest last.
+
+        Args:
+            program: Knows how to read them.
+
+        Raises:
+            CFPError: An option is wrong, there is no run, it has no policy yet, or a file is damaged.
+        """
+        at_least_one(episodes=self.episodes)
+        if (self.folder is None) == (self.policy is None):
+            raise ConfigError(f"policy: got {self.policy!r} and the folder {self.folder}, allowed is one of the two")
+        if self.folder is not None:
+            config, policies = open_run(program, self.folder, self.device, self.seed)
+        else:
+            assert self.policy is not None
+            config, policies = open_policy(program, self.policy, self.device, self.seed)
+        if self.particles is not None:
+            config = replace(config, environment=replace(config.environment, particles=self.particles))
+            config.check()
+        return config, policies
+
+
+@dataclass(frozen=True)
+class Command(Selection):
+    """Evaluate the policies of a run, or a single one, beside zero and random action, on the same particle layouts."""
+
+    noise: Noise = "default"
+    """Action noise of the trained policies: with, without, both in rows of their own, or default, as trained."""
     json: bool = False
     """Print JSON instead of a table."""
     video: Path | None = None
@@ -93,17 +121,7 @@ def run(program: Program, command: Command) -> str:
     Raises:
         CFPError: There is no run, it has no policy yet, or a file is damaged.
     """
-    at_least_one(episodes=command.episodes)
-    if (command.folder is None) == (command.policy is None):
-        raise ConfigError(f"policy: got {command.policy!r} and the folder {command.folder}, allowed is one of the two")
-    if command.folder is not None:
-        config, policies = open_run(program, command.folder, command.device, command.seed)
-    else:
-        assert command.policy is not None
-        config, policies = open_policy(program, command.policy, command.device, command.seed)
-    if command.particles is not None:
-        config = replace(config, environment=replace(config.environment, particles=command.particles))
-        config.check()
+    config, policies = command.open(program)
     results = compare(config, policies, command.episodes, command.noise)
     if command.video is not None:
         make_video(config, list(policies.values())[-1], command.video)

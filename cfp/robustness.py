@@ -16,7 +16,7 @@ from cfp.command import Program
 from cfp.config import RunConfig, at_least_one
 from cfp.disturbances import Case, applies, disturbed_env, make_cases
 from cfp.errors import CFPError, ConfigError
-from cfp.evaluate import open_run
+from cfp.evaluate import Selection
 from cfp.evaluation import Policy, Result, evaluate, judging_seed
 from cfp.files import csv_text, write_json, write_text
 from cfp.plot import write_figure
@@ -28,16 +28,14 @@ COLUMNS = ("case", "episodes", "mean", "std", "interval", "ratio", "success")
 
 
 @dataclass(frozen=True)
-class Command:
-    """Evaluate the newest policy of a run under faults and changed constants, on the same particle layouts.
+class Command(Selection):
+    """Evaluate the newest policy of a run, or a single one, under faults and changed constants, on the same layouts.
 
-    Writes robustness.md, .csv, .json and .png into the run folder.
+    Writes robustness.md, .csv, .json and .png.
     """
 
-    folder: tyro.conf.Positional[Path]
-    """A folder that a training wrote or is writing."""
-    episodes: int = 5
-    """Episodes of each case."""
+    out: Path | None = None
+    """Folder to write into; the run's own if not given."""
     dropout: float = 0.2
     """Share of action entries, and of observation entries, set to zero in every step."""
     noise: float = 0.2
@@ -51,10 +49,6 @@ class Command:
     cases: tuple[str, ...] = ()
     """Try only cases whose names hold one of these words, such as "dropout", beside the unperturbed one; all if not
     given."""
-    seed: int | None = None
-    """Seed of layouts and noise; the run's own if not given."""
-    device: str = "auto"
-    """cpu, cuda, or auto."""
 
     def check(self) -> None:
         """Check what the types cannot.
@@ -62,7 +56,9 @@ class Command:
         Raises:
             ConfigError: Naming the option, what was given and what is allowed.
         """
-        at_least_one(episodes=self.episodes, latency=self.latency)
+        at_least_one(latency=self.latency)
+        if self.out is None and self.folder is None:
+            raise ConfigError("out: got none, allowed with a single policy is a folder to write into")
         for name in ("dropout", "shift"):
             if not 0 < getattr(self, name) < 1:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, allowed between 0 and 1")
@@ -128,7 +124,8 @@ def to_csv(rows: Sequence[dict[str, Any]]) -> str:
 def to_markdown(config: RunConfig, rows: Sequence[dict[str, Any]]) -> str:
     """The table as Markdown."""
     lines = [
-        f"Robustness of {config.name}: mean return of {rows[0]['episodes']} episodes and ratio to the unperturbed.",
+        f"Robustness of {config.name}: mean return of {rows[0]['episodes']} episodes, "
+        f"particles {config.environment.particles}, and ratio to the unperturbed.",
         "",
         "| case | return | 95 % interval | ratio | success |",
         "| --- | ---: | ---: | ---: | ---: |",
@@ -169,9 +166,12 @@ def run(program: Program, command: Command) -> str:
     command.check()
     cases = make_cases(command.dropout, command.noise, command.latency, command.shift, command.friction)
     cases = choose(cases, command.cases)
-    config, policies = open_run(program, command.folder, command.device, command.seed)
+    config, policies = command.open(program)
+    folder = command.out or command.folder
+    assert folder is not None
+    folder.mkdir(parents=True, exist_ok=True)
     results = report(config, list(policies.values())[-1], cases, command.episodes)
-    rows, path = to_rows(results), command.folder / "robustness"
+    rows, path = to_rows(results), folder / "robustness"
     table = to_markdown(config, rows)
     write_json(path.with_suffix(".json"), rows)
     write_text(path.with_suffix(".csv"), to_csv(rows))

@@ -13,7 +13,7 @@ from cfp import robustness
 from cfp.actor import build_actor
 from cfp.config import to_json
 from cfp.disturbances import Case, Disturbed, applies, disturbed_env, make_cases
-from cfp.evaluate import open_run
+from cfp.evaluate import open_policy, open_run
 from cfp.evaluation import Result, student
 from cfp.files import write_json
 from cfp.presets import preset
@@ -132,6 +132,28 @@ def test_command_writes_table_and_plot(folder, capsys):
     config, policies = open_run(PROGRAM, folder, "cpu")
     again = robustness.report(config, policies["stage 2"], make_cases()[:4], 2)  # alone, with the same seed
     assert robustness.to_rows(again) == rows[:4]
+
+
+def test_single_policy_with_other_particles_needs_a_folder_to_write_into(folder, tmp_path, capsys):
+    single = [
+        "--policy",
+        str(folder / "policy.safetensors"),
+        "--episodes",
+        "1",
+        "--device",
+        "cpu",
+        "--particles",
+        "500",
+    ]
+    assert robustness.main([*single, "--cases", "noise"]) == 2
+    assert "out: got none, allowed with a single policy" in capsys.readouterr().err
+    assert robustness.main([*single, "--cases", "noise", "--out", str(tmp_path / "new")]) == 0
+    table = (tmp_path / "new" / "robustness.md").read_text()
+    assert "particles 500" in table and table.count("\n| ") == 4
+    config, policies = open_policy(PROGRAM, single[1], "cpu", None)
+    config = replace(config, environment=replace(config.environment, particles=500))
+    rows = robustness.to_rows(robustness.report(config, policies["policy"], make_cases()[:1], 1))
+    assert json.loads((tmp_path / "new" / "robustness.json").read_text())[0] == rows[0]
 
 
 def test_cases_are_chosen_by_words():
