@@ -42,8 +42,7 @@ def upsample(action: Tensor, size: int, interpolation: Interpolation) -> Tensor:
     """
     if action.shape[-1] == size:
         return action
-    with torch.autocast(action.device.type, enabled=False):  # makes a part of the executed action, not only an input
-        return bicubic(action, size, align_corners=interpolation == "aligned")
+    return bicubic(action, size, align_corners=interpolation == "aligned")
 
 
 def normalise_image(observation: Tensor) -> Tensor:

@@ -53,14 +53,15 @@ def bicubic(image: Tensor, size: int, align_corners: bool = False) -> Tensor:
     backward.
     """
     matrix = bicubic_matrix(image.shape[-1], size, align_corners, image.dtype, image.device)
-    return matrix @ image @ matrix.T
+    with torch.autocast(image.device.type, enabled=False):  # makes what is executed, not only what a network reads
+        return matrix @ image @ matrix.T
 
 
 @functools.lru_cache(maxsize=64)
 @torch.inference_mode(False)  # what is kept must serve gradients later
 def bicubic_matrix(before: int, after: int, align_corners: bool, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Matrix (after, before) of one-dimensional interpolation, read off PyTorch's own on unit vectors."""
-    basis = torch.eye(before, dtype=torch.float64)[:, None, :, None].expand(-1, -1, -1, before)
+    basis = torch.eye(before, dtype=torch.float64, device="cpu")[:, None, :, None].expand(-1, -1, -1, before)
     image = interpolate(basis, size=(after, before), mode="bicubic", align_corners=align_corners)
     return image[:, 0, :, 0].T.contiguous().to(device, dtype)
 

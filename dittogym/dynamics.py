@@ -116,20 +116,29 @@ class Model:
         return replace(self.solver, bodies=bodies, gravity=physics.get("gravity", self.spec.gravity))
 
     def per_particle(self, values: tuple[float, ...] | tuple[bool, ...], like: Tensor) -> Tensor:
-        """Values of the bodies as (N,) over all particles, on the device of ``like``."""
-        return _per_particle(tuple(body.count for body in self.solver.bodies), values, like.device)
+        """Values of the bodies as (N,) over all particles: truth values, or numbers like ``like``."""
+        dtype = torch.bool if isinstance(values[0], bool) else like.dtype
+        return _per_particle(tuple(body.count for body in self.solver.bodies), values, dtype, like.device)
 
 
 @functools.lru_cache(maxsize=64)
 @torch.inference_mode(False)  # what is kept must serve gradients later
 def _per_particle(
-    counts: tuple[int, ...], values: tuple[float, ...] | tuple[bool, ...], device: torch.device
+    counts: tuple[int, ...], values: tuple[float, ...] | tuple[bool, ...], dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    return torch.tensor(values).repeat_interleave(torch.tensor(counts)).to(device)
+    host = torch.device("cpu")
+    repeats = torch.tensor(counts, device=host)
+    return torch.tensor(values, dtype=dtype, device=host).repeat_interleave(repeats).to(device)
 
 
 def make_model(
-    spec: TaskSpec, counts: tuple[int, ...], *, substeps: int, backend: str, unscaled: bool = False
+    spec: TaskSpec,
+    counts: tuple[int, ...],
+    *,
+    substeps: int,
+    backend: str,
+    unscaled: bool = False,
+    segment: Segment = "auto",
 ) -> Model:
     """Build the physics of a task.
 
@@ -142,6 +151,7 @@ def make_model(
         substeps: Substeps of a control step.
         backend: Of the solver.
         unscaled: As in the reference: unit volumes, and the pixel raster, whatever the counts.
+        segment: See :class:`Model`.
 
     Raises:
         ValueError: The matter is too stiff, see :func:`check_stability`.
@@ -157,7 +167,7 @@ def make_model(
         backend=backend,
         allow_unstable=True,  # checked with the muscles, here and when a reset changes the matter
     )
-    model = Model(spec, solver, substeps, shares, pixels=full or unscaled)
+    model = Model(spec, solver, substeps, shares, pixels=full or unscaled, segment=segment)
     check_stability(model, {})
     return model
 
@@ -193,19 +203,45 @@ def _bodies(spec: TaskSpec, counts: tuple[int, ...], shares: tuple[float, ...], 
     return tuple(bodies)
 
 
-def initial(model: Model, positions: Tensor, physics: Physics | None = None) -> EnvState:
-    """State right after a reset with particles at rest at ``positions`` (B, N, 2), m."""
+def initial(model: Model, positions: Tensor, physics: Physics | None = None) -> tuple[EnvState, Tensor]:
+    """State and observation right after a reset with particles at rest at ``positions`` (B, N, 2), m."""
     particles = ParticleState.at_rest(positions)
     start = measure(particles, model.robot)
     origin = window_origin(model.spec, start.com)
     steps = torch.zeros(len(positions), dtype=torch.int64, device=positions.device)
     state = EnvState(particles, origin, start.com, start, {}, physics or {}, steps)
-    memory = model.spec.remember(_moment(model, state, start, observe(model, state)))
-    return replace(state, memory=memory)
+    observation = observe(model, state)
+    memory = model.spec.remember(_moment(model, state, start, observation))
+    return replace(state, memory=memory), observation
+
+
+class Shield:
+    """Keeps what simulations share free of the gradients of those that are not finite after a step.
+
+    Such an element ends with a constant reward, whose derivative is zero. Where autograd goes back through the step it
+    meets zero times infinity, and a sum over the batch, such as the gradient in a shared action or constant, would be
+    no number for all.
+    """
+
+    def __init__(self) -> None:
+        self.finite: Tensor | None = None
+
+    def __call__(self, value: Tensor) -> Tensor:
+        """``value`` (B, ...), through which only gradients of finite elements go back."""
+        if not value.requires_grad:
+            return value
+        view = value.view_as(value)
+        view.register_hook(self._stop)
+        return view
+
+    def _stop(self, gradient: Tensor) -> Tensor:
+        return gradient if self.finite is None else choose(self.finite, gradient, torch.zeros_like(gradient))
 
 
 def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState, Tensor]:
     """Advance by one control step.
+
+    Elements that are not finite afterwards have no gradient in what they came from.
 
     Args:
         model: The task.
@@ -215,12 +251,16 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
     Returns:
         The next state, and the actuation on the patch (B, 2, P, P) in Pa.
     """
+    shield = Shield()
+    if torch.is_grad_enabled():
+        state, action = state.map(shield), shield(action)
     spec, solver = model.spec, model.solver_for(state.physics)
     field = patch_field(action, spec.patch, state.physics.get("max_actuation", spec.max_actuation))
     on_nodes = place(field, in_window(spec.reach, state.centre, state.origin), solver.grid.resolution)
     particles = solver.step(
         state.particles, on_nodes, substeps=model.substeps, origin=state.origin, segment=model.segment
     )
+    shield.finite = diagnostics.finite(particles)
     com = particles.x[:, : model.robot].mean(1)
     origin = state.origin if spec.window.follow is None else window_origin(spec, com)
     return replace(state, particles=particles, origin=origin, centre=com, steps=state.steps + 1), field
@@ -290,7 +330,7 @@ def judge(
 
     Raises:
         ValueError: The task returns a term under a name of :data:`RESERVED`, info under one of :data:`RESERVED_INFO`,
-            something that is not of shape (B,), or another memory than it remembers.
+            something without a leading B, or memory unlike that which it remembers.
         TypeError: The task returns something else.
 
     Returns:
@@ -333,16 +373,21 @@ def _check_outcome(spec: TaskSpec, own: Outcome, state: EnvState) -> None:
         fits = isinstance(value, Tensor) and value.shape == state.steps.shape
         if not fits or (name in answers and value.dtype != torch.bool):
             wanted = f"{name} as bool" if name in answers else "terms"
-            tensor = isinstance(value, Tensor)
-            found = f"{value.dtype} of shape {tuple(value.shape)}" if tensor else type(value).__name__
             raise ValueError(
-                f"judge of task {spec.name!r} must return {wanted} of shape (B,), got {found} for {name!r}"
+                f"judge of task {spec.name!r} must return {wanted} of shape (B,), got {_kind(value)} for {name!r}"
             )
-    if own.memory is not None and own.memory.keys() != state.memory.keys():
-        raise ValueError(
-            f"judge of task {spec.name!r} must return the memory that remember gives, {sorted(state.memory)}, got "
-            f"{sorted(own.memory)}"
-        )
+    for name, value in own.info.items():
+        if not isinstance(value, Tensor) or value.shape[:1] != state.steps.shape:
+            raise ValueError(
+                f"judge of task {spec.name!r} must return info of shape (B, ...), got {_kind(value)} for {name!r}"
+            )
+    before, after = ({n: _kind(v) for n, v in m.items()} for m in (state.memory, own.memory or state.memory))
+    if before != after:
+        raise ValueError(f"judge of task {spec.name!r} must return memory like that of remember, {before}, got {after}")
+
+
+def _kind(value: object) -> str:
+    return f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
 
 
 def averages(model: Model, state: EnvState, now: Measurement) -> dict[str, Tensor]:

@@ -39,7 +39,10 @@ def as_tensor(action: Any, env: TorchEnv, single: bool = False) -> torch.Tensor:
     expected = env.action_shape if single else (env.num_envs, *env.action_shape)
     if array.dtype.kind not in "fiu" or array.shape != expected:
         raise ValueError(f"action must be numbers of shape {expected}, got {array.dtype} of shape {array.shape}")
-    return torch.as_tensor(array[None] if single else array, dtype=env.dtype, device=env.device)
+    # A copy: torch takes neither negative strides nor foreign byte orders.
+    numbers = np.float64 if env.dtype is torch.float64 else np.float32
+    array = np.array(array[None] if single else array, numbers, order="C")
+    return torch.from_numpy(array).to(env.device)
 
 
 def as_image(observation: torch.Tensor) -> np.ndarray:

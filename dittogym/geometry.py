@@ -51,12 +51,21 @@ class Obstacle:
         drawn: What the robot sees of it: boxes whose pixels are set in the occupancy channel. Some obstacles of the
             reference implementation are invisible to the robot; they have none.
         shown: What a person sees of it in :meth:`dittogym.TorchEnv.render`.
+
+    Raises:
+        TypeError: A field is something else; a single rule or box needs its comma too, ``(rule,)``.
     """
 
     name: str
     rules: tuple[VelocityRule, ...]
     drawn: tuple[Box, ...] = ()
     shown: tuple[Box, ...] = ()
+
+    def __post_init__(self) -> None:
+        checks.instance("name", self.name, str)
+        checks.instances("rules", self.rules, VelocityRule)
+        for name in ("drawn", "shown"):
+            checks.instances(name, getattr(self, name), Box)
 
 
 def floor(friction: float = math.inf) -> Obstacle:

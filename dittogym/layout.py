@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dittogym.physics import real_tensor
 from dittogym.spec import Body, TaskSpec
 from dittogym.window import window_origin
 from torchmpm import Grid, checks, sampling
@@ -81,7 +82,7 @@ class LayoutSampler:
     def generator(self) -> dict[str, Tensor]:
         """State of the generator; an assignment brings it back."""
         state = self._generator.get_state(legacy=False)["state"]
-        return {"key": torch.from_numpy(state["key"].astype(np.int64)), "pos": torch.tensor(state["pos"])}
+        return {"key": torch.from_numpy(state["key"].astype(np.int64)), "pos": torch.tensor(state["pos"], device="cpu")}
 
     @generator.setter
     def generator(self, state: Mapping[str, Tensor]) -> None:
@@ -131,6 +132,8 @@ class Layouts:
     @generators.setter
     def generators(self, states: Mapping[int, Mapping[str, Tensor]]) -> None:
         for element, state in states.items():
+            if element not in self._samplers:
+                raise RuntimeError(f"call reset() first: element {element} has no random generator yet")
             self._samplers[element].generator = state
 
     def draw(self, seed: int | None, mask: np.ndarray, given: Any, like: Tensor) -> Tensor:
@@ -161,29 +164,26 @@ class Layouts:
             stacked = np.zeros((self._num_envs, sum(self._counts), 2))
             for i in np.flatnonzero(mask).tolist():
                 stacked[i] = samplers[i].draw()
-            positions = torch.as_tensor(stacked).to(like)
+            positions = torch.from_numpy(stacked).to(like)
         else:
             return self._positions.clone()
         if self._positions is not None:
             positions = choose(torch.as_tensor(mask, device=like.device), positions, self._positions)
+        self._check_inside(positions)
         # Gradients in given positions reach back to this reset only, not to the one that uses them next.
         self._samplers, self._positions = samplers, positions.detach().clone()
         return positions
 
     def _given(self, given: Any, like: Tensor) -> Tensor:
-        try:
-            positions = torch.as_tensor(given)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(f"positions must be numbers, got {given!r}") from error
-        if positions.is_complex():
-            raise ValueError(f"positions must be real, got {positions.dtype}")
-        positions = positions.to(like, copy=True)
+        positions = real_tensor("positions", given).to(like, copy=True)
         shape = (sum(self._counts), 2)
         if tuple(positions.shape) not in (shape, (self._num_envs, *shape)):
             raise ValueError(
                 f"positions must have shape {shape} or {(self._num_envs, *shape)}, got {tuple(positions.shape)}"
             )
-        positions = positions.expand(self._num_envs, *shape).contiguous()
+        return positions.expand(self._num_envs, *shape).contiguous()
+
+    def _check_inside(self, positions: Tensor) -> None:
         origin = window_origin(self._spec, positions[:, : self._counts[0]].mean(1))
         height = positions[..., 1] - origin[:, 1:2]
         inside = Grid().contains(positions[..., 0], origin[:, 0:1]) & (height > 0) & (height < 1)
@@ -194,4 +194,3 @@ class Layouts:
                 f"positions must lie inside the window ({origin[element, 0]:.3f} < x < {origin[element, 0] + 1:.3f}, "
                 f"0 < y < 1), got {where} for particle {particle} of element {element}"
             )
-        return positions

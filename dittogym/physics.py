@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -48,13 +49,7 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
     for name, value in given.items():
         if name not in NAMES:
             raise ValueError(f"physics may hold {', '.join(NAMES)}, got {name!r}")
-        try:
-            tensor = torch.as_tensor(value)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(f"physics[{name!r}] must be numbers, got {value!r}") from error
-        if tensor.is_complex():
-            raise ValueError(f"physics[{name!r}] must be real, got {tensor.dtype}")
-        tensor = tensor.to(like, copy=True)
+        tensor = real_tensor(f"physics[{name!r}]", value).to(like, copy=True)
         own = (2,) if name == "gravity" else ()
         allowed_shapes = [own, (batch, *own), *([(batch, particles)] if name in PER_PARTICLE else [])]
         if tuple(tensor.shape) not in allowed_shapes:
@@ -67,6 +62,24 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
             raise ValueError(f"physics[{name!r}] must be {kind}, got {tensor.detach()[~allowed].flatten()[0].item()}")
         values[name] = _expanded(tensor, name, batch)
     return values
+
+
+def real_tensor(name: str, given: Any) -> Tensor:
+    """What a user gives as numbers, arrays or tensors.
+
+    Raises:
+        ValueError: Not real numbers.
+    """
+    try:
+        if isinstance(given, np.ndarray) and given.dtype.kind in "biuf":
+            # A copy: torch takes neither negative strides nor foreign byte orders.
+            given = np.array(given, np.float64, order="C")
+        tensor = given if isinstance(given, Tensor) else torch.as_tensor(given, device="cpu")
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{name} must be numbers, got {given!r}") from error
+    if tensor.is_complex():
+        raise ValueError(f"{name} must be real, got {tensor.dtype}")
+    return tensor
 
 
 def merged(spec: TaskSpec, old: Physics, new: Physics, mask: Tensor, like: Tensor) -> dict[str, Tensor]:

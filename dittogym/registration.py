@@ -11,6 +11,8 @@ from dittogym.spec import TaskSpec
 from dittogym.tasks import TASKS
 from torchmpm import checks
 
+ENTRY_POINT = "dittogym.env:Env"
+
 
 def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "dittogym", version: int = 0) -> None:
     """Make a task known by name: to :class:`dittogym.TorchEnv`, and to Gymnasium in both resolutions.
@@ -20,7 +22,8 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
         make: Returns the specification; its keyword arguments, which need defaults, become options of the environment.
             Where one of them lengthens the horizon, ``gymnasium.make`` needs ``max_episode_steps`` beside it.
         namespace: Of the ids.
-        version: To be raised with every change of behaviour.
+        version: To be raised with every change of behaviour. Where a function is written anew, as in a notebook, the
+            ids of the one before are taken back.
 
     Raises:
         ValueError: Another function's task has this name, a name is not one word, or the version is negative.
@@ -38,12 +41,17 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
         raise TypeError(f"make must return a TaskSpec, got {type(spec).__name__}")
     if _source(TASKS.get(task, make)) != _source(make):  # of local functions many have the same name
         raise ValueError(f"task must be a new name, got {task!r}, which is taken")
+    if TASKS.get(task, make) is not make:
+        ours = [known for known in gymnasium.registry.values() if known.entry_point == ENTRY_POINT]
+        for known in ours:
+            if known.kwargs["task"] == task:
+                del gymnasium.registry[known.id]
     for resolution in ("coarse", "fine"):
         name = f"{namespace}/{task}-{resolution}-v{version}"
         gymnasium.registry.pop(name, None)  # Gymnasium warns of ids that are replaced
         gymnasium.register(
             id=name,
-            entry_point="dittogym.env:Env",
+            entry_point=ENTRY_POINT,
             vector_entry_point="dittogym.vector:BatchEnv",
             max_episode_steps=spec.horizon,
             kwargs={"task": task, "resolution": resolution},

@@ -49,8 +49,9 @@ def frame(model: Model, state: EnvState, index: int, field: Tensor | None, size:
         IndexError: ``index`` is not in the batch.
         ValueError: ``size`` is below 16 or above 8192.
     """
-    if not isinstance(index, int) or not 0 <= index < len(state.steps):
+    if not isinstance(index, (int, np.integer)) or not 0 <= index < len(state.steps):
         raise IndexError(f"index must be between 0 and {len(state.steps) - 1}, got {index!r}")
+    index = int(index)
     checks.whole("size", size, 16, LARGEST)
     spec = model.spec
     particles = state.particles[index].detach()

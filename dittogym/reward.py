@@ -44,6 +44,18 @@ def beyond(z: Tensor, width: float, *, soft: bool = False) -> Tensor:
     return torch.sigmoid(z / width) if soft else (z > 0).to(z.dtype)
 
 
+def distance(x: Tensor, point: Tensor) -> Tensor:
+    """Of particles ``x`` (B, N, 2) from ``point`` (B, 2), (B, N), m; its derivative is 0 where they coincide."""
+    squared = _squared_distance(x, point)
+    same = squared == 0
+    return torch.where(same, 0.0, torch.where(same, 1.0, squared).sqrt())
+
+
+def _squared_distance(x: Tensor, point: Tensor) -> Tensor:
+    # By component: a state keeps components apart, and Tensor.norm over its last axis takes a hundred times as long.
+    return (x[..., 0] - point[:, :1]).square() + (x[..., 1] - point[:, 1:]).square()
+
+
 def mean_over_nearest(values: Tensor, x: Tensor, point: Tensor, share: float, *, soft: bool = False) -> Tensor:
     """Mean of ``values`` over the particles that ``nearest`` chooses.
 
@@ -63,17 +75,16 @@ def mean_over_nearest(values: Tensor, x: Tensor, point: Tensor, share: float, *,
     if not soft:
         index = nearest(x.detach(), point.detach(), share)
         return values.gather(1, index[..., None].expand(-1, -1, values.shape[2])).mean(1)
-    distance = (x - point[:, None]).square().sum(-1)
-    edge = distance.topk(share_of(share, x), largest=False).values[:, -1:]
+    squared = _squared_distance(x, point)
+    edge = squared.topk(share_of(share, x), largest=False).values[:, -1:]
     width = 2.0 * FADE * edge.clamp_min(FADE**2).sqrt()
-    weight = torch.sigmoid((edge - distance) / width)[..., None]
+    weight = torch.sigmoid((edge - squared) / width)[..., None]
     return (weight * values).sum(1) / weight.sum(1)
 
 
 def nearest(x: Tensor, point: Tensor, share: float) -> Tensor:
     """A share of the particles ``x`` (B, N, 2), those nearest to ``point`` (B, 2), less the widest: indices (B, K)."""
-    distance = (x - point[:, None]).square().sum(-1)
-    return drop_widest(distance.topk(share_of(share, x), largest=False).indices, x)
+    return drop_widest(_squared_distance(x, point).topk(share_of(share, x), largest=False).indices, x)
 
 
 def share_of(share: float, x: Tensor) -> int:

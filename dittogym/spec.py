@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -10,6 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from dittogym.geometry import NODES, Box, Obstacle, mark
+from dittogym.observation import SIZE
 from dittogym.shapes import Shape
 from torchmpm import Material, ParticleState, checks
 
@@ -145,6 +146,16 @@ class Window:
     left: float = 0.0
     follow: float | None = None
 
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ValueError: One is not finite.
+        """
+        checks.number("left", self.left)
+        if self.follow is not None:
+            checks.number("follow", self.follow)
+
 
 #: Centre (x, y) in window coordinates, m; ``None`` stands for the robot's centre.
 Centre = tuple[float | None, float | None]
@@ -187,7 +198,7 @@ class TaskSpec:
 
     Raises:
         ValueError: A number is out of range, or there is more than one object.
-        TypeError: A body is something else, or the judge cannot be called.
+        TypeError: A body, an obstacle or a group of numbers is something else, or the judge cannot be called.
     """
 
     name: str
@@ -217,7 +228,21 @@ class TaskSpec:
 
     def __post_init__(self) -> None:
         """Check what would otherwise fail late or silently."""
+        checks.instance("name", self.name, str)
         checks.whole("horizon", self.horizon, 1)
+        checks.number("mu", self.mu, above=0.0)
+        for name in ("yield_stress", "max_actuation", "damping"):
+            checks.number(name, getattr(self, name), least=0.0)
+        checks.number("lam", self.lam)
+        if self.split_limit is not None:
+            checks.number("split_limit", self.split_limit, above=0.0)
+        for name in ("gravity", "goal", "view", "reach"):
+            self._check_point(name, optional=name == "goal", open_ended=name in ("view", "reach"))
+        checks.instance("weights", self.weights, Weights)
+        checks.instance("window", self.window, Window)
+        checks.instances("obstacles", self.obstacles, Obstacle)
+        if self.target is not None and np.shape(self.target) != (SIZE, SIZE):
+            raise ValueError(f"target must have shape {(SIZE, SIZE)}, got {np.shape(self.target)}")
         checks.whole("patch", self.patch, 4, NODES)
         for name in ("coarse", "fine"):
             checks.whole(name, getattr(self, name), 1, self.patch)
@@ -230,6 +255,16 @@ class TaskSpec:
             raise ValueError(f"objects must be at most one body, got {len(self.objects)}")
         if not callable(self.judge):
             raise TypeError(f"judge must be a function from Moment and Weights to Outcome, got {self.judge!r}")
+
+    def _check_point(self, name: str, *, optional: bool, open_ended: bool) -> None:
+        given = getattr(self, name)
+        if given is None and optional:
+            return
+        if not isinstance(given, Sequence) or isinstance(given, str) or len(given) != 2:
+            raise ValueError(f"{name} must be two numbers (x, y), got {given!r}")
+        for axis, value in zip("xy", given, strict=True):
+            if value is not None or not open_ended:
+                checks.number(f"{name} {axis}", value)
 
     @property
     def bodies(self) -> tuple[Body, ...]:

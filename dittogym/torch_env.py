@@ -37,12 +37,14 @@ class Snapshot:
     Attributes:
         task: Name of the task.
         counts: Particles of each body.
+        shares: By body, the full-size particles that one particle stands for.
         state: Everything that moves, leading B.
         observation: (B, 3, 64, 64) uint8.
     """
 
     task: str
     counts: tuple[int, ...]
+    shares: tuple[float, ...]
     state: EnvState
     observation: Tensor
 
@@ -149,11 +151,12 @@ class TorchEnv:
         self._stale = parity == "reference"
         self.action_layout: Layout = action_layout or ("grid" if self._stale else "image")
         self._counts = counts = particle_counts(self.spec, particles)
-        full = counts == particle_counts(self.spec, "full")
-        self.model = dynamics.make_model(self.spec, counts, substeps=substeps, backend=backend, unscaled=self._stale)
-        self.model = replace(self.model, segment=segment)
-        self._layouts = Layouts(self.spec, counts, num_envs, spread=not (full or self._stale), resample=resample)
+        self.model = dynamics.make_model(
+            self.spec, counts, substeps=substeps, backend=backend, unscaled=self._stale, segment=segment
+        )
+        self._layouts = Layouts(self.spec, counts, num_envs, spread=not self.model.pixels, resample=resample)
         self._like = torch.empty(num_envs, dtype=self.dtype, device=self.device)
+        self.device = self._like.device  # with the number of what is the current device now
         self._physics: Physics = {}
         self._env_state: EnvState | None = None
         self._observation: Tensor | None = None
@@ -178,6 +181,7 @@ class TorchEnv:
         Raises:
             RuntimeError: Neither reset nor assigned yet.
             TypeError: What is assigned is something else.
+            ValueError: It has another number of simulations or particles, another dtype or device.
         """
         if self._env_state is None:
             raise RuntimeError("call reset() first: the environment has no state yet")
@@ -186,6 +190,11 @@ class TorchEnv:
     @env_state.setter
     def env_state(self, value: EnvState) -> None:
         checks.instance("env_state", value, EnvState)
+        theirs = value.particles
+        kind = theirs.batch_size, theirs.num_particles, theirs.dtype, theirs.device
+        own = self.num_envs, self.num_particles, self.dtype, self.device
+        if kind != own:
+            raise ValueError(f"env_state must be of {own} (simulations, particles, dtype, device), got {kind}")
         self._env_state, self._observation, self._field = value, None, None
 
     @property
@@ -218,7 +227,7 @@ class TorchEnv:
     def save(self) -> Snapshot:
         """A copy of the present moment, to which :meth:`load` returns; keeps the autograd graph."""
         state, observation = self._moment()
-        return Snapshot(self.spec.name, self._counts, state.map(Tensor.clone), observation.clone())
+        return Snapshot(self.spec.name, self._counts, self.model.shares, state.map(Tensor.clone), observation.clone())
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Go on from a saved moment, to the last bit as if nothing had happened since.
@@ -241,12 +250,12 @@ class TorchEnv:
         chosen = self._mask(mask, "mask")
         theirs = snapshot.state
         size = len(theirs.steps)
-        kind = (snapshot.task, snapshot.counts, theirs.particles.dtype, theirs.particles.device.type)
-        own = (self.spec.name, self._counts, self.dtype, self.device.type)
+        kind = (snapshot.task, snapshot.counts, snapshot.shares, theirs.particles.dtype, theirs.particles.device)
+        own = (self.spec.name, self._counts, self.model.shares, self.dtype, self.device)
         if kind != own or size not in (1, self.num_envs):
             raise ValueError(
                 f"snapshot must hold 1 or {self.num_envs} simulations of {own}, got {size} of {kind} "
-                "(task, particles, dtype, device)"
+                "(task, particles, what each stands for, dtype, device)"
             )
         index = torch.arange(self.num_envs, device=self.device) % size
         state, observation = theirs.map(lambda t: t[index]), snapshot.observation[index]
@@ -264,7 +273,8 @@ class TorchEnv:
         Args:
             seed: Seeds element i with ``seed + i`` and draws its particles anew. Without it the last layout is used
                 again, unless ``resample`` was asked for.
-            options: ``"positions"``: (N, 2) or (B, N, 2) world positions in m, robot first, used until the next seed;
+            options: ``"positions"``: (N, 2) or (B, N, 2) world positions in m, robot first, used until the next seed,
+                with ``resample`` until the next reset;
                 ``"physics"``: constants of the matter, one value for all, one per element or one per particle, see
                 :func:`dittogym.physics.physics_values`; used until given again, ``{}`` goes back to the task's own;
                 ``"reset_mask"``: (B,) bool, reset only these elements.
@@ -292,18 +302,19 @@ class TorchEnv:
             physics = merged(self.spec, physics, given, mask, self._like)
             dynamics.check_stability(self.model, physics)
         positions = self._layouts.draw(seed, mask.cpu().numpy(), options.get("positions"), self._like)
-        fresh = dynamics.initial(self.model, positions, physics)
+        fresh, observation = dynamics.initial(self.model, positions, physics)
         if old is not None and self._stale:
             memory = {**fresh.memory, **{name: old.memory[name].detach() for name in self.spec.stale}}
             fresh = replace(fresh, centre=old.centre.detach(), memory=memory)
         if old is not None and not everyone:
             kept = merged(self.spec, physics, old.physics, ~mask, self._like)
+            observation = choose(mask, observation, self._moment()[1])
             fresh = replace(fresh, physics=kept).where(mask, replace(old, physics=kept))
         # Gradients in these constants reach back to this reset only, not to those before it.
         self._physics = {name: value.detach().clone() for name, value in physics.items()}
         self._env_state, self._field = fresh, None
         if self._observation is None or not self._stale:
-            self._observation = dynamics.observe(self.model, fresh)
+            self._observation = observation
         now = measure(self.state, self.model.robot)
         info = dynamics.averages(self.model, fresh, now)
         return self._observation, {name: value.detach() for name, value in info.items()}

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torchmpm import native
 from torchmpm.native.library import find_compiler
@@ -28,18 +29,23 @@ def compiler_found() -> bool:
     return find_compiler() is not None
 
 
-def runs_native(solver: Solver, state: ParticleState) -> bool:
+def runs_native(solver: Solver, state: ParticleState, *fields: Tensor | None) -> bool:
     """Whether a step from this state is one for ``torchmpm.native``.
 
     ``"auto"`` takes it on the CPU wherever it works. Where it does not, a warning is logged once that says why. On CUDA
     it waits to be asked for: its kernels there have been tested, but on no device yet.
+
+    Args:
+        solver: The solver.
+        state: The present state.
+        fields: What else the step depends on.
 
     Raises:
         ValueError: The backend is ``"native"`` and cannot run this.
     """
     if solver.backend not in ("auto", "native"):
         return False
-    reason = native.unsupported(solver, state.dtype, state.device)
+    reason = native.unsupported(solver, state.device) or _transformed(solver, state, fields)
     if solver.backend == "native":
         if reason is not None:
             raise ValueError(f"backend 'native' cannot run this: {reason}; use 'eager'")
@@ -54,6 +60,17 @@ def runs_native(solver: Solver, state: ParticleState) -> bool:
     if reason is not None:
         _warn_once(reason)
     return reason is None
+
+
+def _transformed(solver: Solver, state: ParticleState, fields: Sequence[Tensor | None]) -> str | None:
+    """Which way of torch to differentiate is at work that would go past the kernels, or ``None``."""
+    if torch._C._are_functorch_transforms_active():  # torch has no public name for it
+        return "the transforms of torch.func do not go through its kernels"
+    values = (*vars(state).values(), *fields, solver.gravity)
+    values += tuple(value for body in solver.bodies for part in (body, body.material) for value in vars(part).values())
+    if any(isinstance(value, Tensor) and forward_ad.unpack_dual(value).tangent is not None for value in values):
+        return "it has no forward-mode derivatives"
+    return None
 
 
 @functools.cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 from typing import Protocol, TypeAlias, runtime_checkable
 
 import torch
@@ -260,7 +261,7 @@ class Elastic:
         """
         mu, lam = spread(self.mu), spread(self.lam)
         if isinstance(mu, Tensor) or isinstance(lam, Tensor):
-            mu, lam = (torch.as_tensor(value, dtype=torch.float64) for value in (mu, lam))
+            mu, lam = (torch.as_tensor(value, dtype=torch.float64, device="cpu") for value in (mu, lam))
             return 2.0 * torch.where(lam < -mu, -torch.inf, mu + lam.clamp_min(0.0))
         return 2.0 * (mu + max(lam, 0.0))
 
@@ -328,11 +329,13 @@ class Soil(Elastic):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_not_negative(self, "compression", "stretch", "hardening", "shear_cutoff")
+        _check_not_negative(self, "compression", "stretch", "hardening")
+        checks.number("shear_cutoff", self.shear_cutoff, least=0.0)
         if not isinstance(self.compression, Tensor) and not self.compression < 1:
             raise ValueError(f"compression must be below 1, got {self.compression}")
         given = self.hardening_range
-        if not isinstance(given, tuple) or len(given) != 2 or not 0 <= given[0] <= given[1]:
+        numbers = isinstance(given, tuple) and len(given) == 2 and all(isinstance(bound, Real) for bound in given)
+        if not numbers or not 0 <= given[0] <= given[1]:
             raise ValueError(f"hardening_range must be (low, high) with 0 <= low <= high, got {given!r}")
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:

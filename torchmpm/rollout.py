@@ -36,7 +36,7 @@ SEGMENT = 10
 def check_repetition(times: int, segment: Segment, name: str = "times") -> None:
     """Raise the errors of :func:`repeated`, where the caller calls ``times`` by this name."""
     checks.whole(name, times, 0)
-    if segment not in (None, "auto") and not (isinstance(segment, int) and segment >= 1):
+    if segment not in (None, "auto") and (isinstance(segment, bool) or not (isinstance(segment, int) and segment >= 1)):
         raise ValueError(f"segment must be at least 1, None or 'auto', got {segment!r}")
 
 

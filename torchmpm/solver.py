@@ -178,11 +178,13 @@ class Solver:
         rates = [0.0]
         for k, body in enumerate(self.bodies):
             try:
-                pull = torch.as_tensor(spread(actuation), dtype=torch.float64).abs() if body.muscle else 0.0
+                pull = (
+                    torch.as_tensor(spread(actuation), dtype=torch.float64, device="cpu").abs() if body.muscle else 0.0
+                )
                 rate = (body.material.stiffness() + 2.0 * pull) * spread(body.volume) / spread(body.mass)
             except RuntimeError as error:
                 raise ValueError(f"values of bodies[{k}] must have shapes that go together: {error}") from error
-            rate = torch.as_tensor(rate, dtype=torch.float64)
+            rate = torch.as_tensor(rate, dtype=torch.float64, device="cpu")
             if not bool(((rate >= 0) & torch.isfinite(rate)).all()):
                 raise ValueError(
                     f"values of bodies[{k}] must be finite, its mass and volume positive and its stiffness not "
@@ -229,7 +231,7 @@ class Solver:
         origin = self.check(state, actuation, origin)
         if substeps == 0 or state.batch_size == 0:
             return state
-        if runs_native(self, state):
+        if runs_native(self, state, actuation, origin):
             return native.step(self, state, actuation, origin, substeps, segment, mass_epsilon=MASS_EPSILON)
         substep = substep_function(self, self.scene(state, actuation, origin))
         return ParticleState.from_planes(repeated(substep, state.planes(), substeps, segment=segment))

@@ -37,7 +37,8 @@ class ParticleState:
         Jp: (B, N) plastic volume ratio, dimensionless; only soil changes it.
 
     Raises:
-        ValueError: A field has the wrong shape or is not of floating point, or dtype or device differ between fields.
+        ValueError: A field has the wrong shape, is neither float32 nor float64, or dtype or device differ between
+            fields.
         TypeError: A field is not a tensor.
     """
 
@@ -51,8 +52,8 @@ class ParticleState:
         checks.instance("x", self.x, Tensor)
         if self.x.ndim != 3 or self.x.shape[-1] != 2:
             raise ValueError(f"x must have shape (B, N, 2), got {tuple(self.x.shape)}")
-        if not self.x.is_floating_point():
-            raise ValueError(f"x must be of floating point, got {self.x.dtype}")
+        if self.x.dtype not in (torch.float32, torch.float64):  # half precision would lose what a substep adds
+            raise ValueError(f"x must be float32 or float64, got {self.x.dtype}")
         for name, trailing in _TRAILING.items():
             field = getattr(self, name)
             checks.instance(name, field, Tensor)
@@ -74,7 +75,7 @@ class ParticleState:
             x: (B, N, 2) or (N, 2) positions in m; the latter becomes a batch of one.
 
         Raises:
-            ValueError: They have another shape or are not of floating point.
+            ValueError: They have another shape, or are neither float32 nor float64.
             TypeError: They are not a tensor.
         """
         checks.instance("x", x, Tensor)
@@ -123,6 +124,10 @@ class ParticleState:
     def clone(self) -> ParticleState:
         """An independent copy, for branching a simulation."""
         return self.map(Tensor.clone)
+
+    def __reduce__(self) -> tuple[type[ParticleState], tuple[Tensor, ...]]:
+        """Pickle the fields alone: copies would not share memory with a copy of :meth:`stack`."""
+        return ParticleState, tuple(getattr(self, f.name) for f in fields(self))
 
     def __getitem__(self, index: Any) -> ParticleState:
         """Select batch elements; an integer keeps a batch dimension of one.

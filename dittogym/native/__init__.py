@@ -49,9 +49,10 @@ class Painter:
     def __init__(self, model: Model) -> None:
         spec, grid = model.spec, model.solver.grid
         bodies = zip(model.solver.bodies, model.shares, spec.bodies, strict=True)
-        self._body = torch.tensor([(b.count, n, s.moves_visibly) for b, n, s in bodies], dtype=torch.float64)
+        table = [(b.count, n, s.moves_visibly) for b, n, s in bodies]
+        self._body = torch.tensor(table, dtype=torch.float64, device="cpu")
         boxes = [(b.left, b.right, b.bottom, b.top, b.closed) for b in spec.drawn]
-        self._box = torch.tensor(boxes, dtype=torch.float64)
+        self._box = torch.tensor(boxes, dtype=torch.float64, device="cpu")
         self._constants = {
             "pixels": model.pixels,
             "bodies": len(spec.bodies),
@@ -72,7 +73,7 @@ class Painter:
         """
         x, v = (t.detach().movedim(-1, 0).contiguous() for t in (state.particles.x, state.particles.v))
         origin, centre = state.origin.detach().contiguous(), state.centre.detach().contiguous()
-        image = torch.empty(x.shape[1], 3, SIZE, SIZE, dtype=torch.uint8)
+        image = torch.empty(x.shape[1], 3, SIZE, SIZE, dtype=torch.uint8, device="cpu")
         call = Picture(
             batch=x.shape[1],
             particles=x.shape[2],

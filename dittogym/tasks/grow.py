@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from torch import Tensor
 
 from dittogym.geometry import Obstacle, ceiling, floor, nodes, side_walls
-from dittogym.reward import beyond, drop_widest, pick, share_of
+from dittogym.reward import beyond, distance, drop_widest, pick, share_of
 from dittogym.shapes import Lattice
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
 from torchmpm import VelocityRule
@@ -60,14 +60,14 @@ def remember(moment: Moment) -> Mapping[str, Tensor]:
 def judge(moment: Moment, weights: Weights) -> Outcome:
     """Mean distance of the tip from the goal, under a square root."""
     tip = pick(moment.particles.x, moment.memory["tip"])
-    distance = (tip - tip.new_tensor(GOAL)).norm(dim=-1).mean(1)
-    reached = distance < REACHED
-    bonus = BONUS * beyond(REACHED - distance, BONUS_WIDTH, soft=moment.soft)
+    gap = distance(tip, tip.new_tensor(GOAL)[None]).mean(1)
+    reached = gap < REACHED
+    bonus = BONUS * beyond(REACHED - gap, BONUS_WIDTH, soft=moment.soft)
     return Outcome(
-        terms={"distance": -weights.location * distance.sqrt(), "success": bonus},
-        terminated=reached | (distance > LOST),
+        terms={"distance": -weights.location * gap.sqrt(), "success": bonus},
+        terminated=reached | (gap > LOST),
         success=reached,
-        info={"distance": distance},
+        info={"distance": gap},
     )
 
 

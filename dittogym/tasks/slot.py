@@ -9,7 +9,7 @@ from typing import Literal
 from torch import Tensor
 
 from dittogym.geometry import NODES, Box, Obstacle, ceiling, floor, nodes
-from dittogym.reward import beyond, limited, mean_over_nearest, signed_quadratic
+from dittogym.reward import beyond, distance, limited, mean_over_nearest, signed_quadratic
 from dittogym.shapes import Disc, Rectangle
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
 from torchmpm import VelocityRule, fixed
@@ -73,8 +73,7 @@ def front_distance(moment: Moment) -> Tensor:
     """Mean distance of the robot's front from the cap's centre, (B,), m."""
     x, cap = moment.particles.x[:, : moment.robot], moment.now.object_com
     assert cap is not None
-    distance = (x - cap[:, None]).norm(dim=-1, keepdim=True)
-    return mean_over_nearest(distance, x, cap, FRONT, soft=moment.soft)[:, 0]
+    return mean_over_nearest(distance(x, cap)[..., None], x, cap, FRONT, soft=moment.soft)[:, 0]
 
 
 def remember(moment: Moment) -> Mapping[str, Tensor]:
@@ -84,9 +83,9 @@ def remember(moment: Moment) -> Mapping[str, Tensor]:
 
 def judge(moment: Moment, weights: Weights) -> Outcome:
     """Approach to the cap, displacement of the cap, where it falls, and speed in both directions."""
-    cap, distance = moment.now.object_com, front_distance(moment)
+    cap, front = moment.now.object_com, front_distance(moment)
     assert cap is not None
-    z = 2.0 * (moment.memory["front_distance"] - distance)
+    z = 2.0 * (moment.memory["front_distance"] - front)
     soft = moment.soft
     approach = limited(16.0 * z * z.abs() + 10.0 * z, -20.0, 50.0, soft=soft)
     fallen, far = cap[:, 1] < FALLEN, cap[:, 0] >= FAR_SIDE
@@ -102,7 +101,7 @@ def judge(moment: Moment, weights: Weights) -> Outcome:
         },
         terminated=fallen | (moment.now.com[:, 0] < REAR_LIMIT),
         success=fallen & far,
-        info={"distance": distance},
+        info={"distance": front},
     )
 
 

@@ -104,7 +104,16 @@ SOLVER = table(
         ("no backend", lambda: solver(backend=None), ("backend must be one of", "eager", "got None")),
         ("half a substep", lambda: solver().step(state(), substeps=1.5), "substeps must be a whole number, got 1.5"),
         ("segment of a text", lambda: solver().step(state(), segment="all"), ("segment must be", "got 'all'")),
-        ("state of integers", lambda: ParticleState.at_rest(torch.zeros(1, 5, 2, dtype=torch.int64)), "floating point"),
+        (
+            "state of integers",
+            lambda: ParticleState.at_rest(torch.zeros(5, 2, dtype=torch.int64)),
+            "float32 or float64",
+        ),
+        (
+            "state of halves",
+            lambda: ParticleState.at_rest(torch.zeros(5, 2).half()),
+            "float32 or float64, got torch.fl",
+        ),
         ("state of one axis", lambda: ParticleState.at_rest(torch.zeros(5)), ("(B, N, 2) or (N, 2), got (5,)",)),
         ("disc inside out", lambda: sampling.disc(np.zeros((3, 2)), (0, 0), -1.0), "radius must be positive, got -1.0"),
         ("lattice of no cells", lambda: sampling.lattice((0, 3), (0, 0), (1, 1)), "cells in x must be at least 1"),

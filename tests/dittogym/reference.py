@@ -82,7 +82,7 @@ def make(data: dict[str, np.ndarray], **options: Any) -> dittogym.TorchEnv:
     )
     env.reset(seed=0)
     # Not through the option "positions": one file parks particles that it does not need outside the window.
-    env.env_state = dynamics.initial(env.model, torch.as_tensor(data["x0"])[None].to(env.dtype))
+    env.env_state, _ = dynamics.initial(env.model, torch.as_tensor(data["x0"])[None].to(env.dtype))
     return env
 
 

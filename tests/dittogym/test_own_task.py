@@ -1,6 +1,7 @@
 """A task of one's own, registered without touching the library."""
 
 import dataclasses
+import math
 from collections.abc import Iterator
 
 import gymnasium
@@ -12,10 +13,10 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from tiny import SMALL, actions, tiny
 
 import dittogym
-from dittogym.geometry import ceiling, floor
+from dittogym.geometry import Obstacle, ceiling, floor
 from dittogym.shapes import Disc, Rectangle
-from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights
-from torchmpm import Elastic
+from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
+from torchmpm import Elastic, VelocityRule
 
 
 @pytest.fixture(autouse=True)
@@ -229,7 +230,13 @@ def test_a_longer_limit_than_the_horizon() -> None:
         ),
         ({"terms": {"alive": torch.zeros(2)}}, r"must not return the engine's own terms, got \['alive'\]"),
         ({"info": {"com": torch.zeros(2)}}, r"must not return the engine's own info, got \['com'\]"),
-        ({"memory": {"best": torch.zeros(2)}}, r"the memory that remember gives, \['first'\], got \['best'\]"),
+        ({"info": {"risen": 1.0}}, r"must return info of shape \(B, ...\), got float for 'risen'"),
+        ({"info": {"risen": torch.tensor(1.0)}}, r"got torch.float32 of shape \(\) for 'risen'"),
+        (
+            {"memory": {"best": torch.zeros(2)}},
+            r"memory like that of remember, {'first': .*got {'best': 'torch.float32",
+        ),
+        ({"memory": {"first": torch.zeros(2)}}, r"{'first': 'torch.float64 of shape \(2, 2\)'}, got {'first': 'torch"),
     ],
 )
 def test_a_judgement_that_would_do_harm_later_is_refused(changes: dict, message: str) -> None:
@@ -264,6 +271,46 @@ def test_a_function_that_is_written_anew_takes_the_place_of_the_old_one() -> Non
         dittogym.register("jump", names["jump"])
     assert gymnasium.spec("dittogym/jump-coarse-v0").max_episode_steps == 20
     assert tiny("jump").spec.horizon == 20
+    exec(cell % 10, names)
+    dittogym.register("jump", names["jump"], version=1)
+    assert "dittogym/jump-coarse-v1" in gymnasium.registry and "dittogym/jump-coarse-v0" not in gymnasium.registry
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"mu": 0.0}, ValueError, "mu must be positive, got 0.0"),
+        ({"max_actuation": -5.0}, ValueError, "max_actuation must not be negative, got -5.0"),
+        ({"split_limit": -1.0}, ValueError, "split_limit must be positive, got -1.0"),
+        ({"goal": (1.0, 2.0, 3.0)}, ValueError, r"goal must be two numbers \(x, y\), got \(1.0, 2.0, 3.0\)"),
+        ({"view": (0.5,)}, ValueError, r"view must be two numbers \(x, y\), got \(0.5,\)"),
+        ({"reach": (None, "up")}, ValueError, "reach y must be a number, got 'up'"),
+        ({"gravity": (None, -9.0)}, ValueError, "gravity x must be a number, got None"),
+        ({"target": np.zeros((3, 3), bool)}, ValueError, r"target must have shape \(64, 64\), got \(3, 3\)"),
+        ({"weights": {"location": 1.0}}, TypeError, "weights must be a Weights, got dict"),
+        ({"obstacles": (VelocityRule("-y"),)}, TypeError, r"obstacles\[0\] must be a Obstacle, got VelocityRule"),
+        ({"obstacles": floor()}, TypeError, "obstacles must be a sequence of Obstacle, got Obstacle"),
+    ],
+)
+def test_numbers_that_would_fail_late_are_refused(changes: dict, error: type, message: str) -> None:
+    with pytest.raises(error, match=message):
+        dataclasses.replace(hop(), **changes)
+
+
+def test_obstacles_and_windows_check_their_parts() -> None:
+    with pytest.raises(TypeError, match="rules must be a sequence of VelocityRule, got VelocityRule"):
+        Obstacle("ledge", VelocityRule("-y"))
+    with pytest.raises(TypeError, match=r"drawn\[0\] must be a Box, got tuple"):
+        Obstacle("ledge", (), drawn=((0.0, 1.0),))
+    with pytest.raises(ValueError, match="left must be finite, got nan"):
+        Window(left=math.nan)
+
+
+def test_a_robot_outside_its_window_is_refused() -> None:
+    wide = Body(Rectangle((0.9, 0.2), (0.3, 0.1)), count=100)
+    env = tiny(dataclasses.replace(hop(), robot=wide, window=Window(left=0.0)))
+    with pytest.raises(ValueError, match="positions must lie inside the window"):
+        env.reset(seed=0)
 
 
 def test_what_a_robot_cannot_have_is_refused() -> None:

@@ -338,3 +338,15 @@ def test_a_state_that_is_assigned_brings_its_own_picture() -> None:
     assert torch.equal(env.save().observation, moved)
     with pytest.raises(TypeError, match="env_state must be a EnvState, got None"):
         env.env_state = None
+    for unlike in (tiny("run", 3), tiny("run", particles=60), tiny("run", dtype="float32")):
+        unlike.reset(seed=0)
+        with pytest.raises(ValueError, match=r"env_state must be of \(1, 120, torch.float64, device"):
+            env.env_state = unlike.env_state
+
+
+def test_a_moment_of_particles_that_stand_for_others_is_refused() -> None:
+    env, unscaled = tiny("run"), tiny("run", parity="reference")
+    unscaled.reset(seed=0)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="snapshot must hold"):
+        env.load(unscaled.save())

@@ -1,11 +1,15 @@
 """The batched environment: resets, batches, gradients, bad input."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 import dittogym
-from dittogym import TorchEnv, layout
+from dittogym import TorchEnv, dynamics, layout
 from dittogym.spec import FAILURE_REWARD
 
 TASKS = ("run", "shapematch")
@@ -129,6 +133,49 @@ def test_bad_positions(positions: np.ndarray, message: str) -> None:
     assert env.state is before
 
 
+def test_layouts_of_arrays_do_not_matter() -> None:
+    """Mirrored, of the other byte order, or read-only."""
+    env = dittogym.Env("run", particles=60, substeps=1, dtype="float64")
+    masses = np.linspace(1.0, 2.0, 60)[None]
+    positions = (
+        small(particles=60)._layouts.draw(0, np.ones(1, bool), None, torch.zeros(1, dtype=torch.float64))[0].numpy()
+    )
+    action = np.random.default_rng(0).uniform(-1, 1, env.action_space.shape)
+    results = []
+    for form in (
+        lambda a: a,
+        lambda a: a[..., ::-1].copy()[..., ::-1],
+        lambda a: a.astype(a.dtype.newbyteorder()),
+        lambda a: np.broadcast_to(a, a.shape),
+    ):
+        env.reset(options={"positions": form(positions), "physics": {"mass": form(masses)}})
+        results.append(env.step(form(action))[1])
+    assert results == results[:1] * 4
+
+
+def test_defaults_of_torch_change_nothing() -> None:
+    """Neither of dtype, nor of the device, nor autocast."""
+    rewards = []
+    for context in (nullcontext(), torch.device("meta"), torch.autocast("cpu", torch.bfloat16), float64()):
+        dynamics._per_particle.cache_clear()
+        with context:
+            env = small(dtype="float32", particles=60, backend="auto")
+            env.reset(seed=0)
+            rewards.append(
+                env.step(torch.full((1, *env.action_shape), 0.3, device="cpu", dtype=torch.float32), soft=True)[1]
+            )
+    assert all(torch.equal(reward, rewards[0]) for reward in rewards)
+
+
+@contextmanager
+def float64() -> Iterator[None]:
+    torch.set_default_dtype(torch.float64)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
 @pytest.mark.parametrize(
     ("action", "message"),
     [
@@ -183,6 +230,29 @@ def test_bad_resets() -> None:
         env.reset(options={"position": 0})
     with pytest.raises(ValueError, match="seed must not be negative, got -1"):
         env.reset(seed=-1)
+
+
+@pytest.mark.parametrize("backend", ["auto", "eager"])
+@pytest.mark.parametrize("task", ["run", "slot"])
+def test_a_failed_element_leaves_shared_gradients_alone(task: str, backend: str) -> None:
+    """In one action for all and one constant for all: the same as of the intact element by itself."""
+    found = []
+    for batch in (1, 2):
+        env = small(task, batch, particles=60, substeps=4, backend=backend)
+        shared = actions(env, 1)[0, :1].requires_grad_()
+        mu = torch.tensor(500.0, dtype=torch.float64, requires_grad=True)
+        env.reset(seed=0, options={"physics": {"mu": mu}})
+        action = shared.expand(batch, -1, -1, -1)
+        env.step(action)
+        v = env.state.v.clone()
+        v[1:] = torch.nan
+        env.env_state = replace(env.env_state, particles=replace(env.state, v=v))
+        rewards = [env.step(action, soft=soft)[1] for soft in (True, False)]
+        assert torch.equal(rewards[0][1:], torch.full((batch - 1,), FAILURE_REWARD, dtype=torch.float64))
+        found.append(torch.autograd.grad(sum(rewards).sum(), (shared, mu)))
+    for alone, beside in zip(*found, strict=True):
+        torch.testing.assert_close(beside, alone, rtol=1e-12, atol=1e-15)
+        assert alone.abs().max() > 0
 
 
 def test_failed_element_ends_alone() -> None:

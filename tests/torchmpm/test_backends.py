@@ -2,6 +2,7 @@
 
 import importlib.util
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import pytest
 import torch
 from scenes import assert_close, assert_identical, lively, normal, robot, robot_and_ball
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.autograd import forward_ad
 
 from torchmpm import Body, ParticleState, Solver, VonMises, backends
 from torchmpm.backends import BACKENDS, compiler_found
@@ -62,22 +65,58 @@ class Own(VonMises):
     """Somebody's material."""
 
 
-@pytest.mark.parametrize(
-    ("change", "dtype", "reason"),
-    [
-        ({"bodies": (Body(30, Own(500.0, 50.0, 60.0)),)}, torch.float64, "a body has Own"),
-        ({}, torch.bfloat16, "the state is torch.bfloat16"),
-    ],
-)
-def test_auto_is_eager_where_it_does_not(
-    fresh_process: None, caplog: pytest.LogCaptureFixture, change: dict, dtype: torch.dtype, reason: str
-) -> None:
+def test_auto_is_eager_where_it_does_not(fresh_process: None, caplog: pytest.LogCaptureFixture) -> None:
     """And says why, once."""
-    state = lively(30).to(dtype)
-    results = [robot(30, backend=b, **change).step(state, substeps=2) for b in ("auto", "eager", "auto")]
+    state, bodies = lively(30), (Body(30, Own(500.0, 50.0, 60.0)),)
+    results = [robot(30, backend=b, bodies=bodies).step(state, substeps=2) for b in ("auto", "eager", "auto")]
     assert_identical(results[0], results[1])
     (message,) = messages(caplog)
-    assert reason in message and "operator by operator" in message
+    assert "a body has Own" in message and "operator by operator" in message
+
+
+def test_transforms_of_torch_func_get_what_eager_gives(fresh_process: None, caplog: pytest.LogCaptureFixture) -> None:
+    """Forward-mode derivatives too, in actuation and constants, which would be lost on the way through the kernels."""
+    state, drive = lively(20, 2), normal(2, 2, 16, 16, seed=1)
+    mu = torch.tensor(500.0, dtype=torch.float64)
+
+    def loss(backend: str) -> Callable[[Tensor, Tensor], Tensor]:
+        def through(drive: Tensor, mu: Tensor) -> Tensor:
+            bodies = (Body(20, VonMises(mu, 50.0, 62.0), mass=2.0, muscle=True),)
+            solver = robot(20, bodies=bodies, backend=backend, allow_unstable=True)
+            return solver.step(state, drive, substeps=3).F.square().sum()
+
+        return through
+
+    tangents = drive, torch.ones_like(mu)
+    for transform in (
+        lambda f: torch.func.jvp(f, (drive, mu), tangents)[1],
+        lambda f: torch.func.grad(f, (0, 1))(drive, mu),
+        lambda f: torch.func.vmap(lambda factor: f(factor * drive, mu))(torch.arange(3.0, dtype=torch.float64)),
+    ):
+        torch.testing.assert_close(transform(loss("auto")), transform(loss("eager")), rtol=0, atol=0)
+        with pytest.raises(ValueError, match=r"backend 'native' cannot run this: the transforms of torch\.func"):
+            transform(loss("native"))
+    with forward_ad.dual_level():
+        for pair in ((forward_ad.make_dual(drive, drive), mu), (drive, forward_ad.make_dual(mu, torch.ones_like(mu)))):
+            auto, eager = (forward_ad.unpack_dual(loss(backend)(*pair)).tangent for backend in ("auto", "eager"))
+            assert auto is not None and auto == eager != 0
+            with pytest.raises(ValueError, match="it has no forward-mode derivatives"):
+                loss("native")(*pair)
+    assert len(messages(caplog)) == 2
+
+
+def test_other_defaults_of_torch_change_nothing(fresh_process: None) -> None:
+    state, drive = lively(20), normal(1, 2, 16, 16, seed=1)
+    expected = robot(20, backend="auto").step(state, drive, substeps=2)
+    with torch.device("meta"):
+        assert_identical(robot(20, backend="auto").step(state, drive, substeps=2), expected)
+
+
+def test_a_trace_leaves_nothing_behind() -> None:
+    state, solver = lively(20), robot(20, backend="auto")
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        solver.step(state, substeps=2)
+    assert type(solver.step(state, substeps=2).x) is Tensor
 
 
 def test_auto_without_a_compiler(
@@ -143,20 +182,20 @@ def test_compiler_search(
 
 def test_what_native_wants_on_other_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     """None of this needs the device."""
-    cuda, single = torch.device("cuda"), torch.float32
-    assert "on the CPU and on CUDA, the state is on mps" in str(unsupported(robot(5), single, torch.device("mps")))
+    cuda = torch.device("cuda")
+    assert "on the CPU and on CUDA, the state is on mps" in str(unsupported(robot(5), torch.device("mps")))
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CC", raising=False)
     pack.triton_lacks.cache_clear()
-    assert "on CUDA it needs Triton, which is not installed" in str(unsupported(robot(5), single, cuda))
+    assert "on CUDA it needs Triton, which is not installed" in str(unsupported(robot(5), cuda))
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     pack.triton_lacks.cache_clear()
-    assert "needs a C compiler for Triton ($CC, gcc or clang)" in str(unsupported(robot(5), single, cuda))
+    assert "needs a C compiler for Triton ($CC, gcc or clang)" in str(unsupported(robot(5), cuda))
     monkeypatch.setenv("CC", "cc")
-    assert unsupported(robot(5), single, cuda) is None
+    assert unsupported(robot(5), cuda) is None
     monkeypatch.setattr(torch, "are_deterministic_algorithms_enabled", lambda: True)
-    assert "taken in no fixed order" in str(unsupported(robot(5), single, cuda))
+    assert "taken in no fixed order" in str(unsupported(robot(5), cuda))
     pack.triton_lacks.cache_clear()
 
 

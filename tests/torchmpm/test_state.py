@@ -1,12 +1,13 @@
 """ParticleState: shapes, views on its planes, selection and branching."""
 
+import pickle
 import subprocess
 import sys
 import textwrap
 
 import pytest
 import torch
-from scenes import assert_identical, lively
+from scenes import assert_identical, lively, robot
 
 from torchmpm import ParticleState
 
@@ -54,6 +55,12 @@ def test_a_field_of_another_dtype_or_device_is_named(name: str) -> None:
         ParticleState(**right | {name: right[name].float()})
     with pytest.raises(ValueError, match=rf"^{name} is torch.float64 on meta, but x is torch.float64 on cpu"):
         ParticleState(**right | {name: right[name].to("meta")})
+
+
+def test_a_pickled_state_is_one_again() -> None:
+    state = pickle.loads(pickle.dumps(robot(7).step(lively(7), substeps=1)))
+    state.v[..., 0] += 1.0
+    assert torch.equal(state.stack()[2], state.v[..., 0])
 
 
 def test_planes_are_the_components_and_invert() -> None:

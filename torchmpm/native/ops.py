@@ -29,10 +29,10 @@ def _scratch(size: int) -> Iterator[int]:
     try:
         buffer = _kept.pop()
     except IndexError:
-        buffer = torch.empty(0, dtype=torch.uint8)
+        buffer = torch.empty(0, dtype=torch.uint8, device="cpu")
     if buffer.numel() < size + 64:
         del buffer
-        buffer = torch.empty(size + 64, dtype=torch.uint8)
+        buffer = torch.empty(size + 64, dtype=torch.uint8, device="cpu")
     yield (buffer.data_ptr() + 63) // 64 * 64
     if buffer.numel() <= KEPT_BYTES and not _kept:
         _kept.append(buffer)

@@ -36,7 +36,7 @@ MAX_RULES = 254
 MAX_RESOLUTION, MAX_PARTICLES = 16_000, 2**30
 
 
-def unsupported(solver: Solver, dtype: torch.dtype, device: torch.device) -> str | None:
+def unsupported(solver: Solver, device: torch.device) -> str | None:
     """Why the kernels cannot run this solver on such a state, or ``None`` if they can."""
     if device.type not in ("cpu", "cuda"):
         return f"it runs on the CPU and on CUDA, the state is on {device}"
@@ -46,8 +46,6 @@ def unsupported(solver: Solver, dtype: torch.dtype, device: torch.device) -> str
             return missing
         if torch.are_deterministic_algorithms_enabled() and not torch.is_deterministic_algorithms_warn_only_enabled():
             return "on CUDA its sums are taken in no fixed order, torch.use_deterministic_algorithms(True) forbids that"
-    if dtype not in (torch.float32, torch.float64):
-        return f"it computes in float32 or float64, the state is {dtype}"
     for body in solver.bodies:
         if type(body.material) not in KINDS:
             names = ", ".join(kind.__name__ for kind in KINDS)
@@ -73,7 +71,7 @@ def triton_lacks(compiler: str | None, path: str | None) -> str | None:
 
 def upload(numbers: Sequence[float], like: Tensor) -> Tensor:
     """Numbers as a tensor of the dtype and on the device of ``like``; does not wait for the device."""
-    host = torch.tensor(numbers, dtype=like.dtype)
+    host = torch.tensor(numbers, dtype=like.dtype, device="cpu")
     return host.pin_memory().to(like.device, non_blocking=True) if like.is_cuda else host
 
 
@@ -105,7 +103,7 @@ def values(solver: Solver, like: Tensor) -> tuple[Tensor, list[int]]:
     batch = max(table.shape[1] for table in tables)
     widths = [table.shape[2] for table in tables]
     result = torch.cat([table.expand(-1, batch, -1) for table in tables], dim=2).contiguous(), widths
-    if plain:
+    if plain and type(result[0]) is Tensor:  # not one that only stands for a tensor while something is traced
         with torch.inference_mode(False):  # what is kept must serve gradients later
             result = result[0].clone(), widths
         _numbers.setdefault(solver, {})[like.dtype, like.device] = result
@@ -157,7 +155,7 @@ def description(solver: Solver, widths: list[int], mass_epsilon: float) -> Tenso
         ]
         axis, sign = "xy".index(rule.direction[1]), 1.0 if rule.direction[0] == "+" else -1.0
         numbers += [axis, sign, *ends[0], *ends[1], rule.friction, rule.frame == "world"]
-    return torch.tensor(numbers, dtype=torch.float64)
+    return torch.tensor(numbers, dtype=torch.float64, device="cpu")
 
 
 def body_widths(description: Tensor) -> list[tuple[int, int]]:
