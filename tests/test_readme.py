@@ -18,8 +18,8 @@ with install_import_hook("torchmpm", "beartype.beartype"):
 
 
 def examples(page: str) -> str:
-    """The Python blocks of a page that need no trained policy, one after the other."""
-    text, _, _ = (ROOT / page).read_text().partition("<!-- trained -->")
+    """The Python blocks of a page, one after the other."""
+    text = (ROOT / page).read_text()
     return "\n".join(re.findall(r"^```python\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE))
 
 
@@ -33,7 +33,8 @@ PAGES = {
     "README.md": (
         "assert muscles.grad.abs().max() > 0",
         "assert env.observation_space.shape == (3, 64, 64)",
-        "assert reward.shape == (16,) and action.grad.flatten(1).norm(dim=1).min() > 0",
+        "assert reward.shape == (16,) and actions.grad.flatten(1).norm(dim=1).min() > 0",
+        "assert action.shape == env.action_space.shape and action.any()",
     ),
     "docs/start.md": (
         "assert len(frames) == 60 and Image.open('moving.webp').n_frames > 30",
