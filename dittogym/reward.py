@@ -98,8 +98,8 @@ def drop_widest(index: Tensor, x: Tensor) -> Tensor:
     if count == 1:
         return index
     widest = x[..., 0].abs().gather(1, index).argmax(1, keepdim=True)
-    kept = torch.arange(count, device=index.device) != widest
-    return index[kept].view(batch, count - 1)
+    others = torch.arange(count - 1, device=index.device).expand(batch, -1)
+    return index.gather(1, others + (others >= widest))
 
 
 def pick(x: Tensor, index: Tensor) -> Tensor:
