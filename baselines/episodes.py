@@ -32,7 +32,7 @@ class Episodes:
     def __init__(self, env: TorchEnv, seed: int, age: int, layouts: int) -> None:
         self.env, self.layouts = env, layouts
         count = env.num_envs
-        self.first_layout = seed + count  # seeds of single elements are counted back from it, and not below 0
+        self.first_layout = seed + count
         env.reset(seed=self.first_layout)
         self.age = min(age, env.spec.horizon)
         self.limit = torch.tensor([max(1, self.age * (i + 1) // count) for i in range(count)], device=env.device)
@@ -47,15 +47,16 @@ class Episodes:
 
     def restart(self, out: Tensor, terminated: Tensor, finite: Tensor) -> None:
         """Begin new episodes where ``out`` (B,) says so, each on the next layout."""
+        seeds = [0] * self.env.num_envs
         for i in out.nonzero()[:, 0].tolist():
             self.counts["episodes"] += 1
             self.counts["terminated"] += int(terminated[i])
             self.counts["nonfinite"] += int(~finite[i])
             self.ended.append(float(self.returns[i]))
-            layout = self.first_layout + self.drawn % self.layouts
+            seeds[i] = self.first_layout + self.drawn % self.layouts
             self.drawn += 1
-            mask = torch.arange(self.env.num_envs, device=self.env.device) == i
-            self.env.reset(seed=layout - i, options={"reset_mask": mask})
+        if bool(out.any()):
+            self.env.reset(seed=seeds, options={"reset_mask": out})
         self.returns = torch.where(out, 0.0, self.returns)
         self.limit = torch.where(out, self.age, self.limit)
 

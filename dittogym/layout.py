@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -18,6 +18,9 @@ from torchmpm.state import choose
 
 #: ``"full"``, ``"lite"``, the number of robot particles, or the numbers for robot and object.
 Particles: TypeAlias = "str | int | tuple[int, ...]"
+
+#: Of the first element, the others count on from it; or one for each; ``None``: not seeded.
+Seed: TypeAlias = "int | Sequence[int] | None"
 
 #: Robot particles of the lite tier.
 LITE = 2000
@@ -136,11 +139,11 @@ class Layouts:
                 raise RuntimeError(f"call reset() first: element {element} has no random generator yet")
             self._samplers[element].generator = state
 
-    def draw(self, seed: int | None, mask: np.ndarray, given: Any, like: Tensor) -> Tensor:
+    def draw(self, seed: Seed, mask: np.ndarray, given: Any, like: Tensor) -> Tensor:
         """Starting positions (B, N, 2) in m of all elements; those outside ``mask`` (B,) keep theirs.
 
         Args:
-            seed: Of the first element, the others follow; ``None`` goes on with what there is.
+            seed: Of the first element, the others follow, or one for each; ``None`` goes on with what there is.
             mask: Which elements are reset.
             given: (N, 2) or (B, N, 2) positions, or ``None``.
             like: Gives dtype and device.
@@ -148,16 +151,14 @@ class Layouts:
         Raises:
             ValueError: Positions of the wrong shape or outside the window, or a seed out of range.
         """
-        if seed is not None:
-            seed = checks.whole("seed", seed, 0, MAX_SEED + 1 - self._num_envs)
+        seeds = self._seeds(seed)
         samplers = dict(self._samplers)
-        redraw = seed is not None or not samplers
+        redraw = seeds is not None or not samplers
         if self._positions is None:
             mask = np.ones_like(mask)  # every element has a layout from the first draw on
         if redraw:
             for i in np.flatnonzero(mask).tolist():
-                element_seed = None if seed is None else seed + i
-                samplers[i] = LayoutSampler(self._spec, self._counts, element_seed, spread=self._spread)
+                samplers[i] = LayoutSampler(self._spec, self._counts, seeds[i] if seeds else None, spread=self._spread)
         if given is not None:
             positions = self._given(given, like)
         elif self._positions is None or redraw or self._resample:
@@ -173,6 +174,16 @@ class Layouts:
         # Gradients in given positions reach back to this reset only, not to the one that uses them next.
         self._samplers, self._positions = samplers, positions.detach().clone()
         return positions
+
+    def _seeds(self, seed: Seed) -> Sequence[int] | None:
+        if seed is None:
+            return None
+        if not isinstance(seed, Sequence):
+            first = checks.whole("seed", seed, 0, MAX_SEED + 1 - self._num_envs)
+            return range(first, first + self._num_envs)
+        if len(seed) != self._num_envs:
+            raise ValueError(f"seed must be a whole number or {self._num_envs} of them, got {seed!r}")
+        return [checks.whole(f"seed[{i}]", each, 0, MAX_SEED) for i, each in enumerate(seed)]
 
     def _given(self, given: Any, like: Tensor) -> Tensor:
         positions = real_tensor("positions", given).to(like, copy=True)

@@ -14,7 +14,7 @@ from torch import Tensor
 from dittogym import dynamics
 from dittogym.action import Layout, to_grid_layout
 from dittogym.dynamics import EnvState
-from dittogym.layout import Layouts, Particles, particle_counts
+from dittogym.layout import Layouts, Particles, Seed, particle_counts
 from dittogym.physics import Physics, merged, physics_values
 from dittogym.render import frame
 from dittogym.reward import measure
@@ -267,12 +267,12 @@ class TorchEnv:
         self._env_state, self._observation, self._field = state, observation, None
         return observation
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
+    def reset(self, *, seed: Seed = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Start new episodes.
 
         Args:
-            seed: Seeds element i with ``seed + i`` and draws its particles anew. Without it the last layout is used
-                again, unless ``resample`` was asked for.
+            seed: Seeds element i with ``seed + i``, or with ``seed[i]``, and draws its particles anew. Without it the
+                last layout is used again, unless ``resample`` was asked for.
             options: ``"positions"``: (N, 2) or (B, N, 2) world positions in m, robot first, used until the next seed,
                 with ``resample`` until the next reset;
                 ``"physics"``: constants of the matter, one value for all, one per element or one per particle, see

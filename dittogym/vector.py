@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from dittogym.env import RENDER_FPS, RENDER_MODES, as_image, as_numpy, as_tensor, registered_horizon, spaces
+from dittogym.layout import Seed
 from dittogym.spec import TaskSpec
 from dittogym.torch_env import Snapshot, TorchEnv
 from torchmpm import ParticleState, checks
@@ -72,19 +74,17 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self.torch_env.state
 
     @torch.no_grad()
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed: Seed = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Start new episodes, of all elements or of ``options["reset_mask"]``; see :meth:`dittogym.TorchEnv.reset`.
 
         Args:
-            seed: Seeds element i with ``seed + i`` and draws its particles anew.
+            seed: Seeds element i with ``seed + i``, or with ``seed[i]``, and draws its particles anew.
             options: As there.
 
         Returns:
             The observations (B, 3, 64, 64) uint8 of all elements, and ``info``.
         """
-        super().reset(seed=seed)
+        super().reset(seed=seed[0] if isinstance(seed, Sequence) else seed)
         observation, info = self.torch_env.reset(seed=seed, options=options)
         mask = (options or {}).get("reset_mask")
         self._ended = np.zeros(self.num_envs, dtype=bool) if mask is None else self._ended & ~np.asarray(mask)

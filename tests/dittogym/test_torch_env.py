@@ -68,6 +68,21 @@ def test_layouts_follow_seeds() -> None:
     assert not torch.equal(small(num_envs=2).reset()[0], small(num_envs=2).reset()[0])  # entropy of the system
 
 
+def test_a_seed_for_each_element() -> None:
+    env, counted = small(num_envs=3), small(num_envs=3)
+    counted.reset(seed=5)
+    env.reset(seed=[7, 5, 6])
+    assert torch.equal(env.state.x, counted.state.x[[2, 0, 1]])
+    env.reset(seed=(0, 0, 7), options={"reset_mask": torch.tensor([False, False, True])})
+    assert torch.equal(env.state.x, counted.state.x[[2, 0, 2]])
+    for wrong, message in (
+        ([1, 2], "seed must be a whole number or 3 of them"),
+        ([1, -2, 3], r"seed\[1\] must not be"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            env.reset(seed=wrong)
+
+
 def test_masked_seed_draws_only_the_masked_elements() -> None:
     env = small(num_envs=3)
     env.reset(seed=0)
