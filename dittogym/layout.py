@@ -178,7 +178,7 @@ class Layouts:
     def _seeds(self, seed: Seed) -> Sequence[int] | None:
         if seed is None:
             return None
-        if not isinstance(seed, Sequence):
+        if not isinstance(seed, (list, tuple, range)):
             first = checks.whole("seed", seed, 0, MAX_SEED + 1 - self._num_envs)
             return range(first, first + self._num_envs)
         if len(seed) != self._num_envs:

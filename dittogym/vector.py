@@ -84,8 +84,8 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Returns:
             The observations (B, 3, 64, 64) uint8 of all elements, and ``info``.
         """
-        super().reset(seed=seed[0] if isinstance(seed, Sequence) else seed)
         observation, info = self.torch_env.reset(seed=seed, options=options)
+        super().reset(seed=seed[0] if isinstance(seed, Sequence) else seed)
         mask = (options or {}).get("reset_mask")
         self._ended = np.zeros(self.num_envs, dtype=bool) if mask is None else self._ended & ~np.asarray(mask)
         return as_image(observation), _with_masks(as_numpy(info), np.ones(self.num_envs, dtype=bool))
