@@ -14,7 +14,7 @@ from cfp.actor import build_actor
 from cfp.config import to_json
 from cfp.disturbances import Case, Disturbed, applies, disturbed_env, make_cases
 from cfp.evaluate import open_policy, open_run
-from cfp.evaluation import Result, student
+from cfp.evaluation import Result, ZeroPolicy, evaluate, student
 from cfp.files import write_json
 from cfp.presets import preset
 from cfp.train import PROGRAM
@@ -99,6 +99,12 @@ def test_interval_is_student_s(degrees):
     low, high = stats.t.interval(0.95, degrees, returns.mean(), stats.sem(returns))
     assert Result("", 8, tuple(returns)).interval == pytest.approx((high - low) / 2, rel=1e-5)
     assert Result("", 8, (1.0,)).interval is None
+
+
+def test_returns_are_in_the_order_of_layouts():
+    env = monitored(FakeEnv(num_envs=3, horizon=4, end_above=0.15))  # the third is too high, and ends at once
+    result = evaluate("", ZeroPolicy(8), env, 6, deterministic=True, seed=0)
+    assert result.returns == pytest.approx([2.0, 2.0, 2.4, 2.4, 0.7, 0.7])
 
 
 @pytest.fixture
