@@ -156,6 +156,36 @@ def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monk
     assert steps[0] == steps[1]
 
 
+def test_stop_in_the_last_step_leaves_a_whole_stage(tmp_path, monkeypatch):
+    turn = Books.turn
+
+    def interrupt(books, step, scalars):
+        if step == 30:
+            signal.raise_signal(signal.SIGINT)
+        turn(books, step, scalars)
+
+    monkeypatch.setattr(Books, "turn", interrupt)
+    assert run("mpc", tmp_path) == 128 + signal.SIGINT
+    assert [row["step"] for row in read_table(tmp_path / "evaluations.csv")] == ["12", "24", "30"]
+    assert not (tmp_path / "results.json").exists()
+    assert train.main(["--out", str(tmp_path), "--resume"]) == 0
+    assert (tmp_path / "results.json").exists()
+    assert [row["step"] for row in read_table(tmp_path / "evaluations.csv")] == ["12", "24", "30"]
+
+
+def test_last_evaluation_that_a_crash_prevented_is_made_up_for(tmp_path, monkeypatch):
+    def crash(*_):
+        raise RuntimeError("killed")
+
+    monkeypatch.setattr(Books, "close", crash)
+    with pytest.raises(RuntimeError, match="killed"):
+        run("mpc", tmp_path)
+    monkeypatch.undo()
+    assert train.main(["--out", str(tmp_path), "--resume"]) == 0
+    assert [row["step"] for row in read_table(tmp_path / "evaluations.csv")] == ["12", "24", "30"]
+    assert len(baselines.load(tmp_path).actions) == json.loads((tmp_path / "policy.json").read_text())["steps"]
+
+
 def test_polish_is_judged_on_the_layout_it_is_made_for(finished):
     algo, folder = finished
     rows = [row for row in read_table(folder / "evaluations.csv") if row["stage"] == "2"]
