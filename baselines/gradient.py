@@ -130,7 +130,7 @@ class Gradient(Algorithm):
         own = replace(config, environment=replace(config.environment, particles=particles))
         self.env = make_torch_env(own, config.resolution(level), 1 if level else None)
         self.env.reset(seed=config.seed)
-        self.start = self.env.save()  # with reference parity, another reset would keep where the last episode ended
+        self.beginning = self.env.save()  # with reference parity, another reset would keep where the last episode ended
         self.horizon = self.env.spec.horizon
         self.theta = torch.zeros(self.horizon, *self.env.action_shape, device=self.env.device)
         if start is not None:
@@ -216,7 +216,7 @@ class Gradient(Algorithm):
         """One episode from the start; a robot whose episode is over no longer counts, whatever becomes of it."""
         env, window = self.env, self.config.window or self.horizon
         actions = self.theta.detach().tanh().requires_grad_()
-        env.load(self.start)
+        env.load(self.beginning)
         running = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
         loss = size = total = 0.0
         part = torch.zeros((), device=env.device)

@@ -31,6 +31,8 @@ class SegmentPolicy:
         env: Where it looks.
     """
 
+    sees_image = False
+
     def __init__(
         self, actor: ModularActor, nodes: Nodes, description: dict[str, Any] | None = None, env: TorchEnv | None = None
     ) -> None:

@@ -259,18 +259,22 @@ def robustness_table(groups: Sequence[Group]) -> Table:
     """Ratio of returns under faults to the unperturbed return."""
     rows = []
     for group in groups:
-        cases = [run.judged.cases for run in group.runs if run.judged is not None]
+        cases = _cases(group)
+        # What was tried with nobody, such as gravity where there is none, has no row.
+        others = (each for other in groups if other.task == group.task for each in _cases(other))
+        tried = {case for each in others for case, value in each.items() if value is not None}
         for case in list(cases[0])[1:] if cases else []:
-            pairs = [(each[case], each["unperturbed"]) for each in cases if each[case] is not None]
-            ratios = [value / base for value, base in pairs if value is not None and base is not None and base > 0]
-            if not pairs:
+            if case not in tried:
                 continue
+            pairs = [(each[case], each["unperturbed"]) for each in cases]
+            ratios = [value / base for value, base in pairs if value is not None and base is not None and base > 0]
             row = _who(group) | {"case": case, "seeds": len(ratios), "paper": _fault(group, case)}
             row |= {"ratio": float(np.mean(ratios)) if ratios else None}
             rows.append(row | {"low": min(ratios, default=None), "high": max(ratios, default=None)})
     about = (
         "Return under a disturbance as a share of the unperturbed one on the same layouts: mean, lowest and highest of "
-        "the seeds whose unperturbed return is positive. The paper's figures are those of CFP."
+        "the seeds whose unperturbed return is positive; no ratio where a case changes nothing, as lost pixels "
+        "for a policy that looks at none. The paper's figures are those of CFP."
     )
     columns = (
         *WHO,
@@ -282,6 +286,10 @@ def robustness_table(groups: Sequence[Group]) -> Table:
         Column("paper", "paper", ".3f"),
     )
     return Table("robustness", "Robustness", about, columns, rows)
+
+
+def _cases(group: Group) -> list[dict[str, float | None]]:
+    return [run.judged.cases for run in group.runs if run.judged is not None]
 
 
 def _fault(group: Group, case: str) -> float | None:
