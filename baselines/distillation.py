@@ -192,7 +192,7 @@ class Distill(Algorithm):
             return PlannerTeacher(make_torch_env(own, size), config.planner, config.seed, layout)
         policy = read_teacher(path or config.teacher, config.task, config.environment)
         theirs = EnvironmentConfig(**policy.description["environment"])
-        return PolicyTeacher(policy, theirs.layout != layout, layout)
+        return PolicyTeacher(policy, theirs.layout, layout)
 
     @property
     def policy(self) -> ActorPolicy:
