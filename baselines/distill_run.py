@@ -91,6 +91,13 @@ class DistillRun(AlgorithmRun):
             copy_policy(school.folder / "policy.safetensors", self.teacher)
         return super().measure_all()
 
+    def unmeasured(self) -> list[str]:
+        """The teacher's own training."""
+        if self.config.teacher not in TRAINED:
+            return []
+        options = f"--algo {self.config.teacher} --task {self.config.task}"
+        return [f"the teacher's training, which comes first (python -m baselines.train {options} --dry-run)"]
+
     def _school(self) -> Run:
         """The run that trains the teacher, with the defaults of its algorithm."""
         from baselines.registry import configure, open_run  # the registry knows this algorithm too

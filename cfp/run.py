@@ -184,6 +184,10 @@ class Run(ABC):
     def measure(self, model: Any) -> Cost:
         """Time a few steps and updates of a model that has just been made; what it has learned is spoiled."""
 
+    def unmeasured(self) -> list[str]:
+        """Work that `measure_all` leaves out, a line for each."""
+        return []
+
     def measure_all(self) -> list[Cost]:
         """`measure` every stage that is to be trained, each over the untrained policy of the one before."""
         costs = []

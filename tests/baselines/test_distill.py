@@ -207,10 +207,10 @@ def test_action_of_the_other_layout_acts_at_the_same_place():
     env = TorchEnv("run", 1, particles=100)
     env.reset(seed=0)
     seen = torch.zeros(1, 3, 64, 64, dtype=torch.uint8)
-    action = PolicyTeacher(record, False, "image").act(env, seen)
-    as_grid = PolicyTeacher(record, True, "grid").act(env, seen)
+    action = PolicyTeacher(record, "image", "image").act(env, seen)
+    as_grid = PolicyTeacher(record, "image", "grid").act(env, seen)
     assert torch.equal(as_grid, to_grid_layout(action, "image"))
-    back = PolicyTeacher(record, True, "image").act(env, seen)
+    back = PolicyTeacher(record, "grid", "image").act(env, seen)
     assert torch.equal(to_grid_layout(back, "image"), action)
 
 
@@ -219,7 +219,7 @@ def test_sequence_teaches_by_the_step_of_the_episode():
     env = TorchEnv("run", 3, particles=100, substeps=1)
     seen, _ = env.reset(seed=0)
     env.env_state = replace(env.env_state, steps=torch.tensor([0, 4, 20]))
-    action = PolicyTeacher(record, False, "image").act(env, seen)
+    action = PolicyTeacher(record, "image", "image").act(env, seen)
     assert action[:, 0, 0, 0].tolist() == pytest.approx([0.0, 0.4, 0.0])
 
 
@@ -257,7 +257,7 @@ def test_privileged_policy_becomes_one_of_images_that_cfp_refines(privileged, tm
     capsys.readouterr()
 
 
-def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch):
+def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch, capsys):
     base = Shac.preset("shapematch", "quick")
     tiny = replace(base, steps=32, window=4, tier=100, environment=EnvironmentConfig(2, 100, 1))
     tiny = replace(tiny, report=ReportConfig(0, 1, video=False))
@@ -268,7 +268,10 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch):
     assert read_table(folder / "teacher" / "progress.csv")
     trained = (folder / "teacher" / "policy.safetensors").read_bytes()
     assert (folder / "teacher.safetensors").read_bytes() == trained
+    capsys.readouterr()
     assert distill.main([*TINY, *LESSONS, "--teacher", "shac", "--dry-run"]) == 0
+    last = "not counted: the teacher's training, which comes first (python -m baselines.train --algo shac"
+    assert last in capsys.readouterr().out.splitlines()[-1]
 
 
 @pytest.mark.parametrize(
