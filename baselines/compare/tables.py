@@ -187,13 +187,14 @@ def cost_table(groups: Sequence[Group]) -> Table:
         costs, speed, config = group.costs, group.speed, group.runs[0].job.config
         if speed is None:
             continue
+        tier = getattr(config, "tier", None)
         memories = [cost.memory / 2**20 for cost in costs if cost.memory]
         theirs = paper.COST.get(group.label, (None, None)) if group.task == "run" else (None, None)
         rows.append(
             _who(group)
             | {
                 "device": "/".join(sorted({cost.device for cost in costs})),
-                "particles": str(getattr(config, "tier", config.environment.particles)),
+                "particles": str(config.environment.particles if tier is None else tier),
                 "robots": config.environment.num_envs,
                 "steps": max(cost.reached for cost in costs),
                 "minutes": sum(cost.seconds for cost in costs) / len(costs) / 60,

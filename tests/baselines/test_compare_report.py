@@ -12,6 +12,7 @@ from baselines.compare.__main__ import main
 from baselines.compare.collect import find_runs, group
 from baselines.compare.judging import Judging
 from baselines.compare.plan import Plan, make_jobs
+from baselines.compare.tables import cost_table
 from cfp.config import to_json
 from cfp.files import write_json, write_text
 
@@ -131,6 +132,14 @@ def test_cost_beside_the_paper_s(report):
     assert float(row["episode"]) == 80  # 800 steps
     assert (row["memory"], row["paper_episode"], row["paper_memory"]) == ("1024.0", "54", "4053")
     assert find(rows(report, "cost"), task="slot", algo="cfp")["paper_episode"] == ""
+
+
+def test_cost_names_the_particles_of_planners_without_a_tier_of_their_own(tmp_path):
+    (job,) = make_jobs(Plan(), ["run"], ["mpc"], [0], tmp_path)
+    write_run(job, [1.0], {})
+    judging = Judging(1)
+    (row,) = cost_table(group(find_runs([job], judging, judging))).rows
+    assert row["particles"] == "lite"
 
 
 def test_success_of_slot(report):
