@@ -187,6 +187,30 @@ def test_labels_are_dropped_oldest_first_and_survive_a_checkpoint():
         assert torch.equal(images[:, 0, 0, 0].float(), actions[:, 0, 0, 0])
 
 
+def test_labels_larger_than_the_student_s_actions_are_kept_on_its_grid():
+    class Fine(Teacher):
+        resolution = 64
+
+        def act(self, env, seen):
+            return torch.rand(env.num_envs, 2, 64, 64)
+
+    student, given = Distill(make()), []
+    student.collector.teacher, collect = Fine(), student.collector.collect
+    student.collector.collect = lambda *options: given.append(collect(*options)) or given[-1]
+    student.learn(8, lambda _: None)
+    (kept,), (whole,) = student.dataset.rounds, given
+    assert kept.actions.shape[1:] == (2, 8, 8) and whole.actions.shape[1:] == (2, 64, 64)
+    assert torch.equal(kept.observations, whole.observations)
+    losses = [student._loss(*labels).item() for labels in (kept, whole)]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+    old = student.state_dict()
+    old["dataset"]["actions"] = [whole.actions]  # as checkpoints from before have it
+    student.load_state_dict(old)
+    assert torch.equal(student.dataset.rounds[0].actions, kept.actions)
+    coarse = Labels(whole.observations, torch.zeros(len(whole.observations), 2, 4, 4))
+    assert student._kept(coarse) is coarse
+
+
 @pytest.mark.parametrize(("given", "wanted"), [(8, 8), (8, 16), (16, 8), (16, 32), (16, 64), (64, 64)])
 def test_projected_action_drives_the_muscles_alike(given, wanted):
     action = 0.5 * torch.rand(3, 2, given, given).double() - 0.25
