@@ -100,6 +100,7 @@ class Run(ABC):
     Attributes:
         step: Environment steps of the run so far.
         judging: Seconds that this session has spent on evaluations.
+        teaching: Environment steps, and seconds without evaluations, that it has spent on the training of a teacher.
 
     Raises:
         ConfigError: The folder already holds a run and ``resume`` is not set (nothing in it is touched), or the options
@@ -134,7 +135,7 @@ class Run(ABC):
         if self.state is None:
             self.position = self.begin()
             step = self.position.offset
-        self.step, self.judging = step, 0.0
+        self.step, self.judging, self.teaching = step, 0.0, (0, 0.0)
         write_json(folder / "config.json", to_json(config))
         self.evaluations = Table(folder / "evaluations.csv", step)
         progress = ProgressTable(Table(folder / "progress.csv", step))

@@ -198,6 +198,8 @@ def cost_table(groups: Sequence[Group]) -> Table:
                 "robots": config.environment.num_envs,
                 "steps": max(cost.reached for cost in costs),
                 "minutes": sum(cost.seconds for cost in costs) / len(costs) / 60,
+                "teacher": group.teaching / 60 or None,
+                "teacher_steps": max(cost.taught for cost in costs) or None,
                 "judging": sum(cost.judging for cost in costs) / len(costs) / 60,
                 "speed": speed,
                 "episode": make_spec(group.task).horizon / speed,
@@ -207,9 +209,10 @@ def cost_table(groups: Sequence[Group]) -> Table:
             }
         )
     about = (
-        "Training without its evaluations, whose minutes stand beside: mean over seeds. An episode is the task's whole "
-        "length of steps; robots that train side by side share the time. Memory is the most that a run's process held, "
-        "evaluations included. Right: the paper's Table 3, one robot at full size on an RTX 4090."
+        "Training without its evaluations and without that of a teacher that is trained first, whose minutes stand "
+        "beside: mean over seeds. An episode is the task's whole length of steps; robots that train side by side share "
+        "the time. Memory is the most that a run's process held, evaluations included. Right: the paper's Table 3, one "
+        "robot at full size on an RTX 4090."
     )
     columns = (
         *WHO,
@@ -218,6 +221,8 @@ def cost_table(groups: Sequence[Group]) -> Table:
         Column("robots", "robots", "d"),
         Column("steps", "steps", ",d"),
         Column("minutes", "minutes", ".1f"),
+        Column("teacher", "teacher (min)", ".1f"),
+        Column("teacher_steps", ""),
         Column("judging", "evaluations (min)", ".1f"),
         Column("speed", "steps/s", ".1f"),
         Column("episode", "s/episode", ".1f"),

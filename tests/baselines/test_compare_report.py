@@ -142,6 +142,20 @@ def test_cost_names_the_particles_of_planners_without_a_tier_of_their_own(tmp_pa
     assert row["particles"] == "lite"
 
 
+def test_training_of_a_teacher_is_counted_by_itself(tmp_path):
+    (job,) = make_jobs(Plan(), ["run"], ["distill"], [0], tmp_path)
+    write_run(job, [1.0], {500: 1.0, 1000: 2.0}, seconds=160.0)
+    noted = json.loads((job.folder / "sessions.json").read_text())
+    noted["sessions"][0]["teacher"] = {"steps": 300, "seconds": 60.0}
+    write_json(job.folder / "sessions.json", noted)
+    judging = Judging(1)
+    groups = group(find_runs([job], judging, judging))
+    (row,) = cost_table(groups).rows
+    assert (row["speed"], row["minutes"], row["teacher"], row["teacher_steps"]) == (10, 100 / 60, 1, 300)
+    (line,) = pictures.curves(groups, minutes=True).axes[0].lines
+    assert line.get_xdata().tolist() == pytest.approx([1 + 50 / 60, 1 + 100 / 60])
+
+
 def test_success_of_slot(report):
     row = find(rows(report, "success"), task="slot", algo="cfp")
     assert (row["successes"], row["episodes"], row["rate"], row["paper"]) == ("1", "4", "0.25", "0.154")

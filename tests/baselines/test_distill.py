@@ -10,6 +10,7 @@ import baselines
 import cfp
 import cfp.train
 from baselines import Distill, OpenLoop, PlannerConfig, Shac, distill
+from baselines.compare.work import _train
 from baselines.dagger import Collector, Dataset, Labels, lose
 from baselines.distillation import METRICS
 from baselines.episodes import Episodes
@@ -18,6 +19,7 @@ from baselines.teachers import PolicyTeacher, Teacher, project, read_teacher
 from cfp.config import EnvironmentConfig, ReportConfig, to_json
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.files import read_table
+from cfp.process import StopSignals
 from cfp.weights import origin, read_policy, write_policy
 from dittogym import TASKS, TorchEnv
 from dittogym.action import patch_field, to_grid_layout
@@ -296,6 +298,12 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch, caps
     assert distill.main([*TINY, *LESSONS, "--teacher", "shac", "--dry-run"]) == 0
     last = "not counted: the teacher's training, which comes first (python -m baselines.train --algo shac"
     assert last in capsys.readouterr().out.splitlines()[-1]
+    config = configure(json.loads((folder / "config.json").read_text()))
+    with StopSignals() as signals:
+        _train(config, tmp_path / "noted", signals, False)
+    (session,) = json.loads((tmp_path / "noted" / "sessions.json").read_text())["sessions"]
+    assert (session["from"], session["to"], session["teacher"]["steps"]) == (0, 32, 32)
+    assert 0 < session["teacher"]["seconds"] < session["seconds"] - session["judging"]
 
 
 @pytest.mark.parametrize(
