@@ -118,6 +118,8 @@ class StatePolicy:
         env: Where it looks.
     """
 
+    sees_image = False
+
     def __init__(
         self,
         actor: StateActor,

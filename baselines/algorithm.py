@@ -121,6 +121,9 @@ class Algorithm(ABC):
             callback: Called between updates, with scalars to log.
         """
 
+    def written(self) -> None:  # noqa: B027  (most scalars tell of the last update only)
+        """Called when the latest scalars have become a row of the logs."""
+
     @property
     @abstractmethod
     def policy(self) -> PolicyPredictor:
@@ -228,11 +231,15 @@ class AlgorithmRun(Run):
             latest = dict(scalars)
             books.advance(model.num_timesteps - last)
             last = model.num_timesteps
-            books.turn(offset + last, lambda: latest)
+            books.turn(offset + last, row)
+
+        def row() -> Mapping[str, float | None]:
+            model.written()
+            return latest
 
         books.open(offset + last)
         model.learn(steps, turn)
-        books.close(offset + last, lambda: latest)
+        books.close(offset + last, row)
 
     def measure(self, model: Algorithm) -> Cost:
         """Time what the algorithm does in a period; the first time counts as well."""

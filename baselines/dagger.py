@@ -21,7 +21,7 @@ class Labels(NamedTuple):
 
     Attributes:
         observations: (n, 3, 64, 64) uint8.
-        actions: (n, 2, R, R) on the teacher's grid.
+        actions: (n, 2, R, R) on the teacher's grid, or on the student's where that is smaller.
     """
 
     observations: Tensor
@@ -32,7 +32,7 @@ class Dataset:
     """The labels of all rounds; the oldest rounds are dropped when there are too many.
 
     Args:
-        capacity: Labels that are kept at most; an image is 12 KiB.
+        capacity: Labels that are kept at most; an image is 12 KiB, an action 8 R R bytes.
     """
 
     def __init__(self, capacity: int) -> None:

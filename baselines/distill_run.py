@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,10 +77,12 @@ class DistillRun(AlgorithmRun):
         if self.config.teacher in TRAINED and not self.teacher.exists():
             school = self._school()
             print(f"training the teacher first: {self.config.teacher} -> {school.folder}")
+            begun, start = school.step, time.perf_counter()
             try:
                 school.train()
             finally:
                 self.judging += school.judging
+                self.teaching = school.step - begun, time.perf_counter() - start - school.judging
             copy_policy(school.folder / "policy.safetensors", self.teacher)
         super().train()
 
@@ -90,6 +93,13 @@ class DistillRun(AlgorithmRun):
             school.keep(school.make_model(0), 0, 0)
             copy_policy(school.folder / "policy.safetensors", self.teacher)
         return super().measure_all()
+
+    def unmeasured(self) -> list[str]:
+        """The teacher's own training."""
+        if self.config.teacher not in TRAINED:
+            return []
+        options = f"--algo {self.config.teacher} --task {self.config.task}"
+        return [f"the teacher's training, which comes first (python -m baselines.train {options} --dry-run)"]
 
     def _school(self) -> Run:
         """The run that trains the teacher, with the defaults of its algorithm."""

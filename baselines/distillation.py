@@ -17,7 +17,7 @@ from torch import nn
 import cfp
 from baselines.actor_critic import quieten
 from baselines.algorithm import Algorithm, Callback, Sees, grid_size
-from baselines.dagger import Collector, Dataset, lose
+from baselines.dagger import Collector, Dataset, Labels, lose
 from baselines.episodes import Episodes
 from baselines.planner import PlannerConfig
 from baselines.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
@@ -77,7 +77,7 @@ class DistillConfig(LadderConfig):
     """Share of entries that become 0 in half of the images that the student sees and of the actions that it takes, so
     that it learns to do without them."""
     capacity: int = 100_000
-    """Labels that are kept; an image takes 12 KiB."""
+    """Labels that are kept; an image takes 12 KiB, an action on the smaller grid of teacher and student 8 R R bytes."""
     age: int = 400
     """Control steps after which an episode is cut; the first ones are cut at staggered ages."""
     layouts: int = 64
@@ -192,7 +192,7 @@ class Distill(Algorithm):
             return PlannerTeacher(make_torch_env(own, size), config.planner, config.seed, layout)
         policy = read_teacher(path or config.teacher, config.task, config.environment)
         theirs = EnvironmentConfig(**policy.description["environment"])
-        return PolicyTeacher(policy, theirs.layout != layout, layout)
+        return PolicyTeacher(policy, theirs.layout, layout)
 
     @property
     def policy(self) -> ActorPolicy:
@@ -222,7 +222,7 @@ class Distill(Algorithm):
     def _round(self) -> dict[str, float | None]:
         config, share = self.config, self.config.share**self.rounds
         student = partial(self.actor, deterministic=config.report.eval_deterministic)
-        labels = self.collector.collect(config.round, share, student)
+        labels = self._kept(self.collector.collect(config.round, share, student))
         self.dataset.add(labels)
         self.rounds += 1
         with torch.no_grad():
@@ -238,6 +238,13 @@ class Distill(Algorithm):
             "train/labels": float(len(self.dataset)),
             "train/learning_rate": rate,
         }
+
+    def _kept(self, labels: Labels) -> Labels:
+        """Labels as they are kept: on the whole patch an action takes more than an image."""
+        size = self.spec.action_size
+        if labels.actions.shape[-1] <= size:
+            return labels
+        return labels._replace(actions=project(labels.actions, size, self.env.spec.patch))
 
     def _rate(self) -> float:
         bounds = (0, *self.config.ends())
@@ -289,4 +296,5 @@ class Distill(Algorithm):
         """Undo `state_dict`."""
         for name in ("actor", "adam", "dataset", "collector"):
             getattr(self, name).load_state_dict(state[name])
+        self.dataset.rounds = [self._kept(labels) for labels in self.dataset.rounds]  # checkpoints from before differ
         self.rounds = state["rounds"]

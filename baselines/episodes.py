@@ -73,6 +73,7 @@ class Episodes:
             "returns": self.returns.cpu(),
             "drawn": self.drawn,
             "counts": dict(self.counts),
+            "ended": list(self.ended),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -80,3 +81,4 @@ class Episodes:
         TorchVecEnv(self.env).load_state_dict(state["episodes"])
         self.limit, self.returns = state["limit"].to(self.limit), state["returns"].to(self.returns)
         self.drawn, self.counts = state["drawn"], dict(state["counts"])
+        self.ended = list(state.get("ended", ()))  # checkpoints from before have none

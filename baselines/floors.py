@@ -146,6 +146,7 @@ class RandomActions:
     """
 
     deterministic_by_default = False
+    sees_image = False
 
     def __init__(self, resolution: int, description: dict[str, Any] | None = None) -> None:
         self.resolution = resolution

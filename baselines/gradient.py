@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,7 +26,7 @@ FINAL_RATE = 0.1
 SPIKE, MEMORY = 3.0, 0.9
 """A step's gradient is clipped to this many times its usual norm, which is averaged with this momentum."""
 RISE, SLOWER = 0.1, 0.7
-"""An iteration whose loss exceeds the best one by this share of it is undone, and the learning rate falls by this
+"""An iteration whose loss exceeds the best one by this share of its size is undone, and the learning rate falls by this
 factor."""
 PATIENCE = 10
 """Failed iterations in a row after which training gives up."""
@@ -96,6 +96,22 @@ class GradientConfig(GridConfig):
             raise ConfigError(f"blur: got {self.blur}, allowed are one or more numbers of 0 or more")
 
 
+class Episode(NamedTuple):
+    """What an iteration has found.
+
+    Attributes:
+        loss: Mean over layouts and steps.
+        size: Mean magnitude of the same values: a loss made of rewards and costs can be zero, this is not.
+        total: Mean return.
+        gradient: Of theta, (T, 2, R, R).
+    """
+
+    loss: float
+    size: float
+    total: float
+    gradient: Tensor
+
+
 class Gradient(Algorithm):
     """Adam on the actions of a whole episode, through the simulation.
 
@@ -113,6 +129,8 @@ class Gradient(Algorithm):
         particles = config.environment.particles if level else config.tier
         own = replace(config, environment=replace(config.environment, particles=particles))
         self.env = make_torch_env(own, config.resolution(level), 1 if level else None)
+        self.env.reset(seed=config.seed)
+        self.beginning = self.env.save()  # with reference parity, another reset would keep where the last episode ended
         self.horizon = self.env.spec.horizon
         self.theta = torch.zeros(self.horizon, *self.env.action_shape, device=self.env.device)
         if start is not None:
@@ -123,7 +141,7 @@ class Gradient(Algorithm):
         self.objective = make_objective(self.env, config.blur[-1:] if level else config.blur)
         self.usual = torch.zeros(self.horizon, device=self.env.device)
         self.slower, self.failed, self.failed_in_a_row = 1.0, 0, 0
-        self.best_loss, self.best, self.phase = math.inf, self.theta.detach().clone(), 0
+        self.best_loss, self.best_size, self.best, self.phase = math.inf, 0.0, self.theta.detach().clone(), 0
 
     @staticmethod
     def preset(task: str, name: str) -> GradientConfig:
@@ -180,12 +198,12 @@ class Gradient(Algorithm):
         if phase != self.phase:
             self._return_to_best()
             self.best_loss, self.phase = math.inf, phase
-        loss, total, gradient = self._episode(progress)
+        loss, size, total, gradient = self._episode(progress)
         scalars: dict[str, float | None] = {"train/learning_rate": rate, "train/loss": loss, "train/return": total}
         finite = math.isfinite(loss) and bool(torch.isfinite(gradient).all())
-        if finite and loss <= self.best_loss + RISE * abs(self.best_loss):
+        if finite and loss <= self.best_loss + RISE * self.best_size:
             if loss < self.best_loss:
-                self.best_loss, self.best = loss, self.theta.detach().clone()
+                self.best_loss, self.best_size, self.best = loss, size, self.theta.detach().clone()
             scalars["train/gradient_norm"] = float(gradient.norm())
             self.theta.grad, scalars["train/clipped"] = self._clip(gradient)
             self.adam.step()
@@ -194,20 +212,22 @@ class Gradient(Algorithm):
             self._undo()
         return scalars | {"train/failed": float(self.failed)}
 
-    def _episode(self, progress: float) -> tuple[float, float, Tensor]:
-        """Loss, return, and the gradient of theta (T, 2, R, R) of one episode from the start."""
+    def _episode(self, progress: float) -> Episode:
+        """One episode from the start; a robot whose episode is over no longer counts, whatever becomes of it."""
         env, window = self.env, self.config.window or self.horizon
         actions = self.theta.detach().tanh().requires_grad_()
-        env.reset(seed=self.config.seed)
+        env.load(self.beginning)
         running = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
-        loss = total = 0.0
+        loss = size = total = 0.0
         part = torch.zeros((), device=env.device)
         for step in range(self.horizon):
             _, reward, terminated, _, info = env.step(actions[step].expand(env.num_envs, -1, -1, -1))
-            if not bool(info["finite"].all()):
-                return math.nan, math.nan, actions
-            part = part + (self.objective(env, reward, progress) * running).mean() / self.horizon
-            total += float((reward.detach() * running).mean())
+            if not bool((info["finite"] | ~running).all()):
+                return Episode(math.nan, math.nan, math.nan, actions)
+            value = torch.where(running, self.objective(env, reward, progress), 0.0)
+            part = part + value.mean() / self.horizon
+            size += float(value.detach().abs().mean()) / self.horizon
+            total += float(torch.where(running, reward.detach(), 0.0).mean())
             running = running & ~terminated
             ends = not bool(running.any())
             if ends or (step + 1) % window == 0 or step + 1 == self.horizon:
@@ -218,7 +238,7 @@ class Gradient(Algorithm):
             if ends:
                 break
         assert actions.grad is not None
-        return loss, total, actions.grad * (1.0 - actions.detach().square())
+        return Episode(loss, size, total, actions.grad * (1.0 - actions.detach().square()))
 
     def _clip(self, gradient: Tensor) -> tuple[Tensor, float]:
         """Clip each control step's gradient to `SPIKE` times its usual norm; returns the share that was clipped."""
@@ -264,6 +284,7 @@ class Gradient(Algorithm):
             "best": self.best.cpu(),
             "adam": self.adam.state_dict(),
             "usual": self.usual.cpu(),
+            "best_size": self.best_size,
             "counts": [self.best_loss, self.phase, self.slower, self.failed, self.failed_in_a_row],
         }
 
@@ -275,6 +296,7 @@ class Gradient(Algorithm):
         self.adam.load_state_dict(state["adam"])
         self.usual = state["usual"].to(self.theta)
         self.best_loss, self.phase, self.slower, self.failed, self.failed_in_a_row = state["counts"]
+        self.best_size = state.get("best_size", abs(self.best_loss))  # what it was in checkpoints from before
 
 
 def _theta(actions: Tensor, resolution: int) -> Tensor:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from baselines.actor_critic import shown
 from baselines.modular_env import segmented
@@ -30,6 +29,8 @@ class SegmentPolicy:
         description: What it is and comes from.
         env: Where it looks.
     """
+
+    sees_image = False
 
     def __init__(
         self, actor: ModularActor, nodes: Nodes, description: dict[str, Any] | None = None, env: TorchEnv | None = None
@@ -71,7 +72,8 @@ class SegmentPolicy:
         Args:
             observation: (B, 3, 64, 64) or (3, 64, 64); only the number of images matters.
             state: What the last call returned, None at the beginning: the segment of every particle, (B, N).
-            episode_start: (B,) bool, which elements begin anew.
+            episode_start: (B,) bool; changes nothing: the environment knows which of its episodes begin, while
+                stable-baselines3's ``evaluate_policy`` leaves this true for elements that have played theirs.
             deterministic: Without noise.
 
         Raises:
@@ -79,14 +81,13 @@ class SegmentPolicy:
             ValueError: The images are not as many as the environment has simulations.
         """
         env, single = shown(self.env, observation)
-        anew = np.ones(env.num_envs, bool) if state is None else np.zeros(env.num_envs, bool)
-        if episode_start is not None:
-            anew |= episode_start
-        labels: Tensor | None = None
-        if state is not None:
+        anew, labels = env.env_state.steps == 0, None
+        if state is None:
+            anew = torch.ones_like(anew)
+        else:
             labels = torch.as_tensor(state[0], device=env.device)
             labels = follow(places(env), labels, self.nodes.count)
-        labels = segmented(env, self.nodes, labels, torch.as_tensor(anew, device=env.device))
+        labels = segmented(env, self.nodes, labels, anew)
         device = next(self.actor.parameters()).device
         values = self.actor(self.nodes(env, labels).to(device), deterministic).to(env.device)
         actions = self.nodes.act(env, labels, values).float().cpu().numpy()

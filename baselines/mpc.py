@@ -141,7 +141,7 @@ class MPC(Algorithm):
         """Carry out some more steps, fewer if the episode ends."""
         end = self.num_timesteps + total_timesteps
         while self.num_timesteps < end and not self.over:
-            if self.reduced:
+            if self.reduced and self.planner.due:
                 self.reduced.follow(self.env.env_state)
             action = self.planner.act()
             self._carry_out(action)

@@ -116,10 +116,15 @@ class PlannerBase(ABC, Generic[Config]):
 
     def act(self) -> Tensor:
         """Next action of every simulation, (B, 2, R, R); plans anew where the last plan is used up."""
-        if self._position >= min(self.config.commit, len(self._ahead)):
+        if self.due:
             self.plan()
         self._position += 1
         return self._ahead[self._position - 1]
+
+    @property
+    def due(self) -> bool:
+        """Whether the last plan is used up, so that the next action needs another."""
+        return self._position >= min(self.config.commit, len(self._ahead))
 
     @property
     def fresh(self) -> bool:

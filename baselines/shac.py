@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 import cfp
-from baselines.actor_critic import ImageActor, StateActor, StatePolicy, image_critic, state_critic
+from baselines.actor_critic import ImageActor, StateActor, StatePolicy, image_critic, quieten, state_critic
 from baselines.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.features import StateFeatures
 from baselines.shac_rollout import Rollout, Window
@@ -60,7 +60,7 @@ class ShacConfig(GridConfig):
     sees: Literal["state", "image"] = "state"
     """What the policy is given: the privileged state (matter, deformation, clock), or the image like CFP's."""
     start_from: str | None = None
-    """Policy of one level on the image, whatever trained it, whose weights the actor begins with."""
+    """Policy of one level on the image, whatever trained it, whose weights the actor begins with, all but its width."""
     tier: Tier = "lite"
     """Particles of the simulations that are learned from."""
     window: int = 16
@@ -136,6 +136,7 @@ class Shac(Algorithm):
         if start is not None:
             assert isinstance(self.actor, ImageActor) and isinstance(start, ActorPolicy)
             self.actor.actor.load_state_dict(start.actor.state_dict())
+            quieten(self.actor.actor)  # the width is not learned: that of the policy would stay
         self.target.load_state_dict(self.critic.state_dict())
         self.target.requires_grad_(False)
         learning = [p for p in self.actor.parameters() if p.requires_grad]
@@ -231,6 +232,10 @@ class Shac(Algorithm):
             callback(scalars)
         return self
 
+    def written(self) -> None:
+        """The next row tells of the episodes that end from here on."""
+        self.rollout.episodes.ended = []
+
     def _iterate(self) -> dict[str, float | None]:
         rate = self.config.learning_rate * (1.0 - (1.0 - FINAL_RATE) * min(self.num_timesteps / self.config.steps, 1.0))
         for adam in (self.actor_adam, self.critic_adam):
@@ -241,7 +246,7 @@ class Shac(Algorithm):
         with torch.no_grad():
             for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
                 slow.lerp_(fast, self.config.tau)
-        scalars = self.rollout.scalars() | {
+        scalars = self.rollout.episodes.scalars() | {
             "train/reward": float(window.rewards.mean()) / self.config.reward.scale,
             "train/true_reward": window.true_reward,
             "train/value": float(window.values.mean()),

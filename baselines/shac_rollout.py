@@ -64,11 +64,10 @@ class Rollout:
             value: From what is seen to the target critic's values (B,).
         """
         env, gamma = self.env, self.config.gamma
-        self.episodes.ended = []
         total = torch.zeros(env.num_envs, device=env.device)
         discount = torch.ones_like(total)
         seen, rewards, values, ends, truth = [], [], [], [], 0.0
-        now, pairs = self.look(), self._pairs()
+        now, pairs = self.look(), Pairs.of(self._places())
         for step in range(self.config.window):
             seen.append(now.detach())
             before = env.env_state.centre
@@ -88,16 +87,17 @@ class Rollout:
             ends.append(out)
             if bool(out.any()):
                 self.episodes.restart(out, terminated, info["finite"])
-                pairs, fresh = self._pairs(), self.look()
-                after = choose(out, fresh, after)
+                pairs = pairs.renewed(out, self._places())
+                after = choose(out, self.look(), after)
             now = after
         targets = self._targets(rewards, values, ends)
         loss = -total.mean() / self.config.window
         parts = map(torch.stack, (seen, rewards, targets, values))
         return Window(loss, truth / self.config.window, *parts)
 
-    def _pairs(self) -> Pairs:
-        return Pairs.of(self.env.state.x[:, : self.env.model.robot].detach())
+    def _places(self) -> Tensor:
+        """The robots' particles (B, N, 2), m."""
+        return self.env.state.x[:, : self.env.model.robot].detach()
 
     def _act(self, mean: Tensor) -> Tensor:
         """Actions with noise; a gradient that is not finite ends here, for the whole simulation."""
@@ -120,10 +120,6 @@ class Rollout:
             later = reward + self.config.gamma * later
             targets.append(later)
         return targets[::-1]
-
-    def scalars(self) -> dict[str, float | None]:
-        """Counts, and the mean true return of the episodes that ended in the last window."""
-        return self.episodes.scalars()
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next window depends on besides the networks."""

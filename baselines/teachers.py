@@ -18,7 +18,7 @@ from cfp.errors import ConfigError
 from cfp.evaluation import Policy, SeesState
 from cfp.weights import read_policy
 from dittogym import TorchEnv, make_spec
-from dittogym.action import Layout, bicubic_matrix, to_grid_layout
+from dittogym.action import Layout, bicubic_matrix, from_grid_layout, to_grid_layout
 
 PHYSICS = ("substeps", "variant")
 """Options of the environment that change what actions do."""
@@ -53,12 +53,12 @@ class PolicyTeacher(Teacher):
 
     Args:
         policy: Of any kind.
-        turned: It lays out its actions in the other of the two orientations, see `dittogym.TorchEnv`.
-        layout: The orientation that is wanted.
+        theirs: Layout of its actions, see `dittogym.TorchEnv`.
+        layout: The one that is wanted.
     """
 
-    def __init__(self, policy: Policy, turned: bool, layout: Layout) -> None:
-        self.policy, self.turned, self.layout = policy, turned, layout
+    def __init__(self, policy: Policy, theirs: Layout, layout: Layout) -> None:
+        self.policy, self.theirs, self.layout = policy, theirs, layout
         self.resolution = policy.resolution
         self._looking: tuple[TorchEnv, Any] | None = None
 
@@ -69,7 +69,7 @@ class PolicyTeacher(Teacher):
         memory = (env.env_state.steps.cpu().numpy(),) if isinstance(policy, OpenLoop) else None
         array, _ = policy.predict(seen.cpu().numpy(), memory, deterministic=True)
         action = torch.as_tensor(array, device=env.device)
-        return _turn(action, self.layout) if self.turned else action
+        return from_grid_layout(to_grid_layout(action, self.theirs), self.layout)
 
 
 class PlannerTeacher(Teacher):
@@ -131,11 +131,6 @@ def _projection(before: int, after: int, patch: int) -> Tensor:
     cpu = torch.device("cpu")
     given, wanted = (bicubic_matrix(size, patch, False, torch.float64, cpu) for size in (before, after))
     return torch.linalg.pinv(wanted) @ given
-
-
-def _turn(action: Tensor, layout: Layout) -> Tensor:
-    """An action in the other layout, as one in this."""
-    return to_grid_layout(action, "image") if layout == "grid" else action.transpose(-1, -2).flip(-2)
 
 
 def read_teacher(path: str | Path, task: str, environment: EnvironmentConfig) -> Policy:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dittogym import TorchEnv
+from torchmpm.state import choose
 
 SPEED = 60.0
 """Reward for a mean speed of 1 m/s."""
@@ -31,7 +32,8 @@ class RewardConfig:
     split_margin: float = 0.85
     """Share of the limit on the spread from which it costs; no matter in tasks without a limit."""
     integrity: float = 300.0
-    """Cost of particles that were close when the window began and drift apart; see `Pairs`."""
+    """Cost of particles that were close when the window, or the episode within it, began and drift apart; see
+    `Pairs`."""
     scale: float = 0.05
     """Factor of the whole, so that values are not far from one."""
 
@@ -65,6 +67,12 @@ class Pairs:
         distance, other = nearest.values[..., 1:], nearest.indices[..., 1:]  # the first is the particle itself
         return cls(one, other, distance, distance < REACH)
 
+    def renewed(self, anew: Tensor, x: Tensor) -> Pairs:
+        """The same pairs, but chosen again among the particles (B, N, 2) of the simulations of a mask (B,)."""
+        fresh = Pairs.of(x)
+        other, distance = choose(anew, fresh.other, self.other), choose(anew, fresh.distance, self.distance)
+        return Pairs(self.one, other, distance, choose(anew, fresh.counts, self.counts))
+
     def drift(self, x: Tensor) -> Tensor:
         """Mean square of ``(d - d_0) / REACH - SLACK`` where positive, over pairs, (B,), for particles (B, N, 2)."""
         spots = x[:, self.one]
@@ -86,7 +94,7 @@ def training_reward(
         before: (B, 2) the robot's centre before it, m.
         reward: (B,) the smooth reward of ``env.step(action, soft=True)``.
         info: What came with it.
-        pairs: Who was close when the window began.
+        pairs: Who was close when the window, or the episode within it, began.
     """
     terms = info["reward_terms"]
     if config.form == "speed":

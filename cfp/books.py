@@ -29,6 +29,7 @@ class Books:
 
     Args:
         level: Index of the stage.
+        end: Step of the run at which the stage ends.
         total: Environment steps of the whole run, for the progress bar.
         report: How often what happens.
         signals: Whether the user wants to stop.
@@ -36,6 +37,7 @@ class Books:
         evaluate: Called with the step; returns the result, which it has written down.
         save: Called with the step; writes policy and checkpoint.
         evaluate_first: Evaluate before the first step.
+        evaluated: Step of the stage's last evaluation so far.
         over: Asked after an evaluation: whether the stage should end now.
         film: Called with the step when a film is due.
     """
@@ -43,6 +45,7 @@ class Books:
     def __init__(
         self,
         level: int,
+        end: int,
         total: int,
         report: ReportConfig,
         signals: StopSignals,
@@ -50,22 +53,24 @@ class Books:
         evaluate: Callable[[int], Result],
         save: Callable[[int], None],
         evaluate_first: bool = False,
+        evaluated: int = 0,
         over: Callable[[], bool] = lambda: False,
         film: Callable[[int], None] = lambda step: None,
     ) -> None:
-        self.level, self.total = level, total
+        self.level, self.end, self.total = level, end, total
         self.report, self.signals, self.logger = report, signals, logger
         self.evaluate, self.save, self.evaluate_first = evaluate, save, evaluate_first
         self.over, self.film = over, film
         self.last_result: Result | None = None
         self._return: float | None = None
-        self._last = self._logged = self._saved = self._evaluated = 0
+        self._last = self._logged = self._saved = 0
+        self._evaluated = evaluated
         self._clock = time.perf_counter()
         self.bar = tqdm(disable=True)
 
     def open(self, step: int) -> None:
         """Begin at a step of the run."""
-        self._last = self._logged = self._saved = self._evaluated = step
+        self._last = self._logged = self._saved = step
         self._clock = time.perf_counter()
         self.bar = tqdm(
             total=self.total,
@@ -85,10 +90,10 @@ class Books:
         """Log, evaluate and save if it is time, between two updates.
 
         Raises:
-            Stopped: The user wants to stop; the checkpoint is written.
+            Stopped: The user wants to stop before the end of the stage; the checkpoint is written.
             Plateau: The stage is over; the checkpoint is written.
         """
-        due = self._due(step)
+        due, stops = self._due(step), self.signals.number and step < self.end
         self._last = step
         if due["log"]:
             self._log(step, scalars())
@@ -96,9 +101,9 @@ class Books:
             self._evaluate(step)
         if due["film"]:
             self.film(step)
-        if due["save"] or due["evaluate"] or self.signals.number:
+        if due["save"] or due["evaluate"] or stops:
             self._save(step)
-        if self.signals.number:
+        if stops:
             raise Stopped(self.signals.number)
         if due["evaluate"] and self.over():
             raise Plateau
@@ -114,15 +119,25 @@ class Books:
         return {name: every > 0 and step // every > self._last // every for name, every in periods.items()}
 
     def close(self, step: int, scalars: Scalars) -> None:
-        """End the stage: a last row, evaluation and checkpoint, unless they were just made."""
+        """End the stage: a last row, evaluation and checkpoint, unless they were just made.
+
+        Raises:
+            Stopped: The user wants to stop; the stage is whole.
+        """
         if self._logged < step:
             self._log(step, scalars())
-        if self.report.eval_every and self._evaluated < step:
+        if self.lacks_evaluation(step):
             self._evaluate(step)
         if self._due(step)["film"]:
             self.film(step)
         if self._saved < step:
             self._save(step)
+        if self.signals.number:
+            raise Stopped(self.signals.number)
+
+    def lacks_evaluation(self, step: int) -> bool:
+        """Whether a stage that ends at a step was not evaluated there."""
+        return self.report.eval_every > 0 and self._evaluated < step
 
     def leave(self) -> None:
         """End the line of the progress bar, so that what is said next, an error too, begins one."""

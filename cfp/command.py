@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -134,7 +135,7 @@ def main(program: Program, arguments: Sequence[str] | None = None) -> int:
             return 0
         print(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed} -> {folder}")
         keep_memory()
-        _train(program, config, folder, command.resume)
+        return _train(program, config, folder, command.resume)
     except Stopped as stopped:
         print(f"{stopped}; go on with: python -m {program.package}.train --resume --out {folder}")
         return 128 + stopped.number
@@ -152,15 +153,19 @@ def main(program: Program, arguments: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 1
+
+
+def _train(program: Program, config: RunConfig, folder: Path, resume: bool) -> int:
+    """Train, evaluate, draw and film; returns the exit code."""
+    try:
+        with claim(folder):
+            with StopSignals() as signals:
+                run = program.run(config, folder, resume, signals)
+                if config.environment.backend == "compile":
+                    print("compiling the physics; the first time on a machine this takes half a minute ...")
+                run.train()
+            run.finish()
+    except KeyboardInterrupt:  # a second Ctrl-C, or one after training
+        print("stopped; --resume goes on", file=sys.stderr)
+        return 128 + signal.SIGINT
     return 0
-
-
-def _train(program: Program, config: RunConfig, folder: Path, resume: bool) -> None:
-    """Train, evaluate, draw and film."""
-    with claim(folder):
-        with StopSignals() as signals:
-            run = program.run(config, folder, resume, signals)
-            if config.environment.backend == "compile":
-                print("compiling the physics; the first time on a machine this takes half a minute ...")
-            run.train()
-        run.finish()

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import torch
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
@@ -15,6 +16,7 @@ from cfp.config import RunConfig
 from cfp.environments import make_torch_env
 from cfp.vec_env import monitored
 from dittogym import make_spec
+from dittogym.action import bicubic
 from dittogym.geometry import Obstacle, floor
 from dittogym.spec import TaskSpec
 
@@ -27,10 +29,10 @@ class Case:
 
     Attributes:
         name: For tables and plots.
-        action_dropout: Share of the 2 R R action entries that become 0, drawn anew in every step.
+        action_dropout: Share of the 2 R R entries of the policy's own grid that become 0, drawn anew in every step.
         observation_dropout: Share of the 3 x 64 x 64 raw pixels that become 0, drawn anew in every step. A velocity
             pixel of 0 means fast motion, not rest, which is 132.
-        action_noise: Standard deviation of Gaussian noise on every action entry; 1 is the full actuation.
+        action_noise: Standard deviation of Gaussian noise on every entry of that grid; 1 is the full actuation.
         latency: Control steps by which actions come late; the first ones of an episode are 0.
         physics: Factors on the task's own ``mu``, ``yield_stress`` and ``gravity``.
         friction: Coulomb coefficient of the floor; ``math.inf`` sticks. ``None``: the task's own.
@@ -56,7 +58,9 @@ def _friction(item: Obstacle) -> float:
     return item.rules[0].friction
 
 
-def disturbed_env(config: RunConfig, resolution: int, num_envs: int, case: Case, seed: int) -> VecEnv:
+def disturbed_env(
+    config: RunConfig, resolution: int, num_envs: int, case: Case, seed: int, grid: int | None = None
+) -> VecEnv:
     """The environment of a run under a case.
 
     Args:
@@ -65,13 +69,14 @@ def disturbed_env(config: RunConfig, resolution: int, num_envs: int, case: Case,
         num_envs: Robots side by side.
         case: What is disturbed.
         seed: Of the disturbances, and of a first reset that sets the constants.
+        grid: Of the policy, see `Disturbed`.
     """
     spec = make_spec(config.task, **config.environment.task_options())
     options = {} if case.friction is None else {"obstacles": _with_friction(spec, case.friction)}
     env = make_torch_env(config, resolution, num_envs, **options)
     own = {name: np.asarray(getattr(spec, name), np.float64) for name in case.physics}
     env.reset(seed=seed, options={"physics": {name: own[name] * factor for name, factor in case.physics.items()}})
-    return Disturbed(monitored(env), case, seed)
+    return Disturbed(monitored(env), case, seed, grid)
 
 
 def _with_friction(spec: TaskSpec, friction: float) -> tuple[Obstacle, ...]:
@@ -86,21 +91,27 @@ def _with_friction(spec: TaskSpec, friction: float) -> tuple[Obstacle, ...]:
 class Disturbed(VecEnvWrapper):
     """Disturbs actions and observations of a vectorised environment; the same from every ``reset`` on.
 
+    A policy of several levels decides on a grid and hands over an enlarged blend. Its actions are disturbed on that
+    grid: lost entries take away all that they became, noise is enlarged as the environment enlarges actions.
+
     Args:
-        venv: The environment, with actions (B, 2, R, R) and observations uint8 (B, 3, 64, 64).
+        venv: The environment, with actions (B, 2, A, A) and observations uint8 (B, 3, 64, 64).
         case: What is disturbed; its constants of the matter are not applied here.
         seed: Of the generator, which every ``reset`` starts anew.
+        grid: Rows and columns R of the grid on which the policy decides; A if None.
     """
 
-    def __init__(self, venv: VecEnv, case: Case, seed: int) -> None:
+    def __init__(self, venv: VecEnv, case: Case, seed: int, grid: int | None = None) -> None:
         super().__init__(venv)
         self.case, self.seed_of_noise = case, seed
+        assert self.action_space.shape is not None
+        self.size = self.action_space.shape[-1]
+        self.grid = self.size if grid is None else grid
         self._begin()
 
     def _begin(self) -> None:
         self.generator = np.random.default_rng(self.seed_of_noise)
-        assert self.action_space.shape is not None
-        nothing = np.zeros((self.num_envs, *self.action_space.shape), np.float32)
+        nothing = np.zeros((self.num_envs, 2, self.size, self.size), np.float32)
         self._late = deque(nothing.copy() for _ in range(self.case.latency))
 
     def reset(self) -> VecEnvObs:
@@ -109,15 +120,24 @@ class Disturbed(VecEnvWrapper):
         return self._seen(self.venv.reset())
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Hand on what becomes of the actions (B, 2, R, R)."""
+        """Hand on what becomes of the actions (B, 2, A, A)."""
         self._late.append(np.array(actions, np.float32))
         actions = self._late.popleft()
+        shape = (len(actions), 2, self.grid, self.grid)
         if self.case.action_noise:
-            noise = self.generator.standard_normal(actions.shape, np.float32)
-            actions = actions + self.case.action_noise * noise
+            noise = self.generator.standard_normal(shape, np.float32)
+            actions = actions + self.case.action_noise * self._enlarged(noise)
         if self.case.action_dropout:
-            actions = np.where(self.generator.random(actions.shape) < self.case.action_dropout, 0, actions)
+            lost = self.generator.random(shape) < self.case.action_dropout
+            cell = np.arange(self.size) * self.grid // self.size
+            actions = np.where(lost[..., cell[:, None], cell], 0, actions)
         self.venv.step_async(actions.astype(np.float32))
+
+    def _enlarged(self, noise: np.ndarray) -> np.ndarray:
+        if self.grid == self.size:
+            return noise
+        enlarged: np.ndarray = bicubic(torch.from_numpy(noise), self.size).numpy()
+        return enlarged
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step; a new episode does not get the late actions of the one before."""

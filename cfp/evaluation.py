@@ -25,6 +25,10 @@ class Policy(PolicyPredictor, Protocol):
     """A trained policy of any kind, as it comes from its file."""
 
     @property
+    def sees_image(self) -> bool:
+        """Whether it looks at the pixels of the observation."""
+
+    @property
     def resolution(self) -> int:
         """Rows and columns of its actions."""
 
@@ -60,7 +64,7 @@ class Result:
     Attributes:
         name: Of the policy.
         resolution: Its action grid R.
-        returns: One sum of raw rewards per episode.
+        returns: One sum of raw rewards per episode; those of element 0 first, so that equal places are equal layouts.
         success: Share of successful episodes, None where the task does not define success.
     """
 
@@ -162,10 +166,14 @@ def evaluate(
         deterministic: Act without noise.
         seed: Of the first element's layout and of the noise.
     """
+    elements: list[int] = []
     successes: list[bool] = []
 
-    def note_success(local: dict[str, Any], _: dict[str, Any]) -> None:
-        if local["done"] and "is_success" in local["info"]:
+    def note(local: dict[str, Any], _: dict[str, Any]) -> None:
+        if not local["done"]:
+            return
+        elements.append(local["i"])
+        if "is_success" in local["info"]:
             successes.append(bool(local["info"]["is_success"]))
 
     watching = attached(policy, env)
@@ -178,14 +186,16 @@ def evaluate(
             env,
             episodes,
             deterministic=deterministic,
-            callback=note_success,
+            callback=note,
             return_episode_rewards=True,
         )
     assert isinstance(returns, list)
+    # They come in the order in which episodes end.
+    ordered = [value for _, value in sorted(zip(elements, returns, strict=True), key=lambda pair: pair[0])]
     success = float(np.mean(successes)) if successes else None
     action_space = env.action_space
     assert action_space.shape is not None
-    return Result(name, action_space.shape[-1], tuple(float(value) for value in returns), success)
+    return Result(name, action_space.shape[-1], tuple(map(float, ordered)), success)
 
 
 def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, noise: Noise = "default") -> list[Result]:

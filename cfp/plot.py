@@ -40,8 +40,8 @@ def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Pat
     axes.fill_between(steps, low, high, color="tab:blue", alpha=0.2, linewidth=0)
     for (name, value), style in zip(baselines.items(), ("--", ":", "-."), strict=False):
         axes.axhline(value, color="black", linestyle=style, linewidth=1, label=name)
-    for level, step in enumerate(_handovers(training)):
-        before, after = config.resolution(level), config.resolution(level + 1)
+    for stage, step in _handovers(training):
+        before, after = config.resolution(stage - 1), config.resolution(stage)
         axes.axvline(step, color="tab:green", linewidth=1)
         label = f" {before}x{before} → {after}x{after}"
         axes.text(step, 0.01, label, color="tab:green", fontsize=8, transform=axes.get_xaxis_transform())
@@ -67,9 +67,9 @@ def _column(rows: Sequence[dict[str, str]], name: str) -> tuple[list[float], lis
     return [step for step, _ in pairs], [value for _, value in pairs]
 
 
-def _handovers(rows: Sequence[dict[str, str]]) -> list[float]:
-    """Last step of every level but the newest."""
-    last: dict[str, float] = {}
+def _handovers(rows: Sequence[dict[str, str]]) -> list[tuple[int, float]]:
+    """Number and last step of every stage but the newest; a run that starts from a policy lacks the first ones."""
+    last: dict[int, float] = {}
     for row in rows:
-        last[row["stage"]] = float(row["step"])
-    return list(last.values())[:-1]
+        last[int(row["stage"])] = float(row["step"])
+    return list(last.items())[:-1]

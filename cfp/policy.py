@@ -168,6 +168,7 @@ class ActorPolicy(BasePolicy):
 
     action_space: spaces.Box
     deterministic_by_default: bool
+    sees_image = True
 
     def __init__(self, spec: ActorSpec, deterministic_by_default: bool = False) -> None:
         """Build the actor; its weights are random until a state is loaded."""

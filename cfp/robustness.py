@@ -81,7 +81,9 @@ def choose(cases: Sequence[Case], words: Sequence[str]) -> list[Case]:
 
 
 def report(config: RunConfig, policy: Policy, cases: Sequence[Case], episodes: int) -> list[Result]:
-    """Evaluate a policy in every case that changes something in its task, on the same layouts with the same noise.
+    """Evaluate a policy in every case that changes something for it, on the same layouts with the same noise.
+
+    Lost pixels change nothing for a policy that does not look at them.
 
     Args:
         config: Options of the run that trained it.
@@ -90,9 +92,11 @@ def report(config: RunConfig, policy: Policy, cases: Sequence[Case], episodes: i
         episodes: Of each case.
     """
     spec, seed = make_spec(config.task, **config.environment.task_options()), judging_seed(config)
-    results = []
-    for case in (case for case in cases if applies(case, spec)):
-        env = disturbed_env(config, policy.resolution, episodes, case, seed)
+    grid, results = policy.description.get("resolution", policy.resolution), []
+    for case in cases:
+        if not applies(case, spec) or (case.observation_dropout and not policy.sees_image):
+            continue
+        env = disturbed_env(config, policy.resolution, episodes, case, seed, grid)
         deterministic = policy.deterministic_by_default
         results.append(evaluate(case.name, policy, env, episodes, deterministic=deterministic, seed=seed))
     return results

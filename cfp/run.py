@@ -100,6 +100,7 @@ class Run(ABC):
     Attributes:
         step: Environment steps of the run so far.
         judging: Seconds that this session has spent on evaluations.
+        teaching: Environment steps, and seconds without evaluations, that it has spent on the training of a teacher.
 
     Raises:
         ConfigError: The folder already holds a run and ``resume`` is not set (nothing in it is touched), or the options
@@ -134,7 +135,7 @@ class Run(ABC):
         if self.state is None:
             self.position = self.begin()
             step = self.position.offset
-        self.step, self.judging = step, 0.0
+        self.step, self.judging, self.teaching = step, 0.0, (0, 0.0)
         write_json(folder / "config.json", to_json(config))
         self.evaluations = Table(folder / "evaluations.csv", step)
         progress = ProgressTable(Table(folder / "progress.csv", step))
@@ -184,6 +185,10 @@ class Run(ABC):
     def measure(self, model: Any) -> Cost:
         """Time a few steps and updates of a model that has just been made; what it has learned is spoiled."""
 
+    def unmeasured(self) -> list[str]:
+        """Work that `measure_all` leaves out, a line for each."""
+        return []
+
     def measure_all(self) -> list[Cost]:
         """`measure` every stage that is to be trained, each over the untrained policy of the one before."""
         costs = []
@@ -212,11 +217,16 @@ class Run(ABC):
                 self.restore(model, self.state)
                 self.state = None
             left = ends[level] - self.position.offset - model.num_timesteps
-            if left > 0 and not self._plateau(level):
+            step, books, early = self.position.offset + model.num_timesteps, self._books(level, model), False
+            # A process that is killed between the last step and the last evaluation leaves nothing but the latter.
+            if not self._plateau(level) if left > 0 else books.lacks_evaluation(step):
                 (self.folder / "results.json").unlink(missing_ok=True)  # of an earlier end, which is none any more
-                books, early = self._books(level, model), False
                 try:
-                    self.learn(model, left, books)
+                    if left > 0:
+                        self.learn(model, left, books)
+                    else:
+                        books.open(step)
+                        books.close(step, dict)
                 except Plateau:
                     early = True
                 finally:
@@ -250,7 +260,8 @@ class Run(ABC):
         config = self.config
         seed, episodes = config.evaluation(level)
         rows = read_table(self.folder / "evaluations.csv")
-        best = max((float(row["mean"]) for row in rows if int(row["stage"]) == level + 1), default=-math.inf)
+        rows = [row for row in rows if int(row["stage"]) == level + 1]
+        best = max((float(row["mean"]) for row in rows), default=-math.inf)
 
         def measure(step: int) -> Result:
             nonlocal best
@@ -283,8 +294,22 @@ class Run(ABC):
 
         # Such a stage must do better than what it begins with.
         first = self.begins_trained(level) and config.report.eval_every > 0 and best == -math.inf
-        total, over = config.ends()[-1], partial(self._plateau, level)
-        return Books(level, total, config.report, self.signals, self.logger, measure, save, first, over, record)
+        evaluated = int(rows[-1]["step"]) if rows else 0
+        ends, over = config.ends(), partial(self._plateau, level)
+        return Books(
+            level,
+            ends[level],
+            ends[-1],
+            config.report,
+            self.signals,
+            self.logger,
+            measure,
+            save,
+            first,
+            evaluated,
+            over,
+            record,
+        )
 
     def finish(self) -> list[Result]:
         """After training: the final table, ``results.json``, curve, video and page. Returns the table's rows."""

@@ -24,8 +24,10 @@ class Cost:
     Attributes:
         reached: Environment steps of the run after the last of them.
         steps: Environment steps in these sessions.
-        seconds: Wall time of them, without evaluations.
-        judging: Seconds of evaluations between them.
+        seconds: Wall time of them, without evaluations and without the training of a teacher.
+        judging: Seconds of evaluations between them, the teacher's included.
+        teaching: Seconds of the training of a teacher that came first, 0 for none.
+        taught: Environment steps of that.
         memory: Most bytes that a process held, None if not measured.
         device: Where it ran.
     """
@@ -34,6 +36,8 @@ class Cost:
     steps: int
     seconds: float
     judging: float
+    teaching: float
+    taught: int
     memory: int | None
     device: str
 
@@ -97,6 +101,11 @@ class Group:
         return sum(cost.steps for cost in costs) / sum(cost.seconds for cost in costs) if costs else None
 
     @property
+    def teaching(self) -> float:
+        """Mean seconds of the training of the runs' teachers."""
+        return float(np.mean([cost.teaching for cost in self.costs])) if self.costs else 0.0
+
+    @property
     def curves(self) -> list[Curve]:
         """Of the runs that have one."""
         return [run.curve for run in self.runs if len(run.curve[0])]
@@ -141,9 +150,19 @@ def _cost(folder: Path) -> Cost | None:
         return None
     memories = [session["memory"] for session in sessions if session["memory"]]
     judging = sum(session["judging"] for session in sessions)
-    seconds = sum(session["seconds"] for session in sessions) - judging
-    devices = sorted({session["device"] for session in sessions})
-    return Cost(sessions[-1]["to"], steps, max(seconds, 1e-9), judging, max(memories, default=None), "/".join(devices))
+    teachers = [session["teacher"] for session in sessions if "teacher" in session]  # sessions from before have none
+    teaching = sum(teacher["seconds"] for teacher in teachers)
+    seconds = sum(session["seconds"] for session in sessions) - judging - teaching
+    return Cost(
+        sessions[-1]["to"],
+        steps,
+        max(seconds, 1e-9),
+        judging,
+        teaching,
+        sum(teacher["steps"] for teacher in teachers),
+        max(memories, default=None),
+        "/".join(sorted({session["device"] for session in sessions})),
+    )
 
 
 SIGHTS = ("image", "state", "simulator")

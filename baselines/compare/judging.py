@@ -41,7 +41,7 @@ class Judging:
     robustness: Literal["none", "paper", "all"] = "paper"
 
     def cases(self) -> list[Case]:
-        """Cases of the robustness table, the unperturbed one first."""
+        """Cases of the robustness table, the unperturbed one first: it is the evaluation on the common layouts."""
         return [] if self.robustness == "none" else make_cases()[: PAPER_CASES if self.robustness == "paper" else None]
 
     def chunks(self) -> list[tuple[int, int]]:
@@ -71,7 +71,8 @@ class Judged:
         returns: One for each episode on the common layouts; fewer than asked for while judging goes on.
         successes: How many of them were successful, None where the task does not define success.
         own: Return on the one layout that the policy was made for, if it was.
-        cases: Mean return by disturbed case, None where a case changes nothing in the task or was not tried yet.
+        cases: Mean return by case, the unperturbed one first; None where a case changes nothing for the policy or was
+            not tried yet.
         whole: Nothing is left to do.
     """
 
@@ -133,7 +134,7 @@ def judge(config: RunConfig, folder: Path, judging: Judging, stop: Callable[[], 
     if "layout" in policy.description:
         layout = policy.description["layout"]
         record.once(judging.key("own layout"), lambda: _entry(_evaluate(own, policy, layout, 1)))
-    for case in judging.cases():
+    for case in judging.cases()[1:]:
         stop()
         record.once(_case(judging, case), partial(disturbed, case))
 
@@ -147,15 +148,17 @@ def read(folder: Path, judging: Judging) -> Judged | None:
     parts = [entries[key] for key in keys if key in entries]
     if not parts:
         return None
+    returns = [value for part in parts for value in part["returns"]]
     successes = [part["successes"] for part in parts]
-    own = entries.get(judging.key("own layout"))
-    cases = {case.name: entries.get(_case(judging, case)) for case in judging.cases()}
+    own, cases = entries.get(judging.key("own layout")), judging.cases()
+    found = {case.name: entries.get(_case(judging, case)) for case in cases[1:]}
+    means: dict[str, float | None] = {case.name: _mean(returns) for case in cases[:1]}
     return Judged(
-        tuple(value for part in parts for value in part["returns"]),
+        tuple(returns),
         None if None in successes else sum(successes),
         None if own is None else own["returns"][0],
-        {name: _mean(found[0]["returns"]) if found else None for name, found in cases.items()},
-        len(parts) == len(keys) and None not in cases.values(),
+        means | {name: _mean(results[0]["returns"]) if results else None for name, results in found.items()},
+        len(parts) == len(keys) and None not in found.values(),
     )
 
 

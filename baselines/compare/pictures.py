@@ -65,7 +65,8 @@ def curves(groups: Sequence[Group], *, minutes: bool = False) -> Figure:
 
     Args:
         groups: All.
-        minutes: Over the time of training at each group's mean speed, in place of environment steps.
+        minutes: Over the time of training at each group's mean speed, in place of environment steps; a teacher's comes
+            first.
     """
     colours = _colours(groups)
     shown = [group for group in groups if group.curves and (group.speed or not minutes)]
@@ -75,7 +76,7 @@ def curves(groups: Sequence[Group], *, minutes: bool = False) -> Figure:
         colour = colours[group.label]
         mean = interquartile_mean(values)
         if minutes and group.speed:
-            steps = steps / group.speed / 60
+            steps = (group.teaching + steps / group.speed) / 60
         axes.plot(steps, mean, _mark(group), linestyle=_line(group), color=colour, markersize=3, linewidth=1.5)
         band = bootstrap([values], repeats=BAND_REPEATS)
         if band is not None:

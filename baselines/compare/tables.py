@@ -187,16 +187,19 @@ def cost_table(groups: Sequence[Group]) -> Table:
         costs, speed, config = group.costs, group.speed, group.runs[0].job.config
         if speed is None:
             continue
+        tier = getattr(config, "tier", None)
         memories = [cost.memory / 2**20 for cost in costs if cost.memory]
         theirs = paper.COST.get(group.label, (None, None)) if group.task == "run" else (None, None)
         rows.append(
             _who(group)
             | {
                 "device": "/".join(sorted({cost.device for cost in costs})),
-                "particles": str(getattr(config, "tier", config.environment.particles)),
+                "particles": str(config.environment.particles if tier is None else tier),
                 "robots": config.environment.num_envs,
                 "steps": max(cost.reached for cost in costs),
                 "minutes": sum(cost.seconds for cost in costs) / len(costs) / 60,
+                "teacher": group.teaching / 60 or None,
+                "teacher_steps": max(cost.taught for cost in costs) or None,
                 "judging": sum(cost.judging for cost in costs) / len(costs) / 60,
                 "speed": speed,
                 "episode": make_spec(group.task).horizon / speed,
@@ -206,9 +209,10 @@ def cost_table(groups: Sequence[Group]) -> Table:
             }
         )
     about = (
-        "Training without its evaluations, whose minutes stand beside: mean over seeds. An episode is the task's whole "
-        "length of steps; robots that train side by side share the time. Memory is the most that a run's process held, "
-        "evaluations included. Right: the paper's Table 3, one robot at full size on an RTX 4090."
+        "Training without its evaluations and without that of a teacher that is trained first, whose minutes stand "
+        "beside: mean over seeds. An episode is the task's whole length of steps; robots that train side by side share "
+        "the time. Memory is the most that a run's process held, evaluations included. Right: the paper's Table 3, one "
+        "robot at full size on an RTX 4090."
     )
     columns = (
         *WHO,
@@ -217,6 +221,8 @@ def cost_table(groups: Sequence[Group]) -> Table:
         Column("robots", "robots", "d"),
         Column("steps", "steps", ",d"),
         Column("minutes", "minutes", ".1f"),
+        Column("teacher", "teacher (min)", ".1f"),
+        Column("teacher_steps", ""),
         Column("judging", "evaluations (min)", ".1f"),
         Column("speed", "steps/s", ".1f"),
         Column("episode", "s/episode", ".1f"),
@@ -259,18 +265,22 @@ def robustness_table(groups: Sequence[Group]) -> Table:
     """Ratio of returns under faults to the unperturbed return."""
     rows = []
     for group in groups:
-        cases = [run.judged.cases for run in group.runs if run.judged is not None]
+        cases = _cases(group)
+        # What was tried with nobody, such as gravity where there is none, has no row.
+        others = (each for other in groups if other.task == group.task for each in _cases(other))
+        tried = {case for each in others for case, value in each.items() if value is not None}
         for case in list(cases[0])[1:] if cases else []:
-            pairs = [(each[case], each["unperturbed"]) for each in cases if each[case] is not None]
-            ratios = [value / base for value, base in pairs if value is not None and base is not None and base > 0]
-            if not pairs:
+            if case not in tried:
                 continue
+            pairs = [(each[case], each["unperturbed"]) for each in cases]
+            ratios = [value / base for value, base in pairs if value is not None and base is not None and base > 0]
             row = _who(group) | {"case": case, "seeds": len(ratios), "paper": _fault(group, case)}
             row |= {"ratio": float(np.mean(ratios)) if ratios else None}
             rows.append(row | {"low": min(ratios, default=None), "high": max(ratios, default=None)})
     about = (
         "Return under a disturbance as a share of the unperturbed one on the same layouts: mean, lowest and highest of "
-        "the seeds whose unperturbed return is positive. The paper's figures are those of CFP."
+        "the seeds whose unperturbed return is positive; no ratio where a case changes nothing, as lost pixels "
+        "for a policy that looks at none. The paper's figures are those of CFP."
     )
     columns = (
         *WHO,
@@ -282,6 +292,10 @@ def robustness_table(groups: Sequence[Group]) -> Table:
         Column("paper", "paper", ".3f"),
     )
     return Table("robustness", "Robustness", about, columns, rows)
+
+
+def _cases(group: Group) -> list[dict[str, float | None]]:
+    return [run.judged.cases for run in group.runs if run.judged is not None]
 
 
 def _fault(group: Group, case: str) -> float | None:

@@ -102,6 +102,7 @@ def _train(config: RunConfig, folder: Path, signals: StopSignals, alone: bool) -
     finally:
         seconds = time.perf_counter() - start
         session = {"from": begun, "to": run.step, "seconds": seconds, "judging": run.judging, "memory": None}
+        session["teacher"] = dict(zip(("steps", "seconds"), run.teaching, strict=True))
         session |= {"memory": peak_memory() if alone else None, "device": choose_device(config.device)}
         session |= {"host": socket.gethostname(), "process": os.getpid(), "finished": whole}
         finished = config.ends()[-1] if whole else False

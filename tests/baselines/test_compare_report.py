@@ -12,6 +12,7 @@ from baselines.compare.__main__ import main
 from baselines.compare.collect import find_runs, group
 from baselines.compare.judging import Judging
 from baselines.compare.plan import Plan, make_jobs
+from baselines.compare.tables import cost_table
 from cfp.config import to_json
 from cfp.files import write_json, write_text
 
@@ -35,7 +36,7 @@ class TagBalance(HTMLParser):
         assert self.open.pop() == tag
 
 
-def write_run(job, scores, curve, *, successes=0, seconds=100.0, cases=(100.0, 80.0, 50.0), tier="lite"):
+def write_run(job, scores, curve, *, successes=0, seconds=100.0, cases=(0.8, 0.5), tier="lite"):
     """A folder as a run that was trained to step 1000 and judged leaves it."""
     write_json(job.folder / "config.json", to_json(job.config))
     write_text(job.folder / "policy.safetensors", job.name)
@@ -46,8 +47,9 @@ def write_run(job, scores, curve, *, successes=0, seconds=100.0, cases=(100.0, 8
     judging = Judging(len(scores), tier)
     first = {"returns": scores, "successes": successes}
     entries = {judging.key(f"layouts 0 to {len(scores) - 1}"): first}
-    for name, value in zip(CASES, cases, strict=True):
-        entries[judging.key(f"{name}, {len(scores)} episodes")] = [{"returns": [value], "successes": 0}]
+    for name, share in zip(CASES[1:], cases, strict=True):
+        found = [] if share is None else [{"returns": [share * sum(scores) / len(scores)], "successes": 0}]
+        entries[judging.key(f"{name}, {len(scores)} episodes")] = found
     policy = hashlib.sha256(job.name.encode()).hexdigest()
     write_json(job.folder / "judged.json", {"policy": policy, "entries": entries})
 
@@ -63,7 +65,8 @@ def report(tmp_path_factory):
         shift = {"cfp": 0, "shac": 3000, "shac-image": 1000}[job.label] + 100 * job.config.seed
         curve = {500: 2600 + shift, 1000: 4000 + shift}
         if job.config.task == "run":
-            write_run(job, [3900 + shift, 4100 + shift], curve)
+            blind = job.label == "shac"
+            write_run(job, [3900 + shift, 4100 + shift], curve, cases=(0.8, None if blind else 0.5))
         elif job.label != "shac-image":
             write_run(job, [8000 + shift] * 2, {}, successes=job.config.seed)
         else:
@@ -131,6 +134,28 @@ def test_cost_beside_the_paper_s(report):
     assert find(rows(report, "cost"), task="slot", algo="cfp")["paper_episode"] == ""
 
 
+def test_cost_names_the_particles_of_planners_without_a_tier_of_their_own(tmp_path):
+    (job,) = make_jobs(Plan(), ["run"], ["mpc"], [0], tmp_path)
+    write_run(job, [1.0], {})
+    judging = Judging(1)
+    (row,) = cost_table(group(find_runs([job], judging, judging))).rows
+    assert row["particles"] == "lite"
+
+
+def test_training_of_a_teacher_is_counted_by_itself(tmp_path):
+    (job,) = make_jobs(Plan(), ["run"], ["distill"], [0], tmp_path)
+    write_run(job, [1.0], {500: 1.0, 1000: 2.0}, seconds=160.0)
+    noted = json.loads((job.folder / "sessions.json").read_text())
+    noted["sessions"][0]["teacher"] = {"steps": 300, "seconds": 60.0}
+    write_json(job.folder / "sessions.json", noted)
+    judging = Judging(1)
+    groups = group(find_runs([job], judging, judging))
+    (row,) = cost_table(groups).rows
+    assert (row["speed"], row["minutes"], row["teacher"], row["teacher_steps"]) == (10, 100 / 60, 1, 300)
+    (line,) = pictures.curves(groups, minutes=True).axes[0].lines
+    assert line.get_xdata().tolist() == pytest.approx([1 + 50 / 60, 1 + 100 / 60])
+
+
 def test_success_of_slot(report):
     row = find(rows(report, "success"), task="slot", algo="cfp")
     assert (row["successes"], row["episodes"], row["rate"], row["paper"]) == ("1", "4", "0.25", "0.154")
@@ -143,7 +168,10 @@ def test_robustness_beside_the_paper_s(report):
     row = find(table, task="run", algo="cfp", case="action dropout 20%")
     assert (float(row["ratio"]), row["paper"]) == (0.8, "0.954")
     assert find(table, task="run", algo="cfp", case="observation dropout 20%")["paper"] == "0.877"
-    assert find(table, task="run", algo="shac", case="observation dropout 20%")["paper"] == ""
+    blind = find(table, task="run", algo="shac", case="observation dropout 20%")
+    assert (blind["ratio"], blind["seeds"], blind["paper"]) == ("", "0", "")
+    assert "| run | state | shac | observation dropout 20% | 0 | – | – | – | – |" in (report / "report.md").read_text()
+    assert find(table, task="run", algo="shac", case="action dropout 20%")["ratio"] != ""
 
 
 def test_paper_s_returns_stand_beside_ours(report):

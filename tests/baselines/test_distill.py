@@ -10,6 +10,7 @@ import baselines
 import cfp
 import cfp.train
 from baselines import Distill, OpenLoop, PlannerConfig, Shac, distill
+from baselines.compare.work import _train
 from baselines.dagger import Collector, Dataset, Labels, lose
 from baselines.distillation import METRICS
 from baselines.episodes import Episodes
@@ -18,6 +19,7 @@ from baselines.teachers import PolicyTeacher, Teacher, project, read_teacher
 from cfp.config import EnvironmentConfig, ReportConfig, to_json
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.files import read_table
+from cfp.process import StopSignals
 from cfp.weights import origin, read_policy, write_policy
 from dittogym import TASKS, TorchEnv
 from dittogym.action import patch_field, to_grid_layout
@@ -187,6 +189,30 @@ def test_labels_are_dropped_oldest_first_and_survive_a_checkpoint():
         assert torch.equal(images[:, 0, 0, 0].float(), actions[:, 0, 0, 0])
 
 
+def test_labels_larger_than_the_student_s_actions_are_kept_on_its_grid():
+    class Fine(Teacher):
+        resolution = 64
+
+        def act(self, env, seen):
+            return torch.rand(env.num_envs, 2, 64, 64)
+
+    student, given = Distill(make()), []
+    student.collector.teacher, collect = Fine(), student.collector.collect
+    student.collector.collect = lambda *options: given.append(collect(*options)) or given[-1]
+    student.learn(8, lambda _: None)
+    (kept,), (whole,) = student.dataset.rounds, given
+    assert kept.actions.shape[1:] == (2, 8, 8) and whole.actions.shape[1:] == (2, 64, 64)
+    assert torch.equal(kept.observations, whole.observations)
+    losses = [student._loss(*labels).item() for labels in (kept, whole)]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+    old = student.state_dict()
+    old["dataset"]["actions"] = [whole.actions]  # as checkpoints from before have it
+    student.load_state_dict(old)
+    assert torch.equal(student.dataset.rounds[0].actions, kept.actions)
+    coarse = Labels(whole.observations, torch.zeros(len(whole.observations), 2, 4, 4))
+    assert student._kept(coarse) is coarse
+
+
 @pytest.mark.parametrize(("given", "wanted"), [(8, 8), (8, 16), (16, 8), (16, 32), (16, 64), (64, 64)])
 def test_projected_action_drives_the_muscles_alike(given, wanted):
     action = 0.5 * torch.rand(3, 2, given, given).double() - 0.25
@@ -207,10 +233,10 @@ def test_action_of_the_other_layout_acts_at_the_same_place():
     env = TorchEnv("run", 1, particles=100)
     env.reset(seed=0)
     seen = torch.zeros(1, 3, 64, 64, dtype=torch.uint8)
-    action = PolicyTeacher(record, False, "image").act(env, seen)
-    as_grid = PolicyTeacher(record, True, "grid").act(env, seen)
+    action = PolicyTeacher(record, "image", "image").act(env, seen)
+    as_grid = PolicyTeacher(record, "image", "grid").act(env, seen)
     assert torch.equal(as_grid, to_grid_layout(action, "image"))
-    back = PolicyTeacher(record, True, "image").act(env, seen)
+    back = PolicyTeacher(record, "grid", "image").act(env, seen)
     assert torch.equal(to_grid_layout(back, "image"), action)
 
 
@@ -219,7 +245,7 @@ def test_sequence_teaches_by_the_step_of_the_episode():
     env = TorchEnv("run", 3, particles=100, substeps=1)
     seen, _ = env.reset(seed=0)
     env.env_state = replace(env.env_state, steps=torch.tensor([0, 4, 20]))
-    action = PolicyTeacher(record, False, "image").act(env, seen)
+    action = PolicyTeacher(record, "image", "image").act(env, seen)
     assert action[:, 0, 0, 0].tolist() == pytest.approx([0.0, 0.4, 0.0])
 
 
@@ -257,7 +283,7 @@ def test_privileged_policy_becomes_one_of_images_that_cfp_refines(privileged, tm
     capsys.readouterr()
 
 
-def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch):
+def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch, capsys):
     base = Shac.preset("shapematch", "quick")
     tiny = replace(base, steps=32, window=4, tier=100, environment=EnvironmentConfig(2, 100, 1))
     tiny = replace(tiny, report=ReportConfig(0, 1, video=False))
@@ -268,7 +294,16 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch):
     assert read_table(folder / "teacher" / "progress.csv")
     trained = (folder / "teacher" / "policy.safetensors").read_bytes()
     assert (folder / "teacher.safetensors").read_bytes() == trained
+    capsys.readouterr()
     assert distill.main([*TINY, *LESSONS, "--teacher", "shac", "--dry-run"]) == 0
+    last = "not counted: the teacher's training, which comes first (python -m baselines.train --algo shac"
+    assert last in capsys.readouterr().out.splitlines()[-1]
+    config = configure(json.loads((folder / "config.json").read_text()))
+    with StopSignals() as signals:
+        _train(config, tmp_path / "noted", signals, False)
+    (session,) = json.loads((tmp_path / "noted" / "sessions.json").read_text())["sessions"]
+    assert (session["from"], session["to"], session["teacher"]["steps"]) == (0, 32, 32)
+    assert 0 < session["teacher"]["seconds"] < session["seconds"] - session["judging"]
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from baselines import Gradient, OpenLoop
+from baselines.gradient import Episode
 from baselines.registry import configure
 from cfp.config import EnvironmentConfig, to_json
 from cfp.errors import ConfigError, NonFiniteError
@@ -77,7 +78,7 @@ def test_gradient_is_that_of_the_loss(task):
     with torch.no_grad():
         algorithm.theta += 0.3
     algorithm.theta = algorithm.theta.detach().double().requires_grad_()
-    _, _, gradient = algorithm._episode(0.9)
+    gradient = algorithm._episode(0.9).gradient
     index = (1, 0, 2, 2)
     assert gradient[index].item() == pytest.approx(numerical(algorithm, index, 1e-5), rel=1e-4)
 
@@ -85,9 +86,20 @@ def test_gradient_is_that_of_the_loss(task):
 def test_windows_cut_the_gradient_but_not_the_loss():
     whole = shorten(Gradient(make(window=0)), 6)._episode(0.9)
     halves = shorten(Gradient(make(window=3)), 6)._episode(0.9)
-    assert halves[0] == pytest.approx(whole[0], rel=1e-6)
-    assert torch.allclose(halves[2][3:], whole[2][3:], rtol=1e-4, atol=1e-9)
-    assert not torch.allclose(halves[2][:3], whole[2][:3], rtol=0.1, atol=1e-9)
+    assert halves.loss == pytest.approx(whole.loss, rel=1e-6)
+    assert torch.allclose(halves.gradient[3:], whole.gradient[3:], rtol=1e-4, atol=1e-9)
+    assert not torch.allclose(halves.gradient[:3], whole.gradient[:3], rtol=0.1, atol=1e-9)
+
+
+def test_iterations_do_not_depend_on_those_before_even_with_reference_parity():
+    environment = EnvironmentConfig(1, 300, 100, parity="reference")
+    algorithm = shorten(Gradient(make("run", environment=environment)), 4)
+    with torch.no_grad():
+        algorithm.theta += torch.linspace(0.0, 1.0, 4)
+    first, state = algorithm._episode(0.0), algorithm.env.env_state
+    algorithm.env.env_state = replace(state, centre=state.centre + 0.1)  # as after a longer way
+    second = algorithm._episode(0.0)
+    assert first.loss == second.loss and torch.equal(first.gradient, second.gradient)
 
 
 def test_steps_after_the_end_of_an_episode_do_not_count(monkeypatch):
@@ -100,9 +112,27 @@ def test_steps_after_the_end_of_an_episode_do_not_count(monkeypatch):
         return observation, reward, terminated | (len(calls) == 3), truncated, info
 
     monkeypatch.setattr(algorithm.env, "step", end_at_third)
-    _, _, gradient = algorithm._episode(0.0)
+    gradient = algorithm._episode(0.0).gradient
     assert len(calls) == 3
     assert gradient[:3].abs().amax((1, 2, 3)).gt(0).all() and not gradient[3:].any()
+
+
+def test_robot_whose_episode_is_over_may_break(monkeypatch):
+    algorithm = shorten(Gradient(make("run", window=2, environment=EnvironmentConfig(2, 300, 4))), 4)
+    step, calls = algorithm.env.step, []
+
+    def first_breaks_after_its_end(action):
+        calls.append(action)
+        observation, reward, terminated, truncated, info = step(action)
+        first = torch.tensor([True, False])
+        broken = first & (len(calls) > 2)
+        info = {**info, "finite": ~broken}
+        return observation, torch.where(broken, torch.nan, reward), terminated | first, truncated, info
+
+    monkeypatch.setattr(algorithm.env, "step", first_breaks_after_its_end)
+    loss, size, total, gradient = algorithm._episode(0.0)
+    assert len(calls) == 4 and size >= abs(loss) > 0 and total == pytest.approx(-4 * loss)
+    assert gradient.isfinite().all() and gradient.abs().amax((1, 2, 3)).gt(0).all()
 
 
 def test_unusual_gradients_are_clipped():
@@ -122,7 +152,7 @@ def test_iteration_that_breaks_the_robot_is_undone(monkeypatch, loss):
     algorithm = Gradient(make(substeps=1, blur=(1.0,)))
     algorithm.learn(30, lambda _: None)
     good = algorithm._episode
-    fail = lambda progress: (loss, 0.0, torch.zeros_like(algorithm.theta))  # noqa: E731
+    fail = lambda progress: Episode(loss, loss, 0.0, torch.zeros_like(algorithm.theta))  # noqa: E731
     monkeypatch.setattr(algorithm, "_episode", fail)
     scalars = algorithm._iterate()
     assert not algorithm.theta.any() and scalars["train/failed"] == 1  # back to the start, the best so far
@@ -134,11 +164,18 @@ def test_iteration_that_breaks_the_robot_is_undone(monkeypatch, loss):
         algorithm.learn(30 * 20, lambda _: None)
 
 
-def test_better_losses_below_zero_are_kept(monkeypatch):
-    algorithm, losses = Gradient(make("run", substeps=1)), iter([-3.0, -3.05, -2.8, -3.1, -2.6])
-    monkeypatch.setattr(algorithm, "_episode", lambda progress: (next(losses), 0.0, torch.ones_like(algorithm.theta)))
-    failed = [algorithm._iterate()["train/failed"] for _ in range(5)]
-    assert failed == [0, 0, 0, 0, 1] and algorithm.best_loss == -3.1
+@pytest.mark.parametrize(
+    ("sequence", "size"), [([-3.0, -3.05, -2.8, -3.1, -2.6], 3.1), ([0.2, -0.01, 0.25, -0.02, 0.35], 3.1)]
+)
+def test_better_losses_below_zero_are_kept(monkeypatch, sequence, size):
+    algorithm, losses = Gradient(make("run", substeps=1)), iter(sequence)
+    found = lambda progress: Episode(next(losses), size, 0.0, torch.ones_like(algorithm.theta))  # noqa: E731
+    monkeypatch.setattr(algorithm, "_episode", found)
+    assert [algorithm._iterate()["train/failed"] for _ in range(4)] == [0, 0, 0, 0]
+    resumed = Gradient(algorithm.config)
+    resumed.load_state_dict(algorithm.state_dict())
+    monkeypatch.setattr(resumed, "_episode", found)
+    assert resumed._iterate()["train/failed"] == 1 and resumed.best_loss == min(sequence)
 
 
 @pytest.mark.parametrize(("task", "level", "phases"), [("shapematch", 0, 4), ("shapematch", 1, 1), ("run", 0, 1)])
@@ -160,5 +197,5 @@ def test_polish_starts_from_the_actions_of_the_first_stage():
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_has_a_gradient(task):
     algorithm = shorten(Gradient(make(task, substeps=20, particles=100, tier=100)), 3)
-    loss, _, gradient = algorithm._episode(0.0)
+    loss, _, _, gradient = algorithm._episode(0.0)
     assert gradient.isfinite().all() and gradient.abs().sum() > 0 and loss == loss

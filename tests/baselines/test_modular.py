@@ -146,6 +146,22 @@ def test_policy_of_a_file_acts_like_the_one_in_training(tmp_path):
     assert np.array_equal(memory[0].shape, (2, 200)) and action.shape == (2, 2, 64, 64)
 
 
+def test_robots_are_segmented_anew_where_their_episode_begins_and_nowhere_else():
+    policy = SegmentPolicy(ModularActor("gnn", FEATURES), Nodes(16, True), {"resolution": 64})
+    env = TorchEnv("run", 2, 64, particles=200, substeps=2)
+    env.reset(seed=0)
+    images, policy = np.zeros((2, 3, 64, 64), np.uint8), policy.attached(env)
+    _, (first,) = policy.predict(images)
+    env.step(torch.zeros(2, 2, 64, 64))
+    memory = (15 - first,)  # the same segments under other names, which are kept from step to step
+    for start in (None, np.ones(2, bool)):  # evaluate_policy says True of a robot that has played its episodes
+        _, (labels,) = policy.predict(images, memory, start)
+        assert (labels == memory[0]).mean() > 0.9
+    env.reset(options={"reset_mask": torch.tensor([True, False])})
+    _, (labels,) = policy.predict(images, memory, np.zeros(2, bool))
+    assert np.array_equal(labels[0], first[0]) and (labels[1] == memory[0][1]).mean() > 0.9
+
+
 def test_policy_must_be_shown_its_own_kind_of_task(tmp_path):
     policy = SegmentPolicy(ModularActor("gnn", FEATURES), Nodes(16, True), {"resolution": 64})
     with pytest.raises(RuntimeError, match="call attached"):

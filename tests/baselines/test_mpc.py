@@ -58,6 +58,14 @@ def test_learning_stops_with_the_episode() -> None:
     assert len(seen) == 4
 
 
+def test_reduced_model_follows_only_where_a_plan_is_made(monkeypatch) -> None:
+    mpc, followed = MPC(replace(CONFIG, tier=60)), []
+    follow = mpc.reduced.follow
+    monkeypatch.setattr(mpc.reduced, "follow", lambda state: followed.append(int(state.steps)) or follow(state))
+    mpc.learn(5, lambda scalars: None)
+    assert followed == [0, 2, 4]  # a plan is carried out for two steps
+
+
 def test_layout_of_the_reference_is_kept() -> None:
     for environment, layout in (
         (ENVIRONMENT, "image"),

@@ -156,6 +156,43 @@ def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monk
     assert steps[0] == steps[1]
 
 
+def test_stop_in_the_last_step_leaves_a_whole_stage(tmp_path, monkeypatch):
+    turn = Books.turn
+
+    def interrupt(books, step, scalars):
+        if step == 30:
+            signal.raise_signal(signal.SIGINT)
+        turn(books, step, scalars)
+
+    monkeypatch.setattr(Books, "turn", interrupt)
+    assert run("mpc", tmp_path) == 128 + signal.SIGINT
+    assert [row["step"] for row in read_table(tmp_path / "evaluations.csv")] == ["12", "24", "30"]
+    assert not (tmp_path / "results.json").exists()
+    assert train.main(["--out", str(tmp_path), "--resume"]) == 0
+    assert (tmp_path / "results.json").exists()
+    assert [row["step"] for row in read_table(tmp_path / "evaluations.csv")] == ["12", "24", "30"]
+
+
+def test_last_evaluation_that_a_crash_prevented_is_made_up_for(tmp_path, monkeypatch):
+    def crash(*_):
+        raise RuntimeError("killed")
+
+    monkeypatch.setattr(Books, "close", crash)
+    with pytest.raises(RuntimeError, match="killed"):
+        run("mpc", tmp_path)
+    monkeypatch.undo()
+    assert train.main(["--out", str(tmp_path), "--resume"]) == 0
+    assert [row["step"] for row in read_table(tmp_path / "evaluations.csv")] == ["12", "24", "30"]
+    assert len(baselines.load(tmp_path).actions) == json.loads((tmp_path / "policy.json").read_text())["steps"]
+
+
+def test_algorithm_is_told_which_scalars_become_a_row(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr(baselines.Shac, "written", lambda model: told.append(model.num_timesteps))
+    assert run("shac", tmp_path) == 0
+    assert told == [24, 48, 72, 96] == [int(row["step"]) for row in read_table(tmp_path / "progress.csv")]
+
+
 def test_polish_is_judged_on_the_layout_it_is_made_for(finished):
     algo, folder = finished
     rows = [row for row in read_table(folder / "evaluations.csv") if row["stage"] == "2"]
@@ -180,3 +217,4 @@ def test_robustness_is_reported_whatever_trained_it(finished):
     rows = json.loads((folder / "robustness.json").read_text())
     assert rows[0]["case"] == "unperturbed" and rows[0]["ratio"] in (1, None)
     assert {row["episodes"] for row in rows} == {1}
+    assert baselines.load(folder).sees_image == any("observation" in row["case"] for row in rows)

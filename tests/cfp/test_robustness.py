@@ -6,21 +6,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from fakes import FakeEnv
 from scipy import stats
 
+import cfp
 from cfp import robustness
 from cfp.actor import build_actor
 from cfp.config import to_json
 from cfp.disturbances import Case, Disturbed, applies, disturbed_env, make_cases
 from cfp.evaluate import open_policy, open_run
-from cfp.evaluation import Result, student
+from cfp.evaluation import Result, ZeroPolicy, evaluate, student
 from cfp.files import write_json
 from cfp.presets import preset
 from cfp.train import PROGRAM
 from cfp.vec_env import monitored
 from cfp.weights import describe, save_policy
 from dittogym import make_spec
+from dittogym.action import bicubic
 from dittogym.tasks import TASKS
 
 
@@ -58,6 +61,34 @@ def test_noise_has_its_deviation_and_every_reset_repeats_it():
     first, _ = play(env, actions)
     assert first.std() == pytest.approx(0.3, abs=0.02) and first.mean() == pytest.approx(0, abs=0.03)
     np.testing.assert_array_equal(play(env, actions)[0], first)
+
+
+def test_blended_actions_are_disturbed_on_the_grid_that_they_were_decided_on():
+    env = Disturbed(monitored(FakeEnv(num_envs=2, resolution=16, horizon=3)), Case("case", action_dropout=0.2), 0, 4)
+    arrived, _ = play(env, np.full((4, 2, 2, 16, 16), 0.5, np.float32))
+    cells = arrived.reshape(4, 2, 2, 4, 4, 4, 4).transpose(0, 1, 2, 3, 5, 4, 6).reshape(4, 2, 2, 4, 4, 16)
+    assert (cells == cells[..., :1]).all() and (cells == 0).mean() == pytest.approx(0.2, abs=0.07)
+    shaken = Disturbed(monitored(FakeEnv(num_envs=2, resolution=16, horizon=3)), Case("case", action_noise=0.3), 0, 4)
+    plain = Disturbed(monitored(FakeEnv(num_envs=2, resolution=4, horizon=3)), Case("case", action_noise=0.3), 0)
+    (fine, _), (coarse, _) = (play(e, np.zeros((4, 2, 2, r, r), np.float32)) for e, r in ((shaken, 16), (plain, 4)))
+    np.testing.assert_allclose(fine, bicubic(torch.from_numpy(coarse), 16).numpy(), atol=1e-6)
+
+
+def test_policy_of_two_levels_is_disturbed_on_its_finer_grid(tmp_path, monkeypatch):
+    config, grids = preset("run"), []
+    save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(1)), describe(config, 1, 0))
+    monkeypatch.setattr(robustness, "disturbed_env", lambda *given: grids.append(given[1:2] + given[5:]) or given)
+    monkeypatch.setattr(robustness, "evaluate", lambda *_, **__: None)
+    robustness.report(config, cfp.load(tmp_path), make_cases()[:1], 1)
+    assert grids == [(64, 16)]
+
+
+def test_lost_pixels_are_no_case_for_a_policy_without_eyes(folder):
+    config, policies = open_run(PROGRAM, folder, "cpu")
+    blind = policies["stage 2"]
+    blind.sees_image = False
+    names = [result.name for result in robustness.report(config, blind, make_cases()[:4], 1)]
+    assert names == ["unperturbed", "action dropout 20%", "action noise 0.2"]
 
 
 def test_late_actions_stay_in_their_episode():
@@ -99,6 +130,12 @@ def test_interval_is_student_s(degrees):
     low, high = stats.t.interval(0.95, degrees, returns.mean(), stats.sem(returns))
     assert Result("", 8, tuple(returns)).interval == pytest.approx((high - low) / 2, rel=1e-5)
     assert Result("", 8, (1.0,)).interval is None
+
+
+def test_returns_are_in_the_order_of_layouts():
+    env = monitored(FakeEnv(num_envs=3, horizon=4, end_above=0.15))  # the third is too high, and ends at once
+    result = evaluate("", ZeroPolicy(8), env, 6, deterministic=True, seed=0)
+    assert result.returns == pytest.approx([2.0, 2.0, 2.4, 2.4, 0.7, 0.7])
 
 
 @pytest.fixture

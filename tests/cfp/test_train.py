@@ -10,13 +10,14 @@ import pytest
 
 import cfp
 import dittogym
-from cfp import evaluate, train
+from cfp import evaluate, plot, train
 from cfp.actor import ActorSpec
 from cfp.callbacks import StageCallback
 from cfp.evaluation import compare
 from cfp.files import read_table
 from cfp.policy import ActorPolicy
 from cfp.presets import preset
+from cfp.runner import Runner
 from cfp.weights import policy_file, shipped
 
 TINY = (
@@ -58,6 +59,21 @@ def test_run_trains_both_stages_and_leaves_its_files(finished):
     results = json.loads((finished / "results.json").read_text())
     assert [row["policy"] for row in results] == ["zero action", "random action", "stage 1", "stage 2"]
     assert [row["action"] for row in results] == ["4x4", "4x4", "4x4", "8x8"]
+
+
+def test_handovers_are_named_by_their_stage_where_the_first_was_given():
+    rows = [{"stage": stage, "step": step} for stage, step in (("2", "90"), ("2", "100"), ("3", "110"), ("3", "150"))]
+    assert plot._handovers(rows) == [(2, 100.0)]
+
+
+@pytest.mark.parametrize("place", ["finish", "train"])
+def test_interrupt_that_is_not_held_back_is_one_line(tmp_path, monkeypatch, capsys, place):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Runner, place, interrupt)
+    assert run(tmp_path / "a", "--steps", "20", "--handover", "10") == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "stopped; --resume goes on"
 
 
 def test_one_seed_gives_one_table(finished, tmp_path):
