@@ -48,6 +48,7 @@ PAGES = {
         "assert gradient.abs().max() > 0",
         "assert env.model.segment == segment < 100",
     ),
+    "docs/concepts/planning.md": ("assert planner.plans > 0 and planner.failed == 0",),
     "docs/develop/adding.md": (
         "assert width > 2 * start.x[..., 0].std() and bulk.grad.abs() > 0",
         "assert pull.grad.flatten(1).norm(dim=1).min() > 0",
@@ -56,8 +57,8 @@ PAGES = {
 }
 
 
-SLOW = {"docs/own.md", "docs/develop/adding.md"}
-"""Pages with programs that take a minute."""
+SLOW = {"docs/own.md", "docs/concepts/planning.md", "docs/develop/adding.md"}
+"""Pages with programs that take up to a minute."""
 
 
 @pytest.mark.parametrize("page", [pytest.param(p, marks=[pytest.mark.slow] * (p in SLOW)) for p in PAGES])
