@@ -126,6 +126,21 @@ def test_failing_run_is_reported_and_stops_no_other(tmp_path, capsys):
     assert "ConfigError: particles" in (tmp_path / "out" / "report.md").read_text()
 
 
+@pytest.mark.slow
+def test_task_of_a_module_is_compared_in_processes_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(tmp_path), os.environ.get("PYTHONPATH", ""))))
+    (tmp_path / "rolling.py").write_text(
+        "import dataclasses, dittogym\n"
+        "def roll(): return dataclasses.replace(dittogym.make_spec('run'), name='roll', horizon=12)\n"
+        "dittogym.register('roll', roll)"
+    )
+    out = tmp_path / "out"
+    assert compare(out, "--tasks", "rolling:roll", "--algos", "mpc", "--seeds", "0", "--workers", "1") == 0
+    assert (out / "runs" / "mpc-roll-quick-0" / "policy.safetensors").exists()
+    assert "rolling:roll" in (out / "report.md").read_text()
+
+
 def test_array_job_does_one_run_and_no_report(tmp_path):
     out = tmp_path / "out"
     assert compare(out, "--algos", "shac-image", "mpc", "--seeds", "0", "--only", "1") == 0

@@ -3,6 +3,7 @@
 import html
 import json
 import signal
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -197,7 +198,7 @@ def test_damaged_checkpoint_is_an_error_that_names_it(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--task", "jump"], "task: got 'jump', allowed shapematch, run"),
+        (["--task", "jump"], "task: got 'jump', allowed catch, dig"),
         (["--preset", "slow"], "preset: got 'slow', allowed quick, paper"),
         (["--particles", "0"], "particles"),
         (["--target", "no/such.png"], "target"),
@@ -280,6 +281,39 @@ def test_shipped_policy_acts_in_its_task(name):
     observation, _ = env.reset(seed=0)
     action, _ = policy.predict(observation.numpy())
     assert action.shape == (1, *env.action_shape) and np.abs(action).max() <= 1
+
+
+def test_task_of_a_module_is_trained_and_evaluated_by_name(tmp_path, monkeypatch, capsys):
+    """Each time as in a process that has not seen the module. Loading a policy imports nothing, evaluating it does."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("dittogym.tasks.TASKS", dict(dittogym.TASKS))
+    monkeypatch.setattr("dittogym.registration.TASKS", dittogym.tasks.TASKS)
+    (tmp_path / "bouncing.py").write_text(
+        "import dataclasses, dittogym\n"
+        "def bounce(): return dataclasses.replace(dittogym.make_spec('run'), name='bounce', horizon=20)\n"
+        "dittogym.register('bounce', bounce)"
+    )
+
+    def forget():
+        sys.modules.pop("bouncing", None)
+        dittogym.tasks.TASKS.pop("bounce", None)
+
+    folder = tmp_path / "runs" / "cfp-bounce-quick-0"
+    assert train.main([*TINY, "--task", "bouncing:bounce"]) == 0
+    forget()
+    policy = cfp.load(folder)
+    assert policy.description["task"] == "bouncing:bounce" and "bouncing" not in sys.modules
+    capsys.readouterr()
+    for what in ([str(folder)], ["--policy", str(folder / "policy.safetensors")]):
+        forget()
+        assert evaluate.main([*what, "--episodes", "1"]) == 0
+        assert "stage 2" in capsys.readouterr().out or "policy" in what[-1]
+    forget()
+    (tmp_path / "bouncing.py").unlink()
+    sys.path_importer_cache.clear()
+    assert evaluate.main([str(folder), "--episodes", "1"]) == 2
+    assert "(module 'bouncing': ModuleNotFoundError" in capsys.readouterr().err
 
 
 def test_page_shows_the_run_and_opens_from_disk(finished):

@@ -106,6 +106,29 @@ def test_options_of_the_function_arrive() -> None:
         tiny("hope")
 
 
+def test_a_module_that_registers_the_task_is_imported_by_name(tmp_path, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "hopping.py").write_text(
+        "import dataclasses, dittogym\n"
+        "def leap(): return dataclasses.replace(dittogym.make_spec('run'), name='leap')\n"
+        "dittogym.register('leap', leap)"
+    )
+    (tmp_path / "torn.py").write_text("1 / 0")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "hidden.py").write_text("raise AssertionError('is never imported')")
+    env = tiny("hopping:leap", substeps=1)
+    assert (env.spec.name, env.spec.horizon) == ("leap", dittogym.make_spec("run").horizon)
+    for task, reason in (
+        ("hopping:fly", "module 'hopping' does not register 'fly'"),
+        ("torn:leap", "module 'torn': ZeroDivisionError: division by zero"),
+        ("missing_one:leap", "module 'missing_one': ModuleNotFoundError: No module named 'missing_one'"),
+        ("folder.hidden:leap", "module 'folder.hidden': ImportError: its name must be a word, without dots"),
+        (":leap", "module '': ImportError"),
+    ):
+        with pytest.raises(ValueError, match=rf"task must be one of catch.* MODULE:NAME \({reason}.* got '{task}'"):
+            dittogym.make_spec(task)
+
+
 def test_the_horizon_of_an_option_counts_for_the_batch() -> None:
     dittogym.register("hop", hop)
     env = tiny("hop", horizon=2, substeps=1)
