@@ -129,6 +129,12 @@ def test_a_module_that_registers_the_task_is_imported_by_name(tmp_path, monkeypa
             dittogym.make_spec(task)
 
 
+def test_the_name_is_that_of_the_specification() -> None:
+    with pytest.raises(ValueError, match="task must be the name in the specification, got 'leap' for a TaskSpec 'hop'"):
+        dittogym.register("leap", hop)
+    assert "leap" not in dittogym.TASKS
+
+
 def test_the_horizon_of_an_option_counts_for_the_batch() -> None:
     dittogym.register("hop", hop)
     env = tiny("hop", horizon=2, substeps=1)
@@ -280,7 +286,7 @@ def test_a_horizon_among_the_options_holds_through_gymnasium() -> None:
 
 
 def test_a_function_that_is_written_anew_takes_the_place_of_the_old_one() -> None:
-    cell = "def jump(): return dittogym.spec.TaskSpec(**{**vars(hop()), 'horizon': %d})"
+    cell = "def jump(): return dittogym.spec.TaskSpec(**{**vars(hop()), 'name': 'jump', 'horizon': %d})"
     for horizon in (40, 20):
         names = {"dittogym": dittogym, "hop": hop, "__name__": "notebook"}
         exec(cell % horizon, names)
