@@ -146,7 +146,7 @@ def _cost(folder: Path) -> Cost | None:
     return Cost(sessions[-1]["to"], steps, max(seconds, 1e-9), judging, max(memories, default=None), "/".join(devices))
 
 
-SIGHTS = ("image", "state", "simulator")
+SIGHTS = ("image", "state", "simulator", "nothing")
 """Order of groups in tables."""
 
 
