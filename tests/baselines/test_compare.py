@@ -190,6 +190,23 @@ def test_process_that_is_killed_is_begun_again_and_then_given_up(tmp_path, monke
     assert (tmp_path / "error.txt").read_text() == "killed by SIGKILL, 3 times; see log.txt\n"
 
 
+@pytest.mark.parametrize(
+    ("program", "told"),
+    [
+        ("raise ImportError('no hop')", "ImportError: no hop (exit code 1; see log.txt)\n"),
+        ("import os; os._exit(7)", "no word (exit code 7; see log.txt)\n"),
+        ("import sys; open('error.txt', 'w').write('its own word'); sys.exit(1)", "its own word"),
+    ],
+)
+def test_process_that_fails_leaves_its_last_word(tmp_path, monkeypatch, program, told):
+    monkeypatch.setattr("baselines.compare.executor.MODULE", (sys.executable, "-c", program))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "error.txt").write_text("of another time")
+    (tmp_path / "log.txt").write_text("of another time\n")
+    assert run_process({"folder": str(tmp_path)}, 1, 2, lambda: 0) == "failed"
+    assert (tmp_path / "error.txt").read_text() == told
+
+
 @pytest.mark.parametrize(("urgency", "ending"), [(1, "checkpoint"), (2, None)])
 def test_process_is_asked_to_stop_before_it_is_made_to(tmp_path, monkeypatch, urgency, ending):
     waiting = (
