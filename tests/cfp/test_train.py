@@ -2,9 +2,12 @@
 
 import html
 import json
+import os
 import signal
+import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +17,7 @@ import dittogym
 from cfp import evaluate, train
 from cfp.actor import ActorSpec
 from cfp.callbacks import StageCallback
+from cfp.command import started_as
 from cfp.evaluation import compare
 from cfp.files import read_table
 from cfp.policy import ActorPolicy
@@ -25,6 +29,7 @@ TINY = (
     "--random-steps 10 4 --batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 --eval-every 60 "
     "--eval-episodes 2 --checkpoint-every 20 --log-every 10 --no-video --device cpu --backend eager"
 ).split()
+PROCESS = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
 
 
 def run(folder, *more):
@@ -221,6 +226,17 @@ def test_unknown_option_is_exit_code_two(capsys):
     with pytest.raises(SystemExit) as exit_:
         train.main(["--steppes", "3"])
     assert exit_.value.code == 2
+
+
+def test_help_names_the_program_that_was_started(tmp_path, monkeypatch, capsys):
+    (tmp_path / "pit.py").write_text("import sys, cfp.train\nsys.exit(cfp.train.main())")
+    for command, name in (
+        (["pit.py", "--out", ".", "--bad"], "python pit.py --help"),
+        (["-m", "baselines.distill", "--bad"], "python -m baselines.distill --help"),
+    ):
+        done = subprocess.run([sys.executable, *command], cwd=tmp_path, env=PROCESS, capture_output=True, text=True)
+        assert done.returncode == 2 and name in " ".join(done.stderr.replace("│", " ").split())
+    assert started_as("cfp.train", []) == "python -m cfp.train"
 
 
 def test_evaluation_of_a_folder(finished, capsys):
