@@ -39,7 +39,7 @@ class Resources:
 
 def outcome(code: int) -> str:
     """Finished, failed, busy or stopped."""
-    return {FINISHED: "finished", BUSY: "busy"}.get(code, "stopped" if code > 128 else "failed")
+    return {FINISHED: "finished", BUSY: "busy"}.get(code, "failed" if 0 < code <= 128 else "stopped")
 
 
 def run_process(values: dict[str, Any], threads: int, retries: int, stopped: Callable[[], int]) -> str:
