@@ -42,7 +42,8 @@ PAGES = {
     "docs/own.md": (
         "assert env.action_space.shape == (2, 4, 4) and env.observation_space.shape == (3, 16, 16)",
         "assert action.grad.flatten(1).norm(dim=1).min() > 0",
-        'assert dittogym.make_spec("hop").horizon == 200 and policy.description["task"] == "hop"',
+        "batch.reset(seed=0)\n_, first, *_ = batch.step(torch.zeros(2, *batch.action_shape))\nassert first.max() <= 0",
+        'assert dittogym.make_spec("hop").horizon == 20 and policy.description["task"] == "hop"',
     ),
     "docs/concepts/gradients.md": (
         "assert gradient.abs().max() > 0",
