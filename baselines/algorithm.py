@@ -23,8 +23,8 @@ from cfp.state_file import Position
 from cfp.weights import origin
 from dittogym import make_spec
 
-Sees = Literal["image", "state", "simulator"]
-"""What a policy may look at: the observation; anything the simulation knows; the simulator itself, to plan with."""
+Sees = Literal["image", "state", "simulator", "nothing"]
+"""What a policy may look at: the observation; all that the simulation knows; the simulator, to plan with; nothing."""
 
 Callback = Callable[[Mapping[str, float | None]], None]
 """Called by `Algorithm.learn` between two updates, with scalars to log by name; raises to stop the training."""
@@ -57,7 +57,7 @@ class Entry:
     """An algorithm in the registry.
 
     Attributes:
-        sees: What its policies look at, and what its training may use.
+        sees: What its policies look at; their training may use more.
         preset: From task and preset to options.
         open: Opens a run: options, folder, whether to resume, stop signals.
         load: Loads a policy file onto a device.

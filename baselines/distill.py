@@ -5,12 +5,14 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from baselines import train
+from baselines.train import PROGRAM
+from cfp import command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
-    return train.main(["--algo", "distill", *(sys.argv[1:] if arguments is None else arguments)])
+    words = ["--algo", "distill", *(sys.argv[1:] if arguments is None else arguments)]
+    return command.main(PROGRAM, words, command.started_as("baselines.distill", arguments))
 
 
 if __name__ == "__main__":

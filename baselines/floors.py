@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 import cfp
-from baselines.algorithm import Algorithm, Callback, GridConfig
+from baselines.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.open_loop import OpenLoop
 from cfp.config import ReportConfig
 from cfp.evaluation import Policy
@@ -32,6 +32,8 @@ class FloorConfig(GridConfig):
 
 class Floor(Algorithm):
     """A policy that is given, as an algorithm: so it is evaluated, filmed and compared like any other."""
+
+    sees: ClassVar[Sees] = "nothing"
 
     def __init__(self, config: FloorConfig, level: int = 0, start: Policy | None = None) -> None:
         self.config = config

@@ -122,7 +122,7 @@ class Gradient(Algorithm):
     """
 
     name: ClassVar[str] = "gradient"
-    sees: ClassVar[Sees] = "simulator"
+    sees: ClassVar[Sees] = "nothing"
 
     def __init__(self, config: GradientConfig, level: int = 0, start: OpenLoop | None = None) -> None:
         self.config, self.level = config, level

@@ -11,6 +11,7 @@ from baselines.algorithm import Entry
 from cfp.config import Config
 from cfp.errors import ConfigError
 from cfp.runner import Runner
+from dittogym.tasks import task_name
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class LevelConfig(Config):
     @property
     def name(self) -> str:
         """Of the run, for a folder; names the action grid."""
-        return f"{self.algo}{self.resolutions[0]}-{self.task}-{self.preset}-{self.seed}"
+        return f"{self.algo}{self.resolutions[0]}-{task_name(self.task)}-{self.preset}-{self.seed}"
 
     def check(self) -> None:
         """Check what the types cannot, see `cfp.config.RunConfig.check`."""

@@ -209,7 +209,7 @@ class Planner(PlannerBase[PlannerConfig]):
             if not learns:
                 self.failed += int((~value.isfinite()).sum())
                 break
-            (gradient,) = torch.autograd.grad(-climbed.sum(), plan)
+            (gradient,) = torch.autograd.grad(climbed, plan, -torch.ones_like(climbed))  # a caller's no_grad holds here
             broken = ~(value.isfinite() & gradient.isfinite().flatten(2).all(2).all(0))
             self.failed += int(broken.sum())
             plan.grad = torch.where(_spread(broken), 0.0, _clipped(gradient, config.clip))

@@ -75,8 +75,19 @@ class _Choice:
     config: Path | None = None
 
 
-def parse(program: Program, arguments: Sequence[str]) -> Command:
+def started_as(module: str, arguments: Sequence[str] | None) -> str:
+    """What the user has typed to start a program: its module, or a file of his own that hands its command line on."""
+    own = arguments is None and getattr(sys.modules["__main__"], "__spec__", None) is None
+    return f"python {sys.argv[0]}" if own else f"python -m {module}"
+
+
+def parse(program: Program, arguments: Sequence[str], started: str | None = None) -> Command:
     """Read a command line.
+
+    Args:
+        program: Whose it is.
+        arguments: The words.
+        started: How the help calls the program; by its module if not given.
 
     Raises:
         ConfigError: An option is wrong.
@@ -92,7 +103,7 @@ def parse(program: Program, arguments: Sequence[str]) -> Command:
             base = merge(base, _values(choice))
     command: Command = tyro.cli(
         Command,
-        prog=f"python -m {program.package}.train",
+        prog=started or started_as(f"{program.package}.train", arguments),
         description=f"{program.about}\n\n{inspect.getdoc(Command)}",
         args=list(arguments),
         default=Command(base),
@@ -119,10 +130,11 @@ def _default_folder(config: RunConfig) -> Path:
     return Path("runs") / config.name
 
 
-def main(program: Program, arguments: Sequence[str] | None = None) -> int:
-    """Do what a command line says; returns the exit code."""
+def main(program: Program, arguments: Sequence[str] | None = None, started: str | None = None) -> int:
+    """Do what a command line says; returns the exit code, see `parse`."""
+    started = started or started_as(f"{program.package}.train", arguments)
     try:
-        command = parse(program, sys.argv[1:] if arguments is None else arguments)
+        command = parse(program, sys.argv[1:] if arguments is None else arguments, started)
         assert command.out is not None
         folder = command.out
         if folder.exists() and not folder.is_dir():
@@ -137,7 +149,7 @@ def main(program: Program, arguments: Sequence[str] | None = None) -> int:
         keep_memory()
         return _train(program, config, folder, command.resume)
     except Stopped as stopped:
-        print(f"{stopped}; go on with: python -m {program.package}.train --resume --out {folder}")
+        print(f"{stopped}; go on with: {started} --resume --out {folder}")
         return 128 + stopped.number
     except CFPError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -21,7 +21,8 @@ from cfp.groups import positive as positive
 from cfp.groups import share as share
 from cfp.merging import merge as merge
 from cfp.networks import RESOLUTIONS
-from dittogym import TASKS, make_spec
+from dittogym import make_spec
+from dittogym.tasks import allowed_instead, task_name
 
 Preset = Literal["quick", "paper"]
 
@@ -40,7 +41,7 @@ class RunConfig:
     algo: str = "cfp"
     """Which algorithm."""
     task: str = "shapematch"
-    """Which task: see the presets."""
+    """Which task; MODULE:NAME for one of your own, which the module registers."""
     preset: Preset = "quick"
     """Where defaults come from: quick (minutes on two cores) or paper (the published numbers)."""
     seed: int = 0
@@ -56,7 +57,7 @@ class RunConfig:
     @property
     def name(self) -> str:
         """Of the run, for a folder."""
-        return f"{self.algo}-{self.task}-{self.preset}-{self.seed}"
+        return f"{self.algo}-{task_name(self.task)}-{self.preset}-{self.seed}"
 
     def ends(self) -> tuple[int, ...]:
         """Environment steps since the beginning of the run after which each stage ends."""
@@ -211,7 +212,8 @@ class LadderConfig(RunConfig):
             given = len(getattr(self, name))
             if given != count:
                 raise ConfigError(f"{name}: got {given} values, allowed {count} for resolutions {self.resolutions}")
-        if self.task in TASKS and self.resolutions[-1] > (patch := make_spec(self.task).patch):
+        check_task(self.task)
+        if self.resolutions[-1] > (patch := make_spec(self.task).patch):
             raise ConfigError(f"resolutions: got {self.resolutions}, allowed in {self.task} is at most {patch}")
         if any(late <= early for early, late in pairwise((0, *self.ends()))):
             raise ConfigError(
@@ -260,6 +262,16 @@ class Config(LadderConfig, SACConfig):
             raise ConfigError("warm_critic: got True, allowed without start_from (a policy brings no critics)")
         if self.refine and self.start_from is None:
             raise ConfigError("refine: got True, allowed with start_from, which names the policy")
+
+
+def check_task(task: object) -> None:
+    """Check that something names a task; a module that it names is imported.
+
+    Raises:
+        ConfigError: It does not.
+    """
+    if (allowed := allowed_instead(task)) is not None:
+        raise ConfigError(f"task: got {task!r}, allowed {allowed}")
 
 
 def to_json(config: RunConfig) -> dict[str, Any]:

@@ -53,7 +53,8 @@ def estimate(program: Program, config: RunConfig) -> str:
     quiet = replace(config, report=replace(config.report, video=False, video_every=0, wandb="off"))
     with tempfile.TemporaryDirectory() as folder:
         run = program.run(quiet, Path(folder) / "run", False, StopSignals())
-        costs, first, others = run.measure_all(), run.position.level, run.unmeasured()
+        costs, first = run.measure_all(), run.position.level
+        others, remarks = run.unmeasured(), run.remarks()
     bounds, horizon, episodes = (0, *config.ends()), make_spec(config.task).horizon, config.report.eval_episodes
     lines = [f"{'stage':<8}{'action':>8}{'steps':>11}{'steps/s':>10}{'training':>11}{'evaluations':>13}{'replay':>10}"]
     total = 0.0
@@ -71,7 +72,7 @@ def estimate(program: Program, config: RunConfig) -> str:
     held = max(cost.held for cost in costs)
     lines.append(f"time: about {_duration(total)}, of {episodes} episodes to an evaluation that none ends early")
     lines.append("memory: " + (f"about {_size(memory + held)}" if memory else f"{_size(held)} and the program itself"))
-    return "\n".join([*lines, *(f"not counted: {other}" for other in others)])
+    return "\n".join([*lines, *(f"not counted: {other}" for other in others), *remarks])
 
 
 def _evaluation_step(config: RunConfig, level: int) -> float:

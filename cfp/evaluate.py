@@ -10,7 +10,7 @@ from pathlib import Path
 
 import tyro
 
-from cfp.command import Program
+from cfp.command import Program, started_as
 from cfp.config import RunConfig, Tier, at_least_one
 from cfp.errors import CFPError, CheckpointError, ConfigError
 from cfp.evaluation import Noise, Policy, compare, format_table, to_rows
@@ -132,7 +132,8 @@ def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> 
     """Command line entry; returns the exit code."""
     keep_memory()
     try:
-        print(run(program, tyro.cli(Command, prog=f"python -m {program.package}.evaluate", args=arguments)))
+        started = started_as(f"{program.package}.evaluate", arguments)
+        print(run(program, tyro.cli(Command, prog=started, args=arguments)))
     except (CFPError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2 if isinstance(error, CFPError) else 1

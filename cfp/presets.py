@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import dittogym
-from cfp.config import Config, EnvironmentConfig, LearningConfig, NetworkConfig, Preset, ReportConfig, merge
+from cfp.config import Config, EnvironmentConfig, LearningConfig, NetworkConfig, Preset, ReportConfig, check_task, merge
 from cfp.errors import ConfigError
 
 
@@ -61,16 +61,15 @@ def preset(task: str, name: str = "quick") -> Config:
     """The defaults of a task.
 
     Args:
-        task: One of `dittogym.TASKS`. A task of one's own, for which nothing was published, gets the numbers of RUN on
-            its own grids, and has no preset ``"paper"``.
+        task: One of `dittogym.TASKS`, or ``"MODULE:NAME"``. A task of one's own, for which nothing was
+            published, gets the numbers of RUN on its own grids, and has no preset ``"paper"``.
         name: ``"paper"``: one robot at full size, the published numbers, the reference's interpolation and faults.
             ``"quick"``: sixteen robots at the lite tier, larger steps, minutes instead of days.
 
     Raises:
         ConfigError: No such task or preset.
     """
-    if not isinstance(task, str) or task not in dittogym.TASKS:
-        raise ConfigError(f"task: got {task!r}, allowed {', '.join(dittogym.TASKS)}")
+    check_task(task)
     allowed = typing.get_args(Preset) if task in TASKS else ("quick",)
     if name not in allowed:
         raise ConfigError(f"preset: got {name!r}, allowed {', '.join(allowed)} for {task}")

@@ -12,7 +12,7 @@ from typing import Any
 import tyro
 from matplotlib.figure import Figure
 
-from cfp.command import Program
+from cfp.command import Program, started_as
 from cfp.config import RunConfig, at_least_one
 from cfp.disturbances import Case, applies, disturbed_env, make_cases
 from cfp.errors import CFPError, ConfigError
@@ -188,7 +188,8 @@ def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> 
     """Command line entry; returns the exit code."""
     keep_memory()
     try:
-        print(run(program, tyro.cli(Command, prog=f"python -m {program.package}.robustness", args=arguments)))
+        started = started_as(f"{program.package}.robustness", arguments)
+        print(run(program, tyro.cli(Command, prog=started, args=arguments)))
     except (CFPError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2 if isinstance(error, CFPError) else 1

@@ -200,8 +200,14 @@ class Run(ABC):
         self.logger.close()
         return costs
 
+    def remarks(self) -> list[str]:
+        """What the user may not expect of the stages that are left, a line each."""
+        return []
+
     def train(self) -> None:
         """Train the stages that are left."""
+        for line in self.remarks():
+            print(line)
         try:
             self._train()
         finally:

@@ -50,7 +50,7 @@ class SACRun(Run):
             print("compiling the updates; the first time on a machine this takes minutes ...", flush=True)
         options: dict[str, Any] = {
             "update_start": learning.update_start,
-            "random_steps": stage.random_steps,
+            "random_steps": self.random_steps(level),
             "batch_size": learning.batch_size,
             "tau": learning.tau,
             "gamma": learning.gamma,
@@ -71,6 +71,21 @@ class SACRun(Run):
         model = self.model_type(policy, env, learning.learning_rate, learning.buffer_size, **{**options, **others})
         model.set_logger(self.logger)
         return model
+
+    def random_steps(self, level: int) -> int:
+        """Uniformly random environment steps at the start of a stage."""
+        return self.config.stage(level).random_steps
+
+    def remarks(self) -> list[str]:
+        """Stages that are over before they act by their policy, or before they learn."""
+        lines, starts = [], self.config.learning.update_start
+        for level in range(self.position.level, len(self.config.ends())):
+            steps, random = self.config.stage(level).steps, self.random_steps(level)
+            if steps <= random:
+                lines.append(f"stage {level + 1}: all its {steps:,} steps are random (--random-steps {random})")
+            elif steps <= starts:
+                lines.append(f"stage {level + 1}: no update in its {steps:,} steps (--update-start {starts})")
+        return lines
 
     def restore(self, model: CFP, state: dict[str, Any]) -> None:
         """Put the state of a checkpoint into a model that has just been made."""
@@ -138,6 +153,10 @@ class Runner(SACRun):
         """Whether the actor of a level begins as the one in `start`."""
         return self.config.refine and self.start.exists() and read_policy(self.start)[1]["stage"] == level + 1
 
+    def random_steps(self, level: int) -> int:
+        """None where a policy is refined."""
+        return 0 if self.refines(level) else super().random_steps(level)
+
     def begins_trained(self, level: int) -> bool:
         """Also where a policy is refined."""
         return super().begins_trained(level) or self.refines(level)
@@ -160,7 +179,7 @@ class Runner(SACRun):
     def make_model(self, level: int) -> CFP:
         """Networks, replay memory and environment of a level, over the frozen policy of the coarser one."""
         env, refines = make_env(self.config, self.config.action_size(level)), self.refines(level)
-        others = {"random_steps": 0, "anchor": self.config.learning.anchor} if refines else {}
+        others = {"anchor": self.config.learning.anchor} if refines else {}
         model = self.build(level, env, CFPPolicy, {"spec": self.config.actor_spec(level)}, **others)
         if refines:
             model.origin = load(self.start, str(model.device)).actor

@@ -26,7 +26,8 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
             ids of the one before are taken back.
 
     Raises:
-        ValueError: Another function's task has this name, a name is not one word, or the version is negative.
+        ValueError: Another function's task has this name, the specification has another one, a name is not one word, or
+            the version is negative.
         TypeError: ``make`` is no function, or does not return a :class:`dittogym.TaskSpec`.
     """
     if not isinstance(task, str) or re.fullmatch(r"\w+", task) is None:
@@ -41,6 +42,8 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
         raise TypeError(f"make must return a TaskSpec, got {type(spec).__name__}")
     if _source(TASKS.get(task, make)) != _source(make):  # of local functions many have the same name
         raise ValueError(f"task must be a new name, got {task!r}, which is taken")
+    if spec.name != task:
+        raise ValueError(f"task must be the name in the specification, got {task!r} for a TaskSpec {spec.name!r}")
     if TASKS.get(task, make) is not make:
         ours = [known for known in gymnasium.registry.values() if known.entry_point == ENTRY_POINT]
         for known in ours:

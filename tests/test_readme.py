@@ -43,12 +43,14 @@ PAGES = {
     "docs/own.md": (
         "assert env.action_space.shape == (2, 4, 4) and env.observation_space.shape == (3, 16, 16)",
         "assert action.grad.flatten(1).norm(dim=1).min() > 0",
-        'assert dittogym.make_spec("hop").horizon == 200 and policy.description["task"] == "hop"',
+        "batch.reset(seed=0)\n_, first, *_ = batch.step(torch.zeros(2, *batch.action_shape))\nassert first.max() <= 0",
+        'assert dittogym.make_spec("hop").horizon == 20 and policy.description["task"] == "hop"',
     ),
     "docs/concepts/gradients.md": (
         "assert gradient.abs().max() > 0",
         "assert env.model.segment == segment < 100",
     ),
+    "docs/concepts/planning.md": ("assert planner.plans > 0 and planner.failed == 0",),
     "docs/develop/adding.md": (
         "assert width > 2 * start.x[..., 0].std() and bulk.grad.abs() > 0",
         "assert pull.grad.flatten(1).norm(dim=1).min() > 0",
@@ -57,8 +59,8 @@ PAGES = {
 }
 
 
-SLOW = {"docs/own.md", "docs/develop/adding.md"}
-"""Pages with programs that take a minute."""
+SLOW = {"docs/own.md", "docs/concepts/planning.md", "docs/develop/adding.md"}
+"""Pages with programs that take up to a minute."""
 
 
 @pytest.mark.parametrize("page", [pytest.param(p, marks=[pytest.mark.slow] * (p in SLOW)) for p in PAGES])

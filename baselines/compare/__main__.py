@@ -19,6 +19,7 @@ from baselines.compare.plan import Job, Plan, check_there, make_jobs
 from baselines.compare.report import write_report
 from baselines.compare.work import describe
 from baselines.registry import ALGORITHMS
+from cfp.command import started_as
 from cfp.config import Preset, Tier
 from cfp.errors import CFPError, ConfigError
 from cfp.process import StopSignals, keep_memory
@@ -186,7 +187,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     keep_memory()
     try:
         about = f"Algorithms: {', '.join(ALGORITHMS)}.\n\n{inspect.getdoc(Command)}"
-        return compare(tyro.cli(Command, prog="python -m baselines.compare", description=about, args=arguments))
+        started = started_as("baselines.compare", arguments)
+        return compare(tyro.cli(Command, prog=started, description=about, args=arguments))
     except CFPError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

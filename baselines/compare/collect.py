@@ -165,7 +165,7 @@ def _cost(folder: Path) -> Cost | None:
     )
 
 
-SIGHTS = ("image", "state", "simulator")
+SIGHTS = ("image", "state", "simulator", "nothing")
 """Order of groups in tables."""
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from baselines.compare.work import BUSY, FAILED, FINISHED, work
+from baselines.compare.work import BUSY, FINISHED, work
 from cfp.files import write_text
 from cfp.process import StopSignals
 
@@ -39,7 +39,7 @@ class Resources:
 
 def outcome(code: int) -> str:
     """Finished, failed, busy or stopped."""
-    return {FINISHED: "finished", FAILED: "failed", BUSY: "busy"}.get(code, "stopped")
+    return {FINISHED: "finished", BUSY: "busy"}.get(code, "failed" if 0 < code <= 128 else "stopped")
 
 
 def run_process(values: dict[str, Any], threads: int, retries: int, stopped: Callable[[], int]) -> str:
@@ -58,10 +58,12 @@ def run_process(values: dict[str, Any], threads: int, retries: int, stopped: Cal
     """
     folder = Path(values["folder"])
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / "error.txt").unlink(missing_ok=True)
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
     environment.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     for _ in range(1 + retries):
         with open(folder / "log.txt", "ab") as log:
+            begun = log.tell()
             process = subprocess.Popen(
                 MODULE, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment, start_new_session=True
             )
@@ -78,6 +80,11 @@ def run_process(values: dict[str, Any], threads: int, retries: int, stopped: Cal
         reason = f"killed by {signal.Signals(-code).name}, {1 + retries} times; see log.txt"
         write_text(folder / "error.txt", reason + "\n")
         return "failed"
+    if outcome(code) == "failed" and not (folder / "error.txt").exists():  # it ended before or beside the run itself
+        with open(folder / "log.txt", "rb") as log:
+            log.seek(begun)
+            last = log.read().decode(errors="replace").strip().rpartition("\n")[2]
+        write_text(folder / "error.txt", f"{last or 'no word'} (exit code {code}; see log.txt)\n")
     return outcome(code)
 
 

@@ -17,8 +17,8 @@ from baselines.compare.stats import bootstrap, common_curve, interquartile_mean,
 COLOURS = (
     "#0173b2 #de8f05 #029e73 #d55e00 #cc78bc #ca9161 #56b4e9 #949494 #8c564b #bcbd22 #17becf #7f3c8d #e377c2 #1b5e20"
 ).split()
-LINES = {"image": "-", "state": "--", "simulator": ":"}
-MARKS = {"image": "o", "state": "s", "simulator": "^"}
+LINES = {"image": "-", "state": "--", "simulator": ":", "nothing": (0, (1, 4))}
+MARKS = {"image": "o", "state": "s", "simulator": "^", "nothing": "v"}
 BAND_REPEATS = 2_000
 OTHER = "-.", "D"
 """Line and mark of policies that see something else."""

@@ -14,6 +14,7 @@ from cfp.errors import CheckpointError, ConfigError
 from cfp.files import read_json
 from cfp.run import holds_run, read_config
 from cfp.state_file import flatten
+from dittogym.tasks import task_name
 
 IRRELEVANT = ("device", "environment.backend", "report.video", "report.checkpoint_every", "report.log_every")
 """Options that change neither what a run learns nor which policy it keeps."""
@@ -201,7 +202,7 @@ def make_jobs(
         for task in tasks:
             for label in labels:
                 config = resolve(plan, label, task, preset, seed, steps, device)
-                jobs.append(Job(label, config, runs / f"{label}-{task}-{preset}-{seed}"))
+                jobs.append(Job(label, config, runs / f"{label}-{task_name(task)}-{preset}-{seed}"))
     _check_same_task(jobs)
     return jobs
 

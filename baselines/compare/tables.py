@@ -16,7 +16,10 @@ from dittogym import make_spec
 SHARES = (0.5, 0.75, 0.9)
 """Of the way from a resting robot to the best curve, for sample efficiency."""
 WHO = (Column("task", "task"), Column("sees", "sees"), Column("algo", "algorithm"))
-SEPARATE = "Ranks are within a task and within what policies see: image, state and simulator are never ranked together."
+SEPARATE = (
+    "Ranks are within a task and within what policies see: image, state, simulator and nothing are never ranked "
+    "together."
+)
 
 Row = dict[str, Any]
 

@@ -22,6 +22,7 @@ from cfp.config import positive
 from cfp.environments import choose_device
 from cfp.errors import CFPError, ConfigError
 from dittogym import TorchEnv
+from dittogym.tasks import task_name
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def parse(arguments: Sequence[str]) -> Lab:
     default = QUICK if "--quick" in arguments else Lab()
     lab: Lab = tyro.cli(Lab, prog="python -m baselines.gradlab", args=list(arguments), default=default)
     lab.check()
-    return replace(lab, out=lab.out or Path("runs") / f"gradlab-{lab.task}")
+    return replace(lab, out=lab.out or Path("runs") / f"gradlab-{task_name(lab.task)}")
 
 
 def make_env(lab: Lab) -> TorchEnv:

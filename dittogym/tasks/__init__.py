@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -24,6 +25,35 @@ TASKS: dict[str, Callable[..., TaskSpec]] = {
 }
 
 
+def task_name(task: str) -> str:
+    """The name alone of a task that may be given as ``"MODULE:NAME"``."""
+    return task.rpartition(":")[2]
+
+
+def allowed_instead(task: object) -> str | None:
+    """What is allowed in place of something that is no task; ``None`` where it is one.
+
+    Args:
+        task: A name from :data:`dittogym.TASKS`, or ``"MODULE:NAME"``: a module, which is imported, and a task that it
+            registers. The module's name has no dots: options from elsewhere shall not reach the files that came with
+            them in some folder below the current one.
+    """
+    allowed = f"{', '.join(sorted(TASKS))} or MODULE:NAME"
+    if not isinstance(task, str):
+        return allowed
+    module, colon, name = task.rpartition(":")
+    if colon:
+        try:
+            if not module.isidentifier():
+                raise ImportError("its name must be a word, without dots")
+            importlib.import_module(module)
+        except Exception as error:  # whatever the module does
+            return f"{allowed} (module {module!r}: {type(error).__name__}: {error})"
+    if name in TASKS:
+        return None
+    return f"{allowed} (module {module!r} does not register {name!r})" if colon else allowed
+
+
 def make_spec(
     task: str | TaskSpec,
     *,
@@ -34,7 +64,8 @@ def make_spec(
     """The specification of a task.
 
     Args:
-        task: A name from :data:`dittogym.TASKS`, or a specification.
+        task: A name from :data:`dittogym.TASKS`, ``"MODULE:NAME"`` with a module that registers it on import, or a
+            specification.
         body: A robot of one's own, see :func:`dittogym.robots.with_body`.
         obstacles: Static geometry in place of the task's own, see :mod:`dittogym.geometry`.
         options: Options of that task, such as ``target`` of SHAPE MATCH.
@@ -48,14 +79,15 @@ def make_spec(
             raise TypeError(f"a TaskSpec takes no options but body and obstacles, got {sorted(options)}")
         spec = task
     else:
-        if not isinstance(task, str) or task not in TASKS:
-            raise ValueError(f"task must be one of {', '.join(sorted(TASKS))}, got {task!r}")
-        known = list(inspect.signature(TASKS[task]).parameters)
+        if (allowed := allowed_instead(task)) is not None:
+            raise ValueError(f"task must be one of {allowed}, got {task!r}")
+        make = TASKS[task_name(task)]
+        known = list(inspect.signature(make).parameters)
         for name in options:
             if name not in known:
                 names = ", ".join(("body", "obstacles", *known))
                 raise TypeError(f"task {task!r} has no option {name!r}; its options are: {names}")
-        spec = TASKS[task](**options)
+        spec = make(**options)
     if obstacles is not None:
         if not isinstance(obstacles, Sequence) or not all(isinstance(item, Obstacle) for item in obstacles):
             raise TypeError(f"obstacles must be a sequence of Obstacle, got {obstacles!r}")

@@ -90,8 +90,8 @@ figure.tight_layout()
 print(f"highest {max(heights) - heights[0]:.3f} m above the first step; {successes} of 20 steps count as success")
 
 # %%
-# To train a policy on it, call the function behind the command, in a program that has registered the task:
-# ``cfp.train.main(["--task", "hop", "--out", "runs/hop"])``.
+# To train a policy on it, put ``judge``, ``hop`` and the line that registers it into a file ``hop.py``:
+# ``python -m cfp.train --task hop:hop --out runs/hop``.
 
 assert curve[-1] > curve[0] + 1.0
 assert "dittogym/hop-fine-v0" in gymnasium.registry

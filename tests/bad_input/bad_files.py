@@ -281,7 +281,7 @@ CONFIGS = [
     file_of_options("of a list", "[1]", "cannot be read as JSON (it holds list, allowed an object"),
     file_of_options("with an unknown name", '{"stepz": 1}', "stepz: no such option, allowed algo, task,"),
     file_of_options("with a group of nothing", '{"learning": null}', "learning: got None, allowed an object"),
-    file_of_options("with a task of a list", '{"task": ["run"]}', "task: got ['run'], allowed shapematch, run,"),
+    file_of_options("with a task of a list", '{"task": ["run"]}', "task: got ['run'], allowed catch, dig,"),
     file_of_options("with a preset of a list", '{"preset": [1]}', "preset: got [1], allowed quick, paper"),
     file_of_options("with steps as text", '{"steps": "x"}', "steps: got 'x', allowed a whole number"),
     file_of_options("with steps without end", '{"steps": 1e999}', "steps: got inf, allowed a whole number"),

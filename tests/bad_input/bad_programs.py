@@ -43,7 +43,7 @@ def planned(name, plan, *words):
 
 
 TRAIN = [
-    training("an unknown task", "--task swim", "task: got 'swim', allowed shapematch, run"),
+    training("an unknown task", "--task swim", "task: got 'swim', allowed catch, dig"),
     training("an unknown preset", "--preset slow", "preset: got 'slow', allowed quick, paper"),
     training("an unknown option", "--colour red", "Unrecognized options: --colour"),
     training("a seed by name", "--seed x", "Error parsing --seed: invalid literal for int()", "'x'"),

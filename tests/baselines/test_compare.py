@@ -126,6 +126,21 @@ def test_failing_run_is_reported_and_stops_no_other(tmp_path, capsys):
     assert "ConfigError: particles" in (tmp_path / "out" / "report.md").read_text()
 
 
+@pytest.mark.slow
+def test_task_of_a_module_is_compared_in_processes_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(tmp_path), os.environ.get("PYTHONPATH", ""))))
+    (tmp_path / "rolling.py").write_text(
+        "import dataclasses, dittogym\n"
+        "def roll(): return dataclasses.replace(dittogym.make_spec('run'), name='roll', horizon=12)\n"
+        "dittogym.register('roll', roll)"
+    )
+    out = tmp_path / "out"
+    assert compare(out, "--tasks", "rolling:roll", "--algos", "mpc", "--seeds", "0", "--workers", "1") == 0
+    assert (out / "runs" / "mpc-roll-quick-0" / "policy.safetensors").exists()
+    assert "rolling:roll" in (out / "report.md").read_text()
+
+
 def test_array_job_does_one_run_and_no_report(tmp_path):
     out = tmp_path / "out"
     assert compare(out, "--algos", "shac-image", "mpc", "--seeds", "0", "--only", "1") == 0
@@ -173,6 +188,23 @@ def test_process_that_is_killed_is_begun_again_and_then_given_up(tmp_path, monke
     assert run_process({"folder": str(tmp_path)}, 1, 2, lambda: 0) == "failed"
     assert (tmp_path / "count").read_text() == "xxx"
     assert (tmp_path / "error.txt").read_text() == "killed by SIGKILL, 3 times; see log.txt\n"
+
+
+@pytest.mark.parametrize(
+    ("program", "told"),
+    [
+        ("raise ImportError('no hop')", "ImportError: no hop (exit code 1; see log.txt)\n"),
+        ("import os; os._exit(7)", "no word (exit code 7; see log.txt)\n"),
+        ("import sys; open('error.txt', 'w').write('its own word'); sys.exit(1)", "its own word"),
+    ],
+)
+def test_process_that_fails_leaves_its_last_word(tmp_path, monkeypatch, program, told):
+    monkeypatch.setattr("baselines.compare.executor.MODULE", (sys.executable, "-c", program))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "error.txt").write_text("of another time")
+    (tmp_path / "log.txt").write_text("of another time\n")
+    assert run_process({"folder": str(tmp_path)}, 1, 2, lambda: 0) == "failed"
+    assert (tmp_path / "error.txt").read_text() == told
 
 
 @pytest.mark.parametrize(("urgency", "ending"), [(1, "checkpoint"), (2, None)])

@@ -56,6 +56,13 @@ def test_planning_leaves_the_environment_alone_and_repeats_by_seed() -> None:
     assert plans[0].abs().max() <= 1.0 and not plans[0].requires_grad
 
 
+def test_act_plans_the_same_where_the_caller_wants_no_gradients() -> None:
+    config = PlannerConfig(horizon=3, commit=1, iterations=2)
+    wanted = Planner(small(), config).act()
+    with torch.no_grad():
+        assert torch.equal(Planner(small(), config).act(), wanted)
+
+
 def test_plan_goes_on_from_the_last() -> None:
     config = PlannerConfig(horizon=4, commit=1, iterations=1, learning_rate=1e-9, noise=0.5)
     env = small()

@@ -204,6 +204,11 @@ def test_polish_is_judged_on_the_layout_it_is_made_for(finished):
         assert baselines.load(folder).description["layout"] == 0
 
 
+def test_what_acts_without_looking_is_said_to_see_nothing():
+    blind = {name for name, entry in baselines.ALGORITHMS.items() if entry.sees == "nothing"}
+    assert blind == {"gradient", "zero", "random", "scripted"}
+
+
 def test_wrong_algorithm_is_named(tmp_path, capsys):
     assert train.main(["--algo", "alchemy", "--out", str(tmp_path / "a")]) == 2
     assert f"algo: got 'alchemy', allowed {', '.join(baselines.ALGORITHMS)}" in capsys.readouterr().err

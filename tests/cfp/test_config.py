@@ -110,7 +110,7 @@ def test_numbers_out_of_range_are_named(group, changes, message):
         ({"alpha": [0.1, "x"]}, "alpha: got 'x', allowed a number"),
         ({"environment": {"dtype": "float16"}}, "dtype: got 'float16'"),
         ({"environment": {"particles": [1, 2, 3]}}, "particles"),
-        ({"task": "jump"}, "task: got 'jump', allowed shapematch, run"),
+        ({"task": "jump"}, "task: got 'jump', allowed catch, dig"),
         ({"preset": "slow"}, "preset: got 'slow', allowed quick, paper for shapematch"),
     ],
 )

@@ -11,11 +11,12 @@ from cfp.estimate import seconds
 from cfp.presets import preset
 
 TINY = "--particles 100 --substeps 1 --num-envs 2 --device cpu --steps 150".split()
+LEARNS = "--handover 70 --random-steps 4 4 --update-start 20 --batch-size 4".split()
 
 
 def test_dry_run_tells_options_and_costs_and_writes_nothing(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    arguments = [*TINY, "--handover", "70", "--batch-size", "4", "--buffer-size", "60", "--dry-run"]
+    arguments = [*TINY, *LEARNS, "--buffer-size", "60", "--dry-run"]
     assert train.main(arguments) == 0
     assert not list(tmp_path.iterdir())
     options, end = json.JSONDecoder().raw_decode(printed := capsys.readouterr().out)
@@ -29,9 +30,24 @@ def test_dry_run_tells_options_and_costs_and_writes_nothing(tmp_path, capsys, mo
     assert time.startswith("time: about") and memory.startswith("memory: about")
 
 
+def test_stages_that_learn_nothing_are_named(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    quick = [*TINY[:-2], "--steps", "400", "--batch-size", "4", "--buffer-size", "60", "--task", "run", "--dry-run"]
+    assert train.main(quick) == 0
+    assert capsys.readouterr().out.splitlines()[-2:] == [
+        "stage 1: all its 267 steps are random (--random-steps 480)",
+        "stage 2: no update in its 133 steps (--update-start 256)",
+    ]
+    assert train.main([*quick, "--random-steps", "9", "0", "--update-start", "50"]) == 0
+    assert "stage 1: " not in capsys.readouterr().out
+    refined = ["--start-from", "run", "--refine", "--random-steps", "600", "0", "--update-start", "50"]
+    assert train.main([*quick, *refined, "--resolutions", "8", "16"]) == 0
+    assert "are random" not in capsys.readouterr().out
+
+
 def test_replay_of_blended_actions_is_as_small_as_their_parts(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    arguments = [*TINY, "--task", "run", "--handover", "70", "--batch-size", "4", "--buffer-size", "6000", "--dry-run"]
+    arguments = [*TINY, *LEARNS, "--task", "run", "--buffer-size", "6000", "--dry-run"]
     assert train.main(arguments) == 0
     first, second = capsys.readouterr().out.strip().splitlines()[-4:-2]
     for line, numbers in ((first, 2 * 8**2), (second, 2 * 8**2 + 4 * 16**2)):  # not the 2 x 64 x 64 of the patch
@@ -41,7 +57,7 @@ def test_replay_of_blended_actions_is_as_small_as_their_parts(tmp_path, capsys, 
 
 def test_dry_run_counts_only_levels_that_will_be_trained(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    arguments = ["--task", "run", "--start-from", "run", "--handover", "70", "--batch-size", "4", "--buffer-size", "60"]
+    arguments = [*LEARNS, "--task", "run", "--start-from", "run", "--buffer-size", "60"]
     assert train.main([*TINY, *arguments, "--dry-run"]) == 0
     header, stage, time = capsys.readouterr().out.strip().splitlines()[-4:-1]
     assert header.startswith("stage") and stage.split()[:3] == ["2", "16x16", "80"] and time.startswith("time: about")

@@ -2,8 +2,12 @@
 
 import html
 import json
+import os
 import signal
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +17,7 @@ import dittogym
 from cfp import evaluate, plot, train
 from cfp.actor import ActorSpec
 from cfp.callbacks import StageCallback
+from cfp.command import started_as
 from cfp.evaluation import compare
 from cfp.files import read_table
 from cfp.policy import ActorPolicy
@@ -25,6 +30,7 @@ TINY = (
     "--random-steps 10 4 --batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 --eval-every 60 "
     "--eval-episodes 2 --checkpoint-every 20 --log-every 10 --no-video --device cpu --backend eager"
 ).split()
+PROCESS = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
 
 
 def run(folder, *more):
@@ -213,7 +219,7 @@ def test_damaged_checkpoint_is_an_error_that_names_it(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--task", "jump"], "task: got 'jump', allowed shapematch, run"),
+        (["--task", "jump"], "task: got 'jump', allowed catch, dig"),
         (["--preset", "slow"], "preset: got 'slow', allowed quick, paper"),
         (["--particles", "0"], "particles"),
         (["--target", "no/such.png"], "target"),
@@ -236,6 +242,17 @@ def test_unknown_option_is_exit_code_two(capsys):
     with pytest.raises(SystemExit) as exit_:
         train.main(["--steppes", "3"])
     assert exit_.value.code == 2
+
+
+def test_help_names_the_program_that_was_started(tmp_path, monkeypatch, capsys):
+    (tmp_path / "pit.py").write_text("import sys, cfp.train\nsys.exit(cfp.train.main())")
+    for command, name in (
+        (["pit.py", "--out", ".", "--bad"], "python pit.py --help"),
+        (["-m", "baselines.distill", "--bad"], "python -m baselines.distill --help"),
+    ):
+        done = subprocess.run([sys.executable, *command], cwd=tmp_path, env=PROCESS, capture_output=True, text=True)
+        assert done.returncode == 2 and name in " ".join(done.stderr.replace("│", " ").split())
+    assert started_as("cfp.train", []) == "python -m cfp.train"
 
 
 def test_evaluation_of_a_folder(finished, capsys):
@@ -296,6 +313,39 @@ def test_shipped_policy_acts_in_its_task(name):
     observation, _ = env.reset(seed=0)
     action, _ = policy.predict(observation.numpy())
     assert action.shape == (1, *env.action_shape) and np.abs(action).max() <= 1
+
+
+def test_task_of_a_module_is_trained_and_evaluated_by_name(tmp_path, monkeypatch, capsys):
+    """Each time as in a process that has not seen the module. Loading a policy imports nothing, evaluating it does."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("dittogym.tasks.TASKS", dict(dittogym.TASKS))
+    monkeypatch.setattr("dittogym.registration.TASKS", dittogym.tasks.TASKS)
+    (tmp_path / "bouncing.py").write_text(
+        "import dataclasses, dittogym\n"
+        "def bounce(): return dataclasses.replace(dittogym.make_spec('run'), name='bounce', horizon=20)\n"
+        "dittogym.register('bounce', bounce)"
+    )
+
+    def forget():
+        sys.modules.pop("bouncing", None)
+        dittogym.tasks.TASKS.pop("bounce", None)
+
+    folder = tmp_path / "runs" / "cfp-bounce-quick-0"
+    assert train.main([*TINY, "--task", "bouncing:bounce"]) == 0
+    forget()
+    policy = cfp.load(folder)
+    assert policy.description["task"] == "bouncing:bounce" and "bouncing" not in sys.modules
+    capsys.readouterr()
+    for what in ([str(folder)], ["--policy", str(folder / "policy.safetensors")]):
+        forget()
+        assert evaluate.main([*what, "--episodes", "1"]) == 0
+        assert "stage 2" in capsys.readouterr().out or "policy" in what[-1]
+    forget()
+    (tmp_path / "bouncing.py").unlink()
+    sys.path_importer_cache.clear()
+    assert evaluate.main([str(folder), "--episodes", "1"]) == 2
+    assert "(module 'bouncing': ModuleNotFoundError" in capsys.readouterr().err
 
 
 def test_page_shows_the_run_and_opens_from_disk(finished):

@@ -67,7 +67,7 @@ def test_bad_actions(action: np.ndarray, message: str) -> None:
 
 
 def test_unknown_task_names_the_tasks() -> None:
-    with pytest.raises(ValueError, match=r"task must be one of catch, dig, .*, slot, got 'swim'"):
+    with pytest.raises(ValueError, match=r"task must be one of catch, dig, .*, slot or MODULE:NAME, got 'swim'"):
         dittogym.Env("swim")
 
 

@@ -107,6 +107,35 @@ def test_options_of_the_function_arrive() -> None:
         tiny("hope")
 
 
+def test_a_module_that_registers_the_task_is_imported_by_name(tmp_path, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "hopping.py").write_text(
+        "import dataclasses, dittogym\n"
+        "def leap(): return dataclasses.replace(dittogym.make_spec('run'), name='leap')\n"
+        "dittogym.register('leap', leap)"
+    )
+    (tmp_path / "torn.py").write_text("1 / 0")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "hidden.py").write_text("raise AssertionError('is never imported')")
+    env = tiny("hopping:leap", substeps=1)
+    assert (env.spec.name, env.spec.horizon) == ("leap", dittogym.make_spec("run").horizon)
+    for task, reason in (
+        ("hopping:fly", "module 'hopping' does not register 'fly'"),
+        ("torn:leap", "module 'torn': ZeroDivisionError: division by zero"),
+        ("missing_one:leap", "module 'missing_one': ModuleNotFoundError: No module named 'missing_one'"),
+        ("folder.hidden:leap", "module 'folder.hidden': ImportError: its name must be a word, without dots"),
+        (":leap", "module '': ImportError"),
+    ):
+        with pytest.raises(ValueError, match=rf"task must be one of catch.* MODULE:NAME \({reason}.* got '{task}'"):
+            dittogym.make_spec(task)
+
+
+def test_the_name_is_that_of_the_specification() -> None:
+    with pytest.raises(ValueError, match="task must be the name in the specification, got 'leap' for a TaskSpec 'hop'"):
+        dittogym.register("leap", hop)
+    assert "leap" not in dittogym.TASKS
+
+
 def test_the_horizon_of_an_option_counts_for_the_batch() -> None:
     dittogym.register("hop", hop)
     env = tiny("hop", horizon=2, substeps=1)
@@ -264,7 +293,7 @@ def test_a_horizon_among_the_options_holds_through_gymnasium() -> None:
 
 
 def test_a_function_that_is_written_anew_takes_the_place_of_the_old_one() -> None:
-    cell = "def jump(): return dittogym.spec.TaskSpec(**{**vars(hop()), 'horizon': %d})"
+    cell = "def jump(): return dittogym.spec.TaskSpec(**{**vars(hop()), 'name': 'jump', 'horizon': %d})"
     for horizon in (40, 20):
         names = {"dittogym": dittogym, "hop": hop, "__name__": "notebook"}
         exec(cell % horizon, names)
