@@ -138,6 +138,11 @@ class SquashedActor(nn.Module):
         """The action for observations with leading B."""
         return self.sample(observation, deterministic).action
 
+    def action_log_prob(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Flat actions and log-densities (B,): what stable-baselines3's own SAC asks of an actor."""
+        sample = self.sample(observation)
+        return sample.action.flatten(1), sample.log_prob
+
     def set_training_mode(self, mode: bool) -> None:
         """Switch between training and evaluation; without effect on these layers, asked for by stable-baselines3."""
         self.train(mode)
