@@ -224,12 +224,14 @@ class Shield:
     """
 
     def __init__(self) -> None:
+        self.used = False
         self.finite: Tensor | None = None
 
     def __call__(self, value: Tensor) -> Tensor:
         """``value`` (B, ...), through which only gradients of finite elements go back."""
         if not value.requires_grad:
             return value
+        self.used = True
         view = value.view_as(value)
         view.register_hook(self._stop)
         return view
@@ -253,14 +255,16 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
     """
     shield = Shield()
     if torch.is_grad_enabled():
-        state, action = state.map(shield), shield(action)
+        shielded, action = state.map(shield), shield(action)
+        state = shielded if shield.used else state  # which need not be stacked anew
     spec, solver = model.spec, model.solver_for(state.physics)
     field = patch_field(action, spec.patch, state.physics.get("max_actuation", spec.max_actuation))
     on_nodes = place(field, in_window(spec.reach, state.centre, state.origin), solver.grid.resolution)
     particles = solver.step(
         state.particles, on_nodes, substeps=model.substeps, origin=state.origin, segment=model.segment
     )
-    shield.finite = diagnostics.finite(particles)
+    if shield.used:
+        shield.finite = diagnostics.finite(particles)
     com = particles.x[:, : model.robot].mean(1)
     origin = state.origin if spec.window.follow is None else window_origin(spec, com)
     return replace(state, particles=particles, origin=origin, centre=com, steps=state.steps + 1), field
