@@ -13,7 +13,6 @@ import pytest
 from baselines.compare import work
 from baselines.compare.__main__ import main
 from baselines.compare.executor import run_process
-from cfp.books import Books
 from cfp.files import read_table
 
 ENVIRONMENT = {"particles": 100, "substeps": 1, "num_envs": 1}
@@ -95,15 +94,8 @@ def test_more_episodes_are_added_to_those_that_are_there(finished, monkeypatch):
     assert len(set(judged)) == 4  # three layouts and its own
 
 
-def test_interrupted_comparison_goes_on(finished, tmp_path, monkeypatch, capsys):
-    turn = Books.turn
-
-    def interrupt(books, step, scalars):
-        if step == 30:
-            signal.raise_signal(signal.SIGINT)
-        turn(books, step, scalars)
-
-    monkeypatch.setattr(Books, "turn", interrupt)
+def test_interrupted_comparison_goes_on(finished, tmp_path, monkeypatch, capsys, stop_at):
+    stop_at(30)
     out, arguments = tmp_path / "out", ["--algos", "shac-image", "mpc", "--seeds", "0", "1"]
     assert compare(out, *arguments) == 128 + signal.SIGINT
     assert "stopped; the same command goes on" in capsys.readouterr().out

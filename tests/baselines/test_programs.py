@@ -136,16 +136,10 @@ def test_folder_is_evaluated_whatever_trained_it(finished, capsys):
         assert "python -m baselines" in capsys.readouterr().err
 
 
-def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monkeypatch, capsys):
+def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monkeypatch, capsys, stop_at):
     algo, whole = finished
-    folder, turn = tmp_path / "stopped", Books.turn
-
-    def interrupt(books, step, scalars):
-        if step == TINY[algo][1]:
-            signal.raise_signal(signal.SIGINT)
-        turn(books, step, scalars)
-
-    monkeypatch.setattr(Books, "turn", interrupt)
+    folder = tmp_path / "stopped"
+    stop_at(TINY[algo][1])
     assert run(algo, folder) == 128 + signal.SIGINT
     assert "python -m baselines.train --resume" in capsys.readouterr().out
     monkeypatch.undo()
@@ -156,15 +150,8 @@ def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monk
     assert steps[0] == steps[1]
 
 
-def test_stop_in_the_last_step_leaves_a_whole_stage(tmp_path, monkeypatch):
-    turn = Books.turn
-
-    def interrupt(books, step, scalars):
-        if step == 30:
-            signal.raise_signal(signal.SIGINT)
-        turn(books, step, scalars)
-
-    monkeypatch.setattr(Books, "turn", interrupt)
+def test_stop_in_the_last_step_leaves_a_whole_stage(tmp_path, stop_at):
+    stop_at(30)
     assert run("mpc", tmp_path) == 128 + signal.SIGINT
     assert [row["step"] for row in read_table(tmp_path / "evaluations.csv")] == ["12", "24", "30"]
     assert not (tmp_path / "results.json").exists()
