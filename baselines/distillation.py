@@ -86,11 +86,6 @@ class DistillConfig(LadderConfig):
     planner_grid: int | Literal["coarse", "fine"] = "coarse"
     """Action grid of the teacher mpc."""
 
-    def training(self) -> EnvironmentConfig:
-        """Where it is taught: evenly spread particles and no stale values, actions as where it is judged."""
-        own = self.environment
-        return replace(own, particles=self.tier, parity="clean", action_layout=own.layout)
-
     def check(self) -> None:
         """Check what the types cannot, see `LadderConfig.check`."""
         super().check()
@@ -128,7 +123,7 @@ class Distill(Algorithm):
         self, config: DistillConfig, level: int = 0, start: ActorPolicy | None = None, teacher: Path | None = None
     ) -> None:
         self.config, self.level = config, level
-        own = replace(config, environment=config.training())
+        own = replace(config, environment=config.environment.learned_at(config.tier))
         self.env = make_torch_env(own, make_spec(config.task).patch)
         self.spec = config.actor_spec(level)
         with self._luck():

@@ -113,9 +113,8 @@ class MPC(Algorithm):
         self.total, self.reward, self.over = 0.0, 0.0, False
 
     def _reduced(self, config: PlannedConfig, tier: Tier) -> Reduced:
-        layout = self.env.action_layout
-        environment = replace(config.environment, particles=tier, parity="clean", action_layout=layout)
-        small = make_torch_env(replace(config, environment=environment), config.resolution(0), 1)
+        own = replace(config, environment=config.environment.learned_at(tier))
+        small = make_torch_env(own, config.resolution(0), 1)
         small.reset(seed=config.seed)
         try:
             return Reduced(self.env, small)

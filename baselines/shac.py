@@ -16,7 +16,7 @@ from baselines.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.features import StateFeatures
 from baselines.shac_rollout import Rollout, Window
 from baselines.training_reward import RewardConfig
-from cfp.config import EnvironmentConfig, ReportConfig, RunConfig, Tier, at_least_one, not_negative, positive, share
+from cfp.config import ReportConfig, RunConfig, Tier, at_least_one, not_negative, positive, share
 from cfp.environments import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.evaluation import Policy
@@ -97,11 +97,6 @@ class ShacConfig(GridConfig):
         """Environment steps after which the only stage ends."""
         return (self.steps,)
 
-    def training(self) -> EnvironmentConfig:
-        """Where it is trained: evenly spread particles and no stale values, actions as where it is judged."""
-        own = self.environment
-        return replace(own, particles=self.tier, parity="clean", action_layout=own.layout)
-
     def check(self) -> None:
         """Check what the types cannot, see `RunConfig.check`."""
         super().check()
@@ -127,7 +122,7 @@ class Shac(Algorithm):
 
     def __init__(self, config: ShacConfig, level: int = 0, start: Policy | None = None) -> None:
         self.config = config
-        own = replace(config, environment=config.training())
+        own = replace(config, environment=config.environment.learned_at(config.tier))
         self.env = make_torch_env(own, config.resolution(level))
         self.features = StateFeatures(config.deformation, config.clock, config.place)
         with torch.random.fork_rng(devices=[]):

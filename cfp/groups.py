@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 from cfp.errors import ConfigError
@@ -93,6 +93,10 @@ class EnvironmentConfig:
     def layout(self) -> Literal["image", "grid"]:
         """The action layout that these options amount to."""
         return self.action_layout or ("grid" if self.parity == "reference" else "image")
+
+    def learned_at(self, tier: Tier) -> EnvironmentConfig:
+        """The same place to learn in: other particles, evenly spread, no stale values, actions as here."""
+        return replace(self, particles=tier, parity="clean", action_layout=self.layout)
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,9 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
     config = Shac.preset(task, preset)
     config.check()
     assert configure(json.loads(json.dumps(to_json(config)))) == config
-    assert config.training().parity == "clean"
-    assert config.training().action_layout == ("grid" if preset == "paper" else "image")
+    learned = config.environment.learned_at(config.tier)
+    assert (learned.particles, learned.parity) == ("lite", "clean")
+    assert learned.layout == config.environment.layout == ("grid" if preset == "paper" else "image")
 
 
 @pytest.mark.parametrize(
