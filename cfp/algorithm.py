@@ -195,8 +195,9 @@ class CFP(SAC):
         for _ in range(gradient_steps):
             scalars = self.update(self.replay_buffer.sample(batch_size))
             self._n_updates += 1
-            for name, value in scalars.items():
-                self.logger.record_mean(f"train/{name}", value.item())
+            values = torch.stack(tuple(scalars.values())).tolist()  # one wait for the device, not one for each
+            for name, value in zip(scalars, values, strict=True):
+                self.logger.record_mean(f"train/{name}", value)
         self.logger.record("train/n_updates", self._n_updates)
 
     def update(self, batch: ReplayBufferSamples) -> dict[str, Tensor]:
