@@ -266,6 +266,7 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
     if shield.used:
         shield.finite = diagnostics.finite(particles)
     com = particles.x[:, : model.robot].mean(1)
+    com = torch.where(torch.isfinite(com).all(-1, keepdim=True), com, state.centre)  # the last that was finite
     origin = state.origin if spec.window.follow is None else window_origin(spec, com)
     return replace(state, particles=particles, origin=origin, centre=com, steps=state.steps + 1), field
 
@@ -360,7 +361,8 @@ def judge(
     terms["failure"] = torch.where(finite, 0.0, FAILURE_REWARD).to(now.split)
     info = {**common, **own.info}
     success = own.success & finite if own.success is not None else None
-    state = state if own.memory is None else replace(state, memory=own.memory)
+    if own.memory is not None:  # a copy: it may hold what info does
+        state = replace(state, memory={name: value.clone() for name, value in own.memory.items()})
     return state, Outcome(terms, terminated | ~finite, success, info)
 
 

@@ -29,6 +29,11 @@ class Box:
     top: float = math.inf
     closed: bool = False
 
+    @property
+    def ground(self) -> bool:
+        """Whether it is all that lies below some height."""
+        return (self.left, self.right, self.bottom) == (-math.inf, math.inf, -math.inf) and self.top < math.inf
+
 
 def nodes(left: float = -math.inf, right: float = math.inf, bottom: float = -math.inf, top: float = math.inf) -> Box:
     """A box whose bounds are counted in nodes from the world's origin."""

@@ -19,8 +19,8 @@ from torchmpm.state import choose
 #: ``"full"``, ``"lite"``, the number of robot particles, or the numbers for robot and object.
 Particles: TypeAlias = "str | int | tuple[int, ...]"
 
-#: Of the first element, the others count on from it; or one for each; ``None``: not seeded.
-Seed: TypeAlias = "int | Sequence[int] | None"
+#: Of the first element, the others count on from it; or one for each; ``None``, alone or in place of one: not seeded.
+Seed: TypeAlias = "int | Sequence[int | None] | None"
 
 #: Robot particles of the lite tier.
 LITE = 2000
@@ -143,7 +143,8 @@ class Layouts:
         """Starting positions (B, N, 2) in m of all elements; those outside ``mask`` (B,) keep theirs.
 
         Args:
-            seed: Of the first element, the others follow, or one for each; ``None`` goes on with what there is.
+            seed: Of the first element, the others follow, or one for each; ``None`` goes on with what there is, for
+                all or for one.
             mask: Which elements are reset.
             given: (N, 2) or (B, N, 2) positions, or ``None``.
             like: Gives dtype and device.
@@ -153,20 +154,22 @@ class Layouts:
         """
         seeds = self._seeds(seed)
         samplers = dict(self._samplers)
-        redraw = seeds is not None or not samplers
-        if self._positions is None:
-            mask = np.ones_like(mask)  # every element has a layout from the first draw on
-        if redraw:
-            for i in np.flatnonzero(mask).tolist():
-                samplers[i] = LayoutSampler(self._spec, self._counts, seeds[i] if seeds else None, spread=self._spread)
+        # Every element has a layout from the first draw on.
+        mask = np.ones_like(mask) if self._positions is None else mask.copy()
+        for i in np.flatnonzero(mask).tolist():
+            if seeds[i] is not None or i not in samplers:
+                samplers[i] = LayoutSampler(self._spec, self._counts, seeds[i], spread=self._spread)
+            elif not self._resample:
+                mask[i] = given is not None
         if given is not None:
             positions = self._given(given, like)
-        elif self._positions is None or redraw or self._resample:
+        elif mask.any():
             stacked = np.zeros((self._num_envs, sum(self._counts), 2))
             for i in np.flatnonzero(mask).tolist():
                 stacked[i] = samplers[i].draw()
             positions = torch.from_numpy(stacked).to(like)
         else:
+            assert self._positions is not None
             return self._positions.clone()
         if self._positions is not None:
             positions = choose(torch.as_tensor(mask, device=like.device), positions, self._positions)
@@ -175,15 +178,15 @@ class Layouts:
         self._samplers, self._positions = samplers, positions.detach().clone()
         return positions
 
-    def _seeds(self, seed: Seed) -> Sequence[int] | None:
+    def _seeds(self, seed: Seed) -> Sequence[int | None]:
         if seed is None:
-            return None
+            return [None] * self._num_envs
         if not isinstance(seed, (list, tuple, range)):
             first = checks.whole("seed", seed, 0, MAX_SEED + 1 - self._num_envs)
             return range(first, first + self._num_envs)
         if len(seed) != self._num_envs:
             raise ValueError(f"seed must be a whole number or {self._num_envs} of them, got {seed!r}")
-        return [checks.whole(f"seed[{i}]", each, 0, MAX_SEED) for i, each in enumerate(seed)]
+        return [None if each is None else checks.whole(f"seed[{i}]", each, 0, MAX_SEED) for i, each in enumerate(seed)]
 
     def _given(self, given: Any, like: Tensor) -> Tensor:
         positions = real_tensor("positions", given).to(like, copy=True)

@@ -64,7 +64,7 @@ def frame(model: Model, state: EnvState, index: int, field: Tensor | None, size:
         canvas.target(spec.target, state.centre[index].detach().cpu().double().numpy())
     for obstacle in spec.obstacles:
         for box in obstacle.shown:
-            canvas.box(box, filled=bool(obstacle.drawn) or obstacle.name == "floor")
+            canvas.box(box, filled=bool(obstacle.drawn) or box.ground)
     x = particles.x[0].cpu().double().numpy()
     counts = [body.count for body in model.solver.bodies]
     kinds = [ROBOT, *(GROUND_BODY if isinstance(body.material, Soil) else OBJECT for body in spec.objects)]
@@ -96,7 +96,7 @@ class Canvas:
             cv2.line(self.image, (column, 0), (column, self.pixels), GRID, 1 if k % 5 else 4)
 
     def box(self, box: Box, *, filled: bool) -> None:
-        """A box; only its outline where the robot does not see it."""
+        """A box, or only its outline."""
         left, right = np.clip((np.array((box.left, box.right)) - self.origin[0]) * self.pixels, -9, self.pixels + 9)
         low, high = np.clip((np.array((box.bottom, box.top)) - self.origin[1]) * self.pixels, -9, self.pixels + 9)
         corners = (round(left), round(self.pixels - high)), (round(right), round(self.pixels - low))
@@ -105,17 +105,25 @@ class Canvas:
     def goal(self, goal: tuple[float, float]) -> None:
         """A disc at a point of the world."""
         middle = (np.array(goal) - self.origin) * self.pixels
+        if not self._near(middle):
+            return
         cv2.circle(self.image, (round(middle[0]), round(self.pixels - middle[1])), self.pixels // 60, TARGET, -1)
 
     def target(self, target: np.ndarray, centre: np.ndarray) -> None:
         """The picture to match, half a window wide, around the robot's centre."""
+        middle = (centre - self.origin) * self.pixels
+        if not self._near(middle):
+            return
         width = self.pixels // 2
         mask = cv2.resize(target.astype(np.uint8), (width, width), interpolation=cv2.INTER_NEAREST)
         outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        middle = (centre - self.origin) * self.pixels
         corner = np.array((round(middle[0]) - width // 2, self.pixels - round(middle[1]) - width // 2))
         shifted = [outline + corner for outline in outlines]
         cv2.fillPoly(self.image, shifted, TARGET)
+
+    def _near(self, middle: np.ndarray) -> bool:
+        """Whether a figure around here may be seen; OpenCV cannot be given numbers of any size."""
+        return bool((np.abs(middle) < 4 * self.pixels).all())
 
     def dots(self, position: np.ndarray, colours: np.ndarray, radius: int) -> None:
         """Filled circles at world positions (N, 2); what is off the picture or not finite is left out."""

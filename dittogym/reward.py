@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from dittogym.spec import Measurement
-from torchmpm import ParticleState
+from torchmpm import ParticleState, checks
 
 #: The spread of a robot is not counted beyond this, m.
 SPLIT_CAP = 0.2
@@ -22,20 +22,36 @@ def signed_quadratic(z: Tensor, k: float) -> Tensor:
     return 4.0 * z * z.abs() + k * z
 
 
-def limited(z: Tensor, low: float | None = None, high: float | None = None, *, soft: bool = False) -> Tensor:
+def limited(
+    z: Tensor, low: float | None = None, high: float | None = None, *, soft: bool = False, width: float | None = None
+) -> Tensor:
     """Bring ``z`` into [low, high]; ``None`` leaves an end open.
 
-    Soft, a limit l sets in over the width w, a twentieth of its size: ``w ln(1 + exp((z - l) / w))`` is taken off. The
-    result differs by at most w ln 2, at the limit, where its slope is 1/2.
+    Soft, a limit l sets in over the width w: ``w ln(1 + exp((z - l) / w))`` is taken off. The result differs by at most
+    w ln 2, at the limit, where its slope is 1/2.
+
+    Args:
+        z: Of any shape.
+        low: Least value.
+        high: Largest value.
+        soft: For gradients.
+        width: w, in units of ``z``; ``None``: a twentieth of the limit's size, for a limit of 0 of the other's.
+
+    Raises:
+        ValueError: ``width`` is not positive, or is needed and not given: all limits are 0.
     """
     if not soft:
         return z.clamp(low, high)
-    if high is not None:
-        width = SOFTNESS * abs(high)
-        z = z - width * softplus((z - high) / width)
-    if low is not None:
-        width = SOFTNESS * abs(low)
-        z = z + width * softplus((low - z) / width)
+    if width is not None:
+        checks.number("width", width, above=0.0)
+    largest = max((abs(limit) for limit in (low, high) if limit is not None), default=0.0)
+    for limit, sign in ((high, 1.0), (low, -1.0)):
+        if limit is None:
+            continue
+        w = width or SOFTNESS * (abs(limit) or largest)
+        if not w:
+            raise ValueError(f"width must be given where all limits are 0, got None with low {low}, high {high}")
+        z = z - sign * w * softplus(sign * (z - limit) / w)
     return z
 
 

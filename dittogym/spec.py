@@ -133,6 +133,15 @@ class Weights:
     action: float = 0.0
     alive: float = 0.0
 
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ValueError: One is none, or not finite.
+        """
+        for name, value in vars(self).items():
+            checks.number(name, value)
+
 
 @dataclass(frozen=True)
 class Window:

@@ -220,9 +220,15 @@ class TorchEnv:
             self._observation = dynamics.observe(self.model, state)
         return state, self._observation
 
-    def detach(self) -> None:
-        """Cut the autograd graph: gradients do not reach back beyond this moment."""
-        self._env_state = self.env_state.detach()
+    def detach(self, *, physics: bool = True) -> None:
+        """Cut the autograd graph: gradients do not reach back beyond this moment.
+
+        Args:
+            physics: Also those in the constants that the last reset was given; without, a constant can be learned from
+                one stretch of an episode after the other.
+        """
+        state = self.env_state.detach()
+        self._env_state = state if physics else replace(state, physics=self.env_state.physics)
 
     def save(self) -> Snapshot:
         """A copy of the present moment, to which :meth:`load` returns; keeps the autograd graph."""
@@ -264,15 +270,15 @@ class TorchEnv:
             physics = merged(self.spec, mine.physics, state.physics, chosen, self._like)
             state = replace(state, physics=physics).where(chosen, replace(mine, physics=physics))
             observation = choose(chosen, observation, seen)
-        self._env_state, self._observation, self._field = state, observation, None
+        self._env_state, self._observation, self._field = state, observation.clone(), None
         return observation
 
     def reset(self, *, seed: Seed = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Start new episodes.
 
         Args:
-            seed: Seeds element i with ``seed + i``, or with ``seed[i]``, and draws its particles anew. Without it the
-                last layout is used again, unless ``resample`` was asked for.
+            seed: Seeds element i with ``seed + i``, or with ``seed[i]``, and draws its particles anew. Without it, or
+                where ``seed[i]`` is ``None``, the last layout is used again, unless ``resample`` was asked for.
             options: ``"positions"``: (N, 2) or (B, N, 2) world positions in m, robot first, used until the next seed,
                 with ``resample`` until the next reset;
                 ``"physics"``: constants of the matter, one value for all, one per element or one per particle, see
@@ -317,7 +323,7 @@ class TorchEnv:
             self._observation = observation
         now = measure(self.state, self.model.robot)
         info = dynamics.averages(self.model, fresh, now)
-        return self._observation, {name: value.detach() for name, value in info.items()}
+        return self._observation.clone(), {name: value.detach() for name, value in info.items()}
 
     def step(self, action: Tensor, *, soft: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Advance every simulation by one control step.
@@ -340,7 +346,8 @@ class TorchEnv:
         state, field = dynamics.transition(self.model, self.env_state, to_grid_layout(action, self.action_layout))
         observation = dynamics.observe(self.model, state)
         judged, outcome = dynamics.judge(self.model, state, field, observation)
-        self._env_state, self._observation, self._field = judged, observation, field.detach()
+        # The image is kept as a copy: what is returned belongs to the caller.
+        self._env_state, self._observation, self._field = judged, observation.clone(), field.detach()
         info: dict[str, Any] = {"reward_terms": dict(outcome.terms), **outcome.info}
         if outcome.success is not None:
             info["is_success"] = outcome.success

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -28,7 +29,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             ignores), or ``DISABLED`` (``reset(options={"reset_mask": ...})``).
         render_mode: ``None`` or ``"rgb_array"``.
         render_muscles: Colour the robots by their muscles in pictures.
-        max_episode_steps: Horizon if it is to differ from the task's.
+        max_episode_steps: Horizon if it is to differ from the task's; -1 for none.
         options: All other arguments of :class:`dittogym.TorchEnv`.
 
     Raises:
@@ -50,7 +51,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> None:
         if render_mode not in (None, RENDER_MODES[0]):
             raise ValueError(f"render_mode must be None or {RENDER_MODES[0]!r} for a batch, got {render_mode!r}")
-        if max_episode_steps is not None:
+        if max_episode_steps not in (None, -1):
             checks.whole("max_episode_steps", max_episode_steps, 1)
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -62,7 +63,8 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.num_envs, self.render_mode, self.render_muscles = num_envs, render_mode, render_muscles
         own, usual = self.torch_env.spec.horizon, registered_horizon(task)
         # Gymnasium hands on the limit of the id, whatever the options say.
-        self._horizon = own if max_episode_steps in (None, usual) else max_episode_steps
+        limit = own if max_episode_steps in (None, usual) else max_episode_steps
+        self._horizon = math.inf if limit == -1 else limit
         self.single_observation_space, self.single_action_space = spaces(self.torch_env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -78,7 +80,8 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Start new episodes, of all elements or of ``options["reset_mask"]``; see :meth:`dittogym.TorchEnv.reset`.
 
         Args:
-            seed: Seeds element i with ``seed + i``, or with ``seed[i]``, and draws its particles anew.
+            seed: Seeds element i with ``seed + i``, or with ``seed[i]`` if that is no ``None``, and draws its particles
+                anew.
             options: As there.
 
         Returns:
@@ -87,7 +90,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         observation, info = self.torch_env.reset(seed=seed, options=options)
         super().reset(seed=seed[0] if isinstance(seed, Sequence) else seed)
         mask = (options or {}).get("reset_mask")
-        self._ended = np.zeros(self.num_envs, dtype=bool) if mask is None else self._ended & ~np.asarray(mask)
+        self._ended &= False if mask is None else ~_array(mask)
         return as_image(observation), _with_masks(as_numpy(info), np.ones(self.num_envs, dtype=bool))
 
     @torch.no_grad()
@@ -150,7 +153,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             The observations (B, 3, 64, 64) uint8 of all elements.
         """
         observation = self.torch_env.load(snapshot, mask)
-        self._ended &= False if mask is None else ~np.asarray(mask)
+        self._ended &= False if mask is None else ~_array(mask)
         return as_image(observation)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
@@ -158,6 +161,10 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if self.render_mode is None:
             return None
         return tuple(self.torch_env.render(i, muscles=self.render_muscles) for i in range(self.num_envs))
+
+
+def _array(mask: Any) -> np.ndarray:
+    return mask.cpu().numpy() if isinstance(mask, torch.Tensor) else np.asarray(mask)
 
 
 def _restarted(info: dict[str, Any], start: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:

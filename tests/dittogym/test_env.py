@@ -127,6 +127,13 @@ def test_info_of_a_new_episode_is_that_of_its_reset(mode: str) -> None:
     assert not info["_reward_terms"].any() and not info["reward_terms"]["_alive"].any()
 
 
+def test_a_batch_without_a_time_limit() -> None:
+    rows = episode(make_vec(name="dittogym/shapematch-coarse-v0", max_episode_steps=-1, substeps=1), 31)
+    assert not any(row[3].any() for row in rows[1:])
+    with pytest.raises(ValueError, match="max_episode_steps must be at least 1, got -2"):
+        make_vec(max_episode_steps=-2)
+
+
 def test_next_step_autoreset() -> None:
     rows = episode(make_vec(autoreset_mode=AutoresetMode.NEXT_STEP, max_episode_steps=3), 5)
     assert rows[3][3].all() and not np.array_equal(rows[3][0], rows[0][0])

@@ -42,6 +42,16 @@ def test_muscles_target_and_size() -> None:
         env.render(size=3)
 
 
+@pytest.mark.parametrize("task", ["shapematch", "slot"])
+def test_a_robot_that_has_flown_far_away(task: str) -> None:
+    env = TorchEnv(task, 1, particles=100, substeps=1)
+    env.reset(seed=0)
+    env.state.v.fill_(1e30)
+    with torch.no_grad():
+        assert not env.step(torch.zeros(1, *env.action_shape))[-1]["finite"]
+    assert not len(near(env.render(), ROBOT)[0])
+
+
 def test_particles_that_are_not_finite_are_left_out() -> None:
     env = TorchEnv("run", 1, particles=100)
     env.reset(seed=0)

@@ -67,6 +67,25 @@ def test_images_and_infos_that_are_written_to() -> None:
         assert torch.equal(env.torch_env.env_state.memory["object_com"], before)
 
 
+def test_what_a_batch_in_torch_returns_is_written_to() -> None:
+    env, other = tiny("catch", 2), tiny("catch", 2)
+    drive = torch.zeros(2, *env.action_shape)
+    for each in (env, other):
+        each.reset(seed=0)
+    image, *_, info = env.step(drive)
+    seen = other.step(drive)[0]
+    image.zero_()
+    for value in (info["object_com"], info["com"]):
+        value.add_(1.0)
+    assert torch.equal(env.save().observation, seen)
+    env.load(env.save()).zero_()
+    env.reset()[0].zero_()
+    assert torch.equal(env.save().observation, other.reset()[0])
+    env.step(drive)
+    other.step(drive)
+    assert torch.equal(env.step(drive)[1], other.step(drive)[1])
+
+
 def test_an_action_that_is_ignored_stays_as_it_was() -> None:
     env = BatchEnv("run", 2, autoreset_mode="NextStep", max_episode_steps=1, **SMALL)
     env.reset(seed=0)

@@ -175,6 +175,14 @@ def test_soft_limits() -> None:
     assert soft[40].item() == pytest.approx(0.0, abs=1e-7)
     assert (soft.diff() > 0).all()
     assert torch.equal(limited(z, high=30.0), z.clamp_max(30.0))
+    zero = limited(z / 50.0, 0.0, 1.0, soft=True)
+    assert (zero - (z / 50.0).clamp(0.0, 1.0)).abs().max().item() == pytest.approx(0.05 * math.log(2))
+    relu = limited(z, 0.0, soft=True, width=2.0)
+    assert (relu - z.clamp_min(0.0)).abs().max().item() == pytest.approx(2.0 * math.log(2))
+    with pytest.raises(ValueError, match="width must be given where all limits are 0"):
+        limited(z, 0.0, soft=True)
+    with pytest.raises(ValueError, match="width must be positive, got 0"):
+        limited(z, 0.0, soft=True, width=0)
     assert beyond(torch.tensor([-1.0, 0.0, 1.0]), 0.1).tolist() == [0.0, 0.0, 1.0]
     near = beyond(torch.tensor([-0.4, 0.0, 0.4]), 0.1, soft=True).tolist()
     assert near == pytest.approx([0.018, 0.5, 0.982], abs=1e-3)

@@ -73,6 +73,10 @@ def test_a_seed_for_each_element() -> None:
     counted.reset(seed=5)
     env.reset(seed=[7, 5, 6])
     assert torch.equal(env.state.x, counted.state.x[[2, 0, 1]])
+    before = env.state.x
+    env.reset(seed=[None, 7, None])
+    assert torch.equal(env.state.x, torch.stack([before[0], before[0], before[2]]))
+    env.reset(seed=[7, 5, 6])
     env.reset(seed=(0, 0, 7), options={"reset_mask": torch.tensor([False, False, True])})
     assert torch.equal(env.state.x, counted.state.x[[2, 0, 2]])
     for wrong, message in (
@@ -316,6 +320,34 @@ def test_detach_cuts_the_graph() -> None:
     env.detach()
     env.step(second)[1].sum().backward()
     assert first.grad is None and second.grad is not None
+
+
+def test_a_constant_is_learned_from_one_stretch_after_the_other() -> None:
+    env, mu = small(), torch.tensor(500.0, dtype=torch.float64, requires_grad=True)
+    drive = torch.full((1, 2, 8, 8), 0.5, dtype=torch.float64)
+    env.reset(seed=0, options={"physics": {"mu": mu}})
+    env.step(drive)
+    env.detach(physics=False)
+    (slope,) = torch.autograd.grad(env.step(drive)[1].sum(), mu)
+    assert slope != 0
+    env.detach()
+    assert not env.step(drive)[1].requires_grad
+
+
+def test_the_centre_of_a_broken_simulation_is_the_last_that_was_finite() -> None:
+    env = small("slot", num_envs=2)
+    env.reset(seed=0)
+    state, centre = env.env_state, env.env_state.centre
+    v = torch.where(torch.tensor([True, False])[:, None, None], torch.nan, state.particles.v)
+    env.env_state = replace(state, particles=replace(state.particles, v=v))
+    with torch.no_grad():
+        *_, info = env.step(torch.zeros(2, 2, 8, 8, dtype=torch.float64))
+    assert info["finite"].tolist() == [False, True]
+    assert torch.equal(env.env_state.centre[0], centre[0]) and env.env_state.origin.isfinite().all()
+    assert env.soft_observation().isfinite().all()
+    for spoilt in (torch.nan, 1e30):
+        env.env_state = replace(env.env_state, particles=replace(state.particles, x=state.particles.x * spoilt))
+        assert env.render(0).shape == (512, 512, 3)
 
 
 def test_truncation_at_the_horizon() -> None:
