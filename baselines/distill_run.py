@@ -8,7 +8,7 @@ from pathlib import Path
 
 from baselines.algorithm import AlgorithmRun
 from baselines.distillation import Distill, DistillConfig
-from baselines.teachers import PHYSICS, read_teacher
+from baselines.teachers import PHYSICS, is_record_of_another_start, read_teacher
 from cfp.config import RunConfig
 from cfp.errors import CheckpointError, ConfigError
 from cfp.estimate import Cost
@@ -53,6 +53,18 @@ class DistillRun(AlgorithmRun):
             self._check_teacher()
             write_policy(self.teacher, *read_policy(self.config.teacher))
         return super().begin()
+
+    def remarks(self) -> list[str]:
+        """A teacher that may know one start only."""
+        lines, (config, path) = super().remarks(), (self.config, self.teacher)
+        if config.teacher not in ("mpc", *TRAINED) and is_record_of_another_start(
+            read_teacher(path, config.task, config.environment), config.task, config.environment
+        ):
+            lines.append(
+                f"teacher: the record of one planned episode, while every episode of {config.task} starts differently; "
+                "see what it gets from other starts (python -m cfp.evaluate --policy), or take mpc, which plans anew"
+            )
+        return lines
 
     def _check_teacher(self) -> None:
         teacher = self.config.teacher

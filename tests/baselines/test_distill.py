@@ -311,8 +311,6 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch, caps
     [
         ("shapematch", "gradient", "T", "teacher: got a policy for the target T, allowed star"),
         ("kick", "gradient", None, "teacher: got a policy for kick, allowed run"),
-        ("run", "mpc", None, "teacher: got the record of one planned episode"),
-        ("run", "cem", None, "allowed in run, where every episode starts differently, is mpc itself"),
         ("run", "gradient", "T", "teacher: its target or the student's cannot be read"),
         (None, "", None, "allowed mpc, shac, gradient, grow, run, shapematch"),
     ],
@@ -321,8 +319,7 @@ def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, kind, targ
     path = tmp_path / "policy.safetensors"
     if task:
         config = replace(Distill.preset(task, "quick"), environment=EnvironmentConfig(1, 100, 4, target=target))
-        record = {"layout": 0} if kind in ("mpc", "cem") else {}
-        write_policy(path, {"actions": torch.zeros(3, 2, 8, 8)}, origin(config, kind, 0, 0) | record)
+        write_policy(path, {"actions": torch.zeros(3, 2, 8, 8)}, origin(config, kind, 0, 0))
     folder = tmp_path / "run"
     student = ["--target", "star"] if task == "shapematch" else ["--task", "run"]
     assert distill.main([*TINY, *LESSONS, *student, "--teacher", str(path), "--out", str(folder)]) == 2
@@ -330,9 +327,14 @@ def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, kind, targ
     assert not folder.exists()
 
 
-def test_record_teaches_where_every_episode_starts_alike(tmp_path):
-    config = replace(Distill.preset("grow", "quick"), environment=EnvironmentConfig(1, 100))
+@pytest.mark.parametrize(("task", "alike"), [("grow", True), ("run", False)])
+def test_record_of_one_episode_teaches(tmp_path, capsys, task, alike):
+    config = replace(Distill.preset(task, "quick"), environment=EnvironmentConfig(1, 100, 4))
     path = tmp_path / "record.safetensors"
     write_policy(path, {"actions": torch.ones(3, 2, 8, 8)}, origin(config, "mpc", 0, 0) | {"layout": 0})
-    teacher = read_teacher(path, "grow", config.environment)
+    teacher = read_teacher(path, task, config.environment)
     assert isinstance(teacher, OpenLoop) and len(teacher.actions) == 3
+    student = ["--task", task, "--teacher", str(path), "--out", str(tmp_path / "run")]
+    assert distill.main([*TINY, *LESSONS, *student]) == 0
+    remark = f"teacher: the record of one planned episode, while every episode of {task} starts differently"
+    assert (remark in capsys.readouterr().out) != alike
