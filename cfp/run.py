@@ -28,7 +28,7 @@ from cfp.process import Plateau, StopSignals
 from cfp.state_file import Position, StateFile, check_same
 from cfp.tracking import Tracker, check_trackers
 from cfp.video import VideoUnavailable, film, film_episode, write_video
-from cfp.weights import read_policy
+from cfp.weights import is_of_another_task, read_policy
 
 EVALUATION_COLUMNS: dict[str, str] = {
     "step": "environment steps of the run so far",
@@ -130,6 +130,9 @@ class Run(ABC):
                 raise self.checkpoint.misfit(ValueError(f"it is of stage {self.position.level + 1}"))
             step = self.position.offset + self.state["model"]["num_timesteps"]
             print(f"resuming {folder} at step {step} of {config.ends()[-1]} (stage {self.position.level + 1})")
+            newest = folder / "policy.safetensors"
+            if newest.exists() and is_of_another_task(read_policy(newest)[1], config.task):
+                print(f"the file of task {config.task!r} has changed: evaluations from before it are of another task")
         elif resume:
             print(f"{folder} holds no checkpoint: starting from the beginning")
         if self.state is None:

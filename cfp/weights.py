@@ -22,6 +22,7 @@ from cfp.merging import words
 from cfp.networks import RESOLUTIONS
 from cfp.policy import ActorPolicy
 from dittogym.geometry import NODES
+from dittogym.tasks import fingerprint
 
 FORMAT = "cfp-policy"
 VERSION = 1
@@ -36,8 +37,11 @@ _DESCRIBED: dict[str, tuple[type, int | None, int]] = {
     "deterministic": (bool, None, 0),
     "environment": (dict, None, 0),
     "layout": (int, 0, LARGEST_SEED),
+    "task_file": (str, None, 0),
 }
-"""What every description holds (some have no layout): type, least and largest value."""
+"""What every description holds: type, least and largest value."""
+_OPTIONAL = ("layout", "task_file")
+"""What some have not: they were not made for one layout; the task comes with the library."""
 REASON = 300
 """Characters of an error of torch that are shown: it lists every layer."""
 SHIPPED = Path(__file__).parent / "policies"
@@ -64,7 +68,13 @@ def origin(config: RunConfig, kind: str, level: int, steps: int) -> dict[str, An
         "seed": config.seed,
         "deterministic": config.report.eval_deterministic,
         "environment": dataclasses.asdict(config.environment),
-    }
+    } | ({} if (file := fingerprint(config.task)) is None else {"task_file": file})
+
+
+def is_of_another_task(description: Mapping[str, Any], task: str) -> bool:
+    """Whether a policy was trained when the file that a task of one's own comes from was another."""
+    then, now = description.get("task_file"), fingerprint(task)
+    return then is not None and now is not None and then != now
 
 
 def describe(config: Config, level: int, steps: int) -> dict[str, Any]:
@@ -152,7 +162,7 @@ def _checked(description: Any) -> dict[str, Any]:
     description = {"kind": KIND, **description}  # files older than kinds are all of this one
     for name, (kind, least, most) in _DESCRIBED.items():
         value: Any = description.get(name)
-        if name == "layout" and value is None:
+        if name in _OPTIONAL and value is None:
             continue
         wrong = type(value) is not kind  # a truth value is no number here
         if wrong or (least is not None and not least <= value <= most):

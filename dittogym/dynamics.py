@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -212,6 +212,9 @@ def initial(model: Model, positions: Tensor, physics: Physics | None = None) -> 
     state = EnvState(particles, origin, start.com, start, {}, physics or {}, steps)
     observation = observe(model, state)
     memory = model.spec.remember(_moment(model, state, start, observation))
+    if not isinstance(memory, Mapping):
+        raise TypeError(f"remember of task {model.spec.name!r} must return tensors by name, got {_kind(memory)}")
+    _check_leading(model.spec, "remember", "memory", memory, steps)
     return replace(state, memory=memory), observation
 
 
@@ -335,7 +338,8 @@ def judge(
 
     Raises:
         ValueError: The task returns a term under a name of :data:`RESERVED`, info under one of :data:`RESERVED_INFO`,
-            something without a leading B, or memory unlike that which it remembers.
+            something without a leading B, a term that is not finite although the simulation is, or memory unlike that
+            which it remembers.
         TypeError: The task returns something else.
 
     Returns:
@@ -357,7 +361,9 @@ def judge(
     if weights.action:
         terms["action"] = -weights.action * action_cost(field)
     terms["alive"] = torch.full_like(now.split, weights.alive)
-    terms = dict(zip(terms, torch.where(finite, torch.stack(tuple(terms.values())), 0.0).unbind(), strict=True))
+    values = torch.stack(tuple(terms.values()))
+    _check_finite(spec, terms, values, finite)
+    terms = dict(zip(terms, torch.where(finite, values, 0.0).unbind(), strict=True))
     terms["failure"] = torch.where(finite, 0.0, FAILURE_REWARD).to(now.split)
     info = {**common, **own.info}
     success = own.success & finite if own.success is not None else None
@@ -366,10 +372,24 @@ def judge(
     return state, Outcome(terms, terminated | ~finite, success, info)
 
 
+def _check_finite(spec: TaskSpec, names: Iterable[str], values: Tensor, finite: Tensor) -> None:
+    """Refuse terms (K, B) that are not finite where the simulations (B,) are."""
+    wrong = ~torch.isfinite(values.detach()) & finite
+    if bool(wrong.any()):
+        term, element = wrong.nonzero()[0].tolist()
+        raise ValueError(
+            f"judge of task {spec.name!r} must return finite terms where the simulation is finite, "
+            f"got {values[term, element].item()} for {list(names)[term]!r} in simulation {element}"
+        )
+
+
 def _check_outcome(spec: TaskSpec, own: Outcome, state: EnvState) -> None:
     """Refuse what a task must not return, see :func:`judge`."""
     if not isinstance(own, Outcome):
         raise TypeError(f"judge of task {spec.name!r} must return an Outcome, got {type(own).__name__}")
+    for part in ("terms", "info", "memory"):
+        if (given := getattr(own, part)) is not None and not isinstance(given, Mapping):
+            raise TypeError(f"judge of task {spec.name!r} must return {part} by name, got {_kind(given)}")
     if taken := RESERVED & own.terms.keys():
         raise ValueError(f"judge of task {spec.name!r} must not return the engine's own terms, got {sorted(taken)}")
     if taken := RESERVED_INFO & own.info.keys():
@@ -382,14 +402,19 @@ def _check_outcome(spec: TaskSpec, own: Outcome, state: EnvState) -> None:
             raise ValueError(
                 f"judge of task {spec.name!r} must return {wanted} of shape (B,), got {_kind(value)} for {name!r}"
             )
-    for name, value in own.info.items():
-        if not isinstance(value, Tensor) or value.shape[:1] != state.steps.shape:
-            raise ValueError(
-                f"judge of task {spec.name!r} must return info of shape (B, ...), got {_kind(value)} for {name!r}"
-            )
+    _check_leading(spec, "judge", "info", own.info, state.steps)
     before, after = ({n: _kind(v) for n, v in m.items()} for m in (state.memory, own.memory or state.memory))
     if before != after:
         raise ValueError(f"judge of task {spec.name!r} must return memory like that of remember, {before}, got {after}")
+
+
+def _check_leading(spec: TaskSpec, function: str, what: str, values: Mapping[str, object], steps: Tensor) -> None:
+    for name, value in values.items():
+        if not isinstance(value, Tensor) or value.shape[:1] != steps.shape:
+            raise ValueError(
+                f"{function} of task {spec.name!r} must return {what} of shape (B, ...), "
+                f"got {_kind(value)} for {name!r}"
+            )
 
 
 def _kind(value: object) -> str:

@@ -96,7 +96,7 @@ def side_walls(top: int | None) -> Obstacle:
     return Obstacle("side walls", rules, shown=(nodes(32, 34, top=height), nodes(-34, -32, top=height)))
 
 
-def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True) -> Obstacle:
+def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True, friction: float = 0.0) -> Obstacle:
     """A box of nodes that matter cannot enter: one-sided faces left, right, below and above.
 
     Args:
@@ -104,9 +104,12 @@ def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True) -> O
         i: Inclusive range of world node indices in x.
         j: Inclusive range of world node indices in y; ``None`` leaves an end open.
         visible: Whether the robot sees it.
+        friction: Coulomb coefficient of its faces. Matter slips on them unless it is given; ``math.inf`` sticks, as the
+            floor does.
 
     Raises:
-        ValueError: A range is none, or the box is narrower than four nodes, so that its faces would overlap.
+        ValueError: A range is none, the friction is negative, or the box is narrower than four nodes, so that its faces
+            would overlap.
     """
     for axis, given in (("i", i), ("j", j)):
         if not isinstance(given, tuple) or len(given) != 2 or not {type(end) for end in given} <= {int, type(None)}:
@@ -116,10 +119,13 @@ def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True) -> O
     (left, right), (low, high) = i, j
     if right - left < 3 or (low is not None and high is not None and high - low < 3):
         raise ValueError(f"solid needs at least 4 nodes in each direction, got i={i}, j={j}")
-    rules = [VelocityRule("+x", (left, left + 1), j), VelocityRule("-x", (right - 1, right), j)]
+    rules = [
+        VelocityRule("+x", (left, left + 1), j, friction=friction),
+        VelocityRule("-x", (right - 1, right), j, friction=friction),
+    ]
     if low is not None:
-        rules.append(VelocityRule("+y", i, (low, low + 1)))
+        rules.append(VelocityRule("+y", i, (low, low + 1), friction=friction))
     if high is not None:
-        rules.append(VelocityRule("-y", i, (high - 1, high)))
+        rules.append(VelocityRule("-y", i, (high - 1, high), friction=friction))
     box = nodes(left, right, -math.inf if low is None else low, math.inf if high is None else high)
     return Obstacle(name, tuple(rules), (box,) if visible else (), (box,))

@@ -207,7 +207,8 @@ class TaskSpec:
 
     Raises:
         ValueError: A number is out of range, or there is more than one object.
-        TypeError: A body, an obstacle or a group of numbers is something else, or the judge cannot be called.
+        TypeError: A body, an obstacle or a group of numbers is something else, or ``judge`` or ``remember`` cannot be
+            called.
     """
 
     name: str
@@ -264,6 +265,8 @@ class TaskSpec:
             raise ValueError(f"objects must be at most one body, got {len(self.objects)}")
         if not callable(self.judge):
             raise TypeError(f"judge must be a function from Moment and Weights to Outcome, got {self.judge!r}")
+        if not callable(self.remember):
+            raise TypeError(f"remember must be a function from Moment to tensors by name, got {self.remember!r}")
 
     def _check_point(self, name: str, *, optional: bool, open_ended: bool) -> None:
         given = getattr(self, name)

@@ -81,7 +81,7 @@ class TorchEnv:
         resolution: ``"coarse"``, ``"fine"``, or R itself, at most the task's patch.
         particles: ``"full"``, ``"lite"`` (2,000, evenly spread), the robot's number, or (robot, object).
         substeps: Substeps of 1e-4 s in a control step.
-        dtype: ``"float32"`` or ``"float64"``.
+        dtype: ``"float32"`` or ``"float64"``, by name or as torch's.
         device: Where it runs.
         backend: Of the solver, see :class:`torchmpm.Solver`.
         action_layout: ``"image"``: action pixel (row, column) acts where observation pixel (row, column) looks;
@@ -118,7 +118,7 @@ class TorchEnv:
         *,
         particles: Particles = "full",
         substeps: int = 100,
-        dtype: str = "float32",
+        dtype: str | torch.dtype = "float32",
         device: str | torch.device = "cpu",
         backend: str = "auto",
         action_layout: Layout | None = None,
@@ -129,6 +129,7 @@ class TorchEnv:
         **task_options: Any,
     ) -> None:
         self.spec = make_spec(task, **task_options)
+        dtype = str(dtype).removeprefix("torch.")
         for name, value, allowed in (
             ("dtype", dtype, tuple(_DTYPES)),
             ("parity", parity, ("clean", "reference")),

@@ -14,6 +14,7 @@ from cfp.errors import CheckpointError, ConfigError
 from cfp.files import read_json
 from cfp.run import holds_run, read_config
 from cfp.state_file import flatten
+from cfp.weights import is_of_another_task, read_policy
 from dittogym.tasks import task_name
 
 IRRELEVANT = ("device", "environment.backend", "report.video", "report.checkpoint_every", "report.log_every")
@@ -224,7 +225,8 @@ def check_there(job: Job) -> None:
     """Compare what is in a job's folder with what it should be.
 
     Raises:
-        ConfigError: There is a run with other options; the message names the first that differs.
+        ConfigError: There is a run with other options, of which the message names the first, or of a task of one's own
+            whose file has changed since.
     """
     if not holds_run(job.folder):
         return
@@ -241,6 +243,12 @@ def check_there(job: Job) -> None:
                 f"{name}: the run in {job.folder} has {old.get(name)!r}, got {new.get(name)!r}; allowed is the same, "
                 "or another --out"
             )
+    newest = job.folder / "policy.safetensors"
+    if newest.exists() and is_of_another_task(read_policy(newest)[1], job.config.task):
+        raise ConfigError(
+            f"task: the run in {job.folder} was trained when the file of {job.config.task!r} was another; allowed is "
+            "the same, or another --out"
+        )
 
 
 def judged(config: RunConfig, tier: Any) -> RunConfig:

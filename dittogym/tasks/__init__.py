@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from dittogym.geometry import Obstacle
 from dittogym.robots import BodyLike, with_body
@@ -30,6 +32,20 @@ def task_name(task: str) -> str:
     return task.rpartition(":")[2]
 
 
+def fingerprint(task: str) -> str | None:
+    """SHA-256 of the file that a task of one's own was written in; ``None`` for the library's, or where there is none.
+
+    What that file imports is not part of it.
+    """
+    try:
+        file = Path(inspect.getsourcefile(TASKS[task_name(task)]) or "")
+    except TypeError:  # no plain function
+        return None
+    if not file.is_file() or file.parent == Path(__file__).parent:
+        return None
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
 def allowed_instead(task: object) -> str | None:
     """What is allowed in place of something that is no task; ``None`` where it is one.
 
@@ -46,7 +62,8 @@ def allowed_instead(task: object) -> str | None:
         try:
             if not module.isidentifier():
                 raise ImportError("its name must be a word, without dots")
-            importlib.import_module(module)
+            if getattr(importlib.import_module(module), "__file__", None) is None:
+                raise ImportError("that is a folder, not a file")
         except Exception as error:  # whatever the module does
             return f"{allowed} (module {module!r}: {type(error).__name__}: {error})"
     if name in TASKS:
@@ -86,7 +103,9 @@ def make_spec(
         for name in options:
             if name not in known:
                 names = ", ".join(("body", "obstacles", *known))
-                raise TypeError(f"task {task!r} has no option {name!r}; its options are: {names}")
+                raise TypeError(
+                    f"task {task!r} has no option {name!r}; its options, beside the arguments of TorchEnv, are: {names}"
+                )
         spec = make(**options)
     if obstacles is not None:
         if not isinstance(obstacles, Sequence) or not all(isinstance(item, Obstacle) for item in obstacles):

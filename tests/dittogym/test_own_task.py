@@ -1,8 +1,10 @@
 """A task of one's own, registered without touching the library."""
 
 import dataclasses
+import hashlib
 import math
 from collections.abc import Iterator
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -16,6 +18,7 @@ import dittogym
 from dittogym.geometry import Obstacle, ceiling, floor
 from dittogym.shapes import Disc, Rectangle
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
+from dittogym.tasks import fingerprint
 from torchmpm import Elastic, VelocityRule
 
 
@@ -100,7 +103,9 @@ def test_options_of_the_function_arrive() -> None:
     assert env.action_space.shape == (2, 6, 6)
     assert env.unwrapped.torch_env.spec.robot.shape.size == (0.1, 0.1)
     assert tiny("hop", pull=-2.0).spec.gravity == (0.0, -2.0)
-    message = "task 'hop' has no option 'push'; its options are: body, obstacles, pull, horizon, coarse"
+    message = (
+        "task 'hop' has no option 'push'; its options, beside the arguments of TorchEnv, are: body, obstacles, pull"
+    )
     with pytest.raises(TypeError, match=message):
         gymnasium.make("dittogym/hop-coarse-v0", push=1.0)
     with pytest.raises(ValueError, match=r"task must be one of catch, .*, hop, .* got 'hope'"):
@@ -125,6 +130,7 @@ def test_a_module_that_registers_the_task_is_imported_by_name(tmp_path, monkeypa
         ("missing_one:leap", "module 'missing_one': ModuleNotFoundError: No module named 'missing_one'"),
         ("folder.hidden:leap", "module 'folder.hidden': ImportError: its name must be a word, without dots"),
         (":leap", "module '': ImportError"),
+        ("folder:leap", "module 'folder': ImportError: that is a folder, not a file"),
     ):
         with pytest.raises(ValueError, match=rf"task must be one of catch.* MODULE:NAME \({reason}.* got '{task}'"):
             dittogym.make_spec(task)
@@ -224,6 +230,46 @@ def test_memory_and_objects_of_a_task_of_ones_own() -> None:
     assert "is_success" not in info
 
 
+@pytest.mark.parametrize(
+    ("remembered", "error", "message"),
+    [
+        ("peak", TypeError, "remember must be a function from Moment to tensors by name, got 'peak'"),
+        (lambda moment: None, TypeError, "remember of task 'hop' must return tensors by name, got NoneType"),
+        (lambda moment: moment.now.com, TypeError, r"must return tensors by name, got torch.float64 of shape \(1, 2\)"),
+        (lambda moment: {"peak": 1.0}, ValueError, r"must return memory of shape \(B, ...\), got float for 'peak'"),
+        (lambda moment: {"peak": torch.tensor(1.0)}, ValueError, r"got torch.float32 of shape \(\) for 'peak'"),
+    ],
+)
+def test_memory_that_cannot_be_kept_is_refused(remembered: object, error: type, message: str) -> None:
+    with pytest.raises(error, match=message):
+        tiny(dataclasses.replace(hop(), remember=remembered)).reset(seed=0)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_term_that_is_not_finite_is_named(value: float) -> None:
+    def judge(moment: Moment, weights: Weights) -> Outcome:
+        broken = torch.where(moment.now.com[:, 1] > 10.0, 0.0, value)
+        return Outcome({"height": moment.now.split, "way": broken})
+
+    env = tiny(dataclasses.replace(hop(), judge=judge), 2)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=f"must return finite terms .* got {value} for 'way' in simulation 0"):
+        env.step(torch.zeros(2, *env.action_shape))
+    env.state.x[0] = torch.nan  # a simulation that is not finite may be judged as it likes
+    with pytest.raises(ValueError, match="for 'way' in simulation 1"):
+        env.step(torch.zeros(2, *env.action_shape))
+
+
+def test_the_fingerprint_is_that_of_the_task_s_file(tmp_path, monkeypatch) -> None:
+    assert fingerprint("run") is None
+    dittogym.register("hop", hop)
+    assert fingerprint("hop") == hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
+    space = {"dittogym": dittogym, "hop": hop}
+    exec("def jump(): return dittogym.spec.TaskSpec(**{**vars(hop()), 'name': 'jump'})", space)
+    dittogym.register("jump", space["jump"])
+    assert fingerprint("jump") is None
+
+
 def test_a_name_that_gymnasium_would_refuse_leaves_nothing_behind() -> None:
     with pytest.raises(ValueError, match=r"task must be a name of letters, digits and underscores, got 'my task!'"):
         dittogym.register("my task!", hop)
@@ -276,6 +322,13 @@ def test_a_judgement_that_would_do_harm_later_is_refused(changes: dict, message:
     env = tiny(spec, 2)
     env.reset(seed=0)
     with pytest.raises(ValueError, match=message):
+        env.step(actions(env, 1)[0])
+
+
+def test_terms_without_names_are_refused() -> None:
+    env = tiny(dataclasses.replace(hop(), judge=lambda moment, weights: Outcome([moment.now.split])))
+    env.reset(seed=0)
+    with pytest.raises(TypeError, match="judge of task 'hop' must return terms by name, got list"):
         env.step(actions(env, 1)[0])
 
 
