@@ -295,7 +295,7 @@ def test_evaluation_of_a_single_policy_is_that_of_its_run(finished, capsys):
     [
         ([], "policy: got None and the folder None, allowed is one of the two"),
         (["somewhere", "--policy", "run"], "allowed is one of the two"),
-        (["--policy", "alchemy"], "none of that name is shipped (grow, run, shapematch)"),
+        (["--policy", "alchemy"], "none of that name is shipped (catch, grow, run, shapematch)"),
         (["--policy", "run", "--particles", "0"], "particles"),
     ],
 )
