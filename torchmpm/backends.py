@@ -13,6 +13,7 @@ from torch.autograd import forward_ad
 
 from torchmpm import native
 from torchmpm.native.library import find_compiler
+from torchmpm.rollout import reads
 
 if TYPE_CHECKING:
     from torchmpm.solver import Scene, Solver
@@ -86,7 +87,12 @@ def substep_function(solver: Solver, scene: Scene) -> Callable[[Planes], Planes]
     TorchInductor's cache on disk). More than eight combinations in one process run eagerly again.
     """
     run = _compiled() if solver.backend == "compile" else type(solver).substep
-    return lambda planes: run(solver, scene, planes)
+
+    def substep(planes: Planes) -> Planes:
+        reads({"solver": solver, "origin": scene.origin})
+        return run(solver, scene, planes)
+
+    return substep
 
 
 @functools.cache

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import fields, is_dataclass
 from functools import partial
-from typing import Literal, TypeAlias, TypeVar
+from types import FunctionType
+from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import torch
+from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from torchmpm import checks
@@ -16,11 +21,102 @@ Input = TypeVar("Input")
 Output = TypeVar("Output")
 
 
-def _segmented(function: Callable[[State], State], state: State) -> State:
-    """Run ``function`` so that autograd keeps only its input and replays it in the backward pass."""
-    if not torch.is_grad_enabled():
+class _Running(threading.local):
+    """The segments that this thread is inside of, forward or in a replay."""
+
+    def __init__(self) -> None:
+        self.segments: list[_Segment[Any]] = []
+
+
+_running = _Running()
+
+
+class _Segment(Generic[State]):
+    """A function to be replayed, which must then read what it read the first time.
+
+    It remembers how often each tensor had been changed in place, not the tensors, which would keep their memory.
+    """
+
+    def __init__(self, function: Callable[[State], State], given: Callable[[], dict[str, Any]]) -> None:
+        self.function = function
+        self.given = given
+        self.versions: list[int] = []
+        self.replayed: Iterator[int] | None = None  # the versions still to be compared, once it has run
+
+    def __call__(self, state: State) -> State:
+        _running.segments.append(self)
+        try:
+            reads({"state": state} | self.given())
+            return self.function(state)
+        finally:
+            _running.segments.pop()
+            self.replayed = iter(self.versions)
+
+    def read(self, name: str, tensor: Tensor) -> None:
+        version = -1 if tensor.is_inference() else tensor._version
+        if self.replayed is None:
+            self.versions.append(version)
+        elif next(self.replayed, version) != version:
+            raise RuntimeError(
+                f"{name} was changed in place after a step had read it, and the backward pass replays that step: give "
+                "each step tensors of its own, such as a clone, or keep the whole graph (checkpointed=False, "
+                "segment=None)"
+            )
+
+
+def reads(values: Mapping[str, Any]) -> None:
+    """Tell the segments around this call what it reads; their replay raises an error if that has changed since.
+
+    Args:
+        values: Tensors by name, or tuples, lists, mappings and dataclasses of them; anything else is ignored.
+    """
+    if _running.segments:
+        for name, tensor in _tensors(values, ""):
+            for segment in _running.segments:
+                segment.read(name, tensor)
+
+
+def _tensors(value: Any, name: str) -> Iterator[tuple[str, Tensor]]:
+    if isinstance(value, Tensor):
+        yield name, value
+    elif isinstance(value, tuple | list):
+        for index, item in enumerate(value):
+            yield from _tensors(item, f"{name}[{index}]")
+    elif isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _tensors(item, f"{name}.{key}" if name else str(key))
+    elif is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            yield from _tensors(getattr(value, field.name), f"{name}.{field.name}")
+
+
+def _captured(function: Callable[..., Any]) -> dict[str, Tensor]:
+    """The tensors that a Python function names beside its arguments."""
+    if not isinstance(function, FunctionType):
+        return {}
+    code, named = function.__code__, {}
+    for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
+        with suppress(ValueError):  # nothing has been assigned yet
+            named[name] = cell.cell_contents
+    named |= {name: function.__globals__.get(name) for name in code.co_names}
+    return {name: value for name, value in named.items() if isinstance(value, Tensor)}
+
+
+def _segmented(function: Callable[[State], State], state: State, step: Callable[..., State], **given: Any) -> State:
+    """Run ``function`` so that autograd keeps only its input and replays it in the backward pass.
+
+    The transforms of ``torch.func`` know no checkpoints: under them the whole graph is kept.
+
+    Args:
+        function: What to run.
+        state: Its argument.
+        step: The caller's part of it.
+        given: What else that gets.
+    """
+    if not torch.is_grad_enabled() or torch._C._are_functorch_transforms_active():
         return function(state)
-    return checkpoint(function, state, use_reentrant=False, preserve_rng_state=False)
+    segment = _Segment(function, lambda: given | _captured(step))
+    return checkpoint(segment, state, use_reentrant=False, preserve_rng_state=False)
 
 
 def _apply(step: Callable[[State, Input], State], value: Input, state: State) -> State:
@@ -49,10 +145,13 @@ def repeated(step: Callable[[State], State], state: State, times: int, *, segmen
         times: How often.
         segment: With gradients enabled, keep the state only every ``segment`` steps and replay the steps between in
             the backward pass: memory for ``times / segment`` states and the graph of ``segment`` steps, for one more
-            forward pass. ``None`` keeps the whole graph, ``"auto"`` is 10.
+            forward pass. ``None`` keeps the whole graph, ``"auto"`` is 10. The transforms of ``torch.func`` know no
+            checkpoints and keep the whole graph too.
 
     Raises:
         ValueError: ``times`` is negative or ``segment`` is below 1.
+        RuntimeError: In the backward pass: a tensor that a step reads was changed in place before its replay. The
+            state, tensors that ``step`` names, and all that goes into :meth:`torchmpm.Solver.step` are watched.
     """
     check_repetition(times, segment)
     segment = SEGMENT if segment == "auto" else segment
@@ -62,7 +161,7 @@ def repeated(step: Callable[[State], State], state: State, times: int, *, segmen
         return state
     for start in range(0, times, segment):
         length = min(segment, times - start)
-        state = _segmented(partial(repeated, step, times=length), state)
+        state = _segmented(partial(repeated, step, times=length), state, step)
     return state
 
 
@@ -82,15 +181,19 @@ def trajectory(
         inputs: One entry a step, for example actuation fields.
         observe: What to keep of each state, for example ``lambda s: s.x.mean(1)``.
         checkpointed: With gradients enabled, keep only the states between steps and replay each step in the backward
-            pass. Nests with the ``segment`` of :meth:`torchmpm.Solver.step`.
+            pass. Nests with the ``segment`` of :meth:`torchmpm.Solver.step`, and does nothing under ``torch.func``.
 
     Returns:
         The final state and the list of observations, one per input.
+
+    Raises:
+        RuntimeError: In the backward pass: a tensor that a step reads, such as an input, was changed in place before
+            its replay; see :func:`repeated`.
     """
     outputs = []
     for value in inputs:
         if checkpointed:
-            state = _segmented(partial(_apply, step, value), state)
+            state = _segmented(partial(_apply, step, value), state, step, input=value)
         else:
             state = step(state, value)
         outputs.append(observe(state))

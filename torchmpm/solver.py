@@ -19,7 +19,7 @@ from torchmpm.grid import PAD, Grid
 from torchmpm.linalg import Mat2, matmul
 from torchmpm.material import Material, Sym2, Value, column, spread
 from torchmpm.native.library import NO_COMPILER
-from torchmpm.rollout import Segment, check_repetition, repeated
+from torchmpm.rollout import Segment, check_repetition, reads, repeated
 from torchmpm.spline import Stencil, stencil
 from torchmpm.state import ParticleState
 
@@ -225,12 +225,14 @@ class Solver:
             ValueError: Shapes, dtypes or devices do not fit together, or the native backend was chosen and cannot run
                 this.
             TypeError: The state, the actuation or the origin is something else.
+            RuntimeError: In the backward pass: one of these tensors was changed in place, and is read again there.
         """
         checks.instance("state", state, ParticleState)
         check_repetition(substeps, segment, "substeps")
         origin = self.check(state, actuation, origin)
         if substeps == 0 or state.batch_size == 0:
             return state
+        reads({"solver": self, "state": state, "actuation": actuation, "origin": origin})
         if runs_native(self, state, actuation, origin):
             return native.step(self, state, actuation, origin, substeps, segment, mass_epsilon=MASS_EPSILON)
         substep = substep_function(self, self.scene(state, actuation, origin))
