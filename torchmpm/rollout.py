@@ -21,6 +21,11 @@ Input = TypeVar("Input")
 Output = TypeVar("Output")
 
 
+def transforming() -> bool:
+    """Whether a transform of ``torch.func`` is at work; torch has no public name for it."""
+    return bool(torch._C._are_functorch_transforms_active())
+
+
 class _Running(threading.local):
     """The segments that this thread is inside of, forward or in a replay."""
 
@@ -113,7 +118,7 @@ def _segmented(function: Callable[[State], State], state: State, step: Callable[
         step: The caller's part of it.
         given: What else that gets.
     """
-    if not torch.is_grad_enabled() or torch._C._are_functorch_transforms_active():
+    if not torch.is_grad_enabled() or transforming():
         return function(state)
     segment = _Segment(function, lambda: given | _captured(step))
     return checkpoint(segment, state, use_reentrant=False, preserve_rng_state=False)

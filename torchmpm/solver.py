@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchmpm import checks, muscle, native, transfer
-from torchmpm.backends import BACKENDS, compiler_found, runs_native, substep_function
+from torchmpm.backends import BACKENDS, compiler_found, runs_native, substep_function, vmapping
 from torchmpm.boundary import Face, VelocityRule, constrain, faces
 from torchmpm.grid import PAD, Grid
 from torchmpm.linalg import Mat2, matmul
@@ -150,11 +150,16 @@ class Solver:
             raise ValueError(f"backend must be one of {BACKENDS}, got {self.backend!r}")
         if self.backend in ("compile", "native") and not compiler_found() and not torch.cuda.is_available():
             raise ValueError(f"backend {self.backend!r} {NO_COMPILER}")
-        if not self.allow_unstable and self.dt > (limit := self.stable_dt()):
+        if not (self.allow_unstable or self._vmapped()) and self.dt > (limit := self.stable_dt()):
             raise ValueError(
                 f"dt must be at most {limit} s for matter so stiff and light to be stable, got {self.dt}; "
                 "allow_unstable=True accepts it"
             )
+
+    def _vmapped(self) -> bool:
+        """Whether constants may be tensors of a ``vmap``, under which nothing can depend on the numbers they hold."""
+        values = (v for body in self.bodies for v in (body.mass, body.volume, *vars(body.material).values()))
+        return vmapping() and any(isinstance(value, Tensor) for value in values)
 
     @property
     def num_particles(self) -> int:

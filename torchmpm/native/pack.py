@@ -14,6 +14,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
+from torchmpm.grid import Grid
 from torchmpm.material import STRETCH_FLOOR, Elastic, Soil, Value, VonMises, column, yield_ratio
 
 if TYPE_CHECKING:
@@ -46,6 +47,9 @@ def unsupported(solver: Solver, device: torch.device) -> str | None:
             return missing
         if torch.are_deterministic_algorithms_enabled() and not torch.is_deterministic_algorithms_warn_only_enabled():
             return "on CUDA its sums are taken in no fixed order, torch.use_deterministic_algorithms(True) forbids that"
+    own = _overridden(type(solver), type(solver.grid))
+    if own is not None:
+        return f"it would go past {own}, which the substep calls"
     for body in solver.bodies:
         if type(body.material) not in KINDS:
             names = ", ".join(kind.__name__ for kind in KINDS)
@@ -56,6 +60,19 @@ def unsupported(solver: Solver, device: torch.device) -> str | None:
         return f"it takes at most {MAX_RESOLUTION:,} nodes per axis, got {solver.grid.resolution:,}"
     if solver.num_particles > MAX_PARTICLES:
         return f"it takes at most {MAX_PARTICLES:,} particles a simulation, got {solver.num_particles:,}"
+    return None
+
+
+@functools.cache
+def _overridden(solver: type[Solver], grid: type[Grid]) -> str | None:
+    """The first part of a substep that a subclass has its own of, or ``None``."""
+    from torchmpm.solver import Solver  # not at the top: the solver imports this module
+
+    of_solver = ("scene", "substep", "to_grid", "_internal_force", "parts", "per_particle")
+    for given, known, names in ((solver, Solver, of_solver), (grid, Grid, ("h", "width", "contains"))):
+        for name in names:
+            if getattr(given, name) is not getattr(known, name):
+                return f"{given.__name__}.{name}"
     return None
 
 
