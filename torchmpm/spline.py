@@ -70,7 +70,7 @@ def stencil(grid: Grid, x: Tensor, y: Tensor, origin: Tensor) -> Stencil:
     for position, start in ((x, origin[:, 0:1]), (y, origin[:, 1:2])):
         u = (position - start) * (1.0 / grid.h)
         base = torch.trunc(u.detach() - 0.5)
-        f = u - base
+        f = torch.nan_to_num(u - base, nan=1.0)  # no number would spoil derivatives in what particles share
         fraction.append(f)
         weight.append(quadratic_weights(f))
         # Clamped before the conversion, which is undefined for large numbers; a NaN ends at the low end: padding.
