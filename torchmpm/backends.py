@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from torchmpm.state import ParticleState
 
 Planes = tuple[Tensor, ...]
+Substep = Callable[["Solver", "Scene", Planes], Planes]
 
 BACKENDS = ("auto", "eager", "compile", "native")
 _logger = logging.getLogger(__name__)
@@ -94,7 +95,9 @@ def substep_function(solver: Solver, scene: Scene) -> Callable[[Planes], Planes]
     faster, after about ten seconds of compilation for each new combination of solver and shapes in a process (less with
     TorchInductor's cache on disk). More than eight combinations in one process run eagerly again.
     """
-    run = _compiled(type(solver)) if solver.backend == "compile" else type(solver).substep
+    run: Substep = type(solver).substep
+    if solver.backend == "compile":
+        run = _compiled(run)
 
     def substep(planes: Planes) -> Planes:
         reads({"solver": solver, "origin": scene.origin})
@@ -104,7 +107,7 @@ def substep_function(solver: Solver, scene: Scene) -> Callable[[Planes], Planes]
 
 
 @functools.cache
-def _compiled(kind: type[Solver]) -> Callable[[Solver, Scene, Planes], Planes]:
+def _compiled(substep: Substep) -> Substep:
     # Sums over the nine nodes become one expression that computes their addresses once; addresses are clamped already.
     options: dict[str, Any] = {"unroll_reductions_threshold": 16, "assert_indirect_indexing": False}
-    return torch.compile(kind.substep, dynamic=False, options=options)
+    return torch.compile(substep, dynamic=False, options=options)

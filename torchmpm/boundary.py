@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Literal
 
 import torch
@@ -55,11 +56,12 @@ class VelocityRule:
             checks.number("friction", self.friction, least=0.0)
         for name, given in (("i", self.i), ("j", self.j)):
             ends = [end for end in given if end is not None] if isinstance(given, tuple) and len(given) == 2 else [None]
-            if not all(isinstance(end, int) for end in ends) or ends != sorted(ends):
+            if not all(isinstance(end, Integral) for end in ends) or ends != sorted(ends):
                 raise ValueError(
                     f"{name} must be an inclusive range (low, high) of node indices or None with low <= high, "
                     f"got {given!r}"
                 )
+            object.__setattr__(self, name, tuple(None if end is None else int(end) for end in given))
 
 
 def fixed(

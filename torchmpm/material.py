@@ -126,12 +126,14 @@ def yield_values(limit: Value) -> tuple[Value, Value, Value, Value]:
         Difference over sum of the stretches, their ratio, and sum and difference of its square root and the inverse.
     """
     excess = 2.0 * (limit * limit - NORM_EPSILON)
+    growth: Value
+    root: Value
     if isinstance(excess, Tensor):
         difference = excess.clamp(NORM_EPSILON, LARGEST_DIFFERENCE**2).sqrt()
         growth, root = difference.expm1(), (0.5 * difference).exp()
     else:
-        difference = math.sqrt(min(max(excess, NORM_EPSILON), LARGEST_DIFFERENCE**2))
-        growth, root = math.expm1(difference), math.exp(0.5 * difference)
+        number = math.sqrt(min(max(excess, NORM_EPSILON), LARGEST_DIFFERENCE**2))
+        growth, root = math.expm1(number), math.exp(0.5 * number)
     return growth / (growth + 2.0), growth + 1.0, root + 1.0 / root, growth / root
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from functools import partial
+from numbers import Integral
 from types import FunctionType
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
@@ -134,11 +135,17 @@ Segment: TypeAlias = "int | Literal['auto'] | None"
 SEGMENT = 10
 
 
-def check_repetition(times: int, segment: Segment, name: str = "times") -> None:
-    """Raise the errors of :func:`repeated`, where the caller calls ``times`` by this name."""
-    checks.whole(name, times, 0)
-    if segment not in (None, "auto") and (isinstance(segment, bool) or not (isinstance(segment, int) and segment >= 1)):
-        raise ValueError(f"segment must be at least 1, None or 'auto', got {segment!r}")
+def check_repetition(times: int, segment: Segment, name: str = "times") -> tuple[int, Segment]:
+    """``times``, which the caller calls by this name, and ``segment``, of Python's integers where they are integers.
+
+    Raises the errors of :func:`repeated`.
+    """
+    given: Any = segment
+    if given not in (None, "auto"):
+        if isinstance(given, bool) or not isinstance(given, Integral) or int(given) < 1:
+            raise ValueError(f"segment must be at least 1, None or 'auto', got {given!r}")
+        segment = int(given)
+    return checks.whole(name, times, 0), segment
 
 
 def repeated(step: Callable[[State], State], state: State, times: int, *, segment: Segment = None) -> State:
@@ -158,7 +165,7 @@ def repeated(step: Callable[[State], State], state: State, times: int, *, segmen
         RuntimeError: In the backward pass: a tensor that a step reads was changed in place before its replay. The
             state, tensors that ``step`` names, and all that goes into :meth:`torchmpm.Solver.step` are watched.
     """
-    check_repetition(times, segment)
+    times, segment = check_repetition(times, segment)
     segment = SEGMENT if segment == "auto" else segment
     if segment is None or segment >= times or not torch.is_grad_enabled():
         for _ in range(times):

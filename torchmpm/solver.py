@@ -139,6 +139,8 @@ class Solver:
         if not self.bodies:
             raise ValueError("bodies must hold at least one Body, got none")
         checks.instances("rules", self.rules, VelocityRule)
+        for name in ("bodies", "rules"):  # a list could change behind the tables that backends keep
+            object.__setattr__(self, name, tuple(getattr(self, name)))
         if not isinstance(self.gravity, Tensor):
             if not isinstance(self.gravity, Sequence) or len(self.gravity) != 2:
                 raise ValueError(f"gravity must be two numbers (x, y) or a tensor, got {self.gravity!r}")
@@ -233,7 +235,7 @@ class Solver:
             RuntimeError: In the backward pass: one of these tensors was changed in place, and is read again there.
         """
         checks.instance("state", state, ParticleState)
-        check_repetition(substeps, segment, "substeps")
+        substeps, segment = check_repetition(substeps, segment, "substeps")
         origin = self.check(state, actuation, origin)
         if substeps == 0 or state.batch_size == 0:
             return state

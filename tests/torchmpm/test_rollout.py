@@ -4,12 +4,13 @@ import gc
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from scenes import lively, normal, robot
 from torch import Tensor
 
-from torchmpm import Body, Elastic, ParticleState, repeated, trajectory
+from torchmpm import Body, Elastic, ParticleState, estimate_memory, repeated, trajectory
 from torchmpm.backends import compiler_found
 from torchmpm.memory import PeakMemory
 
@@ -66,6 +67,24 @@ def test_repeated_takes_tuples() -> None:
     (slope,) = torch.autograd.grad(a + b, x)
     # Fibonacci: x, 2x, 2x^2, 4x^3, 8x^5, 32x^8, 256x^13
     assert (a.item(), b.item(), slope.item()) == (32.0, 256.0, 32.0 * 8 + 256.0 * 13)
+
+
+@pytest.mark.parametrize("backend", ["eager", pytest.param("native", marks=NATIVE)])
+def test_numbers_of_numpy(backend: str) -> None:
+    """Count like others: a segment of two is one natively too."""
+    solver, state = robot(5, backend=backend), lively(5)
+    given = replace(state, v=state.v.clone().requires_grad_())
+    calls = []
+    with torch.autograd.graph.saved_tensors_hooks(lambda t: calls.append(t) or t, lambda t: t):
+        results = []
+        for kind in (int, np.int64):
+            before = len(calls)
+            solver.step(given, substeps=kind(6), segment=kind(2))
+            results.append(len(calls) - before)
+    assert results[0] == results[1]
+    sizes = {estimate_memory(solver, state, substeps=kind(6), segment=kind(2)) for kind in (int, np.int64)}
+    assert len(sizes) == 1
+    assert repeated(double, torch.ones(1), np.int64(3), segment=np.int64(2)).item() == 8.0
 
 
 def test_repeated_rejects() -> None:

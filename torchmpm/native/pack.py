@@ -8,7 +8,7 @@ import math
 import os
 import shutil
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import torch
@@ -64,8 +64,8 @@ def unsupported(solver: Solver, device: torch.device) -> str | None:
 
 
 @functools.cache
-def _overridden(solver: type[Solver], grid: type[Grid]) -> str | None:
-    """The first part of a substep that a subclass has its own of, or ``None``."""
+def _overridden(solver: Any, grid: Any) -> str | None:
+    """The first part of a substep that these types have their own of, or ``None``."""
     from torchmpm.solver import Solver  # not at the top: the solver imports this module
 
     of_solver = ("scene", "substep", "to_grid", "_internal_force", "parts", "per_particle")
