@@ -8,7 +8,7 @@ import math
 import os
 import shutil
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import torch
@@ -47,7 +47,7 @@ def unsupported(solver: Solver, device: torch.device) -> str | None:
             return missing
         if torch.are_deterministic_algorithms_enabled() and not torch.is_deterministic_algorithms_warn_only_enabled():
             return "on CUDA its sums are taken in no fixed order, torch.use_deterministic_algorithms(True) forbids that"
-    own = _overridden(type(solver), type(solver.grid))
+    own = _overridden(solver)
     if own is not None:
         return f"it would go past {own}, which the substep calls"
     for body in solver.bodies:
@@ -63,16 +63,18 @@ def unsupported(solver: Solver, device: torch.device) -> str | None:
     return None
 
 
-@functools.cache
-def _overridden(solver: Any, grid: Any) -> str | None:
-    """The first part of a substep that these types have their own of, or ``None``."""
+def _overridden(solver: Solver) -> str | None:
+    """The first part of a substep that the type of a solver, or of its grid, has its own of, or ``None``."""
     from torchmpm.solver import Solver  # not at the top: the solver imports this module
 
     of_solver = ("scene", "substep", "to_grid", "_internal_force", "parts", "per_particle")
-    for given, known, names in ((solver, Solver, of_solver), (grid, Grid, ("h", "width", "contains"))):
-        for name in names:
-            if getattr(given, name) is not getattr(known, name):
-                return f"{given.__name__}.{name}"
+    for kind, known, names in (
+        (type(solver), Solver, of_solver),
+        (type(solver.grid), Grid, ("h", "width", "contains")),
+    ):
+        for name in names if kind is not known else ():
+            if getattr(kind, name) is not getattr(known, name):
+                return f"{kind.__name__}.{name}"
     return None
 
 
