@@ -99,8 +99,10 @@ def substep_function(solver: Solver, scene: Scene) -> Callable[[Planes], Planes]
     if solver.backend == "compile":
         run = _compiled(run)
 
+    read = {"origin": scene.origin} | solver.tensors
+
     def substep(planes: Planes) -> Planes:
-        reads({"solver": solver, "origin": scene.origin})
+        reads(read)
         return run(solver, scene, planes)
 
     return substep

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from functools import partial
 from numbers import Integral
 from types import FunctionType
@@ -77,23 +77,33 @@ def reads(values: Mapping[str, Any]) -> None:
         values: Tensors by name, or tuples, lists, mappings and dataclasses of them; anything else is ignored.
     """
     if _running.segments:
-        for name, tensor in _tensors(values, ""):
+        for name, tensor in tensors(values).items():
             for segment in _running.segments:
                 segment.read(name, tensor)
 
 
-def _tensors(value: Any, name: str) -> Iterator[tuple[str, Tensor]]:
-    if isinstance(value, Tensor):
-        yield name, value
-    elif isinstance(value, tuple | list):
-        for index, item in enumerate(value):
-            yield from _tensors(item, f"{name}[{index}]")
-    elif isinstance(value, Mapping):
-        for key, item in value.items():
-            yield from _tensors(item, f"{name}.{key}" if name else str(key))
-    elif is_dataclass(value) and not isinstance(value, type):
-        for field in fields(value):
-            yield from _tensors(getattr(value, field.name), f"{name}.{field.name}")
+def tensors(values: Mapping[str, Any]) -> dict[str, Tensor]:
+    """The tensors among ``values``, see :func:`reads`, by names such as ``state.x`` and ``bodies[0].mass``."""
+    found: dict[str, Tensor] = {}
+
+    def collect(value: Any, name: str) -> None:
+        if isinstance(value, Tensor):
+            found[name] = value
+        elif value is None or isinstance(value, int | float | str):
+            pass
+        elif isinstance(value, tuple | list):
+            for index, item in enumerate(value):
+                collect(item, f"{name}[{index}]")
+        elif isinstance(value, Mapping):
+            for key, item in value.items():
+                collect(item, f"{name}.{key}")
+        elif is_dataclass(value) and not isinstance(value, type):
+            for key in value.__dataclass_fields__:
+                collect(getattr(value, key), f"{name}.{key}")
+
+    for name, value in values.items():
+        collect(value, name)
+    return found
 
 
 def _captured(function: Callable[..., Any]) -> dict[str, Tensor]:

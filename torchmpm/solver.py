@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -19,7 +20,7 @@ from torchmpm.grid import PAD, Grid
 from torchmpm.linalg import Mat2, matmul
 from torchmpm.material import Material, Sym2, Value, column, spread
 from torchmpm.native.library import NO_COMPILER
-from torchmpm.rollout import Segment, check_repetition, reads, repeated
+from torchmpm.rollout import Segment, check_repetition, reads, repeated, tensors
 from torchmpm.spline import Stencil, stencil
 from torchmpm.state import ParticleState
 
@@ -158,10 +159,14 @@ class Solver:
                 "allow_unstable=True accepts it"
             )
 
+    @cached_property
+    def tensors(self) -> dict[str, Tensor]:
+        """Constants of the matter, and gravity, that are tensors; by names such as ``bodies[0].material.mu``."""
+        return tensors({"bodies": self.bodies, "gravity": self.gravity})
+
     def _vmapped(self) -> bool:
         """Whether constants may be tensors of a ``vmap``, under which nothing can depend on the numbers they hold."""
-        values = (v for body in self.bodies for v in (body.mass, body.volume, *vars(body.material).values()))
-        return vmapping() and any(isinstance(value, Tensor) for value in values)
+        return bool(self.tensors) and vmapping()
 
     @property
     def num_particles(self) -> int:
@@ -239,7 +244,7 @@ class Solver:
         origin = self.check(state, actuation, origin)
         if substeps == 0 or state.batch_size == 0:
             return state
-        reads({"solver": self, "state": state, "actuation": actuation, "origin": origin})
+        reads({"state": state, "actuation": actuation, "origin": origin} | self.tensors)
         if runs_native(self, state, actuation, origin):
             return native.step(self, state, actuation, origin, substeps, segment, mass_epsilon=MASS_EPSILON)
         substep = substep_function(self, self.scene(state, actuation, origin))
