@@ -166,7 +166,7 @@ class Solver:
 
     def _vmapped(self) -> bool:
         """Whether constants may be tensors of a ``vmap``, under which nothing can depend on the numbers they hold."""
-        return bool(self.tensors) and vmapping()
+        return vmapping() and bool(self.tensors)
 
     @property
     def num_particles(self) -> int:
