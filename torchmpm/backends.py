@@ -13,12 +13,14 @@ from torch.autograd import forward_ad
 
 from torchmpm import native
 from torchmpm.native.library import find_compiler
+from torchmpm.rollout import reads, transforming
 
 if TYPE_CHECKING:
     from torchmpm.solver import Scene, Solver
     from torchmpm.state import ParticleState
 
 Planes = tuple[Tensor, ...]
+Substep = Callable[["Solver", "Scene", Planes], Planes]
 
 BACKENDS = ("auto", "eager", "compile", "native")
 _logger = logging.getLogger(__name__)
@@ -41,11 +43,17 @@ def runs_native(solver: Solver, state: ParticleState, *fields: Tensor | None) ->
         fields: What else the step depends on.
 
     Raises:
-        ValueError: The backend is ``"native"`` and cannot run this.
+        ValueError: The backend is ``"native"``, or ``"compile"``, and cannot run this.
     """
+    if solver.backend == "compile" and not transforming() and _has_tangents(solver, state, fields):
+        raise ValueError("backend 'compile' loses the tangents of forward_ad; use 'eager', or torch.func.jvp")
     if solver.backend not in ("auto", "native"):
         return False
-    reason = native.unsupported(solver, state.device) or _transformed(solver, state, fields)
+    reason = native.unsupported(solver, state.device)
+    if reason is None and transforming():
+        reason = "the transforms of torch.func do not go through its kernels"
+    elif reason is None and _has_tangents(solver, state, fields):
+        reason = "it has no forward-mode derivatives"
     if solver.backend == "native":
         if reason is not None:
             raise ValueError(f"backend 'native' cannot run this: {reason}; use 'eager'")
@@ -62,15 +70,17 @@ def runs_native(solver: Solver, state: ParticleState, *fields: Tensor | None) ->
     return reason is None
 
 
-def _transformed(solver: Solver, state: ParticleState, fields: Sequence[Tensor | None]) -> str | None:
-    """Which way of torch to differentiate is at work that would go past the kernels, or ``None``."""
-    if torch._C._are_functorch_transforms_active():  # torch has no public name for it
-        return "the transforms of torch.func do not go through its kernels"
+def vmapping() -> bool:
+    """Whether a ``torch.func.vmap`` is at work."""
+    stack = torch._C._functorch.get_interpreter_stack() if transforming() else None
+    return any(interpreter.key() == torch._C._functorch.TransformType.Vmap for interpreter in stack or ())
+
+
+def _has_tangents(solver: Solver, state: ParticleState, fields: Sequence[Tensor | None]) -> bool:
+    """Whether anything that a step depends on is a dual tensor of :mod:`torch.autograd.forward_ad`."""
     values = (*vars(state).values(), *fields, solver.gravity)
     values += tuple(value for body in solver.bodies for part in (body, body.material) for value in vars(part).values())
-    if any(isinstance(value, Tensor) and forward_ad.unpack_dual(value).tangent is not None for value in values):
-        return "it has no forward-mode derivatives"
-    return None
+    return any(isinstance(value, Tensor) and forward_ad.unpack_dual(value).tangent is not None for value in values)
 
 
 @functools.cache
@@ -85,14 +95,21 @@ def substep_function(solver: Solver, scene: Scene) -> Callable[[Planes], Planes]
     faster, after about ten seconds of compilation for each new combination of solver and shapes in a process (less with
     TorchInductor's cache on disk). More than eight combinations in one process run eagerly again.
     """
-    run = _compiled() if solver.backend == "compile" else type(solver).substep
-    return lambda planes: run(solver, scene, planes)
+    run: Substep = type(solver).substep
+    if solver.backend == "compile":
+        run = _compiled(run)
+
+    read = {"origin": scene.origin} | solver.tensors
+
+    def substep(planes: Planes) -> Planes:
+        reads(read)
+        return run(solver, scene, planes)
+
+    return substep
 
 
 @functools.cache
-def _compiled() -> Callable[[Solver, Scene, Planes], Planes]:
-    from torchmpm.solver import Solver  # not at the top: the solver imports this module
-
+def _compiled(substep: Substep) -> Substep:
     # Sums over the nine nodes become one expression that computes their addresses once; addresses are clamped already.
     options: dict[str, Any] = {"unroll_reductions_threshold": 16, "assert_indirect_indexing": False}
-    return torch.compile(Solver.substep, dynamic=False, options=options)
+    return torch.compile(substep, dynamic=False, options=options)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Literal
 
 import torch
@@ -55,11 +56,12 @@ class VelocityRule:
             checks.number("friction", self.friction, least=0.0)
         for name, given in (("i", self.i), ("j", self.j)):
             ends = [end for end in given if end is not None] if isinstance(given, tuple) and len(given) == 2 else [None]
-            if not all(isinstance(end, int) for end in ends) or ends != sorted(ends):
+            if not all(isinstance(end, Integral) for end in ends) or ends != sorted(ends):
                 raise ValueError(
                     f"{name} must be an inclusive range (low, high) of node indices or None with low <= high, "
                     f"got {given!r}"
                 )
+            object.__setattr__(self, name, tuple(None if end is None else int(end) for end in given))
 
 
 def fixed(
@@ -83,8 +85,8 @@ class Face:
         axis: 0 for x, 1 for y.
         sign: +1 or -1, the sign of the removed component.
         active: (1 or B, cells) nodes with a rule.
-        stick: (1 or B, cells) nodes of these that stick, or ``None`` if there are none.
-        friction: (1 or B, cells) Coulomb coefficients, or ``None`` if all are zero.
+        stick: (1 or B, cells) nodes of these that stick, or ``None`` if no rule does.
+        friction: (1 or B, cells) Coulomb coefficients, or ``None`` if no rule rubs.
     """
 
     axis: int
@@ -111,11 +113,10 @@ def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Fa
     shift = node_shift(grid, origin)
     result = []
     for direction in dict.fromkeys(rule.direction for rule in rules):
+        same = [rule for rule in rules if rule.direction == direction]
         active = torch.zeros(1, grid.width, grid.width, dtype=torch.bool, device=origin.device)
         stick, friction = active, torch.zeros_like(active, dtype=origin.dtype)
-        for rule in rules:
-            if rule.direction != direction:
-                continue
+        for rule in same:
             inside = []
             for axis, (low, high) in enumerate((rule.i, rule.j)):
                 bounded = low is not None or high is not None
@@ -133,8 +134,8 @@ def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Fa
                 axis="xy".index(direction[1]),
                 sign=1 if direction[0] == "+" else -1,
                 active=active.flatten(1),
-                stick=stick.flatten(1) if stick.any() else None,
-                friction=friction.flatten(1) if friction.any() else None,
+                stick=stick.flatten(1) if any(math.isinf(rule.friction) for rule in same) else None,
+                friction=friction.flatten(1) if any(0 < rule.friction < math.inf for rule in same) else None,
             )
         )
     return tuple(result)
@@ -156,7 +157,7 @@ def constrain(faces: Sequence[Face], velocity: Tensor) -> Tensor:
         hit = face.active & (normal > 0 if face.sign > 0 else normal < 0)
         if face.friction is not None:
             left = (tangent.abs() - face.friction * normal.abs()).clamp_min(0.0)
-            tangent = torch.where(hit, torch.copysign(left, tangent), tangent)
+            tangent = torch.where(hit & (face.friction > 0), torch.copysign(left, tangent), tangent)
         if face.stick is not None:
             tangent = torch.where(hit & face.stick, 0.0, tangent)
         component[face.axis], component[1 - face.axis] = torch.where(hit, 0.0, normal), tangent

@@ -114,16 +114,27 @@ def corotated_energy(F: Mat2, mu: Value, lam: Value, J: Tensor | None = None) ->
     return mu * distance + 0.5 * lam * ((det(F) if J is None else J) - 1.0).square()
 
 
-def _sqrt(value: Value) -> Value:
-    return value.sqrt() if isinstance(value, Tensor) else math.sqrt(value)
+def yield_values(limit: Value) -> tuple[Value, Value, Value, Value]:
+    """What :func:`von_mises_return` needs to know of the principal stretches at yield.
 
+    From exp(d) - 1 with their logarithms' difference d, for the digits that the ratio alone would lose in small d.
 
-def yield_ratio(limit: Value) -> Value:
-    """Ratio of the principal stretches at yield, for a limit of :func:`von_mises_return`."""
+    Args:
+        limit: Yield stress / (2 mu).
+
+    Returns:
+        Difference over sum of the stretches, their ratio, and sum and difference of its square root and the inverse.
+    """
     excess = 2.0 * (limit * limit - NORM_EPSILON)
+    growth: Value
+    root: Value
     if isinstance(excess, Tensor):
-        return excess.clamp(NORM_EPSILON, LARGEST_DIFFERENCE**2).sqrt().exp()
-    return math.exp(math.sqrt(min(max(excess, NORM_EPSILON), LARGEST_DIFFERENCE**2)))
+        difference = excess.clamp(NORM_EPSILON, LARGEST_DIFFERENCE**2).sqrt()
+        growth, root = difference.expm1(), (0.5 * difference).exp()
+    else:
+        number = math.sqrt(min(max(excess, NORM_EPSILON), LARGEST_DIFFERENCE**2))
+        growth, root = math.expm1(number), math.exp(0.5 * number)
+    return growth / (growth + 2.0), growth + 1.0, root + 1.0 / root, growth / root
 
 
 def von_mises_return(F: Mat2, limit: Value) -> Mat2:
@@ -141,8 +152,7 @@ def von_mises_return(F: Mat2, limit: Value) -> Mat2:
         F: Trial deformation gradient, planes (B, N).
         limit: Yield stress / (2 mu), a number or broadcastable to (B, N).
     """
-    ratio = yield_ratio(limit)
-    slope = (ratio - 1.0) / (ratio + 1.0)  # difference over sum of the stretches at yield
+    slope, ratio, plus, minus = yield_values(limit)
     p, q, r, s = split(F)
     rotation, reflection = p.square() + q.square(), r.square() + s.square()
     proper = rotation >= reflection
@@ -155,8 +165,7 @@ def von_mises_return(F: Mat2, limit: Value) -> Mat2:
     minor = (0.5 * (total - difference)).clamp_min(STRETCH_FLOOR)
     yields = beyond & (major > minor * ratio)
     mean = (major * minor).sqrt()
-    root = _sqrt(ratio)
-    grow_total, grow_difference = mean * (root + 1.0 / root) / total, mean * (root - 1.0 / root) / difference
+    grow_total, grow_difference = mean * plus / total, mean * minus / difference
     of_rotation = 0.5 * torch.where(proper, grow_total, grow_difference)
     of_reflection = 0.5 * torch.where(proper, grow_difference, grow_total)
     return (
@@ -363,5 +372,9 @@ class Soil(Elastic):
         return min(max(1.0, low), high) * super().stiffness()
 
     def _hardened(self, Jp: Tensor) -> tuple[Value, Value]:
-        factor = torch.exp(column(self.hardening, Jp, "hardening") * (1.0 - Jp)).clamp(*self.hardening_range)
+        low, high = self.hardening_range
+        exponent = column(self.hardening, Jp, "hardening") * (1.0 - Jp)
+        if high > 0:  # beyond it an exponential could overflow, whose derivative is no number even where it is clamped
+            exponent = exponent.clamp_max(math.log(high) + 0.01)
+        factor = exponent.exp().clamp(low, high)
         return factor * column(self.mu, Jp, "mu"), factor * column(self.lam, Jp, "lam")

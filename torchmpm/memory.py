@@ -17,7 +17,7 @@ from torch.utils.weak import WeakIdKeyDictionary
 from torchmpm import checks
 from torchmpm.backends import runs_native, substep_function
 from torchmpm.native import ops, pack
-from torchmpm.rollout import SEGMENT, Segment, repeated
+from torchmpm.rollout import SEGMENT, Segment, check_repetition, repeated
 from torchmpm.solver import MASS_EPSILON, Solver
 from torchmpm.state import ParticleState
 
@@ -93,6 +93,7 @@ def estimate_memory(
     batch = state.batch_size if isinstance(state, ParticleState) else state[0]
     for name, number in (("substeps", substeps), ("env_steps", env_steps), ("the state's batch size", batch)):
         checks.whole(name, number, 1)
+    substeps, segment = check_repetition(substeps, segment, "substeps")
     share = _occupied(solver, state)
     state = _empty(solver, state)
     if runs_native(solver, state):

@@ -133,9 +133,10 @@ def image(numbers: Points, mask: NDArray[np.bool_], corner: tuple[float, float],
     if not counts.any():
         raise ValueError("mask must have at least one pixel set, got none")
     edges = np.concatenate(([0], np.cumsum(counts)))
-    place = numbers[:, 0] * edges[-1]
+    # A one is the end of the last pixel, not the start of another.
+    place = np.minimum(numbers[:, 0] * edges[-1], np.nextafter(edges[-1], 0.0))
     column = np.searchsorted(edges, place, side="right") - 1
-    depth = numbers[:, 1] * counts[column]
+    depth = np.minimum(numbers[:, 1] * counts[column], np.nextafter(counts[column], 0.0))
     rank = edges[column] + depth.astype(np.int64)
     row = np.nonzero(pixels)[1][rank]
     points = np.stack((column + (place - edges[column]) / counts[column], row + depth % 1.0), axis=1)

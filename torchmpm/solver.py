@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -13,13 +14,13 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchmpm import checks, muscle, native, transfer
-from torchmpm.backends import BACKENDS, compiler_found, runs_native, substep_function
+from torchmpm.backends import BACKENDS, compiler_found, runs_native, substep_function, vmapping
 from torchmpm.boundary import Face, VelocityRule, constrain, faces
 from torchmpm.grid import PAD, Grid
 from torchmpm.linalg import Mat2, matmul
 from torchmpm.material import Material, Sym2, Value, column, spread
 from torchmpm.native.library import NO_COMPILER
-from torchmpm.rollout import Segment, check_repetition, repeated
+from torchmpm.rollout import Segment, check_repetition, reads, repeated, tensors
 from torchmpm.spline import Stencil, stencil
 from torchmpm.state import ParticleState
 
@@ -139,6 +140,8 @@ class Solver:
         if not self.bodies:
             raise ValueError("bodies must hold at least one Body, got none")
         checks.instances("rules", self.rules, VelocityRule)
+        for name in ("bodies", "rules"):  # a list could change behind the tables that backends keep
+            object.__setattr__(self, name, tuple(getattr(self, name)))
         if not isinstance(self.gravity, Tensor):
             if not isinstance(self.gravity, Sequence) or len(self.gravity) != 2:
                 raise ValueError(f"gravity must be two numbers (x, y) or a tensor, got {self.gravity!r}")
@@ -150,11 +153,20 @@ class Solver:
             raise ValueError(f"backend must be one of {BACKENDS}, got {self.backend!r}")
         if self.backend in ("compile", "native") and not compiler_found() and not torch.cuda.is_available():
             raise ValueError(f"backend {self.backend!r} {NO_COMPILER}")
-        if not self.allow_unstable and self.dt > (limit := self.stable_dt()):
+        if not (self.allow_unstable or self._vmapped()) and self.dt > (limit := self.stable_dt()):
             raise ValueError(
                 f"dt must be at most {limit} s for matter so stiff and light to be stable, got {self.dt}; "
                 "allow_unstable=True accepts it"
             )
+
+    @cached_property
+    def tensors(self) -> dict[str, Tensor]:
+        """Constants of the matter, and gravity, that are tensors; by names such as ``bodies[0].material.mu``."""
+        return tensors({"bodies": self.bodies, "gravity": self.gravity})
+
+    def _vmapped(self) -> bool:
+        """Whether constants may be tensors of a ``vmap``, under which nothing can depend on the numbers they hold."""
+        return vmapping() and bool(self.tensors)
 
     @property
     def num_particles(self) -> int:
@@ -225,12 +237,14 @@ class Solver:
             ValueError: Shapes, dtypes or devices do not fit together, or the native backend was chosen and cannot run
                 this.
             TypeError: The state, the actuation or the origin is something else.
+            RuntimeError: In the backward pass: one of these tensors was changed in place, and is read again there.
         """
         checks.instance("state", state, ParticleState)
-        check_repetition(substeps, segment, "substeps")
+        substeps, segment = check_repetition(substeps, segment, "substeps")
         origin = self.check(state, actuation, origin)
         if substeps == 0 or state.batch_size == 0:
             return state
+        reads({"state": state, "actuation": actuation, "origin": origin} | self.tensors)
         if runs_native(self, state, actuation, origin):
             return native.step(self, state, actuation, origin, substeps, segment, mass_epsilon=MASS_EPSILON)
         substep = substep_function(self, self.scene(state, actuation, origin))

@@ -71,6 +71,7 @@ def stencil(grid: Grid, x: Tensor, y: Tensor, origin: Tensor) -> Stencil:
         u = (position - start) * (1.0 / grid.h)
         base = torch.trunc(u.detach() - 0.5)
         f = u - base
+        f = torch.where(torch.isnan(f), 1.0, f)  # a particle at no place is on padding; it spoils no shared derivative
         fraction.append(f)
         weight.append(quadratic_weights(f))
         # Clamped before the conversion, which is undefined for large numbers; a NaN ends at the low end: padding.

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchmpm import checks
+from torchmpm.rollout import transforming
 
 #: Trailing shape of every field after the leading (B, N).
 _TRAILING = {"x": (2,), "v": (2,), "C": (2, 2), "F": (2, 2), "Jp": ()}
@@ -89,7 +90,7 @@ class ParticleState:
             x=x,
             v=torch.zeros_like(x),
             C=x.new_zeros(batch, count, 2, 2),
-            F=identity.expand(batch, count, 2, 2),
+            F=identity.repeat(batch, count, 1, 1),
             Jp=x.new_ones(batch, count),
         )
 
@@ -173,11 +174,19 @@ class ParticleState:
     def stack(self) -> Tensor:
         """The :meth:`planes` as one tensor (13, B, N); no copy of what :meth:`from_stack` made, unless with a graph."""
         stacked: Tensor | None = getattr(self, "_stack", None)
-        # With a graph the tensor goes through the fields, so that derivatives in them can be asked for.
-        if stacked is None or stacked.requires_grad or any(getattr(self, f.name).requires_grad for f in fields(self)):
+        if stacked is None or stacked.requires_grad or transforming():
             return torch.stack(self.planes())
+        memory = stacked.untyped_storage()._cdata
+        for field in (self.x, self.v, self.C, self.F, self.Jp):
+            # With a graph the tensor goes through the fields, so that derivatives in them can be asked for. And
+            # ``state.x.data = ...`` gives a field other memory.
+            if field.requires_grad or field.untyped_storage()._cdata != memory:
+                return torch.stack(self.planes())
         return stacked
 
     def map(self, function: Callable[..., Tensor], *others: ParticleState) -> ParticleState:
         """Apply ``function`` to every field, together with the same field of ``others``."""
         return ParticleState(*(function(*(getattr(s, f.name) for s in (self, *others))) for f in fields(self)))
+
+
+torch.serialization.add_safe_globals([ParticleState])  # its tensors are all that a file holds of it

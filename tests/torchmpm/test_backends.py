@@ -1,21 +1,23 @@
 """Backends: the same numbers, and clear words where one cannot run."""
 
 import importlib.util
+import math
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from scenes import assert_close, assert_identical, lively, normal, robot, robot_and_ball
+from scenes import GRID, assert_close, assert_identical, lively, normal, robot, robot_and_ball
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.autograd import forward_ad
 
-from torchmpm import Body, ParticleState, Solver, VonMises, backends
+from torchmpm import Body, Grid, ParticleState, Solver, VelocityRule, VonMises, backends, trajectory
 from torchmpm.backends import BACKENDS, compiler_found
 from torchmpm.native import library, pack, unsupported
+from torchmpm.solver import Scene
 
 
 def run(solver: Solver) -> tuple[ParticleState, tuple[Tensor, ...]]:
@@ -49,6 +51,15 @@ def fresh_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "_loaded", {})
 
 
+@pytest.fixture
+def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """``"compile"`` without waiting for a compiler."""
+    monkeypatch.setattr(torch, "compile", lambda function, **_: function)
+    backends._compiled.cache_clear()
+    yield
+    backends._compiled.cache_clear()
+
+
 def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.message for record in caplog.records if record.name == "torchmpm.backends"]
 
@@ -74,7 +85,79 @@ def test_auto_is_eager_where_it_does_not(fresh_process: None, caplog: pytest.Log
     assert "a body has Own" in message and "operator by operator" in message
 
 
-def test_transforms_of_torch_func_get_what_eager_gives(fresh_process: None, caplog: pytest.LogCaptureFixture) -> None:
+class Still(Solver):
+    """Its particles rest."""
+
+    def substep(self, scene: Scene, planes: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """Nothing moves."""
+        return planes
+
+
+class Narrow(Grid):
+    """Of its particles none takes part."""
+
+    def contains(self, x: Tensor, origin_x: Tensor) -> Tensor:
+        """None."""
+        return x != x
+
+
+@pytest.mark.parametrize("name", ["Still.substep", "Narrow.contains"])
+def test_subclasses_are_heard(
+    name: str, fresh_process: None, uncompiled: None, caplog: pytest.LogCaptureFixture
+) -> None:
+    """By every backend; the kernels do not call what they override, and say so."""
+    kind, grid = (Still, GRID) if name.startswith("Still") else (Solver, Narrow(16))
+    state, body = lively(30), Body(30, VonMises(500.0, 50.0, 60.0))
+    for backend in ("auto", "eager", *(("compile",) if compiler_found() else ())):
+        assert_identical(kind(grid, (body,), backend=backend).step(state, substeps=2), state)
+    (message,) = messages(caplog)
+    if compiler_found():
+        assert f"it would go past {name}, which the substep calls" in message
+        with pytest.raises(ValueError, match=f"cannot run this: it would go past {name}"):
+            kind(grid, (body,), backend="native").step(state)
+
+
+@pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
+def test_subclasses_that_change_nothing_stay_fast(fresh_process: None, caplog: pytest.LogCaptureFixture) -> None:
+    class Named(Solver):
+        """Only has more to say."""
+
+        def title(self) -> str:
+            """What it is."""
+            return "named"
+
+    solver, state = robot(30, backend="auto"), lively(30)
+    assert_identical(
+        Named(**vars(solver)).step(state, substeps=2), replace(solver, backend="native").step(state, substeps=2)
+    )
+    assert messages(caplog) == []
+
+
+def test_long_steps_go_through_torch_func() -> None:
+    """Which knows no checkpoints; and through vmap, with rules and a constant for each."""
+    state, zeros = lively(5), torch.zeros(2, 1, 5, 2, dtype=torch.float64)
+    rules = (VelocityRule("-y", j=(None, 6), friction=0.4), VelocityRule("-x", i=(None, 6), friction=math.inf))
+
+    def loss(shift: Tensor, mu: Tensor) -> Tensor:
+        solver = robot(5, bodies=(Body(5, VonMises(mu, 50.0, 60.0), mass=2.0),), rules=rules, backend="auto")
+        last, _ = trajectory(
+            lambda s, _: solver.step(s, substeps=50), replace(state, x=state.x + shift), range(2), observe=id
+        )
+        return last.F.square().sum()
+
+    arguments = zeros[0].clone().requires_grad_(), torch.tensor(500.0, dtype=torch.float64, requires_grad=True)
+    expected = torch.autograd.grad(loss(*arguments), arguments)
+    got = torch.func.grad(loss, (0, 1))(*(a.detach() for a in arguments))
+    mapped = torch.func.vmap(torch.func.grad(loss, (0, 1)))(zeros, torch.full((2,), 500.0, dtype=torch.float64))
+    for one, each, other in zip(got, mapped, expected, strict=True):
+        assert other.abs().max() > 0
+        for gradient in (one, *each):
+            torch.testing.assert_close(gradient, other, rtol=1e-9, atol=1e-12 * other.abs().max().item())
+
+
+def test_transforms_of_torch_func_get_what_eager_gives(
+    fresh_process: None, uncompiled: None, caplog: pytest.LogCaptureFixture
+) -> None:
     """Forward-mode derivatives too, in actuation and constants, which would be lost on the way through the kernels."""
     state, drive = lively(20, 2), normal(2, 2, 16, 16, seed=1)
     mu = torch.tensor(500.0, dtype=torch.float64)
@@ -93,7 +176,8 @@ def test_transforms_of_torch_func_get_what_eager_gives(fresh_process: None, capl
         lambda f: torch.func.grad(f, (0, 1))(drive, mu),
         lambda f: torch.func.vmap(lambda factor: f(factor * drive, mu))(torch.arange(3.0, dtype=torch.float64)),
     ):
-        torch.testing.assert_close(transform(loss("auto")), transform(loss("eager")), rtol=0, atol=0)
+        for backend in ("auto", *(("compile",) if compiler_found() else ())):
+            torch.testing.assert_close(transform(loss(backend)), transform(loss("eager")), rtol=0, atol=0)
         with pytest.raises(ValueError, match=r"backend 'native' cannot run this: the transforms of torch\.func"):
             transform(loss("native"))
     with forward_ad.dual_level():
@@ -102,6 +186,8 @@ def test_transforms_of_torch_func_get_what_eager_gives(fresh_process: None, capl
             assert auto is not None and auto == eager != 0
             with pytest.raises(ValueError, match="it has no forward-mode derivatives"):
                 loss("native")(*pair)
+            with pytest.raises(ValueError, match="'compile' loses the tangents of forward_ad; use 'eager'"):
+                loss("compile")(*pair)
     assert len(messages(caplog)) == 2
 
 

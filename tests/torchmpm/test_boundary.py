@@ -3,6 +3,7 @@
 import itertools
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -96,6 +97,12 @@ def test_the_first_rule_that_covers_a_node_counts() -> None:
     rough = VelocityRule("-y", i=(3, 6), friction=0.25)
     assert apply((rough, sticky), velocity)[0, 0, :, 0].tolist() == [1, 1, 1, 0.75, 0.75, 0.75, 0.75, 1]
     assert apply((sticky, rough), velocity)[0, 0, :, 0].tolist() == [1, 1, 1, 0, 0, 0, 0, 1]
+
+
+def test_ranges_of_numpy_are_ranges() -> None:
+    low, high = np.int64(3), np.int32(5)
+    assert VelocityRule("-y", i=(low, high), j=(None, low)) == VelocityRule("-y", i=(3, 5), j=(None, 3))
+    assert type(VelocityRule("-y", i=(low, high)).i[0]) is int
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import torch
 from native_scenes import moving, solvers
 from scenes import GRID, assert_close, assert_identical, generator, lively, normal, positions, robot
 
-from torchmpm import Body, Elastic, ParticleState, Solver, diagnostics, estimate_memory
+from torchmpm import Body, Elastic, ParticleState, Solver, VonMises, diagnostics, estimate_memory
 
 pytestmark = pytest.mark.usefixtures("backend")
 
@@ -167,6 +167,26 @@ def test_gradients_of_a_broken_element_harm_no_other(name: str, value: float) ->
         gradients.append(torch.autograd.grad(final.x.square().sum() + final.F.square().sum(), (v, field)))
     for sound, beside in zip(*gradients, strict=True):
         assert torch.equal(sound[[0, 2]], beside[[0, 2]]) and sound[[0, 2]].abs().max() > 0
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_particle_at_no_place_harms_no_other(axis: int) -> None:
+    """It is as good as far away, for values and derivatives, also of particles below the window."""
+    results = []
+    for place in (-50.0, math.nan):
+        state, rest = lively(20), [k for k in range(20) if k != 3]
+        x, mu = state.x.clone(), torch.tensor(500.0, dtype=torch.float64, requires_grad=True)
+        x[0, 5:8, 1] -= 0.5
+        x[0, 3, 0 if place == place else axis] = place
+        x, v = x.requires_grad_(), state.v.requires_grad_()
+        body = Body(20, VonMises(mu, 50.0, 60.0), mass=2.0)
+        final = robot(20, bodies=(body,)).step(replace(state, x=x, v=v), substeps=4)
+        loss = sum(getattr(final, name)[:, rest].square().sum() for name in ("x", "v", "F"))
+        of_x, of_v, of_mu = torch.autograd.grad(loss, (x, v, mu))
+        shared = of_mu if axis == 0 or scenes.BACKEND == "eager" else torch.zeros(())
+        results.append((loss.detach(), of_x[:, rest], of_v[:, rest], shared))
+    for beside, alone in zip(results[1], results[0], strict=True):
+        torch.testing.assert_close(beside, alone, rtol=1e-10, atol=0)
 
 
 def test_a_simulation_that_flies_apart_harms_no_other() -> None:

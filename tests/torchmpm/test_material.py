@@ -9,7 +9,7 @@ from scenes import generator, normal
 from torch import Tensor
 
 from torchmpm import Elastic, VonMises, lame
-from torchmpm.material import column, corotated_energy, corotated_stress, von_mises_return
+from torchmpm.material import column, corotated_energy, corotated_stress, von_mises_return, yield_values
 
 MU, LAM, YIELD = 500.0, 50.0, 62.0
 LIMIT = YIELD / (2 * MU)
@@ -143,6 +143,19 @@ def test_stress_is_the_derivative_of_the_energy(material: Elastic) -> None:
     tau = symmetric(material.stress(planes(F.detach()), Jp))
     torch.testing.assert_close(tau, first_piola @ F.detach().mT, rtol=1e-12, atol=1e-9)
     torch.testing.assert_close(tau, tau.mT, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("limit", [2e-4, 1e-3, 0.07, 1.0, 10.0, 1e9])
+def test_yield_in_single_precision(limit: float) -> None:
+    """To its last digits: the ratio of the stretches alone holds few of a small limit."""
+    single = torch.tensor([limit])
+    difference = min(math.sqrt(2.0 * (single.item() ** 2 - 1e-8)), 40.0)
+    ratio = math.exp(difference)
+    exact = [math.tanh(difference / 2), ratio, 2 * math.cosh(difference / 2), 2 * math.sinh(difference / 2)]
+    assert yield_values(single.item()) == pytest.approx(exact, rel=1e-13)
+    assert [value.item() for value in yield_values(single)] == pytest.approx(
+        exact, rel=3e-6 if difference > 4 else 1e-6
+    )
 
 
 def test_stress_formula() -> None:

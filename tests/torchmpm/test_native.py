@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from native_scenes import NAMES, moving, solvers
 from scenes import assert_close, assert_identical, lively, normal, robot
 
-from torchmpm import Body, Grid, ParticleState, Solver, VelocityRule, VonMises
+from torchmpm import Body, Grid, ParticleState, Soil, Solver, VelocityRule, VonMises
 from torchmpm.backends import compiler_found
 from torchmpm.grid import PAD
 from torchmpm.native import pack
@@ -135,6 +136,26 @@ def test_an_element_of_a_batch_is_the_same_alone() -> None:
     for i in range(4):
         alone = solver.step(state[i], field[i : i + 1], substeps=20, origin=origin[i : i + 1])
         assert_identical(alone, together[i])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_constant_is_the_same_in_every_form(dtype: torch.dtype) -> None:
+    """Bit by bit: as a number, and beside the constants of others as one for each simulation or particle."""
+    state = lively(24, 3).to(dtype)
+    others = torch.tensor([1.3, 1.0, 0.4], dtype=dtype)
+
+    def solver(form: Callable[[float], float | torch.Tensor], yield_stress: float) -> Solver:
+        gel = VonMises(form(640.0), form(75.0), form(yield_stress))
+        bodies = (Body(12, gel, form(2.0), form(1.5)), Body(12, Soil(form(800.0), form(500.0), form(0.25)), form(1.5)))
+        return robot(24, bodies=bodies, backend="native")
+
+    for yield_stress in (0.5, 64.0, 128.0):  # limits of 4e-4, where digits are lost, to 0.1
+        alone = solver(float, yield_stress).step(state, substeps=20)
+        together = solver(lambda value: value * others, yield_stress).step(state, substeps=20)
+        each = solver(lambda value: value * others[:, None].expand(3, 12), yield_stress).step(state, substeps=20)
+        assert_identical(together[1], alone[1])
+        assert_identical(each, together)
+        assert not torch.equal(together.F[0], alone.F[0])
 
 
 def test_lower_end_of_the_window() -> None:

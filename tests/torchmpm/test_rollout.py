@@ -1,15 +1,20 @@
 """Loops over steps and their checkpoints, on a step simple enough to know the answer."""
 
 import gc
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from scenes import lively, normal, robot
 from torch import Tensor
 
-from torchmpm import ParticleState, repeated, trajectory
+from torchmpm import Body, Elastic, ParticleState, estimate_memory, repeated, trajectory
+from torchmpm.backends import compiler_found
 from torchmpm.memory import PeakMemory
+
+NATIVE = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
 
 
 def double(x: Tensor) -> Tensor:
@@ -62,6 +67,24 @@ def test_repeated_takes_tuples() -> None:
     (slope,) = torch.autograd.grad(a + b, x)
     # Fibonacci: x, 2x, 2x^2, 4x^3, 8x^5, 32x^8, 256x^13
     assert (a.item(), b.item(), slope.item()) == (32.0, 256.0, 32.0 * 8 + 256.0 * 13)
+
+
+@pytest.mark.parametrize("backend", ["eager", pytest.param("native", marks=NATIVE)])
+def test_numbers_of_numpy(backend: str) -> None:
+    """Count like others: a segment of two is one natively too."""
+    solver, state = robot(5, backend=backend), lively(5)
+    given = replace(state, v=state.v.clone().requires_grad_())
+    calls = []
+    with torch.autograd.graph.saved_tensors_hooks(lambda t: calls.append(t) or t, lambda t: t):
+        results = []
+        for kind in (int, np.int64):
+            before = len(calls)
+            solver.step(given, substeps=kind(6), segment=kind(2))
+            results.append(len(calls) - before)
+    assert results[0] == results[1]
+    sizes = {estimate_memory(solver, state, substeps=kind(6), segment=kind(2)) for kind in (int, np.int64)}
+    assert len(sizes) == 1
+    assert repeated(double, torch.ones(1), np.int64(3), segment=np.int64(2)).item() == 8.0
 
 
 def test_repeated_rejects() -> None:
@@ -142,6 +165,69 @@ def test_checkpoints_do_not_change_gradients(checkpointed: bool, segment: int | 
     assert all(g.abs().max() > 0 for g in plain)
     for with_checkpoints, without in zip(rollout_gradients(checkpointed, segment), plain, strict=True):
         torch.testing.assert_close(with_checkpoints, without, rtol=0, atol=1e-12 * without.abs().max().item())
+
+
+CHANGED = "was changed in place after a step had read it"
+
+
+def test_one_buffer_for_all_inputs_is_refused() -> None:
+    """Its last numbers would be replayed in every step."""
+    x, buffer = torch.ones(2, requires_grad=True), torch.zeros(2)
+    final, _ = trajectory(lambda s, a: s * a, x, (buffer.fill_(k) for k in (2.0, 3.0)), observe=lambda s: None)
+    with pytest.raises(RuntimeError, match=f"^input {CHANGED}.*give each step tensors of its own"):
+        final.sum().backward()
+    final, _ = trajectory(lambda s, a: s * a, x, (buffer.fill_(k).clone() for k in (2.0, 3.0)), observe=lambda s: None)
+    for _ in range(2):  # replayed twice
+        final.sum().backward(retain_graph=True)
+    assert x.grad.tolist() == [12.0, 12.0]
+
+
+FACTOR = torch.tensor(3.0)
+
+
+@pytest.mark.parametrize("name", ["state", "gain", "FACTOR"])
+def test_what_a_step_reads_lasts_until_its_replay(name: str) -> None:
+    """The start, and what a step names, whether from a function around it or from its module."""
+    x, gain = torch.ones(2, requires_grad=True), torch.tensor(2.0)
+    state = x + 0.0
+    (final,) = repeated(lambda s: (s[0] + FACTOR * gain * s[0],), (state,), 4, segment=2)
+    with torch.no_grad():
+        {"state": state, "gain": gain, "FACTOR": FACTOR}[name].add_(1.0)
+    with pytest.raises(RuntimeError, match=f"^{name}.* {CHANGED}"):
+        final.sum().backward()
+
+
+@pytest.mark.parametrize(
+    ("name", "changed"),
+    [("mu", r"bodies\[0\].material.mu"), ("volume", r"bodies\[0\].volume"), ("origin",) * 2],
+)
+def test_a_step_reads_the_same_in_the_backward_pass(name: str, changed: str) -> None:
+    """Eagerly its segments are replayed; no change, or one after the gradient, is no error."""
+    tensors = {n: torch.full((1,), v, dtype=torch.float64) for n, v in (("mu", 500.0), ("volume", 1.0))}
+    tensors["origin"] = torch.zeros(1, 2, dtype=torch.float64)
+    body = Body(5, Elastic(tensors["mu"], 50.0), mass=2.0, volume=tensors["volume"])
+    solver, state = robot(5, bodies=(body,)), lively(5)
+    v = state.v.clone().requires_grad_()
+    final = solver.step(replace(state, v=v), substeps=20, origin=tensors["origin"])
+    final.x.sum().backward(retain_graph=True)
+    tensors[name].mul_(0.1).add_(0.01)
+    with pytest.raises(RuntimeError, match=f"^{changed} {CHANGED}"):
+        final.x.sum().backward()
+
+
+@pytest.mark.parametrize("backend", ["eager", pytest.param("native", marks=NATIVE)])
+def test_a_trajectory_watches_what_its_solver_reads(backend: str) -> None:
+    """Also what is made anew in every step, here a view of a changed field."""
+    solver, state = robot(5, backend=backend), lively(5)
+    fields, v = normal(2, 1, 2, 16, 16, seed=1), state.v.clone().requires_grad_()
+    drive = {"fields": fields}
+    final, _ = trajectory(
+        lambda s, k: solver.step(s, drive["fields"][k]), replace(state, v=v), range(2), observe=lambda s: None
+    )
+    final.x.sum().backward(retain_graph=True)
+    fields.add_(1.0)
+    with pytest.raises(RuntimeError, match=f"^actuation {CHANGED}"):
+        final.x.sum().backward()
 
 
 def peak_memory(substeps: int, segment: int | None, checkpointed: bool | None = None) -> int:

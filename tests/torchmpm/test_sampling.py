@@ -145,8 +145,8 @@ def test_image_keeps_sobol_numbers_even() -> None:
     assert (counts == 16).all()
 
 
-def test_image_at_the_last_number() -> None:
-    last = np.nextafter(1.0, 0.0)
+@pytest.mark.parametrize("last", [np.nextafter(1.0, 0.0), 1.0])
+def test_image_at_the_last_number(last: float) -> None:
     points = sampling.image(np.array([[0.0, 0.0], [last, last]]), MASK, (0.0, 0.0), (4.0, 3.0))
     np.testing.assert_allclose(points, [[0.0, 0.0], [3.0, 2.0]], atol=1e-12)
 

@@ -138,3 +138,17 @@ def test_gradient_of_a_field_has_no_infinities(dtype: torch.dtype, cutoff: float
 def test_bad_values_are_named(values: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         soil(**values)
+
+
+def test_steep_hardening_has_derivatives() -> None:
+    """Where the factor is at its bound its exponential overflows: the derivative there is zero, not no number."""
+    for Jp, at_bound in ((0.05, True), (1.5, True), (0.99, False)):
+        plane = torch.full((1, 1), Jp, requires_grad=True)
+        xx, *_ = soil(hardening=100.0).stress(tuple(torch.tensor([[[[f]]]]) for f in (1.1, 0.0, 0.0, 1.0)), plane)
+        plain, *_ = soil(hardening=0.0).stress(
+            tuple(torch.tensor([[[[f]]]]) for f in (1.1, 0.0, 0.0, 1.0)), plane.detach()
+        )
+        (slope,) = torch.autograd.grad(xx.sum(), plane)
+        factor = min(max(math.exp(100.0 * (1.0 - Jp)), 0.1), 5.0)
+        torch.testing.assert_close(xx, factor * plain)
+        assert (slope == 0) == at_bound and slope.isfinite()

@@ -558,3 +558,14 @@ def test_spacing_is_only_a_unit() -> None:
     doubled = large.step(replace(state, x=2 * state.x, C=state.C / 2), field(), substeps=20)
     here = small.step(state, field(), substeps=20)
     assert_close(replace(doubled, x=doubled.x / 2, C=doubled.C * 2), here, 1e-7)
+
+
+def test_a_list_of_bodies_is_copied() -> None:
+    """All backends see the bodies that the solver was made with."""
+    bodies, rules = list(robot(5).bodies), list(robot(5).rules)
+    solver = robot(5, bodies=bodies, rules=rules)
+    before = solver.step(lively(5), substeps=3)
+    bodies[0] = Body(5, Elastic(1.0, 1.0))
+    rules.clear()
+    assert_identical(solver.step(lively(5), substeps=3), before)
+    assert solver.rules == robot(5).rules

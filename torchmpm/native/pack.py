@@ -14,7 +14,8 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from torchmpm.material import STRETCH_FLOOR, Elastic, Soil, Value, VonMises, column, yield_ratio
+from torchmpm.grid import Grid
+from torchmpm.material import STRETCH_FLOOR, Elastic, Soil, Value, VonMises, column, yield_values
 
 if TYPE_CHECKING:
     from torchmpm.solver import Body, Solver
@@ -46,6 +47,9 @@ def unsupported(solver: Solver, device: torch.device) -> str | None:
             return missing
         if torch.are_deterministic_algorithms_enabled() and not torch.is_deterministic_algorithms_warn_only_enabled():
             return "on CUDA its sums are taken in no fixed order, torch.use_deterministic_algorithms(True) forbids that"
+    own = _overridden(solver)
+    if own is not None:
+        return f"it would go past {own}, which the substep calls"
     for body in solver.bodies:
         if type(body.material) not in KINDS:
             names = ", ".join(kind.__name__ for kind in KINDS)
@@ -56,6 +60,21 @@ def unsupported(solver: Solver, device: torch.device) -> str | None:
         return f"it takes at most {MAX_RESOLUTION:,} nodes per axis, got {solver.grid.resolution:,}"
     if solver.num_particles > MAX_PARTICLES:
         return f"it takes at most {MAX_PARTICLES:,} particles a simulation, got {solver.num_particles:,}"
+    return None
+
+
+def _overridden(solver: Solver) -> str | None:
+    """The first part of a substep that the type of a solver, or of its grid, has its own of, or ``None``."""
+    from torchmpm.solver import Solver  # not at the top: the solver imports this module
+
+    of_solver = ("scene", "substep", "to_grid", "_internal_force", "parts", "per_particle")
+    for kind, known, names in (
+        (type(solver), Solver, of_solver),
+        (type(solver.grid), Grid, ("h", "width", "contains")),
+    ):
+        for name in names if kind is not known else ():
+            if getattr(kind, name) is not getattr(known, name):
+                return f"{kind.__name__}.{name}"
     return None
 
 
@@ -93,10 +112,10 @@ def values(solver: Solver, like: Tensor) -> tuple[Tensor, list[int]]:
     tables, plain = [], True
     for body, part in solver.parts():
         rows = _rows(solver, body, like[:, part])
+        plain = plain and not any(isinstance(value, Tensor) for value in (vars(body) | vars(body.material)).values())
         if all(isinstance(row, (int, float)) for row in rows):
             tables.append(upload([float(row) for row in rows], like).view(VALUES, 1, 1))
         else:
-            plain = False
             planes = [torch.as_tensor(row, dtype=like.dtype, device=like.device) for row in rows]
             planes = [plane.reshape(1, 1) if plane.ndim == 0 else plane for plane in planes]
             tables.append(torch.stack(torch.broadcast_tensors(*planes)))
@@ -111,20 +130,26 @@ def values(solver: Solver, like: Tensor) -> tuple[Tensor, list[int]]:
 
 
 def _rows(solver: Solver, body: Body, like: Tensor) -> list[Value]:
-    """The eight values of a body in the order of ``struct Values``."""
+    """The eight values of a body in the order of ``struct Values``.
+
+    Of tensors in double precision, as of numbers: a value does not depend on the form in which it was given.
+    """
     material = body.material
     assert isinstance(material, Elastic)
+    wide = like.new_empty((), dtype=torch.float64).expand(like.shape)
 
     def value(name: str) -> Value:
-        return column(getattr(material, name), like, name)
+        return column(getattr(material, name), wide, name)
 
     mu, lam = value("mu"), value("lam")
-    factor = -solver.dt * (4.0 / solver.grid.h**2) * column(body.volume, like, "volume")
-    rows: list[Value] = [column(body.mass, like, "mass"), factor, 2.0 * mu, lam]
+    factor = -solver.dt * (4.0 / solver.grid.h**2) * column(body.volume, wide, "volume")
+    rows: list[Value] = [column(body.mass, wide, "mass"), factor, 2.0 * mu, lam]
     if isinstance(material, VonMises):
-        ratio = yield_ratio(value("yield_stress") / (2.0 * mu))
-        slope, root = (ratio - 1.0) / (ratio + 1.0), ratio**0.5
-        return [*rows, slope * slope, ratio, root + 1.0 / root, root - 1.0 / root]
+        limit = value("yield_stress") / (2.0 * mu)
+        if not isinstance(limit, Tensor):  # Python's exponential may differ from torch's in the last digit
+            limit = torch.tensor(limit, dtype=torch.float64, device="cpu")
+        slope, *others = yield_values(limit)
+        return [*rows, slope * slope, *others]
     if isinstance(material, Soil):
         return [*rows, 1.0 - value("compression"), 1.0 + value("stretch"), value("hardening"), 0.0]
     return [*rows, 0.0, 0.0, 0.0, 0.0]
