@@ -19,7 +19,7 @@ from dittogym.physics import Physics, merged, physics_values
 from dittogym.render import frame
 from dittogym.reward import measure
 from dittogym.soft import soft_observation
-from dittogym.spec import TaskSpec
+from dittogym.spec import Measurement, TaskSpec
 from dittogym.tasks import make_spec
 from torchmpm import ParticleState, checks
 from torchmpm.rollout import Segment, check_repetition
@@ -47,6 +47,9 @@ class Snapshot:
     shares: tuple[float, ...]
     state: EnvState
     observation: Tensor
+
+
+torch.serialization.add_safe_globals([Snapshot, EnvState, Measurement])  # tensors, numbers and a name
 
 
 def _device(device: str | torch.device) -> torch.device:

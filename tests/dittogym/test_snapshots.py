@@ -350,3 +350,13 @@ def test_a_moment_of_particles_that_stand_for_others_is_refused() -> None:
     env.reset(seed=0)
     with pytest.raises(ValueError, match="snapshot must hold"):
         env.load(unscaled.save())
+
+
+def test_a_moment_goes_through_a_file(tmp_path) -> None:
+    env = tiny("catch", 2)
+    env.reset(seed=0)
+    drive = actions(env, STEPS)
+    torch.save(env.save(), tmp_path / "moment.pt")
+    before = go_on(env, drive)
+    env.load(torch.load(tmp_path / "moment.pt", weights_only=True))
+    assert_same_bits(go_on(env, drive), before)
