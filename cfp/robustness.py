@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from cfp.command import Program, started_as
 from cfp.config import RunConfig, at_least_one
-from cfp.disturbances import Case, applies, disturbed_env, make_cases
+from cfp.disturbances import Case, Decides, applies, disturbed_env, make_cases
 from cfp.errors import CFPError, ConfigError
 from cfp.evaluate import Selection
 from cfp.evaluation import Policy, Result, evaluate, judging_seed
@@ -92,13 +92,14 @@ def report(config: RunConfig, policy: Policy, cases: Sequence[Case], episodes: i
         episodes: Of each case.
     """
     spec, seed = make_spec(config.task, **config.environment.task_options()), judging_seed(config)
-    grid, results = policy.description.get("resolution", policy.resolution), []
+    grid, results = 0 if isinstance(policy, Decides) else policy.description.get("resolution", policy.resolution), []
     for case in cases:
         if not applies(case, spec) or (case.observation_dropout and not policy.sees_image):
             continue
         env = disturbed_env(config, policy.resolution, episodes, case, seed, grid)
+        acting = policy.through(env.disturb) if isinstance(policy, Decides) else policy
         deterministic = policy.deterministic_by_default
-        results.append(evaluate(case.name, policy, env, episodes, deterministic=deterministic, seed=seed))
+        results.append(evaluate(case.name, acting, env, episodes, deterministic=deterministic, seed=seed))
     return results
 
 
