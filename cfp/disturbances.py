@@ -51,15 +51,24 @@ class Case:
     friction: float | None = None
 
 
-def applies(case: Case, spec: TaskSpec) -> bool:
-    """Whether a case changes anything in a task: not gravity where there is none, not the friction it has already."""
-    if case.friction is not None:
-        return any(item.name == FLOOR and _friction(item) != case.friction for item in spec.obstacles)
-    return "gravity" not in case.physics or any(spec.gravity)
+def idle(case: Case, spec: TaskSpec, sees_image: bool = True) -> str:
+    """Why a case changes nothing in a task for a policy; empty if it changes something.
 
-
-def _friction(item: Obstacle) -> float:
-    return item.rules[0].friction
+    Args:
+        case: One way to disturb it.
+        spec: The task.
+        sees_image: Whether the policy looks at pixels.
+    """
+    if case.observation_dropout and not sees_image:
+        return "the policy looks at no pixels"
+    if "gravity" in case.physics and not any(spec.gravity):
+        return f"{spec.name} has no gravity"
+    if case.friction is None:
+        return ""
+    own = {item.rules[0].friction for item in spec.obstacles if item.name == FLOOR}
+    if not own:
+        return f"{spec.name} has no obstacle with the name {FLOOR!r}"
+    return f"the floor of {spec.name} has this friction" if own == {case.friction} else ""
 
 
 def disturbed_env(
