@@ -230,7 +230,7 @@ def test_ratios_need_a_positive_return():
         (["--noise", "nan"], "noise: got nan"),
         (["--friction", "-1"], "friction: got (-1.0,), allowed 0 or more"),
         (["--device", "abacus"], "device: got 'abacus'"),
-        (["--cases", "noise", "gravity"], "cases: got 'gravity', allowed words of cases that change something (gravity"),
+        (["--cases", "noise", "gravity"], "cases: got 'gravity', allowed words of cases that change something"),
     ],
 )
 def test_wrong_option_is_one_line_and_exit_code_two(folder, capsys, arguments, message):
