@@ -67,7 +67,7 @@ class SegmentPolicy:
         return SegmentPolicy(self.actor, self.nodes, self.description, env, self.change)
 
     def through(self, change: Callable[[np.ndarray], np.ndarray]) -> SegmentPolicy:
-        """The same policy, whose decisions (B, K, 2), one for each segment, are changed before they are painted."""
+        """The same policy, with ``change`` made to its decisions (B, K, 2) before they are painted on the patch."""
         return SegmentPolicy(self.actor, self.nodes, self.description, self.env, change)
 
     @torch.no_grad()

@@ -115,7 +115,7 @@ class Decides(Protocol):
     """A policy that decides something else than a grid, from which its actions are painted."""
 
     def through(self, change: Callable[[np.ndarray], np.ndarray]) -> Policy:
-        """The same policy, whose decisions (B, ...) are changed before they are painted."""
+        """The same policy, with ``change`` made to its decisions (B, ...) before its actions are painted from them."""
 
 
 class Disturbed(VecEnvWrapper):
