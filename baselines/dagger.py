@@ -12,6 +12,7 @@ from torch import Tensor
 
 from baselines.episodes import Episodes
 from baselines.teachers import Teacher, project
+from cfp import disturbances
 from dittogym import TorchEnv, dynamics
 from torchmpm.state import choose
 
@@ -79,13 +80,19 @@ class Dataset:
             self.rounds.append(Labels(torch.from_numpy(pixels.reshape(-1, *TorchEnv.observation_shape)), actions))
 
 
-def lose(values: Tensor, share: float) -> Tensor:
-    """Set a share of the entries to 0 in half of the elements (B, ...), drawn from torch's generator."""
+def lose(values: Tensor, share: float, grid: int | None = None) -> Tensor:
+    """Set a share of the entries to 0 in half of the elements, drawn from torch's generator.
+
+    Args:
+        values: (B, ..., A, A).
+        share: Of the entries.
+        grid: Rows and columns on which they are drawn, see `cfp.disturbances.lose`; A if None.
+    """
     if not share:
         return values
-    lost = torch.rand(values.shape) < share
+    lost = torch.rand(values.shape if grid is None else (*values.shape[:-2], grid, grid)) < share
     lost &= torch.rand(len(values), *[1] * (values.ndim - 1)) < 0.5
-    return values.masked_fill(lost.to(values.device), 0)
+    return disturbances.lose(values, lost.to(values.device))
 
 
 class Collector:
@@ -100,10 +107,20 @@ class Collector:
         episodes: Of the simulations.
         leg: Control steps.
         faults: Share of the entries that the student loses, see `lose`, while it looks and moves.
+        grid: Rows and columns of the grid on which it decides, where it loses actions; if None, of what it hands over.
     """
 
-    def __init__(self, env: TorchEnv, teacher: Teacher, episodes: Episodes, leg: int, faults: float = 0.0) -> None:
-        self.env, self.teacher, self.episodes, self.leg, self.faults = env, teacher, episodes, leg, faults
+    def __init__(
+        self,
+        env: TorchEnv,
+        teacher: Teacher,
+        episodes: Episodes,
+        leg: int,
+        faults: float = 0.0,
+        grid: int | None = None,
+    ) -> None:
+        self.env, self.teacher, self.episodes, self.leg = env, teacher, episodes, leg
+        self.faults, self.grid = faults, grid
         self.position = leg
         self.led = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
         self.lost = self.led.clone()
@@ -131,7 +148,7 @@ class Collector:
             counts = ~self.lost if self.teacher.fresh else follows
             images.append(seen[counts].cpu())
             actions.append(told[counts].cpu())
-            own = self._enlarged(lose(student(lose(seen, self.faults)), self.faults))
+            own = self._enlarged(lose(student(lose(seen, self.faults)), self.faults, self.grid))
             seen = self._step(choose(follows, self._enlarged(told), own))
         return Labels(torch.cat(images), torch.cat(actions))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +29,20 @@ class SegmentPolicy:
         nodes: How segments are seen and act.
         description: What it is and comes from.
         env: Where it looks.
+        change: What becomes of its decisions, see `through`.
     """
 
     sees_image = False
 
     def __init__(
-        self, actor: ModularActor, nodes: Nodes, description: dict[str, Any] | None = None, env: TorchEnv | None = None
+        self,
+        actor: ModularActor,
+        nodes: Nodes,
+        description: dict[str, Any] | None = None,
+        env: TorchEnv | None = None,
+        change: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> None:
-        self.actor, self.nodes, self.env = actor, nodes, env
+        self.actor, self.nodes, self.env, self.change = actor, nodes, env, change
         self.description = description or {}
 
     @property
@@ -57,7 +64,11 @@ class SegmentPolicy:
         found, features = self.nodes.features(env.spec), self.actor.trunk.features
         if found != features:
             raise ValueError(f"env: got {env.spec.name!r} with {found} features, allowed {features}")
-        return SegmentPolicy(self.actor, self.nodes, self.description, env)
+        return SegmentPolicy(self.actor, self.nodes, self.description, env, self.change)
+
+    def through(self, change: Callable[[np.ndarray], np.ndarray]) -> SegmentPolicy:
+        """The same policy, with ``change`` made to its decisions (B, K, 2) before they are painted on the patch."""
+        return SegmentPolicy(self.actor, self.nodes, self.description, self.env, change)
 
     @torch.no_grad()
     def predict(
@@ -89,7 +100,10 @@ class SegmentPolicy:
             labels = follow(places(env), labels, self.nodes.count)
         labels = segmented(env, self.nodes, labels, anew)
         device = next(self.actor.parameters()).device
-        values = self.actor(self.nodes(env, labels).to(device), deterministic).to(env.device)
+        values = self.actor(self.nodes(env, labels).to(device), deterministic)
+        if self.change is not None:
+            values = torch.from_numpy(self.change(values.cpu().numpy()))
+        values = values.to(env.device)
         actions = self.nodes.act(env, labels, values).float().cpu().numpy()
         return actions[0] if single else actions, (labels.cpu().numpy(),)
 

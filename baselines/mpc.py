@@ -142,9 +142,9 @@ class MPC(Algorithm):
         while self.num_timesteps < end and not self.over:
             if self.reduced and self.planner.due:
                 self.reduced.follow(self.env.env_state)
-            action = self.planner.act()
+            action = self.planner.act().float()  # as the record keeps it, so that it repeats the episode exactly
             self._carry_out(action)
-            self.actions = torch.cat((self.actions, action.float().cpu()))
+            self.actions = torch.cat((self.actions, action.cpu()))
             self.num_timesteps += 1
             callback(
                 {

@@ -51,6 +51,8 @@ class Teacher(ABC):
 class PolicyTeacher(Teacher):
     """A trained policy, without noise. A sequence of actions is read at the step that an episode has come to.
 
+    What other policies remember is handed back to them, and begins anew where an episode does.
+
     Args:
         policy: Of any kind.
         theirs: Layout of its actions, see `dittogym.TorchEnv`.
@@ -60,16 +62,26 @@ class PolicyTeacher(Teacher):
     def __init__(self, policy: Policy, theirs: Layout, layout: Layout) -> None:
         self.policy, self.theirs, self.layout = policy, theirs, layout
         self.resolution = policy.resolution
-        self._looking: tuple[TorchEnv, Any] | None = None
+        self._memory: tuple[np.ndarray, ...] | None = None
 
     @torch.no_grad()
     def act(self, env: TorchEnv, seen: Tensor) -> Tensor:
         """Its mean actions."""
         policy = self.policy.attached(env) if isinstance(self.policy, SeesState) else self.policy
-        memory = (env.env_state.steps.cpu().numpy(),) if isinstance(policy, OpenLoop) else None
-        array, _ = policy.predict(seen.cpu().numpy(), memory, deterministic=True)
+        steps = env.env_state.steps.cpu().numpy()
+        memory = (steps,) if isinstance(policy, OpenLoop) else self._memory
+        array, self._memory = policy.predict(seen.cpu().numpy(), memory, steps == 0, deterministic=True)
         action = torch.as_tensor(array, device=env.device)
         return from_grid_layout(to_grid_layout(action, self.theirs), self.layout)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What the policy remembers."""
+        return {"memory": [torch.from_numpy(array) for array in self._memory or ()]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Undo `state_dict`."""
+        arrays = state.get("memory")  # checkpoints from before have none
+        self._memory = tuple(array.numpy() for array in arrays) if arrays else None
 
 
 class PlannerTeacher(Teacher):

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from torch import Tensor
 
 from cfp.config import RunConfig
 from cfp.environments import make_torch_env
+from cfp.evaluation import Policy
 from cfp.vec_env import monitored
 from dittogym import make_spec
 from dittogym.action import bicubic
@@ -29,10 +32,11 @@ class Case:
 
     Attributes:
         name: For tables and plots.
-        action_dropout: Share of the 2 R R entries of the policy's own grid that become 0, drawn anew in every step.
+        action_dropout: Share of the policy's decisions that become 0, drawn anew in every step: of the 2 R R entries of
+            its own grid, or what else it decides, see `Decides`.
         observation_dropout: Share of the 3 x 64 x 64 raw pixels that become 0, drawn anew in every step. A velocity
             pixel of 0 means fast motion, not rest, which is 132.
-        action_noise: Standard deviation of Gaussian noise on every entry of that grid; 1 is the full actuation.
+        action_noise: Standard deviation of Gaussian noise on every decision; 1 is the full actuation.
         latency: Control steps by which actions come late; the first ones of an episode are 0.
         physics: Factors on the task's own ``mu``, ``yield_stress`` and ``gravity``.
         friction: Coulomb coefficient of the floor; ``math.inf`` sticks. ``None``: the task's own.
@@ -47,20 +51,29 @@ class Case:
     friction: float | None = None
 
 
-def applies(case: Case, spec: TaskSpec) -> bool:
-    """Whether a case changes anything in a task: not gravity where there is none, not the friction it has already."""
-    if case.friction is not None:
-        return any(item.name == FLOOR and _friction(item) != case.friction for item in spec.obstacles)
-    return "gravity" not in case.physics or any(spec.gravity)
+def idle(case: Case, spec: TaskSpec, sees_image: bool = True) -> str:
+    """Why a case changes nothing in a task for a policy; empty if it changes something.
 
-
-def _friction(item: Obstacle) -> float:
-    return item.rules[0].friction
+    Args:
+        case: One way to disturb it.
+        spec: The task.
+        sees_image: Whether the policy looks at pixels.
+    """
+    if case.observation_dropout and not sees_image:
+        return "the policy looks at no pixels"
+    if "gravity" in case.physics and not any(spec.gravity):
+        return f"{spec.name} has no gravity"
+    if case.friction is None:
+        return ""
+    own = {item.rules[0].friction for item in spec.obstacles if item.name == FLOOR}
+    if not own:
+        return f"{spec.name} has no obstacle with the name {FLOOR!r}"
+    return f"the floor of {spec.name} has this friction" if own == {case.friction} else ""
 
 
 def disturbed_env(
     config: RunConfig, resolution: int, num_envs: int, case: Case, seed: int, grid: int | None = None
-) -> VecEnv:
+) -> Disturbed:
     """The environment of a run under a case.
 
     Args:
@@ -88,6 +101,23 @@ def _with_friction(spec: TaskSpec, friction: float) -> tuple[Obstacle, ...]:
     )
 
 
+def lose(values: Tensor, lost: Tensor) -> Tensor:
+    """Values (B, ..., A, A) without what is lost (B, ..., R, R), bool: each entry takes its whole cell along."""
+    if lost.shape != values.shape:
+        size, grid = values.shape[-1], lost.shape[-1]
+        cell = torch.arange(size, device=lost.device) * grid // size
+        lost = lost[..., cell[:, None], cell]
+    return values.masked_fill(lost, 0)
+
+
+@runtime_checkable
+class Decides(Protocol):
+    """A policy that decides something else than a grid, from which its actions are painted."""
+
+    def through(self, change: Callable[[np.ndarray], np.ndarray]) -> Policy:
+        """The same policy, with ``change`` made to its decisions (B, ...) before its actions are painted from them."""
+
+
 class Disturbed(VecEnvWrapper):
     """Disturbs actions and observations of a vectorised environment; the same from every ``reset`` on.
 
@@ -98,7 +128,8 @@ class Disturbed(VecEnvWrapper):
         venv: The environment, with actions (B, 2, A, A) and observations uint8 (B, 3, 64, 64).
         case: What is disturbed; its constants of the matter are not applied here.
         seed: Of the generator, which every ``reset`` starts anew.
-        grid: Rows and columns R of the grid on which the policy decides; A if None.
+        grid: Rows and columns R of the grid on which the policy decides; A if None, 0 if it decides on none and calls
+            `disturb` itself, see `Decides`.
     """
 
     def __init__(self, venv: VecEnv, case: Case, seed: int, grid: int | None = None) -> None:
@@ -123,21 +154,24 @@ class Disturbed(VecEnvWrapper):
         """Hand on what becomes of the actions (B, 2, A, A)."""
         self._late.append(np.array(actions, np.float32))
         actions = self._late.popleft()
-        shape = (len(actions), 2, self.grid, self.grid)
-        if self.case.action_noise:
-            noise = self.generator.standard_normal(shape, np.float32)
-            actions = actions + self.case.action_noise * self._enlarged(noise)
-        if self.case.action_dropout:
-            lost = self.generator.random(shape) < self.case.action_dropout
-            cell = np.arange(self.size) * self.grid // self.size
-            actions = np.where(lost[..., cell[:, None], cell], 0, actions)
-        self.venv.step_async(actions.astype(np.float32))
+        if self.grid:
+            actions = self._disturbed(actions, (len(actions), 2, self.grid, self.grid))
+        self.venv.step_async(actions)
 
-    def _enlarged(self, noise: np.ndarray) -> np.ndarray:
-        if self.grid == self.size:
-            return noise
-        enlarged: np.ndarray = bicubic(torch.from_numpy(noise), self.size).numpy()
-        return enlarged
+    def disturb(self, decisions: np.ndarray) -> np.ndarray:
+        """What becomes of decisions (B, ...) that are no grid."""
+        return self._disturbed(decisions, decisions.shape)
+
+    def _disturbed(self, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+        """Values with noise and losses that are drawn in another shape."""
+        found = torch.from_numpy(values)
+        if self.case.action_noise:
+            noise = torch.from_numpy(self.generator.standard_normal(shape, np.float32))
+            found = found + self.case.action_noise * (noise if shape == values.shape else bicubic(noise, self.size))
+        if self.case.action_dropout:
+            found = lose(found, torch.from_numpy(self.generator.random(shape) < self.case.action_dropout))
+        disturbed: np.ndarray = found.numpy()
+        return disturbed
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step; a new episode does not get the late actions of the one before."""
@@ -151,7 +185,8 @@ class Disturbed(VecEnvWrapper):
         if not self.case.observation_dropout:
             return observation
         lost = self.generator.random(observation.shape) < self.case.observation_dropout
-        return np.where(lost, 0, observation).astype(observation.dtype)
+        seen: np.ndarray = lose(torch.from_numpy(observation), torch.from_numpy(lost)).numpy()
+        return seen
 
 
 def make_cases(

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from cfp.command import Program, started_as
 from cfp.config import RunConfig, at_least_one
-from cfp.disturbances import Case, applies, disturbed_env, make_cases
+from cfp.disturbances import Case, Decides, disturbed_env, idle, make_cases
 from cfp.errors import CFPError, ConfigError
 from cfp.evaluate import Selection
 from cfp.evaluation import Policy, Result, evaluate, judging_seed
@@ -23,6 +23,7 @@ from cfp.plot import write_figure
 from cfp.process import keep_memory
 from cfp.train import PROGRAM
 from dittogym import make_spec
+from dittogym.spec import TaskSpec
 
 COLUMNS = ("case", "episodes", "mean", "std", "interval", "ratio", "success")
 
@@ -80,10 +81,21 @@ def choose(cases: Sequence[Case], words: Sequence[str]) -> list[Case]:
     return [*cases[:1], *(case for case in cases[1:] if not words or any(word in case.name for word in words))]
 
 
+def check_words(cases: Sequence[Case], words: Sequence[str], spec: TaskSpec, policy: Policy) -> None:
+    """Check that each word chooses something.
+
+    Raises:
+        ConfigError: No case with a word in its name changes anything; it says why.
+    """
+    for word in words:
+        reasons = {case.name: idle(case, spec, policy.sees_image) for case in cases[1:] if word in case.name}
+        if all(reasons.values()):
+            told = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
+            raise ConfigError(f"cases: got {word!r}, allowed words of cases that change something ({told})")
+
+
 def report(config: RunConfig, policy: Policy, cases: Sequence[Case], episodes: int) -> list[Result]:
     """Evaluate a policy in every case that changes something for it, on the same layouts with the same noise.
-
-    Lost pixels change nothing for a policy that does not look at them.
 
     Args:
         config: Options of the run that trained it.
@@ -92,13 +104,14 @@ def report(config: RunConfig, policy: Policy, cases: Sequence[Case], episodes: i
         episodes: Of each case.
     """
     spec, seed = make_spec(config.task, **config.environment.task_options()), judging_seed(config)
-    grid, results = policy.description.get("resolution", policy.resolution), []
+    grid, results = 0 if isinstance(policy, Decides) else policy.description.get("resolution", policy.resolution), []
     for case in cases:
-        if not applies(case, spec) or (case.observation_dropout and not policy.sees_image):
+        if idle(case, spec, policy.sees_image):
             continue
         env = disturbed_env(config, policy.resolution, episodes, case, seed, grid)
+        acting = policy.through(env.disturb) if isinstance(policy, Decides) else policy
         deterministic = policy.deterministic_by_default
-        results.append(evaluate(case.name, policy, env, episodes, deterministic=deterministic, seed=seed))
+        results.append(evaluate(case.name, acting, env, episodes, deterministic=deterministic, seed=seed))
     return results
 
 
@@ -171,10 +184,11 @@ def run(program: Program, command: Command) -> str:
     cases = make_cases(command.dropout, command.noise, command.latency, command.shift, command.friction)
     cases = choose(cases, command.cases)
     config, policies = command.open(program)
-    folder = command.out or command.folder
+    policy, folder = list(policies.values())[-1], command.out or command.folder
     assert folder is not None
+    check_words(cases, command.cases, make_spec(config.task, **config.environment.task_options()), policy)
     folder.mkdir(parents=True, exist_ok=True)
-    results = report(config, list(policies.values())[-1], cases, command.episodes)
+    results = report(config, policy, cases, command.episodes)
     rows, path = to_rows(results), folder / "robustness"
     table = to_markdown(config, rows)
     write_json(path.with_suffix(".json"), rows)

@@ -38,10 +38,10 @@ class Command:
 
     tasks: tuple[str, ...] = ("shapematch",)
     """Which tasks."""
-    algos: tuple[str, ...] = ("cfp",)
-    """Which algorithms, or variants that the plan names."""
+    algos: tuple[str, ...] = ("zero", "cfp")
+    """Which algorithms, or variants that the plan names; zero is a resting robot, from which efficiency counts."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds of the runs."""
+    """Seeds of the runs; what learns nothing has one run, with the first."""
     out: Path = Path("runs/compare")
     """Folder of the report, with the run folders in runs/."""
     plan: Path | None = None
@@ -94,11 +94,13 @@ class Command:
         if self.gpus_per_run and self.executor == "local":
             raise ConfigError(f"gpus_per_run: got {self.gpus_per_run}, allowed with --executor ray only")
 
-    def judging(self) -> tuple[Judging, Judging]:
-        """How policies are judged, and how in SLOT."""
+    def judging(self, job: Job) -> Judging:
+        """How the policy of a run is judged."""
         general = Judging(self.episodes, self.tier, self.robustness)
-        for_each = -(-self.slot_episodes // len(self.seeds))
-        return general, replace(general, episodes=max(self.episodes, for_each))
+        if job.config.task != "slot":
+            return general
+        for_each = -(-self.slot_episodes // (1 if job.untrained else len(self.seeds)))
+        return replace(general, episodes=max(self.episodes, for_each))
 
 
 def compare(command: Command) -> int:
@@ -141,10 +143,9 @@ def compare(command: Command) -> int:
 
 def _carry_out(command: Command, jobs: Sequence[Job], signals: StopSignals) -> dict[int, str]:
     """Do all runs; returns how each ended."""
-    general, slot = command.judging()
     alone = command.executor == "local" and command.only is None  # else the same folder is seen by other machines
     patience = PATIENCE if alone else CLUSTER_PATIENCE
-    works = [describe(job, slot if job.config.task == "slot" else general, patience) for job in jobs]
+    works = [describe(job, command.judging(job), patience) for job in jobs]
     resources = Resources(command.cpus_per_run, command.gpus_per_run, command.retries)
     outcomes: dict[int, str] = {}
 
@@ -172,13 +173,12 @@ def _execute(
 
 
 def _report(command: Command, jobs: Sequence[Job]) -> list[Found]:
-    general, slot = command.judging()
     about = (
         f"{', '.join(command.algos)} on {', '.join(command.tasks)}, preset {command.preset}, seeds "
-        f"{', '.join(map(str, command.seeds))}. Final evaluations with {command.tier} particles."
+        f"{', '.join(map(str, command.seeds))}."
     )
-    runs = find_runs(jobs, general, slot)
-    print(f"report: {write_report(command.out, runs, command.episodes, about)}")
+    runs = find_runs(jobs, command.judging)
+    print(f"report: {write_report(command.out, runs, command.episodes, command.tier, about)}")
     return runs
 
 

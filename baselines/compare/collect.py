@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 
 from baselines.compare.judging import Judged, Judging, read
 from baselines.compare.plan import Job, read_sessions
+from cfp.config import Tier
 from cfp.files import read_table
 
 Curve = tuple[np.ndarray, np.ndarray]
@@ -90,6 +91,21 @@ class Group:
         return [run.score for run in self.runs if run.score is not None]
 
     @property
+    def algo(self) -> str:
+        """Which algorithm the label stands for."""
+        return self.runs[0].job.config.algo
+
+    @property
+    def untrained(self) -> bool:
+        """Whether nothing is learned."""
+        return self.runs[0].job.untrained
+
+    @property
+    def particles(self) -> Tier:
+        """Of the evaluations while it trains."""
+        return self.runs[0].job.config.environment.particles
+
+    @property
     def costs(self) -> list[Cost]:
         """Of the runs of which a session has ended in order."""
         return [run.cost for run in self.runs if run.cost is not None]
@@ -111,15 +127,14 @@ class Group:
         return [run.curve for run in self.runs if len(run.curve[0])]
 
 
-def find_runs(jobs: Iterable[Job], judging: Judging, slot: Judging) -> list[Found]:
+def find_runs(jobs: Iterable[Job], judging: Callable[[Job], Judging]) -> list[Found]:
     """Read all run folders.
 
     Args:
         jobs: The comparison.
-        judging: How policies are judged.
-        slot: The same in SLOT.
+        judging: How the policy of a run is judged.
     """
-    return [_find(job, slot if job.config.task == "slot" else judging) for job in jobs]
+    return [_find(job, judging(job)) for job in jobs]
 
 
 def _find(job: Job, judging: Judging) -> Found:

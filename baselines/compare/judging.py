@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +21,7 @@ from cfp.robustness import report
 from cfp.weights import policy_file
 
 CHUNK = 10
-"""Episodes side by side; what is kept when an evaluation is stopped."""
+"""Episodes side by side; what is kept when an evaluation is stopped, or more episodes are asked for."""
 PAPER_CASES = 3
 """Of `make_cases`: unperturbed, action dropout, observation dropout, which the paper reports."""
 
@@ -72,7 +72,7 @@ class Judged:
         successes: How many of them were successful, None where the task does not define success.
         own: Return on the one layout that the policy was made for, if it was.
         cases: Mean return by case, the unperturbed one first; None where a case changes nothing for the policy or was
-            not tried yet.
+            not tried on all layouts yet.
         whole: Nothing is left to do.
     """
 
@@ -125,8 +125,8 @@ def judge(config: RunConfig, folder: Path, judging: Judging, stop: Callable[[], 
     def part(first: int, count: int) -> dict[str, Any]:
         return _entry(_evaluate(own, policy, judging_seed(own) + first, count))
 
-    def disturbed(case: Case) -> list[dict[str, Any]]:
-        return [_entry(result) for result in report(own, policy, [case], judging.episodes)]
+    def disturbed(first: int, count: int, case: Case) -> list[dict[str, Any]]:
+        return [_entry(result) for result in report(replace(own, seed=own.seed + first), policy, [case], count)]
 
     for first, count in judging.chunks():
         stop()
@@ -135,8 +135,9 @@ def judge(config: RunConfig, folder: Path, judging: Judging, stop: Callable[[], 
         layout = policy.description["layout"]
         record.once(judging.key("own layout"), lambda: _entry(_evaluate(own, policy, layout, 1)))
     for case in judging.cases()[1:]:
-        stop()
-        record.once(_case(judging, case), partial(disturbed, case))
+        for first, count in judging.chunks():
+            stop()
+            record.once(_layouts(judging, first, count, case), partial(disturbed, first, count, case))
 
 
 def read(folder: Path, judging: Judging) -> Judged | None:
@@ -151,23 +152,23 @@ def read(folder: Path, judging: Judging) -> Judged | None:
     returns = [value for part in parts for value in part["returns"]]
     successes = [part["successes"] for part in parts]
     own, cases = entries.get(judging.key("own layout")), judging.cases()
-    found = {case.name: entries.get(_case(judging, case)) for case in cases[1:]}
+    found = {
+        case.name: [entries.get(_layouts(judging, first, count, case)) for first, count in judging.chunks()]
+        for case in cases[1:]
+    }
     means: dict[str, float | None] = {case.name: _mean(returns) for case in cases[:1]}
     return Judged(
         tuple(returns),
         None if None in successes else sum(successes),
         None if own is None else own["returns"][0],
-        means | {name: _mean(results[0]["returns"]) if results else None for name, results in found.items()},
-        len(parts) == len(keys) and None not in found.values(),
+        means | {name: _mean_of(results) for name, results in found.items()},
+        len(parts) == len(keys) and not any(None in results for results in found.values()),
     )
 
 
-def _layouts(judging: Judging, first: int, count: int) -> str:
-    return judging.key(f"layouts {first} to {first + count - 1}")
-
-
-def _case(judging: Judging, case: Case) -> str:
-    return judging.key(f"{case.name}, {judging.episodes} episodes")
+def _layouts(judging: Judging, first: int, count: int, case: Case | None = None) -> str:
+    layouts = f"layouts {first} to {first + count - 1}"
+    return judging.key(layouts if case is None else f"{case.name}, {layouts}")
 
 
 def _evaluate(config: RunConfig, policy: Policy, seed: int, count: int) -> Result:
@@ -178,6 +179,11 @@ def _evaluate(config: RunConfig, policy: Policy, seed: int, count: int) -> Resul
 def _entry(result: Result) -> dict[str, Any]:
     successes = None if result.success is None else round(result.success * len(result.returns))
     return {"returns": list(result.returns), "successes": successes}
+
+
+def _mean_of(parts: list[list[dict[str, Any]] | None]) -> float | None:
+    """Mean return of a case; None where it changes nothing, or a part of it is missing."""
+    return _mean([value for part in parts if part for value in part[0]["returns"]]) if all(parts) else None
 
 
 def _mean(values: list[float]) -> float:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from baselines.floors import FloorConfig
 from baselines.registry import configure, find
 from cfp.config import EVALUATION_SEED, RunConfig, to_json
 from cfp.errors import CheckpointError, ConfigError
@@ -48,6 +49,11 @@ class Job:
     def sees(self) -> str:
         """What its policy looks at."""
         return str(getattr(self.config, "sees", find(self.config.algo).sees))
+
+    @property
+    def untrained(self) -> bool:
+        """Whether nothing is learned, so that the seed changes nothing: layouts and noise of judging are the same."""
+        return isinstance(self.config, FloorConfig)
 
     @property
     def finished(self) -> bool:
@@ -175,6 +181,8 @@ def make_jobs(
 ) -> list[Job]:
     """All runs of a comparison; those of one seed come first, so that a stop leaves something to compare.
 
+    What learns nothing has one run, that of the first seed.
+
     Args:
         plan: Options beyond presets.
         tasks: Names.
@@ -203,7 +211,9 @@ def make_jobs(
         for task in tasks:
             for label in labels:
                 config = resolve(plan, label, task, preset, seed, steps, device)
-                jobs.append(Job(label, config, runs / f"{label}-{task_name(task)}-{preset}-{seed}"))
+                job = Job(label, config, runs / f"{label}-{task_name(task)}-{preset}-{seed}")
+                if seed == seeds[0] or not job.untrained:
+                    jobs.append(job)
     _check_same_task(jobs)
     return jobs
 

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from baselines.compare import pictures, tables
 from baselines.compare.collect import Found, Group, group
 from baselines.compare.table import Table
+from cfp.config import Tier
 from cfp.files import write_text
 from cfp.page import STYLE
 from cfp.plot import write_figure
@@ -19,47 +20,62 @@ MORE_STYLE = """
 body { max-width: 76rem; } .wide { overflow-x: auto; } table { font-size: 14px; } th { vertical-align: bottom; }
 th.text, td.text { text-align: left; } td { font-variant-numeric: tabular-nums; white-space: nowrap; }
 """
+PAPER: Tier = "full"
+"""Particles of the paper's figures."""
 Picture = tuple[str, str, str]
 """File, title, words."""
 
 
-def write_report(folder: Path, runs: Sequence[Found], episodes: int, about: str) -> Path:
+def write_report(folder: Path, runs: Sequence[Found], episodes: int, tier: Tier, about: str) -> Path:
     """Write all files of the report; those of an earlier one are replaced.
 
     Args:
         folder: Where they go: ``index.html``, ``report.md``, ``*.csv``, ``*.png``.
         runs: Of the comparison.
         episodes: Of a final evaluation, for the words.
+        tier: Particles of the final evaluations.
         about: What was compared, for the head of the page.
 
     Returns:
         The path of the page.
     """
     groups = group(runs)
-    whole = make_tables(runs, groups, episodes)
+    whole = make_tables(runs, groups, episodes, tier)
     for table in whole:
         write_text(folder / f"{table.name}.csv", table.to_csv())
     shown = {table.name: table for table in whole}
     shown["runs"] = tables.unfinished(shown["runs"])
     sketches = _draw(folder, groups, shown["robustness"])
-    about = f"{about} {_sights(groups)}"
+    about = f"{about} {_size(tier)} {_sights(groups)}"
     write_text(folder / "report.md", _markdown(shown, sketches, about))
     write_text(folder / "index.html", _page(shown, sketches, about))
     return folder / "index.html"
 
 
-def make_tables(runs: Sequence[Found], groups: Sequence[Group], episodes: int) -> list[Table]:
-    """All tables, in the order of the report."""
+def make_tables(runs: Sequence[Found], groups: Sequence[Group], episodes: int, tier: Tier) -> list[Table]:
+    """All tables, in the order of the report; those with the paper's returns have rows at its size only."""
+    alike = groups if tier == PAPER else []
     return [
         tables.runs_table(runs),
         tables.returns_table(groups, episodes),
-        tables.aggregate_table(groups),
-        tables.efficiency_table(groups),
+        tables.aggregate_table(alike),
+        tables.efficiency_table(groups, tier),
         tables.cost_table(groups),
         tables.success_table(groups),
         tables.robustness_table(groups),
-        tables.paper_table(groups),
+        tables.paper_table(alike),
     ]
+
+
+def _size(tier: Tier) -> str:
+    """What was judged with how many particles, in words."""
+    words = f"Final evaluations with {tier} particles."
+    if tier != PAPER:
+        words += (
+            " None of them is set beside the paper's returns or scaled by them: those are of full size, and returns of "
+            "other sizes differ (--tier full judges the same policies there)."
+        )
+    return words
 
 
 def _sights(groups: Sequence[Group]) -> str:
@@ -94,7 +110,7 @@ def _curve_words(groups: Sequence[Group]) -> str:
         "The runs' own evaluations while they trained: interquartile mean over seeds and its 95 % bootstrap band, on "
         "steps where all seeds have values. The line says what is seen."
     )
-    particles = {each.label: each.runs[0].job.config.environment.particles for each in groups}
+    particles = {each.label: each.particles for each in groups}
     if len(set(particles.values())) > 1:
         listed = ", ".join(f"{label} {value}" for label, value in particles.items())
         words += f" Not the same particles for all: {listed}."

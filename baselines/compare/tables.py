@@ -11,6 +11,8 @@ from baselines.compare import paper
 from baselines.compare.collect import Found, Group
 from baselines.compare.stats import common_curve, first_reach, interquartile_mean, interval, wilson
 from baselines.compare.table import Column, Table
+from baselines.floors import Zero
+from cfp.config import Tier
 from dittogym import make_spec
 
 SHARES = (0.5, 0.75, 0.9)
@@ -90,8 +92,9 @@ def returns_table(groups: Sequence[Group], episodes: int) -> Table:
     about = (
         f"Each policy plays the same layouts, which neither trained nor chose it ({episodes} of them but in SLOT). The "
         "score of a run is its mean return; IQM is the interquartile mean over seeds (up to three seeds: the mean) "
-        f"with a 95 % bootstrap interval; std is that of the scores. {SEPARATE} Own layout: the return on the only "
-        "layout that a policy was made for."
+        "with a 95 % bootstrap interval; std is that of the scores. The interval is about other trainings on "
+        f"these layouts, not about other layouts. {_alone(groups)}{SEPARATE} Own layout: the return on the only layout "
+        "that a policy was made for."
     )
     columns = (
         *WHO,
@@ -106,6 +109,12 @@ def returns_table(groups: Sequence[Group], episodes: int) -> Table:
         Column("own", "own layout", ".1f"),
     )
     return Table("returns", "Final evaluation", about, columns, rows)
+
+
+def _alone(groups: Sequence[Group]) -> str:
+    """Which algorithms have a single run, in words."""
+    labels = ", ".join(dict.fromkeys(group.label for group in groups if group.untrained))
+    return f"Nothing is learned by {labels}: one run for all seeds. " if labels else ""
 
 
 def aggregate_table(groups: Sequence[Group]) -> Table:
@@ -125,9 +134,9 @@ def aggregate_table(groups: Sequence[Group]) -> Table:
         rows.append(row)
     _rank([row for row in rows if row["all"]], "iqm", ("sees",))
     about = (
-        "Interquartile mean over all runs of all tasks, with a bootstrap stratified by task (Agarwal et al., 2021), of "
-        "scores on a scale where 0 is the paper's resting robot and 1 the paper's CFP at the end of its training. "
-        "Ranked within what policies see, and only with a score in every task."
+        "Interquartile mean over all runs of all tasks, with a bootstrap of trainings (not of layouts) by task "
+        "(Agarwal et al., 2021), of scores on a scale where 0 is the paper's resting robot and 1 the paper's CFP at "
+        "the end of its training. Ranked within what policies see, and only with a score in every task."
     )
     columns = (
         Column("sees", "sees"),
@@ -143,36 +152,52 @@ def aggregate_table(groups: Sequence[Group]) -> Table:
     return Table("aggregate", "All tasks together", about, columns, rows)
 
 
-def efficiency_table(groups: Sequence[Group]) -> Table:
-    """Steps until the evaluations of a run reach shares of the best curve among those that see the same."""
+def efficiency_table(groups: Sequence[Group], tier: Tier) -> Table:
+    """Steps until the evaluations of a run reach shares of the way from rest to the best that see the same.
+
+    Args:
+        groups: All; that of ``zero`` is the resting robot.
+        tier: Particles that it was judged with, and with which other curves can be compared.
+    """
+    rest = {group.task: iqm(group.scores) for group in groups if group.algo == Zero.name and group.scores}
+    shown = [group for group in groups if group.curves and not group.untrained]
     best: dict[tuple[str, str], float] = {}
-    for group in groups:
-        if group.curves:
+    for group in shown:
+        if group.particles == tier:
             key = group.task, group.sees
             best[key] = max(best.get(key, -np.inf), top_of_curve(group))
     rows = []
-    for group in groups:
-        if not group.curves:
-            continue
-        floor, top = paper.REST.get(group.task, 0.0), best[group.task, group.sees]
-        row = _who(group) | {"seeds": len(group.curves), "best": top}
-        for share in SHARES:
-            level = floor + share * (top - floor)
-            reached = [first_reach(*curve, level) for curve in group.curves] if top > floor else []
-            steps = [step for step in reached if step is not None]
-            row |= {f"steps_{share:.0%}": float(np.median(steps)) if steps else None}
-            row |= {f"reached_{share:.0%}": f"{len(steps)}/{len(group.curves)}"}
-        rows.append(row)
+    for group in shown:
+        floor = rest.get(group.task)
+        top = best[group.task, group.sees] if group.particles == tier else None
+        row = _who(group) | {"seeds": len(group.curves), "rest": floor, "best": top}
+        rows.append(row if floor is None or top is None else row | _reached(group, floor, top))
     about = (
         "Environment steps until a run's own evaluation first reaches a share of the way from a resting robot (the "
-        "paper's figure) to the highest point of any mean curve among the algorithms that see the same in this task: "
-        "median of the seeds that get there, and how many do. No entry where no curve rises above the resting robot."
+        "final evaluation of zero) to the highest point of any mean curve among the algorithms that see the same in "
+        "this task: median of the seeds that get there, and how many do. No entry where no curve rises above rest."
     )
+    if unknown := ", ".join(dict.fromkeys(group.task for group in shown if group.task not in rest)):
+        about += f" Rest was not measured in {unknown}: add zero to --algos."
+    if others := ", ".join(dict.fromkeys(group.label for group in shown if group.particles != tier)):
+        about += f" None for {others}, evaluated in training with other particles than those that are judged, {tier}."
     parts = (
         (Column(f"steps_{s:.0%}", f"steps to {s:.0%}", ",.0f"), Column(f"reached_{s:.0%}", "seeds")) for s in SHARES
     )
-    columns = (*WHO, Column("best", "best", ".1f"), *(column for part in parts for column in part))
-    return Table("efficiency", "Sample efficiency", about, (*columns, Column("seeds", "")), rows)
+    ends = Column("rest", "rest", ".1f"), Column("best", "best", ".1f")
+    columns = (*WHO, *ends, *(column for part in parts for column in part), Column("seeds", ""))
+    return Table("efficiency", "Sample efficiency", about, columns, rows)
+
+
+def _reached(group: Group, floor: float, top: float) -> Row:
+    """When the curves of a group reach the shares of a way, and how many do."""
+    row: Row = {}
+    for share in SHARES if top > floor else ():
+        reached = [first_reach(*curve, floor + share * (top - floor)) for curve in group.curves]
+        steps = [step for step in reached if step is not None]
+        row |= {f"steps_{share:.0%}": float(np.median(steps)) if steps else None}
+        row |= {f"reached_{share:.0%}": f"{len(steps)}/{len(group.curves)}"}
+    return row
 
 
 def top_of_curve(group: Group) -> float:

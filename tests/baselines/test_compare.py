@@ -6,13 +6,17 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from baselines.compare import work
+from baselines.compare import judging, work
 from baselines.compare.__main__ import main
 from baselines.compare.executor import run_process
+from baselines.compare.plan import judged
+from baselines.registry import configure, load
+from cfp.disturbances import make_cases
 from cfp.files import read_table
 
 ENVIRONMENT = {"particles": 100, "substeps": 1, "num_envs": 1}
@@ -92,6 +96,22 @@ def test_more_episodes_are_added_to_those_that_are_there(finished, monkeypatch):
     assert set(after["entries"]) - set(before["entries"]) == {"layouts 2 to 2, particles 100"}
     judged = [value for entry in after["entries"].values() for value in entry["returns"]]
     assert len(set(judged)) == 4  # three layouts and its own
+
+
+def test_disturbed_cases_are_played_and_kept_in_the_same_parts(finished, monkeypatch):
+    counts, report = [], judging.report
+    monkeypatch.setattr(judging, "report", lambda *given: counts.append(given[-1]) or report(*given))
+    monkeypatch.setattr(judging, "CHUNK", 2)
+    options = ["--algos", "shac-image", "--seeds", "1", "--robustness", "paper"]
+    for episodes, played in (("2", [2, 2]), ("3", [1, 1])):
+        counts.clear()
+        assert compare(finished, *options, "--episodes", episodes) == 0
+        assert counts == played
+    folder, case = finished / "runs" / "shac-image-shapematch-quick-1", make_cases()[1]
+    entries = json.loads((folder / "judged.json").read_text())["entries"]
+    (last,) = entries[f"{case.name}, layouts 2 to 2, particles 100"]
+    config = replace(judged(configure(json.loads((folder / "config.json").read_text())), 100), seed=2)
+    assert last["returns"] == list(report(config, load(folder), [case], 1)[0].returns)
 
 
 def test_interrupted_comparison_goes_on(finished, tmp_path, monkeypatch, capsys, stop_at):

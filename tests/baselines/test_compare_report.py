@@ -6,17 +6,21 @@ import json
 from html.parser import HTMLParser
 
 import pytest
+import torch
 
 from baselines.compare import pictures
 from baselines.compare.__main__ import main
 from baselines.compare.collect import find_runs, group
 from baselines.compare.judging import Judging
 from baselines.compare.plan import Plan, make_jobs
-from baselines.compare.tables import cost_table
+from baselines.compare.report import make_tables
+from baselines.compare.tables import aggregate_table, cost_table, efficiency_table, paper_table
 from cfp.config import to_json
 from cfp.files import write_json, write_text
+from cfp.weights import origin, write_policy
 
 CASES = [case.name for case in Judging(1).cases()]
+LABELS = ["zero", "cfp", "shac", "shac-image"]
 PLAN = {"algos": {"shac-image": {"algo": "shac", "sees": "image"}}}
 
 
@@ -39,7 +43,8 @@ class TagBalance(HTMLParser):
 def write_run(job, scores, curve, *, successes=0, seconds=100.0, cases=(0.8, 0.5), tier="lite"):
     """A folder as a run that was trained to step 1000 and judged leaves it."""
     write_json(job.folder / "config.json", to_json(job.config))
-    write_text(job.folder / "policy.safetensors", job.name)
+    newest = job.folder / "policy.safetensors"
+    write_policy(newest, {}, origin(job.config, job.config.algo, 0, 0))
     lines = [f"{step},{value}" for step, value in curve.items()]
     write_text(job.folder / "evaluations.csv", "\n".join(["step,mean", *lines]) + "\n")
     session = {"from": 0, "to": 1000, "seconds": seconds + 7, "judging": 7.0, "memory": 2**30, "device": "cpu"}
@@ -49,19 +54,21 @@ def write_run(job, scores, curve, *, successes=0, seconds=100.0, cases=(0.8, 0.5
     entries = {judging.key(f"layouts 0 to {len(scores) - 1}"): first}
     for name, share in zip(CASES[1:], cases, strict=True):
         found = [] if share is None else [{"returns": [share * sum(scores) / len(scores)], "successes": 0}]
-        entries[judging.key(f"{name}, {len(scores)} episodes")] = found
-    policy = hashlib.sha256(job.name.encode()).hexdigest()
+        entries[judging.key(f"{name}, layouts 0 to {len(scores) - 1}")] = found
+    policy = hashlib.sha256(newest.read_bytes()).hexdigest()
     write_json(job.folder / "judged.json", {"policy": policy, "entries": entries})
 
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
-    """RUN and SLOT; cfp, shac (state) and shac-image; seeds 0 and 1; shac-image failed on SLOT."""
+    """RUN and SLOT; zero, cfp, shac (state) and shac-image; seeds 0 and 1; shac-image failed on SLOT."""
     out = tmp_path_factory.mktemp("report")
     (out / "plan.json").write_text(json.dumps(PLAN))
-    labels = ["cfp", "shac", "shac-image"]
-    jobs = make_jobs(Plan(**PLAN), ["run", "slot"], labels, [0, 1], out / "runs")
+    jobs = make_jobs(Plan(**PLAN), ["run", "slot"], LABELS, [0, 1], out / "runs")
     for job in jobs:
+        if job.label == "zero":
+            write_run(job, [3000, 3000] if job.config.task == "run" else [5000] * 4, {1: 2990})
+            continue
         shift = {"cfp": 0, "shac": 3000, "shac-image": 1000}[job.label] + 100 * job.config.seed
         curve = {500: 2600 + shift, 1000: 4000 + shift}
         if job.config.task == "run":
@@ -71,10 +78,15 @@ def report(tmp_path_factory):
             write_run(job, [8000 + shift] * 2, {}, successes=job.config.seed)
         else:
             write_text(job.folder / "error.txt", "NonFiniteError: a loss | is not finite\n")
-    options = f"--tasks run slot --algos {' '.join(labels)} --seeds 0 1 --plan {out / 'plan.json'} --out {out}"
+    options = f"--tasks run slot --algos {' '.join(LABELS)} --seeds 0 1 --plan {out / 'plan.json'} --out {out}"
     code = main([*options.split(), "--episodes", "2", "--slot-episodes", "4", "--report-only"])
     assert code == 1  # two runs are missing
     return out
+
+
+def groups_of(report, tasks=("run", "slot"), labels=LABELS):
+    jobs = make_jobs(Plan(**PLAN), tasks, labels, [0, 1], report / "runs")
+    return group(find_runs(jobs, lambda job: Judging(4 if job.name.startswith("zero-slot") else 2)))
 
 
 def rows(folder, name):
@@ -99,31 +111,65 @@ def test_final_evaluation(report):
 def test_what_is_seen_is_never_ranked_together(report):
     table = rows(report, "returns")
     ranks = {(row["sees"], row["algo"]): row["rank"] for row in table if row["task"] == "run"}
+    assert ranks.pop(("nothing", "zero")) == "1"
     # shac has the highest return, but is alone with the state.
     assert ranks == {("image", "cfp"): "2", ("image", "shac-image"): "1", ("state", "shac"): "1"}
-    assert [row["sees"] for row in table] == ["image", "image", "state"] * 2
+    assert [row["sees"] for row in table] == ["image", "image", "state", "nothing"] * 2
     for name in ("index.html", "report.md"):
         text = (report / name).read_text()
-        assert "image: cfp, shac-image; state: shac." in text
+        assert "image: cfp, shac-image; state: shac; nothing: zero." in text
         assert "never ranked together" in text
 
 
+def test_what_learns_nothing_is_one_run(report):
+    row = find(rows(report, "returns"), task="run", algo="zero")
+    assert (row["seeds"], row["episodes"], row["iqm"], row["low"]) == ("1", "2", "3000.0", "")
+    assert find(rows(report, "returns"), task="slot", algo="zero")["episodes"] == "4", "as many as of two seeds"
+    assert "Nothing is learned by zero: one run for all seeds." in (report / "index.html").read_text()
+
+
+def test_paper_s_returns_are_set_beside_full_size_only(report):
+    assert rows(report, "aggregate") == rows(report, "paper") == []
+    for name in ("index.html", "report.md"):
+        assert "None of them is set beside the paper" in (report / name).read_text()
+    groups = groups_of(report)
+    full, lite = ({each.name: each.rows for each in make_tables([], groups, 2, tier)} for tier in ("full", "lite"))
+    assert full["aggregate"] and full["paper"] and not lite["aggregate"] and not lite["paper"]
+
+
 def test_all_tasks_together_rank_only_who_did_all(report):
-    table = rows(report, "aggregate")
+    table = aggregate_table(groups_of(report)).rows
     cfp = find(table, algo="cfp")
     # (4000 - 2500) / 6150, with seed 1 a hundred more; (8000 - 7000) / 58000: four scores, the middle two.
     assert float(cfp["iqm"]) == pytest.approx((1100 / 58000 + 1500 / 6150) / 2)
-    assert cfp["rank"] == "1"
-    assert find(table, algo="shac-image")["rank"] == ""
+    assert cfp["rank"] == 1
+    assert "rank" not in find(table, algo="shac-image")
 
 
 def test_sample_efficiency(report):
     row = find(rows(report, "efficiency"), task="run", algo="cfp")
-    # Best of those that see the image: shac-image, 5050; half of the way from 2500 to there is 3775.
-    assert float(row["best"]) == 5050
-    assert (row["steps_50%"], row["reached_50%"]) == ("1000.0", "2/2")
+    # Best of those that see the image: shac-image, 5050; half of the way from zero's 3000 to there is 4025.
+    assert (float(row["rest"]), float(row["best"])) == (3000, 5050)
+    assert (row["steps_50%"], row["reached_50%"]) == ("1000.0", "1/2")
     assert (row["steps_75%"], row["reached_75%"]) == ("", "0/2")
     assert float(find(rows(report, "efficiency"), task="run", algo="shac")["best"]) == 7050
+    assert all(row["algo"] != "zero" for row in rows(report, "efficiency"))
+
+
+@pytest.mark.parametrize(
+    ("labels", "tier", "words"),
+    [
+        (["cfp"], "lite", "Rest was not measured in run: add zero to --algos."),
+        (
+            ["zero", "cfp"],
+            "full",
+            "None for cfp, evaluated in training with other particles than those that are judged",
+        ),
+    ],
+)
+def test_efficiency_without_a_rest_of_its_size_says_so(report, labels, tier, words):
+    table = efficiency_table(groups_of(report, ["run"], labels), tier)
+    assert words in table.about and "steps_50%" not in find(table.rows, algo="cfp")
 
 
 def test_cost_beside_the_paper_s(report):
@@ -138,7 +184,7 @@ def test_cost_names_the_particles_of_planners_without_a_tier_of_their_own(tmp_pa
     (job,) = make_jobs(Plan(), ["run"], ["mpc"], [0], tmp_path)
     write_run(job, [1.0], {})
     judging = Judging(1)
-    (row,) = cost_table(group(find_runs([job], judging, judging))).rows
+    (row,) = cost_table(group(find_runs([job], lambda _: judging))).rows
     assert row["particles"] == "lite"
 
 
@@ -149,7 +195,7 @@ def test_training_of_a_teacher_is_counted_by_itself(tmp_path):
     noted["sessions"][0]["teacher"] = {"steps": 300, "seconds": 60.0}
     write_json(job.folder / "sessions.json", noted)
     judging = Judging(1)
-    groups = group(find_runs([job], judging, judging))
+    groups = group(find_runs([job], lambda _: judging))
     (row,) = cost_table(groups).rows
     assert (row["speed"], row["minutes"], row["teacher"], row["teacher_steps"]) == (10, 100 / 60, 1, 300)
     (line,) = pictures.curves(groups, minutes=True).axes[0].lines
@@ -175,22 +221,19 @@ def test_robustness_beside_the_paper_s(report):
 
 
 def test_paper_s_returns_stand_beside_ours(report):
-    row = find(rows(report, "paper"), task="run", algo="cfp")
-    assert (row["ours"], row["paper"], row["band"], row["paper_steps"]) == ("4050.0", "8650", "420", "550000")
+    row = find(paper_table(groups_of(report)).rows, task="run", algo="cfp")
+    assert (row["ours"], row["paper"], row["band"], row["paper_steps"]) == (4050, 8650, 420, 550_000)
 
 
 def test_curves_over_time_end_with_the_training(report):
-    labels = ["cfp", "shac", "shac-image"]
-    jobs = make_jobs(Plan(**PLAN), ["run", "slot"], labels, [0, 1], report / "runs")
-    judging = Judging(2)
-    axes = pictures.curves(group(find_runs(jobs, judging, judging)), minutes=True).axes[0]
+    axes = pictures.curves(groups_of(report, labels=LABELS[1:]), minutes=True).axes[0]
     assert [line.get_xdata().tolist() for line in axes.lines] == [pytest.approx([50 / 60, 100 / 60])] * 3
 
 
 def test_failures_are_named(report):
     row = find(rows(report, "runs"), run="shac-image-slot-quick-1")
     assert (row["state"], row["error"]) == ("failed", "NonFiniteError: a loss | is not finite")
-    assert "10 of 12 runs are finished and judged; the others:" in (report / "index.html").read_text()
+    assert "12 of 14 runs are finished and judged; the others:" in (report / "index.html").read_text()
     assert "NonFiniteError: a loss \\| is not finite" in (report / "report.md").read_text()
 
 
@@ -201,13 +244,13 @@ def test_page_shows_only_files_beside_it(report):
     assert "http" not in page
     balance = TagBalance()
     balance.feed(page)
-    assert balance.open == [] and balance.tables == 8
+    assert balance.open == [] and balance.tables == 6
 
 
 def test_evaluations_of_another_policy_do_not_count(report, tmp_path):
     (job,) = make_jobs(Plan(), ["run"], ["cfp"], [0], tmp_path / "runs")
     write_run(job, [1.0, 2.0], {1000: 5.0})
-    write_text(job.folder / "policy.safetensors", "another")
-    assert main(f"--tasks run --seeds 0 --out {tmp_path} --episodes 2 --report-only".split()) == 1
+    write_policy(job.folder / "policy.safetensors", {"more": torch.zeros(1)}, origin(job.config, "cfp", 0, 0))
+    assert main(f"--tasks run --algos cfp --seeds 0 --out {tmp_path} --episodes 2 --report-only".split()) == 1
     assert find(rows(tmp_path, "returns"), task="run")["iqm"] == ""
     assert find(rows(tmp_path, "runs"), task="run")["state"] == "unjudged"

@@ -9,11 +9,14 @@ import torch
 import baselines
 import cfp
 import cfp.train
-from baselines import Distill, OpenLoop, PlannerConfig, Shac, distill
+from baselines import Distill, OpenLoop, PlannerConfig, Shac, distill, modular_env
 from baselines.compare.work import _train
 from baselines.dagger import Collector, Dataset, Labels, lose
 from baselines.distillation import METRICS
 from baselines.episodes import Episodes
+from baselines.modular_networks import ModularActor
+from baselines.modular_policy import SegmentPolicy
+from baselines.nodes import Nodes
 from baselines.registry import configure
 from baselines.teachers import PolicyTeacher, Teacher, project, read_teacher
 from cfp.config import EnvironmentConfig, ReportConfig, to_json
@@ -40,6 +43,15 @@ def privileged(tmp_path_factory):
         config = replace(Shac.preset(task, "quick"), environment=EnvironmentConfig(2, 300, 4), tier=300)
         Shac(config).save(path, origin(config, "shac", 0, 0))
     return paths
+
+
+@pytest.fixture(scope="module")
+def segments(tmp_path_factory):
+    """An untrained policy of segments, on file."""
+    path = tmp_path_factory.mktemp("segments") / "policy.safetensors"
+    config = configure({"algo": "gnn-16", "task": "run", "environment": {"particles": 300, "substeps": 4}})
+    SegmentPolicy(ModularActor("gnn", 10), Nodes(16, True), origin(config, "gnn-16", 0, 0)).save(path)
+    return path
 
 
 class Mirror(Teacher):
@@ -88,6 +100,15 @@ def test_faults_hit_half_of_what_they_may() -> None:
     assert bool((values == 7).all()) and lose(values, 0.0) is values
 
 
+def test_actions_are_lost_on_the_grid_on_which_the_student_decides() -> None:
+    env, taken = TorchEnv("run", 2, 64, particles=100, substeps=1), []
+    collector, step = Collector(env, Mirror(), Episodes(env, 0, 20, 3), 2, faults=0.5, grid=16), env.step
+    env.step = lambda action: taken.append(action) or step(action)
+    collector.collect(8, 0.0, lambda seen: torch.ones(2, 2, 64, 64))
+    cells = torch.cat(taken).unflatten(3, (16, 4)).unflatten(2, (16, 4)).transpose(3, 4).flatten(4)
+    assert (cells == cells[..., :1]).all() and 0.1 < (cells == 0).float().mean() < 0.4
+
+
 def test_student_meets_faults_and_labels_do_not() -> None:
     config = make(num_envs=2, substeps=5, round=8, steps=64, handover=(32,))
     rounds = {}
@@ -132,9 +153,10 @@ def test_student_does_as_the_teacher_in_a_closed_loop():
 
 
 @pytest.mark.parametrize("level", [0, 1])
-@pytest.mark.parametrize("kind", ["mpc", "privileged"])
-def test_resumed_distillation_is_the_same_to_the_last_bit(kind, level, privileged):
-    config = make(teacher=kind if kind == "mpc" else str(privileged["run"]), age=6, planner=PlannerConfig(3, 3, 1))
+@pytest.mark.parametrize("kind", ["mpc", "privileged", "segments"])
+def test_resumed_distillation_is_the_same_to_the_last_bit(kind, level, privileged, segments):
+    teacher = {"mpc": "mpc", "privileged": str(privileged["run"]), "segments": str(segments)}[kind]
+    config = make(teacher=teacher, age=6, planner=PlannerConfig(3, 3, 1))
     start = Distill(config).policy if level else None
     whole, first, second = (Distill(config, level, start) for _ in range(3))
     whole.learn(32, lambda _: None)
@@ -147,6 +169,13 @@ def test_resumed_distillation_is_the_same_to_the_last_bit(kind, level, privilege
     assert torch.equal(whole.env.state.x, second.env.state.x)
     for mine, theirs in zip(whole.dataset.rounds, second.dataset.rounds, strict=True):
         assert torch.equal(mine.observations, theirs.observations) and torch.equal(mine.actions, theirs.actions)
+
+
+def test_teacher_remembers_its_segments_as_long_as_an_episode_lasts(segments, monkeypatch):
+    anew, begin = [], modular_env.begin
+    monkeypatch.setattr(modular_env, "begin", lambda x, count: anew.append(len(x)) or begin(x, count))
+    Distill(make(teacher=str(segments), age=6)).learn(32, lambda _: None)
+    assert sum(anew) == 7, "of 16 steps: the first robot begins anew after 3, 9 and 15, the second after 6 and 12"
 
 
 class Scripted(Teacher):

@@ -9,6 +9,7 @@ import torch
 from baselines import MPC, OpenLoop, PlannerConfig, train
 from baselines.mpc import MPCConfig
 from cfp.config import EnvironmentConfig
+from cfp.environments import make_torch_env
 from cfp.errors import ConfigError
 from cfp.files import read_table
 from cfp.process import StopSignals
@@ -31,6 +32,18 @@ def test_record_repeats_the_episode(tmp_path) -> None:
     assert rows["own layout"]["mean"] == pytest.approx(max(evaluated), abs=1e-3)
     record = OpenLoop.load(tmp_path)
     assert 0 < len(record.actions) <= 30 and record.resolution == 4 and record.description["layout"] == 0
+
+
+def test_record_repeats_the_episode_exactly_in_double_precision() -> None:
+    config = replace(CONFIG, environment=replace(ENVIRONMENT, dtype="float64"))
+    model = MPC(config)
+    model.learn(4, lambda scalars: None)
+    env, memory = make_torch_env(config, 4, 1), None
+    seen, _ = env.reset(seed=0)
+    for _ in range(4):
+        action, memory = model.policy.predict(seen.numpy(), memory)
+        env.step(torch.as_tensor(action))
+    assert torch.equal(env.state.x, model.env.state.x)
 
 
 def test_options_that_only_the_model_can_refuse_leave_the_folder_free(tmp_path, capsys) -> None:

@@ -14,7 +14,8 @@ import cfp
 from cfp import robustness
 from cfp.actor import build_actor
 from cfp.config import to_json
-from cfp.disturbances import Case, Disturbed, applies, disturbed_env, make_cases
+from cfp.disturbances import Case, Disturbed, disturbed_env, idle, make_cases
+from cfp.errors import ConfigError
 from cfp.evaluate import open_policy, open_run
 from cfp.evaluation import Result, ZeroPolicy, evaluate, student
 from cfp.files import write_json
@@ -117,7 +118,7 @@ def test_constants_reach_the_physics_of_every_task(task):
 
 def test_cases_that_change_nothing_in_a_task_are_left_out():
     cases = make_cases()
-    names = {task: [case.name for case in cases if applies(case, make_spec(task))] for task in TASKS}
+    names = {task: [case.name for case in cases if not idle(case, make_spec(task))] for task in TASKS}
     assert "gravity x 0.8" in names["run"] and "gravity x 0.8" not in names["shapematch"]
     assert "floor friction sticky" in names["dig"] and "floor friction 0" not in names["dig"]
     assert "floor friction sticky" not in names["run"] and "floor friction 0" in names["run"]
@@ -154,7 +155,7 @@ def test_command_writes_table_and_plot(folder, capsys):
     printed = capsys.readouterr().out
     rows = json.loads((folder / "robustness.json").read_text())
     assert [row["case"] for row in rows] == [
-        case.name for case in make_cases() if applies(case, make_spec("shapematch"))
+        case.name for case in make_cases() if not idle(case, make_spec("shapematch"))
     ]
     assert rows[0]["ratio"] == 1
     for row in rows:
@@ -200,6 +201,20 @@ def test_cases_are_chosen_by_words():
     assert robustness.choose(make_cases(), []) == make_cases()
 
 
+def test_chosen_cases_that_change_nothing_are_refused(folder):
+    words, run = ["friction"], make_spec("run")
+    policy = open_run(PROGRAM, folder, "cpu")[1]["stage 2"]
+    robustness.check_words(make_cases(), [*words, "observation"], run, policy)
+    ground = [replace(item, name="ground") if item.name == "floor" else item for item in run.obstacles]
+    with pytest.raises(ConfigError, match="floor friction 0: run has no obstacle with the name 'floor'; floor"):
+        robustness.check_words(make_cases(), words, replace(run, obstacles=tuple(ground)), policy)
+    with pytest.raises(ConfigError, match="floor friction sticky: the floor of run has this friction"):
+        robustness.check_words(make_cases(), ["sticky"], run, policy)
+    policy.sees_image = False
+    with pytest.raises(ConfigError, match="observation dropout 20%: the policy looks at no pixels"):
+        robustness.check_words(make_cases(), ["observation"], run, policy)
+
+
 def test_ratios_need_a_positive_return():
     rows = robustness.to_rows([Result("unperturbed", 8, (-2.0, -1.0)), Result("noise", 8, (-4.0, -3.0))])
     assert [row["ratio"] for row in rows] == [None, None]
@@ -215,6 +230,7 @@ def test_ratios_need_a_positive_return():
         (["--noise", "nan"], "noise: got nan"),
         (["--friction", "-1"], "friction: got (-1.0,), allowed 0 or more"),
         (["--device", "abacus"], "device: got 'abacus'"),
+        (["--cases", "noise", "gravity"], "cases: got 'gravity', allowed words of cases that change something"),
     ],
 )
 def test_wrong_option_is_one_line_and_exit_code_two(folder, capsys, arguments, message):
