@@ -135,7 +135,8 @@ class Distill(Algorithm):
         learning = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
         self.adam = torch.optim.Adam(learning, config.student_rate)
         episodes = Episodes(self.env, config.seed + level * config.layouts, config.age, config.layouts)
-        self.collector = Collector(self.env, self._teacher(own, teacher), episodes, config.leg, config.faults)
+        grid = self.spec.resolutions[-1]
+        self.collector = Collector(self.env, self._teacher(own, teacher), episodes, config.leg, config.faults, grid)
         self.dataset, self.rounds = Dataset(config.capacity), 0
         self.period = config.round * self.env.num_envs
 

@@ -109,6 +109,11 @@ def test_actions_are_lost_on_the_grid_on_which_the_student_decides() -> None:
     assert (cells == cells[..., :1]).all() and 0.1 < (cells == 0).float().mean() < 0.4
 
 
+def test_every_level_loses_actions_on_its_own_grid() -> None:
+    first = Distill(make())
+    assert [model.collector.grid for model in (first, Distill(make(), 1, first.policy))] == [8, 16]
+
+
 def test_student_meets_faults_and_labels_do_not() -> None:
     config = make(num_envs=2, substeps=5, round=8, steps=64, handover=(32,))
     rounds = {}
