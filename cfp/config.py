@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
@@ -75,8 +76,13 @@ class RunConfig:
         """Seed of the first layout, and episodes, by which stage ``level`` is evaluated while it trains."""
         return self.seed + EVALUATION_SEED, self.report.eval_episodes
 
-    def adapted(self, base: RunConfig) -> RunConfig:
-        """These options with what follows from those that differ from ``base``, unless it was changed too."""
+    def adapted(self, base: RunConfig, given: Collection[str]) -> RunConfig:
+        """These options with what follows from others, unless it was given too.
+
+        Args:
+            base: The preset.
+            given: Names of the options that do not come from there, even if their values are the same.
+        """
         return self
 
     def check(self) -> None:
@@ -161,24 +167,21 @@ class LadderConfig(RunConfig):
         """Rows and columns of the actions that the environment of a level takes, see `ActorSpec.patch`."""
         return self.actor_spec(level).action_size
 
-    def adapted(self, base: RunConfig) -> RunConfig:
+    def adapted(self, base: RunConfig, given: Collection[str]) -> RunConfig:
         """Other steps move the handovers in proportion; another number of levels stretches what each has one of.
 
         Then levels are equally long, and further ones have the values of the last one that has any.
         """
         assert isinstance(base, LadderConfig)
-        levels, changes = len(self.resolutions), dict[str, Any]()
-        if levels != len(base.resolutions):
-            for name, count in self.counts().items():
-                values: tuple[float, ...] = getattr(self, name)
-                if name != "handover" and values and values == getattr(base, name):
-                    changes[name] = (*values, *values[-1:] * count)[:count]
-            if self.handover == base.handover:
-                changes["handover"] = tuple(round(self.steps * level / levels) for level in range(1, levels))
-        elif self.steps != base.steps and self.handover == base.handover:
-            share = self.steps / base.steps
+        levels, share, changes = len(self.resolutions), self.steps / base.steps, dict[str, Any]()
+        for name, count in self.counts().items():
+            values: tuple[float, ...] = getattr(base, name)
+            changes[name] = (*values, *values[-1:] * count)[:count]
+        if levels == len(base.resolutions):
             changes["handover"] = tuple(round(step * share) for step in base.handover)
-        return replace(self, **changes)
+        else:
+            changes["handover"] = tuple(round(self.steps * level / levels) for level in range(1, levels))
+        return replace(self, **{name: value for name, value in changes.items() if name not in given})
 
     def counts(self) -> dict[str, int]:
         """How many values each option has that has one for a level."""
