@@ -218,7 +218,7 @@ class Shac(Algorithm):
         """Do as many windows as cover the steps.
 
         Raises:
-            NonFiniteError: Ten updates in a row had no finite gradient.
+            NonFiniteError: Ten updates in a row had no finite gradient, or actions are not finite.
         """
         end = self.num_timesteps + total_timesteps
         while self.num_timesteps < end:

@@ -178,6 +178,14 @@ def test_updates_without_a_finite_gradient_end_the_training(monkeypatch):
     assert rows[-1]["train/skipped"] == 9 and torch.equal(before, parameters(algorithm))
 
 
+def test_actor_that_has_diverged_does_not_act():
+    algorithm = Shac(make())
+    with torch.no_grad():
+        next(algorithm.actor.parameters()).fill_(torch.nan)
+    with pytest.raises(NonFiniteError, match="the actor's actions became NaN"):
+        algorithm.learn(8, lambda scalars: None)
+
+
 def test_episodes_are_cut_at_staggered_ages_and_change_layouts():
     algorithm = Shac(make(age=8, layouts=3))
     first = algorithm.env.state.x[0].clone()
