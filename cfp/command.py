@@ -154,7 +154,8 @@ def main(program: Program, arguments: Sequence[str] | None = None, started: str 
             print(f"{folder} holds no run yet: starting afresh")
         config = command.run
         if command.dry_run:
-            print(json.dumps(to_json(config), indent=2), estimate(program, config), sep="\n")
+            begun = folder if command.resume else None
+            print(json.dumps(to_json(config), indent=2), estimate(program, config, begun), sep="\n")
             return 0
         print(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed} -> {folder}")
         keep_memory()

@@ -320,9 +320,13 @@ class Run(ABC):
             record,
         )
 
+    def policies(self) -> dict[str, Policy]:
+        """Policies of the run so far by name, see `stage_files`."""
+        return {name: self.load(path) for name, path in stage_files(self.folder, len(self.config.ends())).items()}
+
     def finish(self) -> list[Result]:
         """After training: the final table, ``results.json``, curve, video and page. Returns the table's rows."""
-        policies = {name: self.load(path) for name, path in stage_files(self.folder, len(self.config.ends())).items()}
+        policies = self.policies()
         results = compare(self.config, policies, self.config.report.eval_episodes)
         write_json(self.folder / "results.json", to_rows(results))
         untrained = {result.name: result.mean for result in results[:2]}
