@@ -311,7 +311,7 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch, caps
     [
         ("shapematch", "gradient", "T", "teacher: got a policy for the target T, allowed star"),
         ("kick", "gradient", None, "teacher: got a policy for kick, allowed run"),
-        ("run", "gradient", "T", "teacher: its target or the student's cannot be read"),
+        ("run", "gradient", "T", "teacher: its target or the one wanted cannot be read"),
         (None, "", None, "allowed mpc, shac, gradient, grow, run, shapematch"),
     ],
 )

@@ -270,7 +270,7 @@ def test_policy_of_the_image_is_one_of_cfp(tmp_path):
 def test_actor_on_the_image_begins_with_a_policy_of_any_algorithm(tmp_path):
     config = make(sees="image")
     actor, path = build_actor(ActorSpec((config.resolution(0),))), tmp_path / "policy.safetensors"
-    origins = cfp.Config(task="run", resolutions=(config.resolution(0),), gate_bias=())
+    origins = cfp.Config(task="run", resolutions=(config.resolution(0),), gate_bias=(), environment=config.environment)
     save_policy(path, actor, describe(origins, 0, 5))
     warm = replace(config, start_from=str(path))
     algorithm = Shac(warm, 0, Shac.start(warm))

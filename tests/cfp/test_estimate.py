@@ -44,7 +44,7 @@ def test_stages_that_learn_nothing_are_named(tmp_path, capsys, monkeypatch):
     ]
     assert train.main([*quick, "--random-steps", "9", "0", "--update-start", "50"]) == 0
     assert "stage 1: " not in capsys.readouterr().out
-    refined = ["--start-from", "run", "--refine", "--random-steps", "600", "0", "--update-start", "50"]
+    refined = "--substeps 100 --start-from run --refine --random-steps 600 0 --update-start 50".split()
     assert train.main([*quick, *refined, "--resolutions", "8", "16"]) == 0
     assert "are random" not in capsys.readouterr().out
 
@@ -102,7 +102,7 @@ def test_replay_of_blended_actions_is_as_small_as_their_parts(tmp_path, capsys, 
 
 def test_dry_run_counts_only_levels_that_will_be_trained(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    arguments = [*LEARNS, "--task", "run", "--start-from", "run", "--buffer-size", "60"]
+    arguments = [*LEARNS, "--task", "run", "--substeps", "100", "--start-from", "run", "--buffer-size", "60"]
     assert train.main([*TINY, *arguments, "--dry-run"]) == 0
     header, stage, time = capsys.readouterr().out.strip().splitlines()[-4:-1]
     assert header.startswith("stage") and stage.split()[:3] == ["2", "16x16", "80"] and time.startswith("time: about")
