@@ -86,6 +86,11 @@ class DistillConfig(LadderConfig):
     planner_grid: int | Literal["coarse", "fine"] = "coarse"
     """Action grid of the teacher mpc."""
 
+    def idle(self) -> dict[str, str]:
+        """What concerns plans."""
+        plans = {} if self.teacher == "mpc" else dict.fromkeys(("planner.", "planner_grid"), "teacher mpc")
+        return super().idle() | plans
+
     def check(self) -> None:
         """Check what the types cannot, see `LadderConfig.check`."""
         super().check()

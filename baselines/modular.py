@@ -68,6 +68,11 @@ class ModularConfig(SACConfig):
         """Action grid R: the task's whole patch, so that segments write to its nodes."""
         return make_spec(self.task).patch
 
+    def idle(self) -> dict[str, str]:
+        """What concerns ladders, and grids of actions: segments act on nodes."""
+        needs = dict.fromkeys(("learning.anchor", "learning.warm_critic", "environment.action_layout"), "algo cfp")
+        return super().idle() | needs
+
     def stage(self, level: int) -> StageConfig:
         """What the training needs."""
         return StageConfig(self.resolution(level), self.steps, self.random_steps, self.alpha, 0.0)

@@ -97,6 +97,11 @@ class ShacConfig(GridConfig):
         """Environment steps after which the only stage ends."""
         return (self.steps,)
 
+    def idle(self) -> dict[str, str]:
+        """Which parts of the state are seen, where it is not."""
+        parts = {} if self.sees == "state" else dict.fromkeys(("deformation", "clock", "place"), "sees state")
+        return super().idle() | parts
+
     def check(self) -> None:
         """Check what the types cannot, see `RunConfig.check`."""
         super().check()

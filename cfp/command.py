@@ -117,6 +117,7 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
     command = read(base)
     run = command.run.adapted(preset, values.keys() | _named(arguments))
     run.check()
+    run.check_effect(preset)
     return replace(command, run=run, out=command.out or _default_folder(run))
 
 

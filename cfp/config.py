@@ -20,6 +20,7 @@ from cfp.groups import at_least_one as at_least_one
 from cfp.groups import not_negative as not_negative
 from cfp.groups import positive as positive
 from cfp.groups import share as share
+from cfp.merging import flatten
 from cfp.merging import merge as merge
 from cfp.networks import RESOLUTIONS
 from dittogym import make_spec
@@ -28,6 +29,7 @@ from dittogym.tasks import allowed_instead, task_name
 Preset = Literal["quick", "paper"]
 
 LARGEST_SEED = 2**31 - 1
+SEVERAL = "resolutions of several levels"
 EVALUATION_SEED = 10_000
 """Added to a run's seed for evaluations, so that they start from particle layouts not trained on."""
 
@@ -84,6 +86,23 @@ class RunConfig:
             given: Names of the options that do not come from there, even if their values are the same.
         """
         return self
+
+    def idle(self) -> dict[str, str]:
+        """Options that change nothing as the others are, with what they need (a dot at the end: the whole group)."""
+        return {"report.wandb_project": "wandb"} if self.report.wandb == "off" else {}
+
+    def check_effect(self, base: RunConfig) -> None:
+        """Refuse options that differ from those of ``base``, the preset, and change nothing, see `idle`.
+
+        Raises:
+            ConfigError: Naming the option, what was given and what it needs.
+        """
+        mine, theirs = flatten(to_json(self)), flatten(to_json(base))
+        for option, needs in self.idle().items():
+            for name, value in mine.items():
+                if name.startswith(option) and value != theirs[name]:
+                    leaf = name.split(".")[-1]
+                    raise ConfigError(f"{leaf}: got {value!r}, which changes nothing; allowed with {needs}")
 
     def check(self) -> None:
         """Check what the types cannot.
@@ -183,6 +202,10 @@ class LadderConfig(RunConfig):
             changes["handover"] = tuple(round(self.steps * level / levels) for level in range(1, levels))
         return replace(self, **{name: value for name, value in changes.items() if name not in given})
 
+    def idle(self) -> dict[str, str]:
+        """One level has no gate."""
+        return super().idle() | ({"network.gate_scale": SEVERAL} if len(self.resolutions) == 1 else {})
+
     def counts(self) -> dict[str, int]:
         """How many values each option has that has one for a level."""
         levels = len(self.resolutions)
@@ -254,6 +277,11 @@ class Config(LadderConfig, SACConfig):
             self.alpha[level],
             self.gate_penalty[level - 1] if level else 0.0,
         )
+
+    def idle(self) -> dict[str, str]:
+        """What concerns a policy that is refined, or the level before."""
+        idle = super().idle() | ({} if self.refine else {"learning.anchor": "refine"})
+        return idle | ({"learning.warm_critic": SEVERAL} if len(self.resolutions) == 1 else {})
 
     def check(self) -> None:
         """Check what the types cannot, see `LadderConfig.check`."""
