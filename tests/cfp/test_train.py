@@ -107,8 +107,7 @@ def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monk
     assert f"resuming {folder} at step" in capsys.readouterr().out
     assert (folder / "results.json").read_bytes() == (finished / "results.json").read_bytes()
     assert (folder / "evaluations.csv").read_bytes() == (finished / "evaluations.csv").read_bytes()
-    steps = [row["step"] for row in read_table(folder / "progress.csv")]
-    assert steps == [row["step"] for row in read_table(finished / "progress.csv")]
+    assert (folder / "progress.csv").read_bytes() == (finished / "progress.csv").read_bytes()
 
 
 def test_killed_run_repeats_what_no_checkpoint_holds(finished, tmp_path, monkeypatch):
