@@ -27,6 +27,21 @@ def action_space(resolution: int) -> spaces.Box:
     return spaces.Box(-1.0, 1.0, (2, resolution, resolution), np.float32)
 
 
+def check_images(observation: object) -> None:
+    """Check what a policy of the image is shown: its networks would take other numbers as mapped already.
+
+    Raises:
+        ValueError: It is not an image, or a batch of them.
+    """
+    found = type(observation).__name__
+    if isinstance(observation, np.ndarray):
+        if observation.dtype == np.uint8 and observation.shape[-3:] == (3, IMAGE_SIZE, IMAGE_SIZE):
+            if observation.ndim in (3, 4):
+                return
+        found = f"{observation.dtype} array of shape {observation.shape}"
+    raise ValueError(f"observation: got {found}, allowed a uint8 array (3, 64, 64) or (B, 3, 64, 64)")
+
+
 class NetworkPolicy(sac_policies.SACPolicy, ABC):
     """Actor, twin critics and target critics of a kind that a subclass makes, for `cfp.algorithm.CFP`.
 
@@ -147,6 +162,17 @@ class CFPPolicy(NetworkPolicy):
         """Critics of the executed action."""
         return TwinCritic(self.spec.action_size, self.spec.split, self.spec.interpolation)
 
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """As stable-baselines3's, of images only, see `check_images`."""
+        check_images(observation)
+        return super().predict(observation, state, episode_start, deterministic)
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
             "observation_space": self.observation_space,
@@ -183,6 +209,30 @@ class ActorPolicy(BasePolicy):
     def resolution(self) -> int:
         """Rows and columns of its actions: what the environment must take."""
         return self.spec.action_size
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Choose actions, as stable-baselines3's ``predict``.
+
+        Args:
+            observation: (3, 64, 64) or (B, 3, 64, 64) uint8.
+            state: Returned as it is: nothing is remembered.
+            episode_start: Changes nothing.
+            deterministic: Without noise.
+
+        Returns:
+            Actions (2, R, R) or (B, 2, R, R) float32, and ``state``.
+
+        Raises:
+            ValueError: The observation is something else.
+        """
+        check_images(observation)
+        return super().predict(observation, state, episode_start, deterministic)
 
     def forward(self, observation: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
         """Choose actions.
