@@ -21,7 +21,7 @@ from baselines.nodes import Nodes
 from cfp.algorithm import CFP
 from cfp.composition import Composition
 from cfp.config import RunConfig, SACConfig, StageConfig, at_least_one, not_negative
-from cfp.environments import make_torch_env
+from cfp.environments import choose_device, make_torch_env
 from cfp.errors import ConfigError
 from cfp.policy import NetworkPolicy
 from cfp.runner import SACRun
@@ -186,4 +186,4 @@ class ModularRun(SACRun):
 
     def load(self, path: Path) -> SegmentPolicy:
         """Load a policy of the run."""
-        return SegmentPolicy.load(path)
+        return SegmentPolicy.load(path, choose_device(self.config.device))

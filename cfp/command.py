@@ -33,14 +33,14 @@ class Program:
         about: First words of the help.
         configure: From JSON values to options; what the values leave out comes from the preset they name.
         run: Opens a run: options, folder, whether to resume, stop signals.
-        load: Loads a policy file.
+        load: Loads a policy file onto a device.
     """
 
     package: str
     about: str
     configure: Callable[[dict[str, Any]], RunConfig]
     run: Callable[[RunConfig, Path, bool, StopSignals], Run]
-    load: Callable[[Path], Policy]
+    load: Callable[[Path, str], Policy]
 
 
 @dataclass(frozen=True)

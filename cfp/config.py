@@ -120,6 +120,7 @@ class RunConfig:
             checkpoint_every=self.report.checkpoint_every,
             log_every=self.report.log_every,
         )
+        training_layouts("num_envs", self.environment.num_envs)
         for name in ("eval_every", "video_every"):
             if (every := getattr(self.report, name)) < 0:
                 raise ConfigError(f"{name}: got {every}, allowed 0 (never) or more")
@@ -293,6 +294,23 @@ class Config(LadderConfig, SACConfig):
             raise ConfigError("warm_critic: got True, allowed without start_from (a policy brings no critics)")
         if self.refine and self.start_from is None:
             raise ConfigError("refine: got True, allowed with start_from, which names the policy")
+
+
+def training_layouts(name: str, count: int, before: int = 0) -> None:
+    """Check how many layouts are trained on, which are counted on from the seed.
+
+    Args:
+        name: The option that says so.
+        count: How many.
+        before: Those that come first for another reason, such as one for each robot.
+
+    Raises:
+        ConfigError: The last of them would be one of those that judge.
+    """
+    if before + count > EVALUATION_SEED:
+        raise ConfigError(
+            f"{name}: got {count} layouts, allowed {EVALUATION_SEED - before}: further ones judge policies"
+        )
 
 
 def check_task(task: object) -> None:

@@ -200,4 +200,4 @@ class Runner(SACRun):
 
     def load(self, path: Path) -> ActorPolicy:
         """Load a policy of the run."""
-        return load(path)
+        return load(path, choose_device(self.config.device))

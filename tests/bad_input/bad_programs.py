@@ -81,17 +81,11 @@ TRAIN = [
     training("a policy that is not there", "--start-from none", "none.safetensors: there is no policy"),
     training("a policy of another task", "--start-from run", "start_from: got a policy for run, allowed shapematch"),
     training("an algorithm of baselines", "--algo shac", "algo: got 'shac', allowed 'cfp'; python -m baselines.train"),
-    Case(
-        "train with more robots than memory",
-        command(cfp.train.main, TINY + NEW + "--num-envs 999999999999"),
-        ("not enough memory: take fewer num_envs",),
-        Refused,
-        leaves="new",
-    ),
+    training("robots on judging layouts", "--num-envs 10001", "num_envs: got 10001 layouts, allowed 10000: further"),
     Case(
         "train with a memory of years",
         command(cfp.train.main, TINY + NEW + "--buffer-size 99999999999999"),
-        ("not enough memory", "a smaller buffer_size"),
+        ("not enough memory: take fewer num_envs", "a smaller buffer_size"),
         Refused,
         leaves="new",
     ),
@@ -143,6 +137,10 @@ OTHERS = [
     distilling("an unknown teacher", "--teacher socrates", "teacher: got 'socrates'", "mpc, shac, gradient"),
     distilling("a teacher of another task", "--teacher run", "teacher: got a policy for run, allowed shapematch"),
     distilling("a share of 2", "--share 2", "share: got 2.0, allowed 0 to 1"),
+    learning(
+        "shac", "judging layouts", "--layouts 50000", "layouts: got 50000 layouts, allowed 9996: further ones judge"
+    ),
+    distilling("judging layouts", "--layouts 5000", "layouts: got 10000 layouts, allowed 9984: further ones judge"),
     distilling("no labels", "--capacity 0", "capacity: got 0, allowed 1 or more"),
     evaluating("nothing", "", "policy: got None and the folder None, allowed is one of the two"),
     evaluating("a folder that is not there", "{folder}/none", "none: there is no run (no config.json)"),

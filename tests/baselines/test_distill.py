@@ -42,6 +42,19 @@ def privileged(tmp_path_factory):
     return paths
 
 
+def test_how_a_policy_is_judged_does_not_change_what_it_learns():
+    def learned(quiet, **changes):
+        config = make(share=0.0, **changes)
+        student = Distill(replace(config, report=replace(config.report, eval_deterministic=quiet)))
+        student.learn(16, lambda scalars: None)  # the student leads in the second round
+        return torch.nn.utils.parameters_to_vector(student.actor.parameters()).detach()
+
+    assert torch.equal(learned(False), learned(True))
+    assert not torch.equal(learned(True), learned(True, student_noise=False))
+    assert Distill.preset("shapematch", "quick").student_noise
+    assert not Distill.preset("shapematch", "paper").student_noise  # which is judged without
+
+
 class Mirror(Teacher):
     """Pulls where the image shows matter, by image alone: what a student can copy."""
 

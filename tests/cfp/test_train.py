@@ -8,6 +8,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -80,6 +81,23 @@ def test_interrupt_that_is_not_held_back_is_one_line(tmp_path, monkeypatch, caps
     monkeypatch.setattr(Runner, place, interrupt)
     assert run(tmp_path / "a", "--steps", "20", "--handover", "10") == 130
     assert capsys.readouterr().err.splitlines()[-1] == "stopped; --resume goes on"
+
+
+def test_policies_are_judged_on_the_device_that_was_chosen(finished, monkeypatch):
+    seen = []
+
+    def load(path, device):
+        seen.append(device)
+        return cfp.load(path, "cpu")
+
+    for module in ("runner", "evaluate"):
+        monkeypatch.setattr(f"cfp.{module}.choose_device", lambda name: f"the one that {name} means")
+    program = replace(train.PROGRAM, load=load)
+    evaluate.open_run(program, finished, "cuda")
+    evaluate.open_policy(program, "run", "cuda", None)
+    monkeypatch.setattr("cfp.runner.load", load)
+    Runner.load(SimpleNamespace(config=preset("run")), finished)
+    assert seen == [*["the one that cuda means"] * 3, "the one that auto means"]
 
 
 def test_one_seed_gives_one_table(finished, tmp_path):
