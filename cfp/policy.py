@@ -106,7 +106,35 @@ class NetworkPolicy(sac_policies.SACPolicy, ABC):
         return cast(Actor, self.actor), cast(TwinCritic, self.critic), cast(TwinCritic, self.critic_target)
 
 
-class CFPPolicy(NetworkPolicy):
+class ImagePolicy(BasePolicy, ABC):
+    """A policy that is shown images, and nothing else."""
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Choose actions, as stable-baselines3's ``predict``.
+
+        Args:
+            observation: (3, 64, 64) or (B, 3, 64, 64) uint8.
+            state: Arrays with a leading B, handed through: nothing is remembered.
+            episode_start: (B,) bool; changes nothing.
+            deterministic: Without noise.
+
+        Returns:
+            Actions (2, R, R) or (B, 2, R, R) float32, and ``state``.
+
+        Raises:
+            ValueError: The observation is something else.
+        """
+        check_images(observation)
+        return super().predict(observation, state, episode_start, deterministic)
+
+
+class CFPPolicy(ImagePolicy, NetworkPolicy):
     """Actor, twin critics and target critics of the coarse-to-fine policy.
 
     Coarser levels live inside the actor as frozen submodules, so ``state_dict`` and ``predict`` cover the whole
@@ -162,17 +190,6 @@ class CFPPolicy(NetworkPolicy):
         """Critics of the executed action."""
         return TwinCritic(self.spec.action_size, self.spec.split, self.spec.interpolation)
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """As stable-baselines3's, of images only, see `check_images`."""
-        check_images(observation)
-        return super().predict(observation, state, episode_start, deterministic)
-
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
             "observation_space": self.observation_space,
@@ -184,7 +201,7 @@ class CFPPolicy(NetworkPolicy):
         }
 
 
-class ActorPolicy(BasePolicy):
+class ActorPolicy(ImagePolicy):
     """An actor alone, with stable-baselines3's ``predict``: what `cfp.load` returns.
 
     Args:
@@ -209,30 +226,6 @@ class ActorPolicy(BasePolicy):
     def resolution(self) -> int:
         """Rows and columns of its actions: what the environment must take."""
         return self.spec.action_size
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Choose actions, as stable-baselines3's ``predict``.
-
-        Args:
-            observation: (3, 64, 64) or (B, 3, 64, 64) uint8.
-            state: Returned as it is: nothing is remembered.
-            episode_start: Changes nothing.
-            deterministic: Without noise.
-
-        Returns:
-            Actions (2, R, R) or (B, 2, R, R) float32, and ``state``.
-
-        Raises:
-            ValueError: The observation is something else.
-        """
-        check_images(observation)
-        return super().predict(observation, state, episode_start, deterministic)
 
     def forward(self, observation: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
         """Choose actions.

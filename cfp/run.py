@@ -306,18 +306,18 @@ class Run(ABC):
         evaluated = int(rows[-1]["step"]) if rows else 0
         ends, over = config.ends(), partial(self._plateau, level)
         return Books(
-            level,
-            ends[level],
-            ends[-1],
-            config.report,
-            self.signals,
-            self.logger,
-            measure,
-            save,
-            first,
-            evaluated,
-            over,
-            record,
+            level=level,
+            end=ends[level],
+            total=ends[-1],
+            report=config.report,
+            signals=self.signals,
+            logger=self.logger,
+            evaluate=measure,
+            save=save,
+            evaluate_first=first,
+            evaluated=evaluated,
+            over=over,
+            film=record,
         )
 
     def policies(self) -> dict[str, Policy]:
