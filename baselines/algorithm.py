@@ -15,6 +15,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from cfp.books import Books
 from cfp.config import RunConfig
+from cfp.environments import choose_device
 from cfp.estimate import Cost
 from cfp.evaluation import Policy
 from cfp.process import StopSignals
@@ -260,4 +261,4 @@ class AlgorithmRun(Run):
 
     def load(self, path: Path) -> Policy:
         """Load a policy of the run."""
-        return self.kind.load(path)
+        return self.kind.load(path, choose_device(self.config.device))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from baselines.algorithm import AlgorithmRun
 from baselines.distillation import Distill, DistillConfig
-from baselines.teachers import PHYSICS, is_record_of_another_start, read_teacher
+from baselines.teachers import is_record_of_another_start, read_teacher
 from cfp.config import RunConfig
 from cfp.errors import CheckpointError, ConfigError
 from cfp.estimate import Cost
@@ -16,7 +16,7 @@ from cfp.policy import ActorPolicy
 from cfp.process import StopSignals
 from cfp.run import Run, copy_policy
 from cfp.state_file import Position
-from cfp.weights import read_policy, shipped, write_policy
+from cfp.weights import PHYSICS, read_policy, shipped, write_policy
 
 TRAINED = ("shac", "gradient")
 """Teachers that are trained first if only their name is given."""

@@ -22,7 +22,7 @@ from baselines.episodes import Episodes
 from baselines.planner import PlannerConfig
 from baselines.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
 from cfp.actor import build_actor
-from cfp.config import EnvironmentConfig, LadderConfig, RunConfig, Tier, at_least_one, positive, share
+from cfp.config import EnvironmentConfig, LadderConfig, RunConfig, Tier, at_least_one, positive, share, training_layouts
 from cfp.environments import make_torch_env
 from cfp.errors import NonFiniteError
 from cfp.policy import ActorPolicy
@@ -65,6 +65,8 @@ class DistillConfig(LadderConfig):
     """Gradient steps in a lesson."""
     batch_size: int = 256
     """Labels in a gradient step."""
+    student_noise: bool = True
+    """The student moves with the noise of its policy."""
     student_rate: float = 1e-3
     """Adam's step size at the beginning of each level; it falls to a tenth."""
     max_grad_norm: float = 1.0
@@ -86,6 +88,11 @@ class DistillConfig(LadderConfig):
     planner_grid: int | Literal["coarse", "fine"] = "coarse"
     """Action grid of the teacher mpc."""
 
+    def idle(self) -> dict[str, str]:
+        """What concerns plans."""
+        plans = {} if self.teacher == "mpc" else dict.fromkeys(("planner.", "planner_grid"), "teacher mpc")
+        return super().idle() | plans
+
     def check(self) -> None:
         """Check what the types cannot, see `LadderConfig.check`."""
         super().check()
@@ -99,6 +106,7 @@ class DistillConfig(LadderConfig):
             age=self.age,
             layouts=self.layouts,
         )
+        training_layouts("layouts", self.layouts * len(self.resolutions), self.environment.num_envs)
         positive(student_rate=self.student_rate, max_grad_norm=self.max_grad_norm)
         share(share=self.share, faults=self.faults)
 
@@ -166,6 +174,7 @@ class Distill(Algorithm):
             round=30 if silhouette else 64,
             updates=160 if silhouette else 48,
             batch_size=64 if silhouette else 256,
+            student_noise=not base.report.eval_deterministic,
             student_rate=2e-3 if silhouette else 1e-3,
             share=0.8 if silhouette else 0.7,
             faults=0.2,
@@ -217,7 +226,7 @@ class Distill(Algorithm):
 
     def _round(self) -> dict[str, float | None]:
         config, share = self.config, self.config.share**self.rounds
-        student = partial(self.actor, deterministic=config.report.eval_deterministic)
+        student = partial(self.actor, deterministic=not config.student_noise)
         labels = self._kept(self.collector.collect(config.round, share, student))
         self.dataset.add(labels)
         self.rounds += 1

@@ -29,6 +29,10 @@ class FloorConfig(GridConfig):
         """Environment steps after which the only stage ends."""
         return (1,)
 
+    def idle(self) -> dict[str, str]:
+        """Nothing is learned side by side."""
+        return super().idle() | {"environment.num_envs": "algorithms that learn"}
+
 
 class Floor(Algorithm):
     """A policy that is given, as an algorithm: so it is evaluated, filmed and compared like any other."""

@@ -86,6 +86,11 @@ class GradientConfig(GridConfig):
         """A polished policy is judged on its own layout while it is polished."""
         return (self.seed, 1) if level else super().evaluation(level)
 
+    def idle(self) -> dict[str, str]:
+        """What concerns the second stage, or a picture to become."""
+        idle = super().idle() | ({} if self.polish else dict.fromkeys(("polish_grid", "polish_rate"), "polish"))
+        return idle | ({"blur": "a task that has a target"} if make_spec(self.task).target is None else {})
+
     def check(self) -> None:
         """Check what the types cannot, see `RunConfig.check`."""
         super().check()

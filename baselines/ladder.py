@@ -21,7 +21,8 @@ class LevelConfig(Config):
     @property
     def name(self) -> str:
         """Of the run, for a folder; names the action grid."""
-        return f"{self.algo}{self.resolutions[0]}-{task_name(self.task)}-{self.preset}-{self.seed}"
+        grid = "-".join(map(str, self.resolutions))
+        return f"{self.algo}{grid}-{task_name(self.task)}-{self.preset}-{self.seed}"
 
     def check(self) -> None:
         """Check what the types cannot, see `cfp.config.RunConfig.check`."""

@@ -21,7 +21,7 @@ from baselines.nodes import Nodes
 from cfp.algorithm import CFP
 from cfp.composition import Composition
 from cfp.config import RunConfig, SACConfig, StageConfig, at_least_one, not_negative
-from cfp.environments import make_torch_env
+from cfp.environments import choose_device, make_torch_env
 from cfp.errors import ConfigError
 from cfp.policy import NetworkPolicy
 from cfp.runner import SACRun
@@ -67,6 +67,11 @@ class ModularConfig(SACConfig):
     def resolution(self, level: int) -> int:
         """Action grid R: the task's whole patch, so that segments write to its nodes."""
         return make_spec(self.task).patch
+
+    def idle(self) -> dict[str, str]:
+        """What concerns ladders, and grids of actions: segments act on nodes."""
+        needs = dict.fromkeys(("learning.anchor", "learning.warm_critic", "environment.action_layout"), "algo cfp")
+        return super().idle() | needs
 
     def stage(self, level: int) -> StageConfig:
         """What the training needs."""
@@ -181,4 +186,4 @@ class ModularRun(SACRun):
 
     def load(self, path: Path) -> SegmentPolicy:
         """Load a policy of the run."""
-        return SegmentPolicy.load(path)
+        return SegmentPolicy.load(path, choose_device(self.config.device))

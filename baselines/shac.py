@@ -16,7 +16,7 @@ from baselines.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.features import StateFeatures
 from baselines.shac_rollout import Rollout, Window
 from baselines.training_reward import RewardConfig
-from cfp.config import ReportConfig, RunConfig, Tier, at_least_one, not_negative, positive, share
+from cfp.config import ReportConfig, RunConfig, Tier, at_least_one, not_negative, positive, share, training_layouts
 from cfp.environments import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.evaluation import Policy
@@ -97,6 +97,11 @@ class ShacConfig(GridConfig):
         """Environment steps after which the only stage ends."""
         return (self.steps,)
 
+    def idle(self) -> dict[str, str]:
+        """Which parts of the state are seen, where it is not."""
+        parts = {} if self.sees == "state" else dict.fromkeys(("deformation", "clock", "place"), "sees state")
+        return super().idle() | parts
+
     def check(self) -> None:
         """Check what the types cannot, see `RunConfig.check`."""
         super().check()
@@ -105,6 +110,7 @@ class ShacConfig(GridConfig):
         )
         if self.start_from is not None and self.sees != "image":
             raise ConfigError(f"start_from: got a policy, allowed with sees 'image', got {self.sees!r}")
+        training_layouts("layouts", self.layouts, self.environment.num_envs)
         share(gamma=self.gamma, td_lambda=self.td_lambda, tau=self.tau)
         positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
         not_negative(noise=self.noise, integrity=self.reward.integrity)
@@ -125,7 +131,7 @@ class Shac(Algorithm):
         own = replace(config, environment=config.environment.learned_at(config.tier))
         self.env = make_torch_env(own, config.resolution(level))
         self.features = StateFeatures(config.deformation, config.clock, config.place)
-        with torch.random.fork_rng(devices=[]):
+        with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             torch.manual_seed(config.seed)
             self._make_networks()
         if start is not None:
@@ -218,7 +224,7 @@ class Shac(Algorithm):
         """Do as many windows as cover the steps.
 
         Raises:
-            NonFiniteError: Ten updates in a row had no finite gradient.
+            NonFiniteError: Ten updates in a row had no finite gradient, or actions are not finite.
         """
         end = self.num_timesteps + total_timesteps
         while self.num_timesteps < end:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from baselines.episodes import Episodes
 from baselines.training_reward import Pairs, training_reward
+from cfp.errors import NonFiniteError
 from dittogym import TorchEnv
 from torchmpm.state import choose
 
@@ -62,6 +63,9 @@ class Rollout:
         Args:
             actor: From what is seen to the mean of actions before tanh, (B, 2, R, R).
             value: From what is seen to the target critic's values (B,).
+
+        Raises:
+            NonFiniteError: The actor's actions are not finite.
         """
         env, gamma = self.env, self.config.gamma
         total = torch.zeros(env.num_envs, device=env.device)
@@ -103,6 +107,8 @@ class Rollout:
         """Actions with noise; a gradient that is not finite ends here, for the whole simulation."""
         noise = torch.randn(mean.shape, generator=self.generator).to(mean)
         action = (mean + self.config.noise * noise).tanh()
+        if not bool(action.isfinite().all()):
+            raise NonFiniteError("the actor's actions became NaN or infinite; the last checkpoint is untouched")
         if action.requires_grad:
             action.register_hook(self._drop)
         return action

@@ -7,21 +7,16 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from baselines.open_loop import OpenLoop
 from baselines.planner import Planner, PlannerConfig
 from cfp.config import EnvironmentConfig
-from cfp.errors import ConfigError
 from cfp.evaluation import Policy, SeesState
-from cfp.weights import read_policy
+from cfp.weights import check_trained_for, read_policy
 from dittogym import TorchEnv, make_spec
 from dittogym.action import Layout, bicubic_matrix, from_grid_layout, to_grid_layout
-
-PHYSICS = ("substeps", "variant")
-"""Options of the environment that change what actions do."""
 
 
 class Teacher(ABC):
@@ -159,19 +154,7 @@ def read_teacher(path: str | Path, task: str, environment: EnvironmentConfig) ->
     """
     from baselines.registry import load  # the registry knows all algorithms, that which is taught included
 
-    description = read_policy(path)[1]
-    if description["task"] != task:
-        raise ConfigError(f"teacher: got a policy for {description['task']}, allowed {task}")
-    theirs = EnvironmentConfig(**description["environment"])
-    for name in PHYSICS:
-        if (given := getattr(theirs, name)) != (allowed := getattr(environment, name)):
-            raise ConfigError(f"teacher: got a policy for {name} {given}, allowed {allowed}")
-    try:
-        one, other = (np.asarray(make_spec(task, **own.task_options()).target) for own in (theirs, environment))
-    except (ValueError, TypeError, OSError) as error:
-        raise ConfigError(f"teacher: its target or the student's cannot be read ({error})") from error
-    if not np.array_equal(one, other):
-        raise ConfigError(f"teacher: got a policy for the target {theirs.target}, allowed {environment.target}")
+    check_trained_for("teacher", read_policy(path)[1], task, environment)
     return load(path)
 
 

@@ -249,11 +249,14 @@ class CFP(SAC):
         """Actions to execute, and what the replay memory stores of them."""
         composition = getattr(self.replay_buffer, "composition", None)
         if self.num_timesteps >= self.random_steps and composition is not None:
-            return self._act_in_parts(composition)
+            actions, stored = self._act_in_parts(composition)
+            self._check_finite("action", actions)  # here, as environments refuse it with an error of their own
+            return actions, stored
         # stable-baselines3 ties the random phase to the start of the updates; here they are two settings.
         actions, stored = super()._sample_action(self.random_steps, action_noise, n_envs)
         if self.num_timesteps < self.random_steps:
             return self._random(actions, stored, composition)
+        self._check_finite("action", actions)
         return actions, stored
 
     def _random(
@@ -290,14 +293,16 @@ class CFP(SAC):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        for name, values in (("reward", reward), ("action", buffer_action)):
-            finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
-            if not finite.all():
-                raise NonFiniteError(
-                    f"the {name} of environment {int(np.argmin(finite))} is not finite at step {self.num_timesteps} of "
-                    "the stage; nothing of this step was stored and the last checkpoint is untouched"
-                )
+        self._check_finite("reward", reward)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _check_finite(self, name: str, values: np.ndarray) -> None:
+        finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
+        if not finite.all():
+            raise NonFiniteError(
+                f"the {name} of environment {int(np.argmin(finite))} is not finite at step {self.num_timesteps} of "
+                "the stage; nothing of this step was stored and the last checkpoint is untouched"
+            )
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         modules, tensors = super()._get_torch_save_params()

@@ -65,7 +65,7 @@ class Checkpoint(StateFile):
 
 def model_state(model: CFP) -> dict[str, Any]:
     """All that `CFP` learns and counts, as tensors and plain values."""
-    actor, critic, _ = model.networks()
+    (actor, critic, _), values = model.networks(), model.logger.name_to_value  # of the row that comes next
     return {
         "policy": model.policy.state_dict(),
         "actor_optimizer": actor.optimizer.state_dict(),
@@ -76,6 +76,7 @@ def model_state(model: CFP) -> dict[str, Any]:
         "updates": model._n_updates,
         "recent": [{key: float(value) for key, value in info.items()} for info in model.ep_info_buffer or ()],
         "successes": [bool(success) for success in model.ep_success_buffer or ()],
+        "means": {name: (values[name], count) for name, count in model.logger.name_to_count.items()},
         "environment": environment_state(model),
         "random": random_state(model),
     }
@@ -93,6 +94,9 @@ def restore_model(model: CFP, state: dict[str, Any]) -> None:
     model._n_updates = state["updates"]
     model.ep_info_buffer = deque(state["recent"], maxlen=model._stats_window_size)
     model.ep_success_buffer = deque(state["successes"], maxlen=model._stats_window_size)
+    for name, (mean, count) in state.get("means", {}).items():  # checkpoints from before have none
+        model.logger.record_mean(name, mean)
+        model.logger.name_to_count[name] = count
     restore_environment(model, state["environment"])
     restore_random(model, state["random"])
 

@@ -33,14 +33,14 @@ class Program:
         about: First words of the help.
         configure: From JSON values to options; what the values leave out comes from the preset they name.
         run: Opens a run: options, folder, whether to resume, stop signals.
-        load: Loads a policy file.
+        load: Loads a policy file onto a device.
     """
 
     package: str
     about: str
     configure: Callable[[dict[str, Any]], RunConfig]
     run: Callable[[RunConfig, Path, bool, StopSignals], Run]
-    load: Callable[[Path], Policy]
+    load: Callable[[Path, str], Policy]
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,6 @@ class _Choice:
     algo: str | None = None
     task: str | None = None
     preset: str | None = None
-    seed: str | None = None
-    """Text, so that what is no number is left to the second reading, which says so better."""
     out: Path | None = None
     resume: bool = False
     config: Path | None = None
@@ -94,24 +92,38 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
         SystemExit: ``--help``, or an option that does not exist or cannot be read (exit code 2).
     """
     choice, _ = tyro.cli(_Choice, args=list(arguments), return_unknown_args=True, add_help=False, console_outputs=False)
-    fresh, base = True, program.configure(_values(choice))
-    seed = int(choice.seed) if choice.seed and choice.seed.isdecimal() else base.seed
-    folder = choice.out or _default_folder(replace(base, seed=seed))
-    if choice.resume and (folder / "config.json").exists():
-        fresh, base = False, read_config(folder, program.configure)
-        if choice.config is not None:  # what differs from the run is refused, not left out
-            base = merge(base, _values(choice))
-    command: Command = tyro.cli(
-        Command,
-        prog=started or started_as(f"{program.package}.train", arguments),
-        description=f"{program.about}\n\n{inspect.getdoc(Command)}",
-        args=list(arguments),
-        default=Command(base),
-        config=(tyro.conf.OmitArgPrefixes,),
-    )
-    run = command.run.adapted(base) if fresh else command.run
+    values = _values(choice)
+    preset = program.configure({name: values[name] for name in ("algo", "task", "preset") if name in values})
+    base = program.configure(values)
+
+    def read(defaults: RunConfig) -> Command:
+        return tyro.cli(
+            Command,
+            prog=started or started_as(f"{program.package}.train", arguments),
+            description=f"{program.about}\n\n{inspect.getdoc(Command)}",
+            args=list(arguments),
+            default=Command(defaults),
+            config=(tyro.conf.OmitArgPrefixes,),
+        )
+
+    if choice.resume:
+        folder = choice.out or _default_folder(read(base).run)  # all that names a folder comes from these words
+        if (folder / "config.json").exists():
+            past = read_config(folder, program.configure)
+            # What a file says otherwise than the run is refused, not left out.
+            command = read(past if choice.config is None else merge(past, values))
+            command.run.check()
+            return replace(command, out=folder)
+    command = read(base)
+    run = command.run.adapted(preset, values.keys() | _named(arguments))
     run.check()
+    run.check_effect(preset)
     return replace(command, run=run, out=command.out or _default_folder(run))
+
+
+def _named(arguments: Sequence[str]) -> set[str]:
+    """Options that words of a command line name."""
+    return {word[2:].partition("=")[0].replace("-", "_") for word in arguments if word.startswith("--")}
 
 
 def _values(choice: _Choice) -> dict[str, Any]:
@@ -143,7 +155,8 @@ def main(program: Program, arguments: Sequence[str] | None = None, started: str 
             print(f"{folder} holds no run yet: starting afresh")
         config = command.run
         if command.dry_run:
-            print(json.dumps(to_json(config), indent=2), estimate(program, config), sep="\n")
+            begun = folder if command.resume else None
+            print(json.dumps(to_json(config), indent=2), estimate(program, config, begun), sep="\n")
             return 0
         print(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed} -> {folder}")
         keep_memory()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
@@ -19,6 +20,7 @@ from cfp.groups import at_least_one as at_least_one
 from cfp.groups import not_negative as not_negative
 from cfp.groups import positive as positive
 from cfp.groups import share as share
+from cfp.merging import flatten
 from cfp.merging import merge as merge
 from cfp.networks import RESOLUTIONS
 from dittogym import make_spec
@@ -27,6 +29,7 @@ from dittogym.tasks import allowed_instead, task_name
 Preset = Literal["quick", "paper"]
 
 LARGEST_SEED = 2**31 - 1
+SEVERAL = "resolutions of several levels"
 EVALUATION_SEED = 10_000
 """Added to a run's seed for evaluations, so that they start from particle layouts not trained on."""
 
@@ -75,9 +78,31 @@ class RunConfig:
         """Seed of the first layout, and episodes, by which stage ``level`` is evaluated while it trains."""
         return self.seed + EVALUATION_SEED, self.report.eval_episodes
 
-    def adapted(self, base: RunConfig) -> RunConfig:
-        """These options with what follows from those that differ from ``base``, unless it was changed too."""
+    def adapted(self, base: RunConfig, given: Collection[str]) -> RunConfig:
+        """These options with what follows from others, unless it was given too.
+
+        Args:
+            base: The preset.
+            given: Names of the options that do not come from there, even if their values are the same.
+        """
         return self
+
+    def idle(self) -> dict[str, str]:
+        """Options that change nothing as the others are, with what they need (a dot at the end: the whole group)."""
+        return {"report.wandb_project": "wandb"} if self.report.wandb == "off" else {}
+
+    def check_effect(self, base: RunConfig) -> None:
+        """Refuse options that differ from those of ``base``, the preset, and change nothing, see `idle`.
+
+        Raises:
+            ConfigError: Naming the option, what was given and what it needs.
+        """
+        mine, theirs = flatten(to_json(self)), flatten(to_json(base))
+        for option, needs in self.idle().items():
+            for name, value in mine.items():
+                if name.startswith(option) and value != theirs[name]:
+                    leaf = name.split(".")[-1]
+                    raise ConfigError(f"{leaf}: got {value!r}, which changes nothing; allowed with {needs}")
 
     def check(self) -> None:
         """Check what the types cannot.
@@ -95,6 +120,7 @@ class RunConfig:
             checkpoint_every=self.report.checkpoint_every,
             log_every=self.report.log_every,
         )
+        training_layouts("num_envs", self.environment.num_envs)
         for name in ("eval_every", "video_every"):
             if (every := getattr(self.report, name)) < 0:
                 raise ConfigError(f"{name}: got {every}, allowed 0 (never) or more")
@@ -161,24 +187,25 @@ class LadderConfig(RunConfig):
         """Rows and columns of the actions that the environment of a level takes, see `ActorSpec.patch`."""
         return self.actor_spec(level).action_size
 
-    def adapted(self, base: RunConfig) -> RunConfig:
+    def adapted(self, base: RunConfig, given: Collection[str]) -> RunConfig:
         """Other steps move the handovers in proportion; another number of levels stretches what each has one of.
 
         Then levels are equally long, and further ones have the values of the last one that has any.
         """
         assert isinstance(base, LadderConfig)
-        levels, changes = len(self.resolutions), dict[str, Any]()
-        if levels != len(base.resolutions):
-            for name, count in self.counts().items():
-                values: tuple[float, ...] = getattr(self, name)
-                if name != "handover" and values and values == getattr(base, name):
-                    changes[name] = (*values, *values[-1:] * count)[:count]
-            if self.handover == base.handover:
-                changes["handover"] = tuple(round(self.steps * level / levels) for level in range(1, levels))
-        elif self.steps != base.steps and self.handover == base.handover:
-            share = self.steps / base.steps
+        levels, share, changes = len(self.resolutions), self.steps / base.steps, dict[str, Any]()
+        for name, count in self.counts().items():
+            values: tuple[float, ...] = getattr(base, name)
+            changes[name] = (*values, *values[-1:] * count)[:count]
+        if levels == len(base.resolutions):
             changes["handover"] = tuple(round(step * share) for step in base.handover)
-        return replace(self, **changes)
+        else:
+            changes["handover"] = tuple(round(self.steps * level / levels) for level in range(1, levels))
+        return replace(self, **{name: value for name, value in changes.items() if name not in given})
+
+    def idle(self) -> dict[str, str]:
+        """One level has no gate."""
+        return super().idle() | ({"network.gate_scale": SEVERAL} if len(self.resolutions) == 1 else {})
 
     def counts(self) -> dict[str, int]:
         """How many values each option has that has one for a level."""
@@ -252,6 +279,11 @@ class Config(LadderConfig, SACConfig):
             self.gate_penalty[level - 1] if level else 0.0,
         )
 
+    def idle(self) -> dict[str, str]:
+        """What concerns a policy that is refined, or the level before."""
+        idle = super().idle() | ({} if self.refine else {"learning.anchor": "refine"})
+        return idle | ({"learning.warm_critic": SEVERAL} if len(self.resolutions) == 1 else {})
+
     def check(self) -> None:
         """Check what the types cannot, see `LadderConfig.check`."""
         super().check()
@@ -262,6 +294,23 @@ class Config(LadderConfig, SACConfig):
             raise ConfigError("warm_critic: got True, allowed without start_from (a policy brings no critics)")
         if self.refine and self.start_from is None:
             raise ConfigError("refine: got True, allowed with start_from, which names the policy")
+
+
+def training_layouts(name: str, count: int, before: int = 0) -> None:
+    """Check how many layouts are trained on, which are counted on from the seed.
+
+    Args:
+        name: The option that says so.
+        count: How many.
+        before: Those that come first for another reason, such as one for each robot.
+
+    Raises:
+        ConfigError: The last of them would be one of those that judge.
+    """
+    if before + count > EVALUATION_SEED:
+        raise ConfigError(
+            f"{name}: got {count} layouts, allowed {EVALUATION_SEED - before}: further ones judge policies"
+        )
 
 
 def check_task(task: object) -> None:

@@ -12,6 +12,7 @@ import tyro
 
 from cfp.command import Program, started_as
 from cfp.config import RunConfig, Tier, at_least_one
+from cfp.environments import choose_device
 from cfp.errors import CFPError, CheckpointError, ConfigError
 from cfp.evaluation import Noise, Policy, compare, format_table, to_rows
 from cfp.process import keep_memory
@@ -93,7 +94,8 @@ def open_run(
     files = stage_files(folder, len(config.ends()))
     if not files:
         raise CheckpointError(f"{folder}: no policy has been written yet")
-    policies = {name: program.load(path) for name, path in files.items()}
+    loaded = choose_device(device)
+    policies = {name: program.load(path, loaded) for name, path in files.items()}
     for (name, policy), path in zip(policies.items(), files.values(), strict=True):
         found, stage = (policy.description["task"], policy.description["resolution"]), policy.description["stage"]
         if stage > len(config.ends()):
@@ -107,7 +109,7 @@ def open_run(
 
 def open_policy(program: Program, path: str, device: str, seed: int | None) -> tuple[RunConfig, dict[str, Policy]]:
     """A single policy and options to evaluate it with, as the run that trained it does; see `open_run`."""
-    policy = program.load(Path(path))
+    policy = program.load(Path(path), choose_device(device))
     about = policy.description
     values = {"algo": about["kind"], "task": about["task"], "environment": about["environment"]}
     config = replace(program.configure(values), device=device, seed=about["seed"] if seed is None else seed)

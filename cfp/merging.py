@@ -84,3 +84,11 @@ def words(kind: Any) -> str:
     if arguments:
         return " or ".join(map(words, arguments))
     return _KINDS[kind]
+
+
+def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested options under names with dots."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat

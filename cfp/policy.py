@@ -27,6 +27,21 @@ def action_space(resolution: int) -> spaces.Box:
     return spaces.Box(-1.0, 1.0, (2, resolution, resolution), np.float32)
 
 
+def check_images(observation: object) -> None:
+    """Check what a policy of the image is shown: its networks would take other numbers as mapped already.
+
+    Raises:
+        ValueError: It is not an image, or a batch of them.
+    """
+    found = type(observation).__name__
+    if isinstance(observation, np.ndarray):
+        if observation.dtype == np.uint8 and observation.shape[-3:] == (3, IMAGE_SIZE, IMAGE_SIZE):
+            if observation.ndim in (3, 4):
+                return
+        found = f"{observation.dtype} array of shape {observation.shape}"
+    raise ValueError(f"observation: got {found}, allowed a uint8 array (3, 64, 64) or (B, 3, 64, 64)")
+
+
 class NetworkPolicy(sac_policies.SACPolicy, ABC):
     """Actor, twin critics and target critics of a kind that a subclass makes, for `cfp.algorithm.CFP`.
 
@@ -91,7 +106,35 @@ class NetworkPolicy(sac_policies.SACPolicy, ABC):
         return cast(Actor, self.actor), cast(TwinCritic, self.critic), cast(TwinCritic, self.critic_target)
 
 
-class CFPPolicy(NetworkPolicy):
+class ImagePolicy(BasePolicy, ABC):
+    """A policy that is shown images, and nothing else."""
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Choose actions, as stable-baselines3's ``predict``.
+
+        Args:
+            observation: (3, 64, 64) or (B, 3, 64, 64) uint8.
+            state: Arrays with a leading B, handed through: nothing is remembered.
+            episode_start: (B,) bool; changes nothing.
+            deterministic: Without noise.
+
+        Returns:
+            Actions (2, R, R) or (B, 2, R, R) float32, and ``state``.
+
+        Raises:
+            ValueError: The observation is something else.
+        """
+        check_images(observation)
+        return super().predict(observation, state, episode_start, deterministic)
+
+
+class CFPPolicy(ImagePolicy, NetworkPolicy):
     """Actor, twin critics and target critics of the coarse-to-fine policy.
 
     Coarser levels live inside the actor as frozen submodules, so ``state_dict`` and ``predict`` cover the whole
@@ -158,7 +201,7 @@ class CFPPolicy(NetworkPolicy):
         }
 
 
-class ActorPolicy(BasePolicy):
+class ActorPolicy(ImagePolicy):
     """An actor alone, with stable-baselines3's ``predict``: what `cfp.load` returns.
 
     Args:

@@ -306,23 +306,27 @@ class Run(ABC):
         evaluated = int(rows[-1]["step"]) if rows else 0
         ends, over = config.ends(), partial(self._plateau, level)
         return Books(
-            level,
-            ends[level],
-            ends[-1],
-            config.report,
-            self.signals,
-            self.logger,
-            measure,
-            save,
-            first,
-            evaluated,
-            over,
-            record,
+            level=level,
+            end=ends[level],
+            total=ends[-1],
+            report=config.report,
+            signals=self.signals,
+            logger=self.logger,
+            evaluate=measure,
+            save=save,
+            evaluate_first=first,
+            evaluated=evaluated,
+            over=over,
+            film=record,
         )
+
+    def policies(self) -> dict[str, Policy]:
+        """Policies of the run so far by name, see `stage_files`."""
+        return {name: self.load(path) for name, path in stage_files(self.folder, len(self.config.ends())).items()}
 
     def finish(self) -> list[Result]:
         """After training: the final table, ``results.json``, curve, video and page. Returns the table's rows."""
-        policies = {name: self.load(path) for name, path in stage_files(self.folder, len(self.config.ends())).items()}
+        policies = self.policies()
         results = compare(self.config, policies, self.config.report.eval_episodes)
         write_json(self.folder / "results.json", to_rows(results))
         untrained = {result.name: result.mean for result in results[:2]}

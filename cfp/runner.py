@@ -78,13 +78,15 @@ class SACRun(Run):
 
     def remarks(self) -> list[str]:
         """Stages that are over before they act by their policy, or before they learn."""
-        lines, starts = [], self.config.learning.update_start
+        lines, (starts, waits) = [], (self.config.learning.update_start, self.config.learning.actor_start)
         for level in range(self.position.level, len(self.config.ends())):
             steps, random = self.config.stage(level).steps, self.random_steps(level)
             if steps <= random:
                 lines.append(f"stage {level + 1}: all its {steps:,} steps are random (--random-steps {random})")
             elif steps <= starts:
                 lines.append(f"stage {level + 1}: no update in its {steps:,} steps (--update-start {starts})")
+            elif steps < waits:
+                lines.append(f"stage {level + 1}: no actor update in its {steps:,} steps (--actor-start {waits})")
         return lines
 
     def restore(self, model: CFP, state: dict[str, Any]) -> None:
@@ -111,6 +113,7 @@ class SACRun(Run):
         for _ in range(-(-model.batch_size // count)):
             buffer.add(observation, observation, stored, np.zeros(count), np.zeros(count), [{}] * count)
         acting = seconds(lambda: env.step(model.predict(observation)[0]))
+        model.num_timesteps = model.actor_start  # from here on an update is a whole one
         updating = seconds(lambda: model.train(1, model.batch_size)) * self.config.learning.gradient_steps
         arrays = (getattr(buffer, name) for name in FIELDS)
         return Cost((acting + updating) / count, sum(array.nbytes for array in arrays))
@@ -197,4 +200,4 @@ class Runner(SACRun):
 
     def load(self, path: Path) -> ActorPolicy:
         """Load a policy of the run."""
-        return load(path)
+        return load(path, choose_device(self.config.device))

@@ -14,6 +14,7 @@ import torch
 from cfp.config import RunConfig, merge, to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.files import parse_json, write_atomically
+from cfp.merging import flatten as flatten
 
 VERSION = 1
 
@@ -117,11 +118,3 @@ def check_same(stored: dict[str, Any], given: RunConfig) -> None:
             f"{name.split('.')[-1]}: the run was started with {old.get(name)!r}, got {new.get(name)!r}; "
             f"a resumed run may change only: {allowed}"
         )
-
-
-def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested options under names with dots."""
-    flat: dict[str, Any] = {}
-    for name, value in values.items():
-        flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
-    return flat

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 from torch import Tensor
 
+from cfp.errors import NonFiniteError
 from cfp.policy import action_space, observation_space
 
 
@@ -66,7 +67,13 @@ class TorchVecEnv(VecEnv):
         return _to_numpy(observation)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Remember the actions (B, 2, R, R), float."""
+        """Remember the actions (B, 2, R, R), float.
+
+        Raises:
+            NonFiniteError: One is NaN or infinite, as those of a policy are that has diverged.
+        """
+        if not np.isfinite(actions).all():
+            raise NonFiniteError("an action is not finite: the policy has diverged; the last checkpoint is untouched")
         self._actions = torch.as_tensor(actions, dtype=torch.float32, device=self.torch_env.device)
 
     @torch.no_grad()

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import safetensors
 import safetensors.torch
 import torch
@@ -21,9 +22,12 @@ from cfp.files import parse_json, write_atomically, write_json
 from cfp.merging import words
 from cfp.networks import RESOLUTIONS
 from cfp.policy import ActorPolicy
+from dittogym import make_spec
 from dittogym.geometry import NODES
 from dittogym.tasks import fingerprint
 
+PHYSICS = ("substeps", "variant")
+"""Options of the environment that change what actions do."""
 FORMAT = "cfp-policy"
 VERSION = 1
 KIND = "cfp"
@@ -235,15 +239,38 @@ def policy_for(config: RunConfig, path: str) -> ActorPolicy:
         path: The option.
 
     Raises:
-        ConfigError: The policy is for another task or action layout.
+        ConfigError: The policy is for another task, target, physics or action layout.
         CheckpointError: See `load`.
     """
     policy = load(path)
+    check_trained_for("start_from", policy.description, config.task, config.environment)
     environment: EnvironmentConfig = merge(EnvironmentConfig(), policy.description["environment"])
-    for what, made, asked in (
-        ("", policy.description["task"], config.task),
-        ("action layout ", environment.layout, config.environment.layout),
-    ):
-        if made != asked:
-            raise ConfigError(f"start_from: got a policy for {what}{made}, allowed {asked}")
+    if (made := environment.layout) != (asked := config.environment.layout):
+        raise ConfigError(f"start_from: got a policy for action layout {made}, allowed {asked}")
     return policy
+
+
+def check_trained_for(option: str, description: Mapping[str, Any], task: str, environment: EnvironmentConfig) -> None:
+    """Check that what a policy was trained for is what it shall go on with, or teach.
+
+    Args:
+        option: Names the policy, for the message.
+        description: Of the policy.
+        task: What shall be done.
+        environment: Where.
+
+    Raises:
+        ConfigError: It was another task, target, or matter and time under an action.
+    """
+    if description["task"] != task:
+        raise ConfigError(f"{option}: got a policy for {description['task']}, allowed {task}")
+    theirs: EnvironmentConfig = merge(EnvironmentConfig(), description["environment"])
+    for name in PHYSICS:
+        if (given := getattr(theirs, name)) != (allowed := getattr(environment, name)):
+            raise ConfigError(f"{option}: got a policy for {name} {given}, allowed {allowed}")
+    try:
+        one, other = (np.asarray(make_spec(task, **own.task_options()).target) for own in (theirs, environment))
+    except (ValueError, TypeError, OSError) as error:
+        raise ConfigError(f"{option}: its target or the one wanted cannot be read ({error})") from error
+    if not np.array_equal(one, other):
+        raise ConfigError(f"{option}: got a policy for the target {theirs.target}, allowed {environment.target}")

@@ -161,7 +161,7 @@ def resolve(plan: Plan, label: str, task: str, preset: str, seed: int, steps: in
         values.setdefault("steps", steps)
     report = {"video": False, **values.pop("report", {})}
     try:
-        config = configure({**start, "seed": seed, "device": device, **values, "report": report}).adapted(base)
+        config = configure({**start, "seed": seed, "device": device, **values, "report": report}).adapted(base, values)
         config.check()
     except ConfigError as error:
         raise ConfigError(f"{label} on {task}: {error}") from error

@@ -63,6 +63,10 @@ TRAIN = [
     training("a temperature that is no number", "--alpha nan", "alpha: got (nan,), allowed are finite numbers"),
     training("random steps below 0", "--random-steps -1", "random_steps: got -1, allowed 0 or more"),
     training("a gate without scale", "--gate-scale 0", "gate_scale: got 0.0, allowed more than 0"),
+    training("warm critics of nothing", "--warm-critic", "warm_critic: got True, which changes nothing; allowed with"),
+    training("a gate of one level", "--gate-scale 0.5", "gate_scale: got 0.5", "allowed with resolutions of several"),
+    training("an anchor to nothing", "--anchor 3", "anchor: got 3.0, which changes nothing; allowed with refine"),
+    training("a project nowhere", "--wandb-project mine", "wandb_project: got 'mine'", "allowed with wandb"),
     training("an endless rate", "--learning-rate inf", "learning_rate: got inf, allowed are finite numbers"),
     training("gradients clipped to nothing", "--max-grad-norm 0", "max_grad_norm: got 0.0, allowed more than 0"),
     training("a share of 2", "--reward-momentum 2", "reward_momentum: got 2.0, allowed 0 to 1"),
@@ -77,17 +81,11 @@ TRAIN = [
     training("a policy that is not there", "--start-from none", "none.safetensors: there is no policy"),
     training("a policy of another task", "--start-from run", "start_from: got a policy for run, allowed shapematch"),
     training("an algorithm of baselines", "--algo shac", "algo: got 'shac', allowed 'cfp'; python -m baselines.train"),
-    Case(
-        "train with more robots than memory",
-        command(cfp.train.main, TINY + NEW + "--num-envs 999999999999"),
-        ("not enough memory: take fewer num_envs",),
-        Refused,
-        leaves="new",
-    ),
+    training("robots on judging layouts", "--num-envs 10001", "num_envs: got 10001 layouts, allowed 10000: further"),
     Case(
         "train with a memory of years",
         command(cfp.train.main, TINY + NEW + "--buffer-size 99999999999999"),
-        ("not enough memory", "a smaller buffer_size"),
+        ("not enough memory: take fewer num_envs", "a smaller buffer_size"),
         Refused,
         leaves="new",
     ),
@@ -126,10 +124,23 @@ OTHERS = [
     learning(
         "shac", "a policy of the state", "--start-from run", "start_from: got a policy, allowed with sees 'image'"
     ),
+    learning("gnn-16", "a layout of images", "--action-layout grid", "action_layout: got 'grid'", "allowed with algo"),
+    learning("coarse", "an anchor", "--anchor 3", "anchor: got 3.0, which changes nothing; allowed with refine"),
+    learning(
+        "shac", "an image without a clock", "--sees image --no-clock", "clock: got False", "allowed with sees state"
+    ),
+    learning("gradient", "polish for nothing", "--polish-rate 1", "polish_rate: got 1.0", "allowed with polish"),
+    learning("gradient", "a blur of rewards", "--task run --blur 1", "blur: got (1.0,)", "a task that has a target"),
+    learning("zero", "two robots", "--num-envs 2", "num_envs: got 2", "allowed with algorithms that learn"),
+    distilling("plans of no planner", "--iterations 9", "iterations: got 9", "allowed with teacher mpc"),
     learning("zero", "a grid of none", "--grid 0", "resolution must be 'coarse', 'fine' or 1 to 64, got 0"),
     distilling("an unknown teacher", "--teacher socrates", "teacher: got 'socrates'", "mpc, shac, gradient"),
     distilling("a teacher of another task", "--teacher run", "teacher: got a policy for run, allowed shapematch"),
     distilling("a share of 2", "--share 2", "share: got 2.0, allowed 0 to 1"),
+    learning(
+        "shac", "judging layouts", "--layouts 50000", "layouts: got 50000 layouts, allowed 9996: further ones judge"
+    ),
+    distilling("judging layouts", "--layouts 5000", "layouts: got 10000 layouts, allowed 9984: further ones judge"),
     distilling("no labels", "--capacity 0", "capacity: got 0, allowed 1 or more"),
     evaluating("nothing", "", "policy: got None and the folder None, allowed is one of the two"),
     evaluating("a folder that is not there", "{folder}/none", "none: there is no run (no config.json)"),

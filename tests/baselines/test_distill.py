@@ -54,6 +54,19 @@ def segments(tmp_path_factory):
     return path
 
 
+def test_how_a_policy_is_judged_does_not_change_what_it_learns():
+    def learned(quiet, **changes):
+        config = make(share=0.0, **changes)
+        student = Distill(replace(config, report=replace(config.report, eval_deterministic=quiet)))
+        student.learn(16, lambda scalars: None)  # the student leads in the second round
+        return torch.nn.utils.parameters_to_vector(student.actor.parameters()).detach()
+
+    assert torch.equal(learned(False), learned(True))
+    assert not torch.equal(learned(True), learned(True, student_noise=False))
+    assert Distill.preset("shapematch", "quick").student_noise
+    assert not Distill.preset("shapematch", "paper").student_noise  # which is judged without
+
+
 class Mirror(Teacher):
     """Pulls where the image shows matter, by image alone: what a student can copy."""
 
@@ -345,7 +358,7 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch, caps
     [
         ("shapematch", "gradient", "T", "teacher: got a policy for the target T, allowed star"),
         ("kick", "gradient", None, "teacher: got a policy for kick, allowed run"),
-        ("run", "gradient", "T", "teacher: its target or the student's cannot be read"),
+        ("run", "gradient", "T", "teacher: its target or the one wanted cannot be read"),
         (None, "", None, "allowed mpc, shac, gradient, catch, grow, run, shapematch"),
     ],
 )

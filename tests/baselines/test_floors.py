@@ -11,8 +11,10 @@ import cfp
 from baselines import train
 from baselines.floors import wave
 from cfp.actor import build_actor
+from cfp.command import parse
+from cfp.config import to_json
 from cfp.errors import ConfigError
-from cfp.files import read_table
+from cfp.files import read_table, write_json
 from dittogym import TorchEnv
 from dittogym.action import from_grid_layout, patch_field, to_grid_layout
 from dittogym.reward import action_cost
@@ -108,3 +110,14 @@ def test_resolutions_can_be_studied_and_ladders_are_refused(tmp_path, capsys):
     assert config.name == "fine4-run-quick-0"
     with pytest.raises(ConfigError, match="resolutions: got \\(8, 16\\), allowed is one"):
         baselines.registry.configure({"algo": "coarse", "resolutions": [8, 16]}).check()
+
+
+def test_the_folder_that_a_run_goes_on_in_is_the_one_that_it_is_written_to(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    study = "--algo coarse --task run --resolutions".split()
+    for grid, steps in ((8, 2000), (4, 9600)):
+        command = parse(train.PROGRAM, [*study, str(grid), "--steps", str(steps)])
+        command.out.mkdir(parents=True)
+        write_json(command.out / "config.json", to_json(command.run))
+    resumed = parse(train.PROGRAM, [*study, "4", "--resume"])
+    assert resumed.out == command.out and resumed.run == command.run

@@ -178,6 +178,14 @@ def test_updates_without_a_finite_gradient_end_the_training(monkeypatch):
     assert rows[-1]["train/skipped"] == 9 and torch.equal(before, parameters(algorithm))
 
 
+def test_actor_that_has_diverged_does_not_act():
+    algorithm = Shac(make())
+    with torch.no_grad():
+        next(algorithm.actor.parameters()).fill_(torch.nan)
+    with pytest.raises(NonFiniteError, match="the actor's actions became NaN"):
+        algorithm.learn(8, lambda scalars: None)
+
+
 def test_episodes_are_cut_at_staggered_ages_and_change_layouts():
     algorithm = Shac(make(age=8, layouts=3))
     first = algorithm.env.state.x[0].clone()
@@ -262,7 +270,7 @@ def test_policy_of_the_image_is_one_of_cfp(tmp_path):
 def test_actor_on_the_image_begins_with_a_policy_of_any_algorithm(tmp_path):
     config = make(sees="image")
     actor, path = build_actor(ActorSpec((config.resolution(0),))), tmp_path / "policy.safetensors"
-    origins = cfp.Config(task="run", resolutions=(config.resolution(0),), gate_bias=())
+    origins = cfp.Config(task="run", resolutions=(config.resolution(0),), gate_bias=(), environment=config.environment)
     save_policy(path, actor, describe(origins, 0, 5))
     warm = replace(config, start_from=str(path))
     algorithm = Shac(warm, 0, Shac.start(warm))

@@ -287,6 +287,21 @@ def test_actions_no_larger_than_their_parts_are_stored_as_they_are():
         np.testing.assert_allclose(model.replay_buffer.actions[2], executed, atol=1e-6)
 
 
+@pytest.mark.parametrize("resolutions", [(8,), (8, 16)])
+def test_actor_that_has_diverged_does_not_act(resolutions):
+    spec = ActorSpec(resolutions, (0.0,) * (len(resolutions) - 1), patch=64 if len(resolutions) > 1 else None)
+    model = make_model(spec, FakeEnv(num_envs=2, resolution=spec.action_size), random_steps=4, update_start=99)
+    model.learn(4)
+    taken = len(model.env.venv.torch_env.actions)
+    with torch.no_grad():
+        model.networks()[0].trainable_parameters()[-1].fill_(torch.nan)
+    with pytest.raises(NonFiniteError, match="action of environment 0 is not finite at step 4"):
+        model.learn(4, reset_num_timesteps=False)
+    assert len(model.env.venv.torch_env.actions) == taken
+    with pytest.raises(NonFiniteError, match="the policy has diverged"):  # such as in an evaluation
+        model.env.step(model.predict(model.env.reset())[0])
+
+
 @pytest.mark.parametrize("fault", ["reward"])
 def test_reward_that_is_not_finite_is_never_stored(fault):
     model = make_model(ActorSpec((8,)), FakeEnv(num_envs=2, horizon=9, faults={3: fault}))

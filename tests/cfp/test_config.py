@@ -150,6 +150,25 @@ def test_fewer_steps_shorten_every_level():
     assert explicit.handover == (900,)
 
 
+def test_what_was_given_stays_even_if_it_is_the_presets_value(tmp_path):
+    handover = preset("run").handover
+    given = ["--handover", str(handover[0])]
+    assert parse(PROGRAM, ["--task", "run", "--steps", "9600", *given]).run.handover == handover
+    paper = parse(PROGRAM, "--task run --preset paper --steps 1000000 --handover=301000".split()).run
+    assert paper.handover == (301_000,)
+    file = tmp_path / "options.json"
+    file.write_text(json.dumps({"task": "run", "handover": handover}))
+    assert parse(PROGRAM, ["--config", str(file), "--steps", "9600"]).run.handover == handover
+
+
+@pytest.mark.parametrize("options", [{"steps": 2400}, {"resolutions": [4, 8, 16]}, {"resolutions": [16], "steps": 99}])
+def test_the_rest_follows_a_file_as_it_follows_the_command_line(tmp_path, options):
+    file = tmp_path / "options.json"
+    file.write_text(json.dumps(options))
+    words = [f"--{name} {' '.join(map(str, np.atleast_1d(value)))}" for name, value in options.items()]
+    assert parse(PROGRAM, ["--config", str(file)]).run == parse(PROGRAM, " ".join(words).split()).run
+
+
 def test_ladder_of_any_length_can_be_asked_for():
     arguments = "--resolutions 4 8 16 --handover 1000 2000 --alpha 0 0 0 --random-steps 9 9 9"
     command = parse(PROGRAM, [*arguments.split(), "--gate-bias", "-1", "-2", "--gate-penalty", "0", "0.5"])

@@ -1,14 +1,18 @@
 """``--dry-run``: options and costs, and nothing written."""
 
 import json
+import re
 
 import pytest
 
 from baselines import train as baselines_train
 from cfp import train
+from cfp.algorithm import CFP
 from cfp.config import Config, merge
-from cfp.estimate import seconds
+from cfp.estimate import REPEATS, _duration, seconds
+from cfp.policy import ActorPolicy
 from cfp.presets import preset
+from dittogym import make_spec
 
 TINY = "--particles 100 --substeps 1 --num-envs 2 --device cpu --steps 150".split()
 LEARNS = "--handover 70 --random-steps 4 4 --update-start 20 --batch-size 4".split()
@@ -40,9 +44,50 @@ def test_stages_that_learn_nothing_are_named(tmp_path, capsys, monkeypatch):
     ]
     assert train.main([*quick, "--random-steps", "9", "0", "--update-start", "50"]) == 0
     assert "stage 1: " not in capsys.readouterr().out
-    refined = ["--start-from", "run", "--refine", "--random-steps", "600", "0", "--update-start", "50"]
+    refined = "--substeps 100 --start-from run --refine --random-steps 600 0 --update-start 50".split()
     assert train.main([*quick, *refined, "--resolutions", "8", "16"]) == 0
     assert "are random" not in capsys.readouterr().out
+
+
+def test_an_actor_that_waits_longer_than_its_stage_is_named(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    updates, update = [], CFP._update_actor
+    monkeypatch.setattr(CFP, "_update_actor", lambda *given: (updates.append(1), update(*given))[1])
+    assert train.main([*TINY, *LEARNS, "--buffer-size", "60", "--actor-start", "75", "--dry-run"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "stage 1: no actor update in its 70 steps (--actor-start 75)"
+    assert len(updates) == 2 * (REPEATS + 1)  # what is timed is a whole update all the same
+
+
+def test_what_follows_the_training_is_counted_with_the_policies_own_time(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    asked, predict = [], ActorPolicy.predict
+    monkeypatch.setattr(ActorPolicy, "predict", lambda *given: (asked.append(1), predict(*given))[1])
+    monkeypatch.setattr("cfp.estimate.seconds", lambda action: action() or 1.0)
+    monkeypatch.setattr("cfp.estimate.available", lambda: True)
+    episode = make_spec("shapematch").horizon
+    floor = [*TINY[:-2], "--algo", "zero", "--dry-run"]
+    assert baselines_train.main(floor) == 0  # an evaluation; a row for zero, random and the floor; a film
+    assert f"time: about {_duration(5 * episode)}, {_duration(4 * episode)} of it for" in capsys.readouterr().out
+    assert train.main([*TINY, *LEARNS, "--buffer-size", "60", "--eval-every", "50", "--no-video", "--dry-run"]) == 0
+    printed = capsys.readouterr().out
+    assert f"{_duration(4 * episode)} of it for" in printed and len(asked) == 4
+    stages = [re.split("  +", line.strip()) for line in printed.splitlines()[-4:-2]]
+    assert [stage[5] for stage in stages] == [_duration(2 * episode), _duration(3 * episode)]  # 50 70, 70 100 150
+
+
+def test_dry_run_of_a_run_that_goes_on_counts_what_is_left(tmp_path, capsys):
+    folder = ["--out", str(tmp_path / "run")]
+    options = [*TINY, *LEARNS, "--buffer-size", "60", "--eval-every", "0", "--eval-episodes", "1", "--no-video"]
+    assert train.main([*options, *folder]) == 0
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert train.main([*folder, "--resume", "--steps", "99000150", "--dry-run"]) == 0
+    begun, header, second, *_ = capsys.readouterr().out.splitlines()[-5:]
+    assert begun.endswith("run is at step 150 of 99,000,150; what is left of it:")
+    cells = [re.split("  +", line.strip()) for line in (header, second)]
+    assert len(cells[0]) == len(cells[1]) == 7 and cells[1][:3] == ["2", "64x64", "99,000,000"]
+    assert train.main([*folder, "--resume", "--dry-run"]) == 0
+    assert "2    64x64            0" in capsys.readouterr().out
+    assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
 
 
 def test_replay_of_blended_actions_is_as_small_as_their_parts(tmp_path, capsys, monkeypatch):
@@ -57,7 +102,7 @@ def test_replay_of_blended_actions_is_as_small_as_their_parts(tmp_path, capsys, 
 
 def test_dry_run_counts_only_levels_that_will_be_trained(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    arguments = [*LEARNS, "--task", "run", "--start-from", "run", "--buffer-size", "60"]
+    arguments = [*LEARNS, "--task", "run", "--substeps", "100", "--start-from", "run", "--buffer-size", "60"]
     assert train.main([*TINY, *arguments, "--dry-run"]) == 0
     header, stage, time = capsys.readouterr().out.strip().splitlines()[-4:-1]
     assert header.startswith("stage") and stage.split()[:3] == ["2", "16x16", "80"] and time.startswith("time: about")

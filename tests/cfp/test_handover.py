@@ -77,6 +77,8 @@ def test_second_level_starts_from_a_policy(coarse, tmp_path, name):
         (["--warm-critic"], "warm_critic: got True, allowed without start_from"),
         (["--start-from", "no/such"], "there is no policy"),
         (["--action-layout", "grid"], "start_from: got a policy for action layout image, allowed grid"),
+        (["--target", "T"], "start_from: got a policy for the target None, allowed T"),
+        (["--substeps", "2"], "start_from: got a policy for substeps 1, allowed 2"),
         (["--parity", "reference"], "start_from: got a policy for action layout image, allowed grid"),
         (
             ["--refine", "--resolutions", "8", "16"],

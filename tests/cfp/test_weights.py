@@ -5,10 +5,11 @@ import pytest
 import torch
 
 import cfp
-from cfp.actor import build_actor
+from cfp.actor import ActorSpec, build_actor
 from cfp.config import Config
 from cfp.errors import CheckpointError
 from cfp.networks import normalise_image
+from cfp.policy import CFPPolicy, action_space, observation_space
 from cfp.weights import describe, save_policy
 
 
@@ -37,6 +38,24 @@ def test_loaded_policy_acts_as_the_saved_one(saved, name):
     torch.manual_seed(0)
     np.testing.assert_array_equal(policy.predict(images)[0], noisy)
     assert np.abs(noisy - actions).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("image", "given"),
+    [
+        (np.zeros((3, 64, 64), np.float32), r"float32 array of shape \(3, 64, 64\)"),  # such as a soft observation
+        (np.zeros((64, 64, 3), np.uint8), r"uint8 array of shape \(64, 64, 3\)"),
+        (np.zeros((64, 64), np.uint8), r"uint8 array of shape \(64, 64\)"),
+        (np.zeros((1, 1, 3, 64, 64), np.uint8), r"uint8 array of shape \(1, 1, 3, 64, 64\)"),
+        (torch.zeros(3, 64, 64, dtype=torch.uint8), "Tensor"),
+    ],
+)
+def test_what_is_no_image_is_refused(saved, image, given):
+    space = action_space(64)
+    whole = CFPPolicy(observation_space(), space, lambda _: 1e-3, ActorSpec((8, 16), (-1.0,), patch=64))
+    for policy in (cfp.load(saved[0]), whole):
+        with pytest.raises(ValueError, match=f"observation: got {given}, allowed a uint8 array"):
+            policy.predict(image)
 
 
 def test_description_stands_beside_and_inside_the_weights(saved):
