@@ -95,7 +95,7 @@ POLICIES = [
     Case(
         "policy missing",
         lambda desk: cfp.load("nobody"),
-        ("nobody.safetensors", "shipped (grow, run, "),
+        ("nobody.safetensors", "shipped (catch, grow, run, "),
         CheckpointError,
     ),
     Case(

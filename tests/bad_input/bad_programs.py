@@ -144,7 +144,7 @@ OTHERS = [
     distilling("no labels", "--capacity 0", "capacity: got 0, allowed 1 or more"),
     evaluating("nothing", "", "policy: got None and the folder None, allowed is one of the two"),
     evaluating("a folder that is not there", "{folder}/none", "none: there is no run (no config.json)"),
-    evaluating("an unknown policy", "--policy alchemy", "none of that name is shipped (grow, run, "),
+    evaluating("an unknown policy", "--policy alchemy", "none of that name is shipped (catch, grow, run, "),
     evaluating("no episodes", "--policy run --episodes 0", "episodes: got 0, allowed 1 or more"),
     evaluating("with seed -1", "--policy run --seed -1", "seed: got -1, allowed 0 to"),
     evaluating("with noise maybe", "--policy run --noise maybe", "'maybe'", "--noise", "without"),
@@ -167,7 +167,7 @@ OTHERS = [
     comparing(
         "parts of a GPU at home", "--gpus-per-run 0.5", "gpus_per_run: got 0.5, allowed with --executor ray only"
     ),
-    comparing("run 99", "--only 99", "only: got 99, allowed 0 to 2"),
+    comparing("run 99", "--only 99", "only: got 99, allowed 0 to 3"),
     comparing("a plan that is not there", "--plan none.json", "plan: none.json cannot be read"),
     planned("of a list", [1], "plan: plan.json cannot be read as JSON (it holds list"),
     planned("of other parts", {"colour": 1}, "holds colour, allowed an object with common, tasks, algos"),
@@ -181,7 +181,7 @@ OTHERS = [
         {"algos": {"cfp": {"tasks": {"run": {"device": "cpu"}}}}},
         "plan: algos.cfp.tasks.run: got device, allowed are options",
     ),
-    planned("with unknown options", {"common": {"colour": 1}}, "cfp on shapematch: colour: no such option"),
+    planned("with unknown options", {"common": {"colour": 1}}, "zero on shapematch: colour: no such option"),
 ]
 
 CASES = [*TRAIN, *OTHERS]
