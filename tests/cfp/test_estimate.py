@@ -65,7 +65,7 @@ def test_what_follows_the_training_is_counted_with_the_policies_own_time(tmp_pat
     monkeypatch.setattr("cfp.estimate.seconds", lambda action: action() or 1.0)
     monkeypatch.setattr("cfp.estimate.available", lambda: True)
     episode = make_spec("shapematch").horizon
-    floor = [*TINY[:-2], "--algo", "zero", "--dry-run"]
+    floor = "--algo zero --particles 100 --substeps 1 --dry-run".split()
     assert baselines_train.main(floor) == 0  # an evaluation; a row for zero, random and the floor; a film
     assert f"time: about {_duration(5 * episode)}, {_duration(4 * episode)} of it for" in capsys.readouterr().out
     assert train.main([*TINY, *LEARNS, "--buffer-size", "60", "--eval-every", "50", "--no-video", "--dry-run"]) == 0
