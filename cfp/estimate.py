@@ -125,7 +125,8 @@ def _episodes(config: RunConfig, policy: PolicyPredictor, size: int, count: int,
 
     def step() -> None:
         nonlocal seen, memory
-        actions, memory = watching.predict(seen, memory)  # type: ignore[arg-type]
+        assert not isinstance(seen, tuple)
+        actions, memory = watching.predict(seen, memory)
         seen = env.step(actions)[0]
         if film:
             env.get_images()
