@@ -239,7 +239,7 @@ def cost_table(groups: Sequence[Group]) -> Table:
     about = (
         "Training without its evaluations and without that of a teacher that is trained first, whose minutes stand "
         "beside: mean over seeds. An episode is the task's whole length of steps; robots that train side by side share "
-        "the time. Memory is the most that a run's process held, evaluations included. Right: the paper's Table 3, one "
+        "the time. Memory is the most that a run's process held, evaluations included. Right: the paper's Table 4, one "
         "robot at full size on an RTX 4090."
     )
     columns = (

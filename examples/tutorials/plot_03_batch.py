@@ -8,7 +8,7 @@ Here 64 robots of RUN with different stiffness and gravity are driven by the sam
 
 # %%
 # `dittogym.TorchEnv` is an environment with tensors in and out. `particles="lite"` gives each robot 2,000 particles
-# instead of 10,000; the task pages say what that changes.
+# instead of 22,000; the page on fidelity says what that changes.
 
 import math
 import time
@@ -59,8 +59,8 @@ right.set(title="the one that came furthest", xticks=[], yticks=[])
 figure.tight_layout()
 
 # %%
-# A batch is not an approximation: element 13 moves as it would alone. (Sums are made in another order, so not to the
-# last bit.)
+# A batch is not an approximation: element 13 moves as it would alone, with the native kernels to the last bit, else to
+# rounding.
 
 alone = dittogym.TorchEnv("run", particles="lite", substeps=50)
 alone.reset(seed=13, options={"physics": {"mu": stiffness[13], "gravity": (0.0, gravity[13].item())}})

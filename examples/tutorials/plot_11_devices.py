@@ -3,7 +3,8 @@ On a GPU, and on a cluster
 ==========================
 
 The same program runs on a laptop's CPU and on a GPU: say ``device="cuda"``. What changes is how many robots it takes
-to fill the machine. This page measures that where it was built.
+to fill the machine. This page measures that where it was built. (On a GPU nothing of this has been timed yet; there
+``backend="native"`` has to be asked for, otherwise the physics runs operator by operator.)
 """
 
 # %%

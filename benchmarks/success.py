@@ -1,0 +1,52 @@
+"""How often a policy succeeds within the first steps of an episode, while its actions are shaken.
+
+``python -m baselines.robustness --cases noise`` tells the same of whole episodes. Where success comes early or
+never, as in GROW under the record of a plan (``python benchmarks/success.py POLICY``),
+most of their time tells nothing.
+"""
+
+import argparse
+from dataclasses import replace
+
+from baselines.compare.stats import wilson
+from baselines.train import PROGRAM
+from cfp.disturbances import Case, Disturbed
+from cfp.evaluate import open_policy
+from cfp.evaluation import evaluate, judging_seed
+from cfp.vec_env import monitored
+from dittogym import TorchEnv, make_spec
+
+BATCH = 20
+"""Episodes side by side."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("policy", help="a policy file, or the name of one that comes with the package")
+    parser.add_argument("--steps", type=int, default=45, help="control steps after which an episode is cut")
+    parser.add_argument("--noise", type=float, default=0.1, help="standard deviation on every action entry")
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--particles", default="full")
+    arguments = parser.parse_args()
+    config, policies = open_policy(PROGRAM, arguments.policy, "cpu", None)
+    policy, own = policies.popitem()[1], config.environment
+    spec = replace(make_spec(config.task, **own.task_options()), horizon=arguments.steps)
+    case = Case("noise", action_noise=arguments.noise)
+    successes = done = 0
+    while done < arguments.episodes:
+        count = min(BATCH, arguments.episodes - done)
+        env = TorchEnv(spec, count, policy.resolution, particles=arguments.particles, action_layout=own.layout)
+        seed = judging_seed(config) + done
+        result = evaluate(
+            "", policy, Disturbed(monitored(env), case, seed, policy.description["resolution"]), count,
+            deterministic=policy.deterministic_by_default, seed=seed,
+        )  # fmt: skip
+        if result.success is None:
+            parser.error(f"policy: got one of {config.task}, allowed of a task that defines success")
+        done, successes = done + count, successes + round(result.success * count)
+        low, high = wilson(successes, done)
+        print(f"{successes} of {done} episodes, 95 % interval {low:.0%} to {high:.0%}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
