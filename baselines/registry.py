@@ -40,6 +40,8 @@ ALGORITHMS: dict[str, Entry] = {
     "random": Random.entry(),
     "scripted": Scripted.entry(),
 }
+ALIASES = {name.replace("-", ""): name for name in ALGORITHMS if "-" in name}
+"""Other spellings: gnn16 for gnn-16."""
 
 
 def find(name: str) -> Entry:
@@ -48,6 +50,7 @@ def find(name: str) -> Entry:
     Raises:
         ConfigError: There is none of that name.
     """
+    name = ALIASES.get(name, name) if isinstance(name, str) else name
     if not isinstance(name, str) or name not in ALGORITHMS:
         raise ConfigError(f"algo: got {name!r}, allowed {', '.join(ALGORITHMS)}")
     return ALGORITHMS[name]
@@ -60,6 +63,8 @@ def configure(values: dict[str, Any]) -> RunConfig:
         ConfigError: An unknown name or a value of the wrong type.
     """
     entry = find(values.get("algo", "cfp"))
+    if values.get("algo") in ALIASES:
+        values = {**values, "algo": ALIASES[values["algo"]]}
     config: RunConfig = merge(entry.preset(values.get("task", "shapematch"), values.get("preset", "quick")), values)
     return config
 

@@ -97,7 +97,7 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
     base = program.configure(values)
 
     def read(defaults: RunConfig) -> Command:
-        return tyro.cli(
+        command = tyro.cli(
             Command,
             prog=started or started_as(f"{program.package}.train", arguments),
             description=f"{program.about}\n\n{inspect.getdoc(Command)}",
@@ -105,6 +105,8 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
             default=Command(defaults),
             config=(tyro.conf.OmitArgPrefixes,),
         )
+        # The word may be another spelling of the name.
+        return command if choice.algo is None else replace(command, run=replace(command.run, algo=base.algo))
 
     if choice.resume:
         folder = choice.out or _default_folder(read(base).run)  # all that names a folder comes from these words

@@ -260,8 +260,8 @@ class Config(LadderConfig, SACConfig):
     gate_penalty: tuple[float, ...] = (0.01,)
     """Weight of the gate penalty (one less than levels)."""
     start_from: str | None = None
-    """Policy of the first levels, a run folder, policy.safetensors, or the name of one that comes with the package: training
-    begins with the level after it."""
+    """Policy of the first levels (a run folder, policy.safetensors, or the name of one that comes with the package):
+    training begins with the level after it."""
     refine: bool = False
     """Training begins with the last level of start_from itself, which goes on learning."""
     learning: LearningConfig = field(default_factory=LearningConfig)

@@ -11,6 +11,7 @@ import cfp.evaluate
 import dittogym
 from baselines import evaluate, robustness, train
 from cfp.books import Books
+from cfp.command import parse
 from cfp.evaluation import SeesState
 from cfp.files import read_table
 
@@ -194,6 +195,12 @@ def test_polish_is_judged_on_the_layout_it_is_made_for(finished):
 def test_what_acts_without_looking_is_said_to_see_nothing():
     blind = {name for name, entry in baselines.ALGORITHMS.items() if entry.sees == "nothing"}
     assert blind == {"gradient", "zero", "random", "scripted"}
+
+
+@pytest.mark.parametrize("given, name", [("gnn16", "gnn-16"), ("transformer64", "transformer-64"), ("cfp", "cfp")])
+def test_algorithm_with_a_count_has_two_spellings(given, name):
+    run = parse(train.PROGRAM, ["--algo", given, "--task", "run"]).run
+    assert run.name == f"{name}-run-quick-0" and run == baselines.registry.configure({"algo": name, "task": "run"})
 
 
 def test_wrong_algorithm_is_named(tmp_path, capsys):
