@@ -126,7 +126,7 @@ def run(program: Program, command: Command) -> str:
     config, policies = command.open(program)
     results = compare(config, policies, command.episodes, command.noise)
     if command.video is not None:
-        make_video(config, list(policies.values())[-1], command.video)
+        make_video(config, list(policies.values())[-1], command.video, aside=command.json)
     return json.dumps(to_rows(results), indent=2) if command.json else format_table(config, results)
 
 

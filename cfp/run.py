@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -344,11 +345,19 @@ def copy_policy(source: Path, target: Path) -> None:
         copy_atomically(source.with_suffix(suffix), target.with_suffix(suffix))
 
 
-def make_video(config: RunConfig, policy: Policy, path: Path) -> None:
-    """Film one episode of a policy; without the optional packages, say how to get them and go on."""
+def make_video(config: RunConfig, policy: Policy, path: Path, aside: bool = False) -> None:
+    """Film one episode of a policy; without the optional packages, say how to get them and go on.
+
+    Args:
+        config: The run's options.
+        policy: Acts.
+        path: Of the MP4 file.
+        aside: Say it on the standard error, where the standard output is for a program to read.
+    """
+    told = sys.stderr if aside else sys.stdout
     try:
         write_video(path, film(config, policy))
     except VideoUnavailable as error:
-        print(error)
+        print(error, file=told)
     else:
-        print(f"video: {path}")
+        print(f"video: {path}", file=told)

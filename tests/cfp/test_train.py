@@ -383,10 +383,15 @@ def test_video_plays_or_tells_how_to_install(finished, tmp_path, monkeypatch, ca
     monkeypatch.setattr("cfp.video.find_spec", lambda name: None)
     assert evaluate.main(arguments) == 0
     assert "pip install 'torchmpm[video]'" in capsys.readouterr().out
+    assert evaluate.main([*arguments, "--json"]) == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out)[-1]["policy"] == "stage 2" and "pip install 'torchmpm[video]'" in told.err
     monkeypatch.undo()
     imageio = pytest.importorskip("imageio.v2")
     pytest.importorskip("imageio_ffmpeg")
-    assert evaluate.main(arguments) == 0
+    assert evaluate.main([*arguments, "--json"]) == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out) and told.err.strip() == f"video: {tmp_path / 'film.mp4'}"
     with imageio.get_reader(tmp_path / "film.mp4") as film:
         metadata = film.get_meta_data()
     assert metadata["codec"].startswith("h264")
