@@ -191,13 +191,13 @@ class Distill(Algorithm):
             yield
 
     def _teacher(self, own: RunConfig, path: Path | None) -> Teacher:
-        config, layout = self.config, self.config.environment.layout
+        config = self.config
         if path is None and config.teacher == "mpc":
             size = grid_size(config.task, config.planner_grid)
-            return PlannerTeacher(make_torch_env(own, size), config.planner, config.seed, layout)
+            return PlannerTeacher(make_torch_env(own, size), config.planner, config.seed)
         policy = read_teacher(path or config.teacher, config.task, config.environment)
         theirs = EnvironmentConfig(**policy.description["environment"])
-        return PolicyTeacher(policy, theirs.layout, layout)
+        return PolicyTeacher(policy, theirs.layout, config.environment.layout)
 
     @property
     def policy(self) -> ActorPolicy:
