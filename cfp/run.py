@@ -141,7 +141,7 @@ class Run(ABC):
             step = self.position.offset
         self.step, self.judging, self.teaching = step, 0.0, (0, 0.0)
         write_json(folder / "config.json", to_json(config))
-        self.evaluations = Table(folder / "evaluations.csv", step)
+        self.evaluations = Table(folder / "evaluations.csv", step, ("step", "stage", "mean"))
         progress = ProgressTable(Table(folder / "progress.csv", step))
         self.tracker = Tracker(config, folder, step)
         self.logger = Logger(str(folder), [progress, *self.tracker.writers])
@@ -269,7 +269,7 @@ class Run(ABC):
     def _books(self, level: int, model: PolicyPredictor) -> Books:
         config = self.config
         seed, episodes = config.evaluation(level)
-        rows = read_table(self.folder / "evaluations.csv")
+        rows = read_table(self.folder / "evaluations.csv", ("step", "stage", "mean"))
         rows = [row for row in rows if int(row["stage"]) == level + 1]
         best = max((float(row["mean"]) for row in rows), default=-math.inf)
 
