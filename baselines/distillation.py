@@ -35,7 +35,7 @@ FINAL_RATE = 0.1
 METRICS: dict[str, str] = {
     "rollout/return": "mean undiscounted return of the episodes that ended in the last round, None for none",
     "train/loss": "mean square by which actions differ from the teacher's, mean over the round's updates",
-    "train/fresh_loss": "the same on the labels of the round before anything was learned from them",
+    "train/fresh_loss": "the same on the labels of the round before anything was learned from them, None for no labels",
     "train/share": "share of the round that the teacher led",
     "train/labels": "labels in the data set",
     "train/learning_rate": "Adam's step size",
@@ -232,7 +232,9 @@ class Distill(Algorithm):
         self.rounds += 1
         with torch.no_grad():
             part = slice(0, None, max(1, len(labels.actions) // config.batch_size))
-            fresh = float(self._loss(labels.observations[part], labels.actions[part]))
+            # A round may lie within a plan that the student does not follow: then nothing in it was labelled.
+            labelled = len(labels.actions) > 0
+            fresh = float(self._loss(labels.observations[part], labels.actions[part])) if labelled else None
         rate = self._rate()
         self.adam.param_groups[0]["lr"] = rate
         losses = [self._improve() for _ in range(config.updates)]
