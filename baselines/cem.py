@@ -16,7 +16,7 @@ from baselines.rollout import Judge, judge_true
 from cfp.config import positive
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
-from dittogym.action import Layout, bicubic
+from dittogym.action import bicubic
 from dittogym.dynamics import EnvState
 
 
@@ -69,9 +69,8 @@ class CEMPlanner(PlannerBase[CEMPlannerConfig]):
         *,
         judge: Judge = judge_true,
         seed: int = 0,
-        layout: Layout = "image",
     ) -> None:
-        super().__init__(env, config, judge=judge, seed=seed, layout=layout)
+        super().__init__(env, config, judge=judge, seed=seed)
 
     @torch.no_grad()
     def _search(self, start: EnvState, plan: Tensor) -> Tensor:

@@ -35,7 +35,7 @@ FINAL_RATE = 0.1
 METRICS: dict[str, str] = {
     "rollout/return": "mean undiscounted return of the episodes that ended in the last round, None for none",
     "train/loss": "mean square by which actions differ from the teacher's, mean over the round's updates",
-    "train/fresh_loss": "the same on the labels of the round before anything was learned from them",
+    "train/fresh_loss": "the same on the labels of the round before anything was learned from them, None for no labels",
     "train/share": "share of the round that the teacher led",
     "train/labels": "labels in the data set",
     "train/learning_rate": "Adam's step size",
@@ -191,13 +191,13 @@ class Distill(Algorithm):
             yield
 
     def _teacher(self, own: RunConfig, path: Path | None) -> Teacher:
-        config, layout = self.config, self.config.environment.layout
+        config = self.config
         if path is None and config.teacher == "mpc":
             size = grid_size(config.task, config.planner_grid)
-            return PlannerTeacher(make_torch_env(own, size), config.planner, config.seed, layout)
+            return PlannerTeacher(make_torch_env(own, size), config.planner, config.seed)
         policy = read_teacher(path or config.teacher, config.task, config.environment)
         theirs = EnvironmentConfig(**policy.description["environment"])
-        return PolicyTeacher(policy, theirs.layout, layout)
+        return PolicyTeacher(policy, theirs.layout, config.environment.layout)
 
     @property
     def policy(self) -> ActorPolicy:
@@ -232,7 +232,9 @@ class Distill(Algorithm):
         self.rounds += 1
         with torch.no_grad():
             part = slice(0, None, max(1, len(labels.actions) // config.batch_size))
-            fresh = float(self._loss(labels.observations[part], labels.actions[part]))
+            # A round may lie within a plan that the student does not follow: then nothing in it was labelled.
+            labelled = len(labels.actions) > 0
+            fresh = float(self._loss(labels.observations[part], labels.actions[part])) if labelled else None
         rate = self._rate()
         self.adam.param_groups[0]["lr"] = rate
         losses = [self._improve() for _ in range(config.updates)]

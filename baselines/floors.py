@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -58,9 +59,9 @@ class Floor(Algorithm):
             report=ReportConfig(1, checkpoint_every=1, log_every=1),
         )
 
-    @property
+    @cached_property
     def policy(self) -> OpenLoop | RandomActions:
-        """The floor."""
+        """The floor; a wave takes longer to make than a step does."""
         return self.make({})
 
     @abstractmethod

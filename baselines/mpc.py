@@ -107,7 +107,7 @@ class MPC(Algorithm):
         self.env.reset(seed=config.seed)
         self.reduced = None if config.tier is None else self._reduced(config, config.tier)
         tried = self.reduced.small if self.reduced else self.env
-        self.planner = self.planner_type(tried, config.planner, seed=config.seed, layout=self.env.action_layout)
+        self.planner = self.planner_type(tried, config.planner, seed=config.seed)
         self.period = config.planner.commit  # all its planning is in the first of these steps
         self.actions = torch.zeros(0, *self.env.action_shape)
         self.total, self.reward, self.over = 0.0, 0.0, False

@@ -13,7 +13,6 @@ from baselines.rollout import Judge, Judgement, judge, rollout
 from cfp.config import not_negative, positive
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
-from dittogym.action import Layout
 from dittogym.dynamics import EnvState, Model
 from dittogym.reward import measure
 
@@ -80,7 +79,6 @@ class PlannerBase(ABC, Generic[Config]):
         config: How to plan.
         judge: What a step is worth; the true reward chooses.
         seed: Of the noise.
-        layout: The environment's action layout.
 
     Attributes:
         failed: Plans that were not finite so far; they are never carried out.
@@ -99,11 +97,10 @@ class PlannerBase(ABC, Generic[Config]):
         *,
         judge: Judge = judge,
         seed: int = 0,
-        layout: Layout = "image",
     ) -> None:
         self.config = config = config or self.options()
         config.check()
-        self.env, self.judge, self.layout = env, judge, layout
+        self.env, self.judge = env, judge
         self.generator = torch.Generator().manual_seed(seed)
         self.failed = self.plans = 0
         self._ahead = self._fresh(config.horizon)
@@ -179,7 +176,8 @@ class PlannerBase(ABC, Generic[Config]):
 
     def _judge(self, start: EnvState, plan: Tensor) -> tuple[Tensor, Tensor]:
         """Smooth return, and true return less what ending forgoes, of plans (T, B, 2, R, R): (B,) each."""
-        steps = rollout(self.env.model, start, plan, self._careful, layout=self.layout, checkpointed=False)
+        layout = self.env.action_layout
+        steps = rollout(self.env.model, start, plan, self._careful, layout=layout, checkpointed=False)
         total = steps.true_rewards.sum(0)
         after = min(self.config.forgone, max(self._left(start) - len(plan), 0))
         charge = torch.where(steps.ended, after / len(plan) * total.clamp_min(0.0), 0.0)

@@ -89,13 +89,12 @@ class PlannerTeacher(Teacher):
         env: Of its own, with its action grid; it follows the one that it is asked about.
         config: How to plan.
         seed: Of the plans' noise.
-        layout: Of actions.
     """
 
-    def __init__(self, env: TorchEnv, config: PlannerConfig, seed: int, layout: Layout) -> None:
+    def __init__(self, env: TorchEnv, config: PlannerConfig, seed: int) -> None:
         env.reset(seed=seed)
         self.env, self.resolution = env, env.action_resolution
-        self.planner = Planner(env, config, seed=seed, layout=layout)
+        self.planner = Planner(env, config, seed=seed)
 
     def act(self, env: TorchEnv, seen: Tensor) -> Tensor:
         """The next actions of its plans."""

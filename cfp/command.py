@@ -173,13 +173,23 @@ def main(program: Program, arguments: Sequence[str] | None = None, started: str 
         print(f"error: {error}", file=sys.stderr)
         return 1
     except (MemoryError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and "allocate memory" not in str(error):  # torch's word for the same
-            raise
-        print(
-            f"error: not enough memory: take fewer num_envs, particles or a smaller buffer_size ({error})",
-            file=sys.stderr,
-        )
-        return 1
+        return out_of_memory(error, "num_envs, particles or a smaller buffer_size")
+
+
+def out_of_memory(error: MemoryError | RuntimeError, fewer: str) -> int:
+    """Say in one line that there was not enough memory; returns the exit code.
+
+    Args:
+        error: What was raised.
+        fewer: Of what to take less.
+
+    Raises:
+        RuntimeError: It is about something else.
+    """
+    if isinstance(error, RuntimeError) and "allocate memory" not in str(error):  # torch's word for the same
+        raise error
+    print(f"error: not enough memory: take fewer {fewer} ({error})", file=sys.stderr)
+    return 1
 
 
 def _train(program: Program, config: RunConfig, folder: Path, resume: bool) -> int:

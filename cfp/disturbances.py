@@ -65,9 +65,12 @@ def idle(case: Case, spec: TaskSpec, sees_image: bool = True) -> str:
         return f"{spec.name} has no gravity"
     if case.friction is None:
         return ""
-    own = {item.rules[0].friction for item in spec.obstacles if item.name == FLOOR}
-    if not own:
+    floors = [item for item in spec.obstacles if item.name == FLOOR]
+    if not floors:
         return f"{spec.name} has no obstacle with the name {FLOOR!r}"
+    own = {rule.friction for item in floors for rule in item.rules}
+    if not own:
+        return f"the floor of {spec.name} has no rules"
     return f"the floor of {spec.name} has this friction" if own == {case.friction} else ""
 
 
@@ -207,8 +210,8 @@ def make_cases(
     """
     cases = [
         Case("unperturbed"),
-        Case(f"action dropout {dropout:.0%}", action_dropout=dropout),
-        Case(f"observation dropout {dropout:.0%}", observation_dropout=dropout),
+        Case(f"action dropout {100 * dropout:g}%", action_dropout=dropout),
+        Case(f"observation dropout {100 * dropout:g}%", observation_dropout=dropout),
         Case(f"action noise {noise:g}", action_noise=noise),
         Case(f"latency {latency} step{'s' if latency > 1 else ''}", latency=latency),
     ]

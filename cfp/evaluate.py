@@ -10,7 +10,7 @@ from pathlib import Path
 
 import tyro
 
-from cfp.command import Program, started_as
+from cfp.command import Program, out_of_memory, started_as
 from cfp.config import RunConfig, Tier, at_least_one
 from cfp.environments import choose_device
 from cfp.errors import CFPError, CheckpointError, ConfigError
@@ -126,7 +126,7 @@ def run(program: Program, command: Command) -> str:
     config, policies = command.open(program)
     results = compare(config, policies, command.episodes, command.noise)
     if command.video is not None:
-        make_video(config, list(policies.values())[-1], command.video)
+        make_video(config, list(policies.values())[-1], command.video, aside=command.json)
     return json.dumps(to_rows(results), indent=2) if command.json else format_table(config, results)
 
 
@@ -139,6 +139,8 @@ def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> 
     except (CFPError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2 if isinstance(error, CFPError) else 1
+    except (MemoryError, RuntimeError) as error:
+        return out_of_memory(error, "episodes or particles")
     return 0
 
 

@@ -14,6 +14,8 @@ from typing import Any, BinaryIO
 from stable_baselines3.common.logger import KVWriter, TensorBoardOutputFormat, filter_excluded_keys
 from torch.utils.tensorboard import SummaryWriter
 
+from cfp.errors import CheckpointError
+
 LARGEST_JSON = 2**20
 """Bytes of a JSON file that is read."""
 
@@ -132,12 +134,16 @@ class Table:
     Args:
         path: The file; what it holds is kept.
         last_step: Rows whose ``step`` is beyond this are dropped: they belong to work that a resumed run repeats.
+        numbers: Columns that hold a number in every row that is there.
+
+    Raises:
+        CheckpointError: The file is damaged.
     """
 
-    def __init__(self, path: Path, last_step: int | None = None) -> None:
+    def __init__(self, path: Path, last_step: int | None = None, numbers: Sequence[str] = ("step",)) -> None:
         """Read the file if it is there."""
         self.path = path
-        self.rows = read_table(path)
+        self.rows = read_table(path, numbers)
         if last_step is not None:
             self.rows = [row for row in self.rows if float(row["step"]) <= last_step]
         self.columns = list(dict.fromkeys(key for row in self.rows for key in row))
@@ -160,14 +166,36 @@ class Table:
         write_text(self.path, csv_text(self.rows, self.columns))
 
 
-def read_table(path: Path) -> list[dict[str, str]]:
-    """Rows of a CSV file as text, none if it does not exist; a last line cut short by a crash is left out."""
+def read_table(path: Path, numbers: Sequence[str] = ("step",)) -> list[dict[str, str]]:
+    """Rows of a CSV file as text, none if it does not exist; a last line cut short by a crash is left out.
+
+    Args:
+        path: The file.
+        numbers: Columns that hold a number in every row.
+
+    Raises:
+        CheckpointError: It is no such table.
+    """
     if not path.exists():
         return []
-    with open(path, newline="") as file:
-        text = file.read()
-    complete = text[: text.rfind("\n") + 1]
-    return [row for row in csv.DictReader(io.StringIO(complete)) if row.get("step")]
+    try:
+        with open(path, newline="") as file:
+            text = file.read()
+        complete = text[: text.rfind("\n") + 1]
+        rows = [row for row in csv.DictReader(io.StringIO(complete)) if row.get("step")]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise CheckpointError(f"{path}: cannot be read ({error})") from error
+    for row in rows:
+        for name in numbers:
+            _check_number(path, name, row.get(name))
+    return rows
+
+
+def _check_number(path: Path, column: str, text: str | None) -> None:
+    try:
+        float(text or "")
+    except ValueError as error:
+        raise CheckpointError(f"{path}: got {text!r} in column {column}, allowed is a number") from error
 
 
 class ProgressTable(KVWriter):

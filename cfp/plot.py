@@ -26,8 +26,8 @@ def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Pat
     """
     figure = Figure(figsize=(8, 4.5), dpi=150, layout="constrained")
     axes = figure.add_subplot()
-    training = read_table(run / "progress.csv")
-    evaluations = read_table(run / "evaluations.csv")
+    training = read_table(run / "progress.csv", ("step", "stage"))
+    evaluations = read_table(run / "evaluations.csv", ("step", "mean", "std"))
     steps, values = _column(training, "rollout/return")
     if steps:
         axes.plot(steps, values, color="tab:gray", alpha=0.8, label="training episodes (with noise)")

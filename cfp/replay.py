@@ -36,6 +36,9 @@ class ReplayRing(ReplayBuffer):
         seed: Seed of the generator.
         composition: If given, actions are stored as its vectors, and made again when a batch is drawn.
         kwargs: As there.
+
+    Raises:
+        ValueError: ``optimize_memory_usage`` is asked for.
     """
 
     def __init__(
@@ -48,6 +51,10 @@ class ReplayRing(ReplayBuffer):
         composition: Composition | None = None,
         **kwargs: Any,
     ) -> None:
+        if kwargs.get("optimize_memory_usage"):  # then next observations would be those of the row after
+            raise ValueError(
+                "optimize_memory_usage: got True, allowed is False, as batches and checkpoints hold next observations"
+            )
         stored = spaces.Box(-np.inf, np.inf, (composition.length,), np.float32) if composition else action_space
         super().__init__(buffer_size, observation_space, stored, *args, **kwargs)
         self.generator = np.random.default_rng(seed)

@@ -12,7 +12,7 @@ from typing import Any
 import tyro
 from matplotlib.figure import Figure
 
-from cfp.command import Program, started_as
+from cfp.command import Program, out_of_memory, started_as
 from cfp.config import RunConfig, at_least_one
 from cfp.disturbances import Case, Decides, disturbed_env, idle, make_cases
 from cfp.errors import CFPError, ConfigError
@@ -207,6 +207,8 @@ def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> 
     except (CFPError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2 if isinstance(error, CFPError) else 1
+    except (MemoryError, RuntimeError) as error:
+        return out_of_memory(error, "episodes or particles")
     return 0
 
 

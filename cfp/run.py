@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -140,7 +141,7 @@ class Run(ABC):
             step = self.position.offset
         self.step, self.judging, self.teaching = step, 0.0, (0, 0.0)
         write_json(folder / "config.json", to_json(config))
-        self.evaluations = Table(folder / "evaluations.csv", step)
+        self.evaluations = Table(folder / "evaluations.csv", step, ("step", "stage", "mean"))
         progress = ProgressTable(Table(folder / "progress.csv", step))
         self.tracker = Tracker(config, folder, step)
         self.logger = Logger(str(folder), [progress, *self.tracker.writers])
@@ -268,7 +269,7 @@ class Run(ABC):
     def _books(self, level: int, model: PolicyPredictor) -> Books:
         config = self.config
         seed, episodes = config.evaluation(level)
-        rows = read_table(self.folder / "evaluations.csv")
+        rows = read_table(self.folder / "evaluations.csv", ("step", "stage", "mean"))
         rows = [row for row in rows if int(row["stage"]) == level + 1]
         best = max((float(row["mean"]) for row in rows), default=-math.inf)
 
@@ -344,11 +345,19 @@ def copy_policy(source: Path, target: Path) -> None:
         copy_atomically(source.with_suffix(suffix), target.with_suffix(suffix))
 
 
-def make_video(config: RunConfig, policy: Policy, path: Path) -> None:
-    """Film one episode of a policy; without the optional packages, say how to get them and go on."""
+def make_video(config: RunConfig, policy: Policy, path: Path, aside: bool = False) -> None:
+    """Film one episode of a policy; without the optional packages, say how to get them and go on.
+
+    Args:
+        config: The run's options.
+        policy: Acts.
+        path: Of the MP4 file.
+        aside: Say it on the standard error, where the standard output is for a program to read.
+    """
+    told = sys.stderr if aside else sys.stdout
     try:
         write_video(path, film(config, policy))
     except VideoUnavailable as error:
-        print(error)
+        print(error, file=told)
     else:
-        print(f"video: {path}")
+        print(f"video: {path}", file=told)

@@ -60,9 +60,23 @@ class TorchVecEnv(VecEnv):
 
     @torch.no_grad()
     def reset(self) -> VecEnvObs:
-        """Start a new episode everywhere; seeds given by ``seed()`` are used once. Returns uint8 (B, 3, 64, 64)."""
-        observation, info = self.torch_env.reset(seed=self._seeds[0])
+        """Start a new episode everywhere; what ``seed()`` and ``set_options()`` gave is used once.
+
+        Returns:
+            uint8 (B, 3, 64, 64).
+
+        Raises:
+            ValueError: The environment refuses the options, or they are not the same for all elements. Values for each
+                element stand within them, see `dittogym.TorchEnv.reset`.
+        """
+        options = self._options[0] if self._options else {}
+        if len(self._options) != self.num_envs or not all(_same(options, other) for other in self._options):
+            raise ValueError(
+                f"options: got {self._options}, allowed are one for all elements, or the same {self.num_envs} times"
+            )
+        observation, info = self.torch_env.reset(seed=self._seeds[0], options=options or None)
         self._reset_seeds()
+        self._reset_options()
         self.reset_infos = self._split_info(info)
         return _to_numpy(observation)
 
@@ -163,6 +177,16 @@ def _to_numpy(tensor: Tensor) -> np.ndarray:
     """A copy, so that what is stored cannot change when the environment reuses its memory."""
     array: np.ndarray = tensor.detach().cpu().numpy().copy()
     return array
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Whether two options are equal, in which there may be arrays and tensors."""
+    if one is other:
+        return True
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(_same(one[key], other[key]) for key in one)
+    one, other = (value.detach().cpu() if isinstance(value, Tensor) else value for value in (one, other))
+    return np.array_equal(one, other)
 
 
 def _to_plain(value: Any) -> Any:

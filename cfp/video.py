@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable, Iterator
+from contextlib import closing
 from importlib.util import find_spec
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +32,7 @@ def available() -> bool:
     return bool(find_spec("imageio") and find_spec("imageio_ffmpeg"))
 
 
-def film(config: RunConfig, policy: Policy) -> list[np.ndarray]:
+def film(config: RunConfig, policy: Policy) -> Iterator[np.ndarray]:
     """Pictures of one episode of a policy as it is evaluated, see `film_episode`.
 
     Args:
@@ -42,46 +45,55 @@ def film(config: RunConfig, policy: Policy) -> list[np.ndarray]:
 
 def film_episode(
     config: RunConfig, policy: PolicyPredictor, size: int, deterministic: bool, seed: int
-) -> list[np.ndarray]:
-    """Pictures of one episode, uint8 (512, 512, 3): the start, then one per environment step.
+) -> Iterator[np.ndarray]:
+    """Pictures of one episode, uint8 (512, 512, 3): the start, then one per environment step, as they are asked for.
 
     Args:
         config: The run's options.
         policy: Acts.
         size: Rows and columns of its actions.
         deterministic: Act without noise.
-        seed: Of layout and noise; torch's own generator is left as it was.
+        seed: Of layout and noise; torch's own generator is left as it was, also between two pictures.
     """
     venv = make_env(config, size, 1).venv
     assert isinstance(venv, TorchVecEnv)
     watching = attached(policy, venv)
     venv.seed(seed)
     observation = venv.reset()
-    frames = [venv.torch_env.render(0)]
-    done, memory = False, None
-    with torch.random.fork_rng(devices=list(range(torch.cuda.device_count()))), torch.no_grad():
+    yield venv.torch_env.render(0)
+    devices = list(range(torch.cuda.device_count()))
+    with torch.random.fork_rng(devices=devices):
         torch.manual_seed(seed)
-        while not done:
-            assert isinstance(observation, np.ndarray)
-            start = np.array([len(frames) == 1])
+        luck = _luck()
+    done, memory, start = False, None, np.array([True])
+    while not done:
+        assert isinstance(observation, np.ndarray)
+        with torch.random.fork_rng(devices=devices), torch.no_grad():  # over before the caller goes on with a picture
+            torch.set_rng_state(luck[0])
+            torch.cuda.set_rng_state_all(luck[1])
             action, memory = watching.predict(observation, memory, start, deterministic)
+            luck = _luck()
             tensors = venv.torch_env.step(torch.as_tensor(action, device=venv.torch_env.device))
-            observation, _, terminated, truncated, _ = (_numpy(value) for value in tensors)
-            frames.append(venv.torch_env.render(0))  # before a reset can replace the last picture
-            done = bool(terminated[0] or truncated[0])
-    return frames
+        observation, _, terminated, truncated, _ = (_numpy(value) for value in tensors)
+        done, start = bool(terminated[0] or truncated[0]), np.array([False])
+        yield venv.torch_env.render(0)
+
+
+def _luck() -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Where torch's generators are, on the CPU and on every CUDA device."""
+    return torch.get_rng_state(), torch.cuda.get_rng_state_all()
 
 
 def _numpy(value: object) -> np.ndarray:
     return value.cpu().numpy() if isinstance(value, torch.Tensor) else np.empty(0)
 
 
-def write_video(path: Path, frames: list[np.ndarray], hold: int = FRAMES_PER_SECOND) -> None:
-    """Write an MP4 file.
+def write_video(path: Path, frames: Iterable[np.ndarray], hold: int = FRAMES_PER_SECOND) -> None:
+    """Write an MP4 file, picture by picture: no more than one is held.
 
     Args:
         path: Where; replaced in one move once it is whole.
-        frames: uint8 (H, W, 3), even H and W.
+        frames: uint8 (H, W, 3), even H and W, one or more.
         hold: How often the last picture is repeated at the end.
 
     Raises:
@@ -95,7 +107,20 @@ def write_video(path: Path, frames: list[np.ndarray], hold: int = FRAMES_PER_SEC
     aside = path.with_name(f".{path.stem}.part.mp4")
     options: dict[str, Any] = {"codec": "libx264", "pixelformat": "yuv420p", "macro_block_size": 2, "quality": 8}
     writer: Any = imageio.get_writer(aside, format="FFMPEG", fps=FRAMES_PER_SECOND, **options)
-    with writer:
-        for frame in [*frames, *frames[-1:] * hold]:
-            writer.append_data(frame)
-    os.replace(aside, path)
+    try:
+        with closing(writer):  # its own `with` leaves ffmpeg running where there is an error
+            for frame in _held(frames, hold):
+                writer.append_data(frame)
+        os.replace(aside, path)
+    except BaseException:  # a simulation that fails, a second Ctrl-C
+        aside.unlink(missing_ok=True)
+        raise
+
+
+def _held(frames: Iterable[np.ndarray], hold: int) -> Iterator[np.ndarray]:
+    """Pictures, the last of them again and again."""
+    last = None
+    for last in frames:
+        yield last
+    if last is not None:
+        yield from repeat(last, hold)

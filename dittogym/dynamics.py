@@ -215,6 +215,10 @@ def initial(model: Model, positions: Tensor, physics: Physics | None = None) -> 
     if not isinstance(memory, Mapping):
         raise TypeError(f"remember of task {model.spec.name!r} must return tensors by name, got {_kind(memory)}")
     _check_leading(model.spec, "remember", "memory", memory, steps)
+    if missing := [name for name in model.spec.stale if name not in memory]:
+        raise ValueError(
+            f"stale of task {model.spec.name!r} must be names that remember returns, {sorted(memory)}, got {missing}"
+        )
     return replace(state, memory=memory), observation
 
 

@@ -116,10 +116,10 @@ class Canvas:
             return
         width = self.pixels // 2
         mask = cv2.resize(target.astype(np.uint8), (width, width), interpolation=cv2.INTER_NEAREST)
-        outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        outlines, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)  # of bodies and of their holes
         corner = np.array((round(middle[0]) - width // 2, self.pixels - round(middle[1]) - width // 2))
         shifted = [outline + corner for outline in outlines]
-        cv2.fillPoly(self.image, shifted, TARGET)
+        cv2.fillPoly(self.image, shifted, TARGET)  # all at once: what lies in two of them stays empty
 
     def _near(self, middle: np.ndarray) -> bool:
         """Whether a figure around here may be seen; OpenCV cannot be given numbers of any size."""

@@ -267,6 +267,7 @@ class TaskSpec:
             raise TypeError(f"judge must be a function from Moment and Weights to Outcome, got {self.judge!r}")
         if not callable(self.remember):
             raise TypeError(f"remember must be a function from Moment to tensors by name, got {self.remember!r}")
+        checks.instances("stale", self.stale, str)
 
     def _check_point(self, name: str, *, optional: bool, open_ended: bool) -> None:
         given = getattr(self, name)

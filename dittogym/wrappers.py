@@ -11,6 +11,8 @@ import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
+from torchmpm import checks
+
 AnyEnv = gymnasium.Env[Any, Any] | VectorEnv[Any, Any, Any]
 
 
@@ -20,10 +22,10 @@ def action_resolution(env: AnyEnv, size: int) -> Any:
     To let the physics itself enlarge them, in one step, give ``resolution=size`` to :func:`gymnasium.make` instead.
 
     Raises:
-        ValueError: ``size`` is not between 1 and the resolution of ``env``.
+        ValueError: ``size`` is no whole number between 1 and the resolution of ``env``.
     """
     box = _box(env, "action_space")
-    _check(size, box.shape[-1])
+    size = checks.whole("size", size, 1, box.shape[-1])
 
     def enlarge(action: np.ndarray) -> np.ndarray:
         expected = (size, size)
@@ -42,10 +44,10 @@ def observation_resolution(env: AnyEnv, size: int) -> Any:
     """Observations of (3, size, size), reduced by averaging over areas.
 
     Raises:
-        ValueError: ``size`` is not between 1 and the resolution of ``env``.
+        ValueError: ``size`` is no whole number between 1 and the resolution of ``env``.
     """
     box = _box(env, "observation_space")
-    _check(size, box.shape[-1])
+    size = checks.whole("size", size, 1, box.shape[-1])
 
     def reduce(observation: np.ndarray) -> np.ndarray:
         return _resized(observation, size, cv2.INTER_AREA)
@@ -86,11 +88,6 @@ def _box(env: AnyEnv, name: str) -> gymnasium.spaces.Box:
     space = getattr(env, "single_" + name if isinstance(env, VectorEnv) else name)
     assert isinstance(space, gymnasium.spaces.Box)
     return space
-
-
-def _check(size: int, largest: int) -> None:
-    if not isinstance(size, int) or not 1 <= size <= largest:
-        raise ValueError(f"size must be a whole number between 1 and {largest}, got {size}")
 
 
 def _resized(images: np.ndarray, size: int, interpolation: int) -> np.ndarray:

@@ -153,7 +153,8 @@ def _find(job: Job, judging: Judging) -> Found:
 
 def _curve(folder: Path) -> Curve:
     """Of evaluations at the same step, at a handover, the last counts: what goes on from there."""
-    values = {float(row["step"]): float(row["mean"]) for row in read_table(folder / "evaluations.csv")}
+    rows = read_table(folder / "evaluations.csv", ("step", "mean"))
+    values = {float(row["step"]): float(row["mean"]) for row in rows}
     steps = np.array(sorted(values))
     return steps, np.array([values[step] for step in steps])
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from baselines.compare.plan import judged
+from baselines.compare.plan import judged, read_notes
 from baselines.registry import load
 from cfp.config import RunConfig, Tier
 from cfp.disturbances import Case, make_cases
@@ -90,13 +89,13 @@ class Record:
         folder: Of the run.
 
     Raises:
-        CheckpointError: There is no policy.
+        CheckpointError: There is no policy, or the record is damaged.
     """
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / "judged.json"
         self.policy = hashlib.sha256(policy_file(folder).read_bytes()).hexdigest()
-        there = json.loads(self.path.read_text()) if self.path.exists() else {}
+        there = read_notes(self.path, entries=dict) if self.path.exists() else {}
         self.entries: dict[str, Any] = there["entries"] if there.get("policy") == self.policy else {}
 
     def once(self, key: str, make: Callable[[], Any]) -> None:
@@ -141,7 +140,11 @@ def judge(config: RunConfig, folder: Path, judging: Judging, stop: Callable[[], 
 
 
 def read(folder: Path, judging: Judging) -> Judged | None:
-    """What has been found so far; None without a policy or a whole part of its evaluation."""
+    """What has been found so far; None without a policy or a whole part of its evaluation.
+
+    Raises:
+        CheckpointError: The record is damaged.
+    """
     if not (folder / "policy.safetensors").exists():
         return None
     entries = Record(folder).entries

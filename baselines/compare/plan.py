@@ -12,7 +12,7 @@ from baselines.floors import FloorConfig
 from baselines.registry import configure, find
 from cfp.config import EVALUATION_SEED, RunConfig, to_json
 from cfp.errors import CheckpointError, ConfigError
-from cfp.files import read_json
+from cfp.files import parse_json, read_json
 from cfp.run import holds_run, read_config
 from cfp.state_file import flatten
 from cfp.weights import is_of_another_task, read_policy
@@ -72,12 +72,36 @@ class Job:
 
 
 def read_sessions(folder: Path) -> dict[str, Any]:
-    """``sessions.json``: the step at which the run was finished or false, and each session that ended in order."""
+    """``sessions.json``: the step at which the run was finished or false, and each session that ended in order.
+
+    Raises:
+        CheckpointError: It is damaged.
+    """
     path = folder / "sessions.json"
     if not path.exists():
         return {"finished": False, "sessions": []}
-    value: dict[str, Any] = json.loads(path.read_text())
-    return value
+    return read_notes(path, finished=int, sessions=list)
+
+
+def read_notes(path: Path, **kinds: type) -> dict[str, Any]:
+    """A JSON object that a comparison has written into a run folder.
+
+    Args:
+        path: The file.
+        kinds: What it holds by name, and of which type.
+
+    Raises:
+        CheckpointError: It cannot be read, or lacks something of that.
+    """
+    try:
+        value = parse_json(path.read_text())
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path}: cannot be read ({error})") from error
+    for name, kind in kinds.items():
+        if not isinstance(value, dict) or not isinstance(value.get(name), kind):
+            raise CheckpointError(f"{path}: cannot be read (it holds no {name})")
+    notes: dict[str, Any] = value
+    return notes
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -89,6 +91,8 @@ def write(
 ) -> str:
     """Write ``report.json``, ``horizons.csv``, ``differences.csv`` and ``gradients.png``.
 
+    What is not finite is null in JSON, which knows no such numbers.
+
     Args:
         folder: Where.
         config: Options of the measurement.
@@ -107,11 +111,20 @@ def write(
         for width, error in zip(widths, line, strict=True)
     ]
     report = {"config": config, "reach": reach, "conclusion": sentence, "horizons": table, "differences": differences}
-    write_json(folder / "report.json", report)
+    write_json(folder / "report.json", _finite(report))
     for name, listed in (("horizons", table), ("differences", differences)):
         write_text(folder / f"{name}.csv", csv_text(listed, list(listed[0])))
     write_figure(folder / "gradients.png", draw(rows, widths, errors, sentence))
     return sentence
+
+
+def _finite(value: Any) -> Any:
+    """A value for JSON, with None in place of every number that is not finite."""
+    if isinstance(value, dict):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def draw(rows: Sequence[Row], widths: Sequence[float], errors: Sequence[Sequence[float]], sentence: str) -> Figure:
@@ -138,7 +151,9 @@ def draw(rows: Sequence[Row], widths: Sequence[float], errors: Sequence[Sequence
     line(panels[1, 1], "zeroth_variance", "zeroth order, as many simulations")
     panels[1, 1].set(title="variance of the mean gradient of a noisy plan", ylabel="total variance")
     for axes in panels.flat:
-        axes.set_yscale("log")
+        shown = np.concatenate([np.asarray(drawn.get_ydata(), float) for drawn in axes.lines])
+        if (np.isfinite(shown) & (shown > 0)).any():  # else there is nothing that such an axis could show
+            axes.set_yscale("log")
         axes.set_xscale("log", base=10 if axes is panels[0, 0] else 2)
         if axes is not panels[0, 0]:
             axes.set_xticks(horizons, [str(horizon) for horizon in horizons])

@@ -17,6 +17,7 @@ from baselines.compare.executor import run_process
 from baselines.compare.plan import judged
 from baselines.registry import configure, load
 from cfp.disturbances import make_cases
+from cfp.errors import CheckpointError
 from cfp.files import read_table
 
 ENVIRONMENT = {"particles": 100, "substeps": 1, "num_envs": 1}
@@ -74,6 +75,19 @@ def test_other_options_are_refused_and_named(finished, capsys):
     error = capsys.readouterr().err
     assert "planner.horizon: the run in" in error and "mpc-shapematch-quick-0 has 3, got 4" in error
     assert contents(finished) == before
+
+
+@pytest.mark.parametrize("content", ['{"finished": fal', '{"sessions": []}', "[]"])
+def test_damaged_notes_are_named(tmp_path, capsys, content):
+    folder = tmp_path / "out" / "runs" / "mpc-shapematch-quick-0"
+    folder.mkdir(parents=True)
+    (folder / "sessions.json").write_text(content)
+    assert compare(tmp_path / "out", "--algos", "mpc", "--seeds", "0", "--dry-run") == 2
+    assert "mpc-shapematch-quick-0/sessions.json: cannot be read (" in capsys.readouterr().err
+    (folder / "policy.safetensors").touch()
+    (folder / "judged.json").write_text(content)
+    with pytest.raises(CheckpointError, match=r"judged\.json: cannot be read \("):
+        judging.Record(folder)
 
 
 def test_options_that_change_no_result_may_differ(finished):

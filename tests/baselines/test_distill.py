@@ -236,6 +236,16 @@ def test_labels_are_dropped_oldest_first_and_survive_a_checkpoint():
         assert torch.equal(images[:, 0, 0, 0].float(), actions[:, 0, 0, 0])
 
 
+def test_round_without_labels_has_no_fresh_loss():
+    student, rows = Distill(make()), []
+    student.learn(8, rows.append)
+    nothing = Labels(torch.zeros(0, 3, 64, 64, dtype=torch.uint8), torch.zeros(0, 2, 8, 8))
+    student.collector.collect = lambda *_: nothing
+    student.learn(8, rows.append)
+    assert rows[0]["train/fresh_loss"] > 0 and rows[-1]["train/fresh_loss"] is None
+    assert rows[-1]["train/labels"] == rows[-2]["train/labels"] and rows[-1]["train/loss"] > 0
+
+
 def test_labels_larger_than_the_student_s_actions_are_kept_on_its_grid():
     class Fine(Teacher):
         resolution = 64

@@ -8,7 +8,7 @@ import torch
 
 import baselines
 import cfp
-from baselines import train
+from baselines import floors, train
 from baselines.floors import wave
 from cfp.actor import build_actor
 from cfp.command import parse
@@ -61,6 +61,15 @@ def test_scripted_drives_the_whole_episode_in_the_layout_of_the_environment(tmp_
     for step in range(30):
         actions, memory = policy.predict(IMAGES, memory)
         assert np.allclose(actions[1], wave(30, 4, "grid")[step])
+
+
+def test_wave_is_made_once(monkeypatch):
+    made = []
+    monkeypatch.setattr(floors, "wave", lambda *given: made.append(given) or wave(*given))
+    algorithm = floors.Scripted(floors.Scripted.preset("shapematch", "quick"))
+    first, memory = algorithm.predict(IMAGES)
+    second, _ = algorithm.predict(IMAGES, memory)
+    assert len(made) == 1 and not np.array_equal(first, second)
 
 
 def test_layouts_are_inverse():

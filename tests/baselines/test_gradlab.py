@@ -1,8 +1,9 @@
 """The gradient laboratory: against functions whose gradients are known, and as a command."""
 
 import json
+import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ import torch
 import dittogym
 from baselines.gradlab import __main__ as command
 from baselines.gradlab.measure import Probe, Row, Smoothing, finite_differences, measure
-from baselines.gradlab.report import conclude, objections
+from baselines.gradlab.report import conclude, objections, write
 from cfp.errors import ConfigError
 
 GOOD = Row(8, 10.0, 2.0, 1.0, 1e-8, 1e-5, 1.0, 1e-6, 0.1, 30.0, 4.0, 3.0, 0.5, 0)
@@ -106,6 +107,17 @@ def test_conclusion_stops_at_the_first_objection(change: dict, reason: str) -> N
     assert re.search(reason, objection)
     assert conclude("run", [bad])[0] == 0
     assert conclude("run", [GOOD])[0] == 8
+
+
+def test_report_without_a_finite_sample_is_written(tmp_path) -> None:
+    nothing = {field.name: math.nan for field in fields(Row)} | {"horizon": 8, "failed": 32}
+    sentence = write(tmp_path, {"task": "run"}, [Row(**nothing)], (1e-2, 1e-4), [[math.nan, math.inf]])
+    assert "32 samples are not finite" in sentence
+    text = (tmp_path / "report.json").read_text()
+    report = json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    assert report["horizons"][0] == dict.fromkeys(nothing) | {"horizon": 8, "failed": 32}
+    assert [row["error"] for row in report["differences"]] == [None, None]
+    assert (tmp_path / "gradients.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_command_writes_the_same_twice(tmp_path, capsys) -> None:

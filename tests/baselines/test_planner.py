@@ -97,7 +97,7 @@ def test_action_layout_is_the_environments(layout: str, place: tuple[int, int]) 
 
     env = small(action_layout=layout)
     config = PlannerConfig(horizon=1, commit=1, iterations=1, noise=0.0)
-    plan = Planner(env, config, judge=upper_left, layout=layout).plan()[0, 0, 0]
+    plan = Planner(env, config, judge=upper_left).plan()[0, 0, 0]
     assert float(plan[place]) == pytest.approx(0.6, rel=1e-3) and plan[3, 0] == plan[3, 3] == 0
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from cfp.errors import CheckpointError
 from cfp.files import ProgressTable, Table, read_table, write_atomically, write_json
 
 
@@ -47,6 +48,21 @@ def test_line_cut_short_by_a_crash_is_left_out(tmp_path):
     assert read_table(path) == [{"step": "10", "a": "1"}]
     Table(path, last_step=30).add({"step": 20, "a": 2})
     assert [row["a"] for row in read_table(path)] == ["1", "2"]
+
+
+@pytest.mark.parametrize("content", [b"step,a\nabc,1\n", b"step,a\n\xff\xfe,1\n"])
+def test_damaged_table_is_named(tmp_path, content):
+    path = tmp_path / "evaluations.csv"
+    path.write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"evaluations\.csv: (got 'abc' in column step|cannot be read)"):
+        Table(path, last_step=30)
+
+
+def test_row_without_a_number_is_named(tmp_path):
+    (tmp_path / "t.csv").write_text("step,mean\n10,1.5\n20,\n")
+    assert len(read_table(tmp_path / "t.csv")) == 2
+    with pytest.raises(CheckpointError, match=r"t\.csv: got '' in column mean, allowed is a number"):
+        read_table(tmp_path / "t.csv", ("step", "mean"))
 
 
 def test_progress_leaves_out_what_is_excluded(tmp_path):

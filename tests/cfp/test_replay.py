@@ -10,6 +10,12 @@ def make_ring(rows=6, envs=2):
     return ReplayRing(rows * envs, observation_space(), action_space(8), device="cpu", n_envs=envs, seed=0)
 
 
+def test_ring_keeps_next_observations():
+    options = {"device": "cpu", "n_envs": 2, "handle_timeout_termination": False}
+    with pytest.raises(ValueError, match="optimize_memory_usage: got True, allowed is False"):
+        ReplayRing(12, observation_space(), action_space(8), optimize_memory_usage=True, **options)
+
+
 def fill(ring, start, stop):
     """Store rows whose every number tells which row it is."""
     for row in range(start, stop):

@@ -25,6 +25,7 @@ from cfp.vec_env import monitored
 from cfp.weights import describe, save_policy
 from dittogym import make_spec
 from dittogym.action import bicubic
+from dittogym.geometry import floor
 from dittogym.tasks import TASKS
 
 
@@ -215,6 +216,26 @@ def test_chosen_cases_that_change_nothing_are_refused(folder):
         robustness.check_words(make_cases(), ["observation"], run, policy)
 
 
+def test_floor_counts_with_all_its_rules():
+    run, (slippery,) = make_spec("run"), floor(0.0).rules
+    rough = replace(slippery, friction=0.5)
+    for rules, reason in (
+        ((), "the floor of run has no rules"),
+        ((slippery,), "the floor of run has this friction"),
+        ((slippery, rough), ""),
+    ):
+        ground = replace(floor(), rules=rules)
+        assert idle(Case("ice", friction=0.0), replace(run, obstacles=(ground,))) == reason
+
+
+WHAT = ("action", "observation")
+
+
+def test_cases_are_named_by_their_whole_share():
+    for share, name in ((0.004, "0.4%"), (0.125, "12.5%"), (0.2, "20%"), (0.07, "7%")):
+        assert [case.name for case in make_cases(share)[1:3]] == [f"{what} dropout {name}" for what in WHAT]
+
+
 def test_ratios_need_a_positive_return():
     rows = robustness.to_rows([Result("unperturbed", 8, (-2.0, -1.0)), Result("noise", 8, (-4.0, -3.0))])
     assert [row["ratio"] for row in rows] == [None, None]
@@ -242,3 +263,18 @@ def test_wrong_option_is_one_line_and_exit_code_two(folder, capsys, arguments, m
 def test_folder_without_a_run_is_an_error(tmp_path, capsys):
     assert robustness.main([str(tmp_path)]) == 2
     assert "there is no run" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("program", [cfp.evaluate, robustness])
+def test_lack_of_memory_is_one_line(folder, capsys, monkeypatch, program):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(program, "run", fail)
+    for error in (MemoryError("backend"), RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried")):
+        assert program.main([str(folder)]) == 1
+        told = capsys.readouterr().err
+        assert told == f"error: not enough memory: take fewer episodes or particles ({error})\n"
+    error = RuntimeError("something else")
+    with pytest.raises(RuntimeError, match="something else"):
+        program.main([str(folder)])

@@ -12,10 +12,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
+from fakes import FakeEnv
 
 import cfp
 import dittogym
-from cfp import evaluate, plot, train
+from cfp import evaluate, plot, train, video
 from cfp.actor import ActorSpec
 from cfp.callbacks import StageCallback
 from cfp.command import started_as
@@ -24,6 +26,7 @@ from cfp.files import read_table
 from cfp.policy import ActorPolicy
 from cfp.presets import preset
 from cfp.runner import Runner
+from cfp.vec_env import monitored
 from cfp.weights import policy_file, shipped
 
 TINY = (
@@ -383,12 +386,53 @@ def test_video_plays_or_tells_how_to_install(finished, tmp_path, monkeypatch, ca
     monkeypatch.setattr("cfp.video.find_spec", lambda name: None)
     assert evaluate.main(arguments) == 0
     assert "pip install 'torchmpm[video]'" in capsys.readouterr().out
+    assert evaluate.main([*arguments, "--json"]) == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out)[-1]["policy"] == "stage 2" and "pip install 'torchmpm[video]'" in told.err
     monkeypatch.undo()
     imageio = pytest.importorskip("imageio.v2")
     pytest.importorskip("imageio_ffmpeg")
-    assert evaluate.main(arguments) == 0
+    assert evaluate.main([*arguments, "--json"]) == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out) and told.err.strip() == f"video: {tmp_path / 'film.mp4'}"
     with imageio.get_reader(tmp_path / "film.mp4") as film:
         metadata = film.get_meta_data()
     assert metadata["codec"].startswith("h264")
     assert tuple(metadata["size"]) == (512, 512)
     assert metadata["duration"] == pytest.approx(4.1, abs=0.15)
+
+
+def test_film_is_made_picture_by_picture(monkeypatch):
+    env = FakeEnv(num_envs=1, horizon=3)
+    monkeypatch.setattr(video, "make_env", lambda *_: monitored(env))
+    monkeypatch.setattr(video, "attached", lambda policy, venv: policy)
+
+    def predict(observation, memory, start, deterministic):
+        seen.append((bool(start[0]), float(torch.rand(()))))
+        return np.zeros((1, 2, 8, 8), np.float32), memory
+
+    runs = []
+    for _ in range(2):
+        seen = []
+        torch.rand(())
+        before = torch.get_rng_state()
+        for count, picture in enumerate(video.film_episode(None, SimpleNamespace(predict=predict), 8, False, 5)):
+            assert picture.shape == (512, 512, 3) and len(seen) == count and torch.is_grad_enabled()
+            assert torch.equal(torch.get_rng_state(), before)
+        runs.append(seen)
+    assert count == 3 and runs[0] == runs[1] and [start for start, _ in seen] == [True, False, False]
+    assert len({luck for _, luck in seen}) == 3
+
+
+def test_film_that_fails_leaves_the_old_file(tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+
+    def frames():
+        yield from np.zeros((3, 32, 32, 3), np.uint8)
+        raise ValueError("the robot is gone")
+
+    (tmp_path / "film.mp4").write_bytes(b"old")
+    with pytest.raises(ValueError, match="the robot is gone"):
+        video.write_video(tmp_path / "film.mp4", frames())
+    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+    assert (tmp_path / "film.mp4").read_bytes() == b"old"

@@ -75,6 +75,25 @@ def test_seed_is_used_at_the_next_reset_and_its_layout_kept():
     np.testing.assert_array_equal(env.reset(), first)
 
 
+def test_options_are_used_at_the_next_reset_only():
+    env = TorchVecEnv(FakeEnv(num_envs=2))
+    env.reset()
+    env.step(actions(env))
+    mask = torch.tensor([True, False])
+    for options in ({"reset_mask": mask}, [{"reset_mask": mask.clone()} for _ in range(2)]):
+        env.set_options(options)
+        assert env.reset()[:, 1, 0, 0].tolist() == [0, 1]
+    assert env.reset()[:, 1, 0, 0].tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("others", [[{}], [{"physics": {"mu": np.full(3, 2.0)}}], []])
+def test_options_that_differ_are_refused(others):
+    env = TorchVecEnv(FakeEnv(num_envs=2))
+    env.set_options([{"physics": {"mu": np.full(3, 1.0)}}, *others])
+    with pytest.raises(ValueError, match=r"options: got .* allowed are one for all elements, or the same 2 times"):
+        env.reset()
+
+
 def test_episode_sums_arrive_in_info():
     env = monitored(FakeEnv(num_envs=2, horizon=2))
     env.reset()

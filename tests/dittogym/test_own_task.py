@@ -245,6 +245,14 @@ def test_memory_that_cannot_be_kept_is_refused(remembered: object, error: type, 
         tiny(dataclasses.replace(hop(), remember=remembered)).reset(seed=0)
 
 
+def test_names_that_a_reset_cannot_leave_stale_are_refused() -> None:
+    spec = dataclasses.replace(hop(), remember=remember_peak, stale=("summit",))
+    with pytest.raises(ValueError, match=r"stale of task 'hop' must be names that remember returns, .* \['summit'\]"):
+        tiny(spec).reset(seed=0)
+    with pytest.raises(TypeError, match="stale must be a sequence of str, got 'summit'"):
+        dataclasses.replace(hop(), stale="summit")
+
+
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_term_that_is_not_finite_is_named(value: float) -> None:
     def judge(moment: Moment, weights: Weights) -> Outcome:

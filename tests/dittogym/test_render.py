@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dittogym import TorchEnv
-from dittogym.render import CONTRACT, ROBOT, SOLID
+from dittogym.render import CONTRACT, GROUND, ROBOT, SOLID, TARGET, Canvas
 
 
 def near(image: np.ndarray, colour) -> np.ndarray:
@@ -58,3 +58,13 @@ def test_particles_that_are_not_finite_are_left_out() -> None:
     env.state.x[0, :50] = torch.nan
     env.render(muscles=True)
     assert len(near(env.render(), ROBOT)[0]) > 0
+
+
+def test_holes_of_a_target_stay_empty() -> None:
+    """A ring with a disc in it."""
+    canvas = Canvas(256, np.zeros(2))
+    y, x = np.mgrid[:64, :64] - 31.5
+    radius = np.hypot(x, y)
+    canvas.target((radius < 8) | ((radius > 16) & (radius < 28)), np.array((0.5, 0.5)))
+    for distance, colour in ((0, TARGET), (24, GROUND), (44, TARGET), (62, GROUND)):  # pixels of the picture
+        assert tuple(canvas.image[128, 128 + distance]) == colour == tuple(canvas.image[128 - distance, 128])

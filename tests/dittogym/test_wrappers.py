@@ -144,20 +144,28 @@ def test_both_together() -> None:
 @pytest.mark.parametrize("make", [single, batch])
 @pytest.mark.parametrize("size", [0, -1, 9])
 def test_bad_action_sizes(make, size: int) -> None:
-    with pytest.raises(ValueError, match=f"size must be a whole number between 1 and 8, got {size}"):
+    with pytest.raises(ValueError, match=f"size must be at (least 1|most 8), got {size}"):
         action_resolution(make(), size)
 
 
 @pytest.mark.parametrize("make", [single, batch])
 @pytest.mark.parametrize("size", [0, -1, 65])
 def test_bad_observation_sizes(make, size: int) -> None:
-    with pytest.raises(ValueError, match=f"size must be a whole number between 1 and 64, got {size}"):
+    with pytest.raises(ValueError, match=f"size must be at (least 1|most 64), got {size}"):
         observation_resolution(make(), size)
+
+
+def test_sizes_are_whole_numbers_of_any_kind() -> None:
+    assert action_resolution(single(), np.int64(4)).action_space.shape == (2, 4, 4)
+    assert observation_resolution(single(), np.int64(16)).observation_space.shape == (3, 16, 16)
+    for size in (4.0, True, "4"):
+        with pytest.raises(ValueError, match=f"size must be a whole number, got {size!r}"):
+            action_resolution(single(), size)
 
 
 def test_the_limit_is_that_of_what_is_wrapped() -> None:
     assert action_resolution(single(resolution=32), 32).action_space.shape == (2, 32, 32)
-    with pytest.raises(ValueError, match="size must be a whole number between 1 and 16, got 17"):
+    with pytest.raises(ValueError, match="size must be at most 16, got 17"):
         observation_resolution(observation_resolution(single(), 16), 17)
 
 
