@@ -64,22 +64,22 @@ def film_episode(
     devices = list(range(torch.cuda.device_count()))
     with torch.random.fork_rng(devices=devices):
         torch.manual_seed(seed)
-        luck = _luck()
+        states = _generator_states()
     done, memory, start = False, None, np.array([True])
     while not done:
         assert isinstance(observation, np.ndarray)
         with torch.random.fork_rng(devices=devices), torch.no_grad():  # over before the caller goes on with a picture
-            torch.set_rng_state(luck[0])
-            torch.cuda.set_rng_state_all(luck[1])
+            torch.set_rng_state(states[0])
+            torch.cuda.set_rng_state_all(states[1])
             action, memory = watching.predict(observation, memory, start, deterministic)
-            luck = _luck()
+            states = _generator_states()
             tensors = venv.torch_env.step(torch.as_tensor(action, device=venv.torch_env.device))
         observation, _, terminated, truncated, _ = (_numpy(value) for value in tensors)
         done, start = bool(terminated[0] or truncated[0]), np.array([False])
         yield venv.torch_env.render(0)
 
 
-def _luck() -> tuple[torch.Tensor, list[torch.Tensor]]:
+def _generator_states() -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Where torch's generators are, on the CPU and on every CUDA device."""
     return torch.get_rng_state(), torch.cuda.get_rng_state_all()
 
