@@ -86,7 +86,7 @@ def test_layout_of_the_reference_is_kept() -> None:
         (replace(ENVIRONMENT, parity="reference"), "grid"),
         (replace(ENVIRONMENT, parity="reference", action_layout="image"), "image"),
     ):
-        assert MPC(replace(CONFIG, environment=environment)).planner.layout == layout
+        assert MPC(replace(CONFIG, environment=environment)).planner.env.action_layout == layout
 
 
 def test_state_goes_on_the_same() -> None:
