@@ -55,8 +55,8 @@ class Selection:
         else:
             assert self.policy is not None
             config, policies = open_policy(program, self.policy, self.device, self.seed)
-        if self.particles is not None:
-            config = replace(config, environment=replace(config.environment, particles=self.particles))
+        if self.particles is not None and self.particles != config.environment.particles:
+            config = replace(config, environment=config.environment.judged_at(self.particles))
             config.check()
         return config, policies
 

@@ -96,7 +96,7 @@ class Command:
 
     def judging(self, job: Job) -> Judging:
         """How the policy of a run is judged."""
-        general = Judging(self.episodes, self.tier, self.robustness)
+        general = Judging(self.episodes, self.tier, self.robustness, job.config.environment.parity)
         if job.config.task != "slot":
             return general
         for_each = -(-self.slot_episodes // (1 if job.untrained else len(self.seeds)))

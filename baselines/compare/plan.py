@@ -264,8 +264,10 @@ def check_there(job: Job) -> None:
 def judged(config: RunConfig, tier: Any) -> RunConfig:
     """Options of the environment in which a run is judged: seed 0 for all, so that all get the same layouts.
 
+    What that environment is depends on the tier and not on the run's own particles, so that it is the same for all.
+
     Args:
         config: Of the run.
         tier: Particles, see `cfp.config.EnvironmentConfig`.
     """
-    return replace(config, seed=0, environment=replace(config.environment, particles=tier))
+    return replace(config, seed=0, environment=config.environment.judged_at(tier))

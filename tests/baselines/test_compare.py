@@ -30,6 +30,7 @@ PLAN = {
         "broken": {"algo": "mpc", **MPC, "environment": {"particles": -3}},
     },
 }
+PLACES = [(tier, parity) for tier in ("full", "lite") for parity in ("clean", "reference")]
 COMMON = "--device cpu --episodes 2 --tier 100 --robustness none --workers 0".split()
 
 
@@ -136,6 +137,20 @@ def test_failing_run_is_reported_and_stops_no_other(tmp_path, capsys):
     assert "[1/2] broken-shapematch-quick-0: failed (ConfigError: particles" in output
     assert "[2/2] mpc-shapematch-quick-0: finished" in output
     assert "ConfigError: particles" in (tmp_path / "out" / "report.md").read_text()
+
+
+def test_runs_of_the_paper_are_judged_in_the_same_sound_world_at_every_tier():
+    for tier, parity in (("full", "reference"), ("lite", "clean"), (100, "clean")):
+        configs = [configure({"algo": algo, "preset": "paper"}) for algo in ("zero", "cfp")]
+        configs.append(replace(configs[0], environment=replace(configs[0].environment, particles=tier)))
+        places = [judged(config, tier).environment for config in configs]
+        assert {(place.particles, place.parity, place.layout) for place in places} == {(tier, parity, "grid")}
+
+
+def test_what_was_judged_in_another_world_is_judged_again():
+    keys = {(tier, parity): judging.Judging(1, tier, "none", parity).key("own layout") for tier, parity in PLACES}
+    assert keys["full", "reference"] == keys["full", "clean"] == "own layout, particles full"
+    assert keys["lite", "clean"] == "own layout, particles lite" != keys["lite", "reference"]
 
 
 @pytest.mark.slow

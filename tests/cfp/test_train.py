@@ -16,7 +16,7 @@ import pytest
 import cfp
 import dittogym
 from cfp import evaluate, plot, train
-from cfp.actor import ActorSpec
+from cfp.actor import ActorSpec, build_actor
 from cfp.callbacks import StageCallback
 from cfp.command import started_as
 from cfp.evaluation import compare
@@ -24,7 +24,7 @@ from cfp.files import read_table
 from cfp.policy import ActorPolicy
 from cfp.presets import preset
 from cfp.runner import Runner
-from cfp.weights import policy_file, shipped
+from cfp.weights import describe, policy_file, save_policy, shipped
 
 TINY = (
     "--task shapematch --particles 100 --substeps 1 --num-envs 2 --resolutions 4 8 --steps 150 --handover 70 "
@@ -305,6 +305,16 @@ def test_evaluation_of_a_single_policy_is_that_of_its_run(finished, capsys):
     assert evaluate.main([str(finished), *common, "--particles", "60"]) == 0
     other = json.loads(capsys.readouterr().out)
     assert [row["mean"] for row in other] != [row["mean"] for row in run]
+
+
+def test_other_particles_are_not_those_of_the_reference_s_faults(tmp_path):
+    config = cfp.preset("shapematch", "paper")
+    save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(0)), describe(config, 0, 0))
+    for particles, parity in ((None, "reference"), ("full", "reference"), ("lite", "clean"), (60, "clean")):
+        chosen = evaluate.Selection(policy=str(tmp_path), particles=particles)
+        environment = chosen.open(train.PROGRAM)[0].environment
+        assert (environment.particles, environment.parity) == (particles or "full", parity)
+        assert environment.layout == "grid"  # as the policy acts
 
 
 @pytest.mark.parametrize(
