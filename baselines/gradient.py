@@ -190,9 +190,9 @@ class Gradient(Algorithm):
         return self
 
     def _progress(self) -> float:
-        """How much of the stage is done, 0 to 1."""
+        """How much of the stage is done, 0 to 1; a stage after one that ended early is longer, and stays at 1."""
         bounds = (0, *self.config.ends())
-        return self.num_timesteps / (bounds[self.level + 1] - bounds[self.level])
+        return min(self.num_timesteps / (bounds[self.level + 1] - bounds[self.level]), 1.0)
 
     def _iterate(self) -> dict[str, float | None]:
         progress = self._progress()

@@ -184,6 +184,15 @@ def test_only_another_blur_begins_anew(task, level, phases):
     assert len({algorithm.objective.phase(progress / 8) for progress in range(9)}) == phases
 
 
+def test_schedule_of_a_stage_that_gets_the_steps_of_an_earlier_one_does_not_rise_again(monkeypatch):
+    algorithm = Gradient(make(polish=2, polish_grid=4, substeps=1), 1)
+    found = Episode(1.0, 1.0, 0.0, torch.zeros_like(algorithm.theta))
+    monkeypatch.setattr(algorithm, "_episode", lambda progress: found)
+    rates = []
+    algorithm.learn(4 * 30, lambda scalars: rates.append(scalars["train/learning_rate"]))
+    assert rates == pytest.approx([0.05, 0.0275, 0.005, 0.005])
+
+
 def test_polish_starts_from_the_actions_of_the_first_stage():
     actions = 0.5 * torch.rand(30, 2, 4, 4, generator=torch.Generator().manual_seed(0)) - 0.25
     algorithm = Gradient(make(polish=1, polish_grid=4, particles=200), 1, OpenLoop(actions))

@@ -10,9 +10,13 @@ import baselines
 import cfp.evaluate
 import dittogym
 from baselines import evaluate, robustness, train
+from cfp.actor import build_actor
 from cfp.books import Books
+from cfp.command import parse
+from cfp.errors import ConfigError
 from cfp.evaluation import SeesState
 from cfp.files import read_table
+from cfp.weights import describe, save_policy
 
 COMMON = "--particles 100 --substeps 1 --eval-episodes 2 --no-video --device cpu".split()
 LEVEL = (
@@ -178,6 +182,29 @@ def test_algorithm_is_told_which_scalars_become_a_row(tmp_path, monkeypatch):
     monkeypatch.setattr(baselines.Shac, "written", lambda model: told.append(model.num_timesteps))
     assert run("shac", tmp_path) == 0
     assert told == [24, 48, 72, 96] == [int(row["step"]) for row in read_table(tmp_path / "progress.csv")]
+
+
+def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, monkeypatch, stop_at):
+    config = baselines.registry.configure({"algo": "coarse", "resolutions": [8], "environment": {"substeps": 1}})
+    start = tmp_path / "start.safetensors"
+    save_policy(start, build_actor(config.actor_spec(0)), describe(config, 0, 5))
+    words = ["--sees", "image", "--start-from", str(start), "--steps", "24", "--eval-every", "24"]
+    stop_at(12)
+    assert run("shac", tmp_path / "run", *words) == 128 + signal.SIGINT
+    assert baselines.load(tmp_path / "run").description["steps"] == 0
+    monkeypatch.undo()
+    assert train.main(["--out", str(tmp_path / "run"), "--resume"]) == 0
+    rows = read_table(tmp_path / "run" / "evaluations.csv")
+    assert [row["step"] for row in rows] == ["0", "24"]
+    best = max(rows, key=lambda row: float(row["mean"]))
+    assert baselines.load(tmp_path / "run").description["steps"] == int(best["step"])
+
+
+@pytest.mark.parametrize("algo", ["shac", "distill", "gradient", "zero", "random", "scripted"])
+def test_new_particles_are_refused_where_the_seed_says_them(algo):
+    with pytest.raises(ConfigError, match="resample: got True, which changes nothing; allowed with soft actor-critic"):
+        parse(train.PROGRAM, ["--algo", algo, "--resample"])
+    assert parse(train.PROGRAM, ["--algo", "gnn-16", "--resample"]).run.environment.resample
 
 
 def test_polish_is_judged_on_the_layout_it_is_made_for(finished):
