@@ -93,6 +93,8 @@ class Command:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, allowed {value} or more")
         if self.gpus_per_run and self.executor == "local":
             raise ConfigError(f"gpus_per_run: got {self.gpus_per_run}, allowed with --executor ray only")
+        if self.only is not None and self.report_only:
+            raise ConfigError(f"only: got {self.only}, allowed without --report-only: a single run has no report")
 
     def judging(self, job: Job) -> Judging:
         """How the policy of a run is judged."""
