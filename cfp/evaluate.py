@@ -127,8 +127,9 @@ def open_policy(program: Program, path: str, device: str, seed: int | None) -> t
 def _ladder(about: dict[str, Any]) -> dict[str, Any]:
     """The levels of a policy; those of the preset may be none that networks have, in a task of one's own."""
     network = about.get("network")
-    names = ("resolutions", "gate_bias") if isinstance(network, dict) else ()
-    return {name: network[name] for name in names if name in network}
+    if not isinstance(network, dict):
+        return {}
+    return {name: network[name] for name in ("resolutions", "gate_bias") if name in network}
 
 
 def run(program: Program, command: Command) -> str:
