@@ -31,6 +31,9 @@ Callback = Callable[[Mapping[str, float | None]], None]
 """Called by `Algorithm.learn` between two updates, with scalars to log by name; raises to stop the training."""
 
 
+SEEDED = {"environment.resample": "soft actor-critic (cfp, coarse, fine, gnn-*, transformer-*)"}
+"""What `RunConfig.idle` says where every episode begins on a layout that is counted from the seed."""
+
 Grid = int | Literal["coarse", "fine"]
 """Action grid R: coarse, fine (the task's), or a number."""
 
@@ -51,6 +54,10 @@ class GridConfig(RunConfig):
     def resolution(self, level: int) -> int:
         """Action grid R."""
         return grid_size(self.task, self.grid)
+
+    def idle(self) -> dict[str, str]:
+        """Layouts are counted from the seed."""
+        return super().idle() | SEEDED
 
 
 @dataclass(frozen=True)
@@ -200,6 +207,10 @@ class AlgorithmRun(Run):
         """Read the policy that the first stage begins with."""
         self.start = self.kind.start(self.config)
         return super().begin()
+
+    def begins_trained(self, level: int) -> bool:
+        """Also where the first stage begins with a policy; a session that goes on from a checkpoint has none."""
+        return super().begins_trained(level) or self.start is not None
 
     def make_model(self, level: int) -> Algorithm:
         """The algorithm at the beginning of a stage."""

@@ -12,11 +12,12 @@ from baselines.teachers import is_record_of_another_start, read_teacher
 from cfp.config import RunConfig
 from cfp.errors import CheckpointError, ConfigError
 from cfp.estimate import Cost
+from cfp.groups import TASK_OPTIONS
 from cfp.policy import ActorPolicy
 from cfp.process import StopSignals
 from cfp.run import Run, copy_policy
 from cfp.state_file import Position
-from cfp.weights import PHYSICS, read_policy, shipped, write_policy
+from cfp.weights import read_policy, shipped, write_policy
 
 TRAINED = ("shac", "gradient")
 """Teachers that are trained first if only their name is given."""
@@ -119,7 +120,7 @@ class DistillRun(AlgorithmRun):
 
         config = self.config
         chosen = configure({"algo": config.teacher, "task": config.task})
-        same = {name: getattr(config.environment, name) for name in (*PHYSICS, "dtype", "backend", "target")}
+        same = {name: getattr(config.environment, name) for name in ("substeps", "dtype", "backend", *TASK_OPTIONS)}
         environment = replace(chosen.environment, **same)
         chosen = replace(chosen, seed=config.seed, device=config.device, environment=environment)
         return open_run(chosen, self.folder / "teacher", True, self.signals)

@@ -16,7 +16,7 @@ from torch import nn
 
 import cfp
 from baselines.actor_critic import quieten
-from baselines.algorithm import Algorithm, Callback, Sees, grid_size
+from baselines.algorithm import SEEDED, Algorithm, Callback, Sees, grid_size
 from baselines.dagger import Collector, Dataset, Labels, lose
 from baselines.episodes import Episodes
 from baselines.planner import PlannerConfig
@@ -89,9 +89,9 @@ class DistillConfig(LadderConfig):
     """Action grid of the teacher mpc."""
 
     def idle(self) -> dict[str, str]:
-        """What concerns plans."""
+        """What concerns plans; layouts are counted from the seed."""
         plans = {} if self.teacher == "mpc" else dict.fromkeys(("planner.", "planner_grid"), "teacher mpc")
-        return super().idle() | plans
+        return super().idle() | plans | SEEDED
 
     def check(self) -> None:
         """Check what the types cannot, see `LadderConfig.check`."""

@@ -33,7 +33,7 @@ class Episodes:
         self.env, self.layouts = env, layouts
         count = env.num_envs
         self.first_layout = seed + count
-        env.reset(seed=self.first_layout)
+        env.reset(seed=[self.first_layout + i % layouts for i in range(count)])
         self.age = min(age, env.spec.horizon)
         self.limit = torch.tensor([max(1, self.age * (i + 1) // count) for i in range(count)], device=env.device)
         self.returns = torch.zeros(count, device=env.device)

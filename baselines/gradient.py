@@ -131,8 +131,8 @@ class Gradient(Algorithm):
 
     def __init__(self, config: GradientConfig, level: int = 0, start: OpenLoop | None = None) -> None:
         self.config, self.level = config, level
-        particles = config.environment.particles if level else config.tier
-        own = replace(config, environment=replace(config.environment, particles=particles))
+        environment = config.environment if level else config.environment.learned_at(config.tier)
+        own = replace(config, environment=environment)
         self.env = make_torch_env(own, config.resolution(level), 1 if level else None)
         self.env.reset(seed=config.seed)
         self.beginning = self.env.save()  # with reference parity, another reset would keep where the last episode ended
@@ -190,9 +190,9 @@ class Gradient(Algorithm):
         return self
 
     def _progress(self) -> float:
-        """How much of the stage is done, 0 to 1."""
+        """How much of the stage is done, 0 to 1; a stage after one that ended early is longer, and stays at 1."""
         bounds = (0, *self.config.ends())
-        return self.num_timesteps / (bounds[self.level + 1] - bounds[self.level])
+        return min(self.num_timesteps / (bounds[self.level + 1] - bounds[self.level]), 1.0)
 
     def _iterate(self) -> dict[str, float | None]:
         progress = self._progress()

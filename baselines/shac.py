@@ -113,7 +113,8 @@ class ShacConfig(GridConfig):
         training_layouts("layouts", self.layouts, self.environment.num_envs)
         share(gamma=self.gamma, td_lambda=self.td_lambda, tau=self.tau)
         positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
-        not_negative(noise=self.noise, integrity=self.reward.integrity)
+        not_negative(noise=self.noise)
+        self.reward.check()
 
 
 class Shac(Algorithm):

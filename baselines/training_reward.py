@@ -8,6 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from cfp.config import not_negative, positive
 from dittogym import TorchEnv
 from torchmpm.state import choose
 
@@ -36,6 +37,15 @@ class RewardConfig:
     `Pairs`."""
     scale: float = 0.05
     """Factor of the whole, so that values are not far from one."""
+
+    def check(self) -> None:
+        """Check what the types cannot.
+
+        Raises:
+            ConfigError: Naming the option, what was given and what is allowed.
+        """
+        not_negative(split_weight=self.split_weight, split_margin=self.split_margin, integrity=self.integrity)
+        positive(scale=self.scale)
 
 
 @dataclass(frozen=True)

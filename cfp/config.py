@@ -91,8 +91,12 @@ class RunConfig:
         """Options that change nothing as the others are, with what they need (a dot at the end: the whole group)."""
         return {"report.wandb_project": "wandb"} if self.report.wandb == "off" else {}
 
-    def check_effect(self, base: RunConfig) -> None:
+    def check_effect(self, base: RunConfig, given: Collection[str] | None = None) -> None:
         """Refuse options that differ from those of ``base``, the preset, and change nothing, see `idle`.
+
+        Args:
+            base: The preset.
+            given: Names, with dots, of the options that are looked at; all if None.
 
         Raises:
             ConfigError: Naming the option, what was given and what it needs.
@@ -100,7 +104,7 @@ class RunConfig:
         mine, theirs = flatten(to_json(self)), flatten(to_json(base))
         for option, needs in self.idle().items():
             for name, value in mine.items():
-                if name.startswith(option) and value != theirs[name]:
+                if name.startswith(option) and value != theirs[name] and (given is None or name in given):
                     leaf = name.split(".")[-1]
                     raise ConfigError(f"{leaf}: got {value!r}, which changes nothing; allowed with {needs}")
 

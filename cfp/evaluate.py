@@ -6,19 +6,25 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import tyro
 
+from cfp import train
 from cfp.command import Program, out_of_memory, started_as
 from cfp.config import RunConfig, Tier, at_least_one
 from cfp.environments import choose_device
 from cfp.errors import CFPError, CheckpointError, ConfigError
 from cfp.evaluation import Noise, Policy, compare, format_table, to_rows
+from cfp.merging import merge
+from cfp.presets import from_json
 from cfp.process import keep_memory
 from cfp.run import make_video, read_config, stage_files
-from cfp.train import PROGRAM
 from cfp.weights import policy_file
+
+PROGRAM = replace(train.PROGRAM, configure=partial(from_json, program="evaluate"))
 
 
 @dataclass(frozen=True)
@@ -55,8 +61,8 @@ class Selection:
         else:
             assert self.policy is not None
             config, policies = open_policy(program, self.policy, self.device, self.seed)
-        if self.particles is not None:
-            config = replace(config, environment=replace(config.environment, particles=self.particles))
+        if self.particles is not None and self.particles != config.environment.particles:
+            config = replace(config, environment=config.environment.judged_at(self.particles))
             config.check()
         return config, policies
 
@@ -111,10 +117,19 @@ def open_policy(program: Program, path: str, device: str, seed: int | None) -> t
     """A single policy and options to evaluate it with, as the run that trained it does; see `open_run`."""
     policy = program.load(Path(path), choose_device(device))
     about = policy.description
-    values = {"algo": about["kind"], "task": about["task"], "environment": about["environment"]}
-    config = replace(program.configure(values), device=device, seed=about["seed"] if seed is None else seed)
+    base = program.configure({"algo": about["kind"], "task": about["task"]})
+    config = merge(base, {"environment": about["environment"], **_ladder(about)}).adapted(base, _ladder(about))
+    config = replace(config, device=device, seed=about["seed"] if seed is None else seed)
     config.check()
     return config, {policy_file(path).stem: policy}
+
+
+def _ladder(about: dict[str, Any]) -> dict[str, Any]:
+    """The levels of a policy; those of the preset may be none that networks have, in a task of one's own."""
+    network = about.get("network")
+    if not isinstance(network, dict):
+        return {}
+    return {name: network[name] for name in ("resolutions", "gate_bias") if name in network}
 
 
 def run(program: Program, command: Command) -> str:

@@ -98,6 +98,13 @@ class EnvironmentConfig:
         """The same place to learn in: other particles, evenly spread, no stale values, actions as here."""
         return replace(self, particles=tier, parity="clean", action_layout=self.layout)
 
+    def judged_at(self, tier: Tier) -> EnvironmentConfig:
+        """The same place to judge in, with other particles: at full size as it is, else as `learned_at`.
+
+        With the reference's parity, fewer particles would be a lighter, softer and fainter robot.
+        """
+        return replace(self, particles=tier) if tier == "full" else self.learned_at(tier)
+
 
 @dataclass(frozen=True)
 class NetworkConfig:

@@ -118,14 +118,18 @@ def _quick(paper: Config) -> Config:
     return quick
 
 
-def from_json(values: dict[str, Any]) -> Config:
+def from_json(values: dict[str, Any], program: str = "train") -> Config:
     """A configuration from JSON values; what they leave out comes from the preset they name.
+
+    Args:
+        values: Options by name.
+        program: Which one of `baselines` takes other algorithms, for the message.
 
     Raises:
         ConfigError: An unknown name or a value of the wrong type.
     """
     if (algo := values.get("algo", "cfp")) != "cfp":
-        raise ConfigError(f"algo: got {algo!r}, allowed 'cfp'; python -m baselines.train has others")
+        raise ConfigError(f"algo: got {algo!r}, allowed 'cfp'; python -m baselines.{program} takes others")
     base = preset(values.get("task", "shapematch"), values.get("preset", "quick"))
     merged: Config = merge(base, values)
     return merged

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import tyro
 from matplotlib.figure import Figure
 
+from cfp import train
 from cfp.command import Program, out_of_memory, started_as
 from cfp.config import RunConfig, at_least_one
 from cfp.disturbances import Case, Decides, disturbed_env, idle, make_cases
@@ -20,11 +22,12 @@ from cfp.evaluate import Selection
 from cfp.evaluation import Policy, Result, evaluate, judging_seed
 from cfp.files import csv_text, write_json, write_text
 from cfp.plot import write_figure
+from cfp.presets import from_json
 from cfp.process import keep_memory
-from cfp.train import PROGRAM
 from dittogym import make_spec
 from dittogym.spec import TaskSpec
 
+PROGRAM = replace(train.PROGRAM, configure=partial(from_json, program="robustness"))
 COLUMNS = ("case", "episodes", "mean", "std", "interval", "ratio", "success")
 
 

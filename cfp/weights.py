@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from cfp.actor import Actor, ActorSpec
 from cfp.config import LARGEST_SEED, Config, EnvironmentConfig, RunConfig, merge
 from cfp.errors import CheckpointError, ConfigError
 from cfp.files import parse_json, write_atomically, write_json
+from cfp.groups import TASK_OPTIONS
 from cfp.merging import words
 from cfp.networks import RESOLUTIONS
 from cfp.policy import ActorPolicy
@@ -26,8 +28,6 @@ from dittogym import make_spec
 from dittogym.geometry import NODES
 from dittogym.tasks import fingerprint
 
-PHYSICS = ("substeps", "variant")
-"""Options of the environment that change what actions do."""
 FORMAT = "cfp-policy"
 VERSION = 1
 KIND = "cfp"
@@ -265,12 +265,36 @@ def check_trained_for(option: str, description: Mapping[str, Any], task: str, en
     if description["task"] != task:
         raise ConfigError(f"{option}: got a policy for {description['task']}, allowed {task}")
     theirs: EnvironmentConfig = merge(EnvironmentConfig(), description["environment"])
-    for name in PHYSICS:
-        if (given := getattr(theirs, name)) != (allowed := getattr(environment, name)):
-            raise ConfigError(f"{option}: got a policy for {name} {given}, allowed {allowed}")
-    try:
-        one, other = (np.asarray(make_spec(task, **own.task_options()).target) for own in (theirs, environment))
-    except (ValueError, TypeError, OSError) as error:
-        raise ConfigError(f"{option}: its target or the one wanted cannot be read ({error})") from error
-    if not np.array_equal(one, other):
-        raise ConfigError(f"{option}: got a policy for the target {theirs.target}, allowed {environment.target}")
+    if theirs.substeps != environment.substeps:
+        raise ConfigError(f"{option}: got a policy for substeps {theirs.substeps}, allowed {environment.substeps}")
+    for name in TASK_OPTIONS:
+        given, allowed = getattr(theirs, name), getattr(environment, name)
+        try:
+            same = is_same_task(task, name, given, allowed)
+        except (ValueError, TypeError, OSError) as error:
+            raise ConfigError(f"{option}: its {name} or the one wanted cannot be read ({error})") from error
+        if not same:
+            raise ConfigError(f"{option}: got a policy for the {name} {given}, allowed {allowed}")
+
+
+def is_same_task(task: str, option: str, one: str | None, other: str | None) -> bool:
+    """Whether two values of an option make the same of a task; None is the task's default.
+
+    Args:
+        task: Its name.
+        option: One of `cfp.groups.TASK_OPTIONS`.
+        one: A value.
+        other: Another.
+
+    Raises:
+        ValueError: The task refuses a value.
+        TypeError: It has no such option.
+        OSError: A picture cannot be read.
+    """
+    if one == other:
+        return True
+    given: list[dict[str, Any]] = [{} if value is None else {option: value} for value in (one, other)]
+    first, second = (make_spec(task, **options) for options in given)
+    if first.target is not None:  # such a task judges by a function made for the picture
+        second = replace(second, judge=first.judge)
+    return first == second and np.array_equal(np.asarray(first.target), np.asarray(second.target))

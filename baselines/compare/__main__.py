@@ -93,10 +93,12 @@ class Command:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, allowed {value} or more")
         if self.gpus_per_run and self.executor == "local":
             raise ConfigError(f"gpus_per_run: got {self.gpus_per_run}, allowed with --executor ray only")
+        if self.only is not None and self.report_only:
+            raise ConfigError(f"only: got {self.only}, allowed without --report-only: a single run has no report")
 
     def judging(self, job: Job) -> Judging:
         """How the policy of a run is judged."""
-        general = Judging(self.episodes, self.tier, self.robustness)
+        general = Judging(self.episodes, self.tier, self.robustness, job.config.environment.parity)
         if job.config.task != "slot":
             return general
         for_each = -(-self.slot_episodes // (1 if job.untrained else len(self.seeds)))

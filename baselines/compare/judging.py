@@ -33,11 +33,13 @@ class Judging:
         episodes: For each policy, on the same layouts for all.
         tier: Particles, see `cfp.config.EnvironmentConfig`.
         robustness: Which disturbed cases: none, those of the paper, or all of `cfp.disturbances.make_cases`.
+        parity: Of the run, which holds at full size only, see `cfp.config.EnvironmentConfig.judged_at`.
     """
 
     episodes: int
     tier: Tier = "lite"
     robustness: Literal["none", "paper", "all"] = "paper"
+    parity: Literal["clean", "reference"] = "clean"
 
     def cases(self) -> list[Case]:
         """Cases of the robustness table, the unperturbed one first: it is the evaluation on the common layouts."""
@@ -49,7 +51,8 @@ class Judging:
 
     def key(self, what: str) -> str:
         """Under which an entry is kept."""
-        return f"{what}, particles {self.tier}"
+        mended = self.parity == "reference" and self.tier != "full"  # not what an earlier version has judged
+        return f"{what}, particles {self.tier}" + (", parity clean" if mended else "")
 
     def to_json(self) -> dict[str, Any]:
         """For `from_json`."""

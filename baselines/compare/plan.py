@@ -13,9 +13,10 @@ from baselines.registry import configure, find
 from cfp.config import EVALUATION_SEED, RunConfig, to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.files import parse_json, read_json
+from cfp.groups import TASK_OPTIONS
 from cfp.run import holds_run, read_config
 from cfp.state_file import flatten
-from cfp.weights import is_of_another_task, read_policy
+from cfp.weights import is_of_another_task, is_same_task, read_policy
 from dittogym.tasks import task_name
 
 IRRELEVANT = ("device", "environment.backend", "report.video", "report.checkpoint_every", "report.log_every")
@@ -146,12 +147,20 @@ class Plan:
 
     def options(self, label: str, task: str) -> dict[str, Any]:
         """What the file says about a run; the later in common, task, algorithm, algorithm in a task wins."""
+        return _over(_over(self.common, self.tasks.get(task, {})), self.own(label, task))
+
+    def own(self, label: str, task: str) -> dict[str, Any]:
+        """What the file says about an algorithm alone."""
         own = dict(self.algos.get(label, {}))
         special = own.pop("tasks", {}).get(task, {})
-        merged: dict[str, Any] = {}
-        for values in (self.common, self.tasks.get(task, {}), own, special):
-            merged = _over(merged, values)
-        return merged
+        return _over(own, special)
+
+    def unused(self, tasks: Sequence[str], labels: Sequence[str]) -> dict[str, set[str]]:
+        """Names that are not in a comparison, by the part of the file that they are in."""
+        parts = {"tasks": set(self.tasks) - set(tasks), "algos": set(self.algos) - set(labels)}
+        for label in labels:
+            parts[f"algos.{label}.tasks"] = set(self.algos.get(label, {}).get("tasks", {})) - set(tasks)
+        return {part: names for part, names in parts.items() if names}
 
 
 def _group(name: str, given: Any) -> dict[str, Any]:
@@ -187,6 +196,7 @@ def resolve(plan: Plan, label: str, task: str, preset: str, seed: int, steps: in
     try:
         config = configure({**start, "seed": seed, "device": device, **values, "report": report}).adapted(base, values)
         config.check()
+        config.check_effect(base, flatten(plan.own(label, task)))  # what is for all may be idle in some
     except ConfigError as error:
         raise ConfigError(f"{label} on {task}: {error}") from error
     return config
@@ -226,10 +236,8 @@ def make_jobs(
     for seed in seeds:
         if not 0 <= seed < EVALUATION_SEED - 1000:
             raise ConfigError(f"seeds: got {seed}, allowed 0 to {EVALUATION_SEED - 1001}: above are layouts that judge")
-    for part, known in (("tasks", tasks), ("algos", labels)):
-        unused = set(getattr(plan, part)) - set(known)
-        if unused:
-            print(f"plan: {part} {', '.join(sorted(unused))} are not in this comparison")
+    for part, names in plan.unused(tasks, labels).items():
+        print(f"plan: {part} {', '.join(sorted(names))} are not in this comparison")
     jobs = []
     for seed in seeds:
         for task in tasks:
@@ -248,11 +256,19 @@ def _check_same_task(jobs: Sequence[Job]) -> None:
         other = first.setdefault(job.config.task, job)
         for name in SAME_TASK:
             mine, theirs = (getattr(each.config.environment, name) for each in (job, other))
-            if mine != theirs:
+            if mine != theirs and not _is_same(job.config.task, name, mine, theirs):
                 raise ConfigError(
                     f"{name}: got {mine!r} for {job.label} and {theirs!r} for {other.label} on {job.config.task}, "
                     "allowed is the same for all, as the task would differ"
                 )
+
+
+def _is_same(task: str, option: str, mine: Any, theirs: Any) -> bool:
+    """Whether one of two values is the task's default, and the other another word for it."""
+    try:
+        return option in TASK_OPTIONS and is_same_task(task, option, mine, theirs)
+    except (ValueError, TypeError, OSError):  # the run itself says what is wrong with a value
+        return False
 
 
 def check_there(job: Job) -> None:
@@ -288,8 +304,10 @@ def check_there(job: Job) -> None:
 def judged(config: RunConfig, tier: Any) -> RunConfig:
     """Options of the environment in which a run is judged: seed 0 for all, so that all get the same layouts.
 
+    What that environment is depends on the tier and not on the run's own particles, so that it is the same for all.
+
     Args:
         config: Of the run.
         tier: Particles, see `cfp.config.EnvironmentConfig`.
     """
-    return replace(config, seed=0, environment=replace(config.environment, particles=tier))
+    return replace(config, seed=0, environment=config.environment.judged_at(tier))

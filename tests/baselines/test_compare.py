@@ -14,7 +14,7 @@ import pytest
 from baselines.compare import judging, work
 from baselines.compare.__main__ import main
 from baselines.compare.executor import run_process
-from baselines.compare.plan import judged
+from baselines.compare.plan import Plan, judged, make_jobs
 from baselines.registry import configure, load
 from cfp.disturbances import make_cases
 from cfp.errors import CheckpointError
@@ -31,6 +31,7 @@ PLAN = {
         "broken": {"algo": "mpc", **MPC, "environment": {"particles": -3}},
     },
 }
+PLACES = [(tier, parity) for tier in ("full", "lite") for parity in ("clean", "reference")]
 COMMON = "--device cpu --episodes 2 --tier 100 --robustness none --workers 0".split()
 
 
@@ -152,6 +153,20 @@ def test_failing_run_is_reported_and_stops_no_other(tmp_path, capsys):
     assert "ConfigError: particles" in (tmp_path / "out" / "report.md").read_text()
 
 
+def test_runs_of_the_paper_are_judged_in_the_same_sound_world_at_every_tier():
+    for tier, parity in (("full", "reference"), ("lite", "clean"), (100, "clean")):
+        configs = [configure({"algo": algo, "preset": "paper"}) for algo in ("zero", "cfp")]
+        configs.append(replace(configs[0], environment=replace(configs[0].environment, particles=tier)))
+        places = [judged(config, tier).environment for config in configs]
+        assert {(place.particles, place.parity, place.layout) for place in places} == {(tier, parity, "grid")}
+
+
+def test_what_was_judged_in_another_world_is_judged_again():
+    keys = {(tier, parity): judging.Judging(1, tier, "none", parity).key("own layout") for tier, parity in PLACES}
+    assert keys["full", "reference"] == keys["full", "clean"] == "own layout, particles full"
+    assert keys["lite", "clean"] == "own layout, particles lite" != keys["lite", "reference"]
+
+
 @pytest.mark.slow
 def test_task_of_a_module_is_compared_in_processes_of_their_own(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
@@ -184,6 +199,7 @@ def test_array_job_does_one_run_and_no_report(tmp_path):
         ("--episodes 0", "episodes: got 0, allowed 1 or more"),
         ("--gpus-per-run 1", "gpus_per_run: got 1.0, allowed with --executor ray only"),
         ("--algos mpc --seeds 0 --only 1", "only: got 1, allowed 0 to 0"),
+        ("--only 0 --report-only", "only: got 0, allowed without --report-only"),
         ("--algos mpc other", "target: got 'M' for other and None for mpc on shapematch, allowed is the same"),
     ],
 )
@@ -192,6 +208,39 @@ def test_wrong_options_are_named(tmp_path, capsys, options, message):
     assert compare(tmp_path / "out", *options.split(), plan=plan) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_names_in_a_plan_that_mean_nothing_are_reported(tmp_path, capsys):
+    algos = {"cfp": {"tasks": {"rnu": {"steps": 9600}, "run": {"steps": 6400}}}, "shac": {"tasks": {"kick": {}}}}
+    assert compare(tmp_path / "out", "--dry-run", "--algos", "cfp", "--tasks", "run", plan={"algos": algos}) == 0
+    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("plan")]
+    assert said == [
+        "plan: algos shac are not in this comparison",
+        "plan: algos.cfp.tasks rnu are not in this comparison",
+    ]
+
+
+def test_options_without_effect_are_refused_where_they_are_for_one_algorithm(tmp_path, capsys):
+    idle = {"learning": {"warm_critic": True}}
+    for algos in ({"gnn-16": idle}, {"gnn-16": {"tasks": {"run": idle}}}, {"gnn": {"algo": "gnn-16", **idle}}):
+        (label,) = algos
+        assert compare(tmp_path / "out", "--algos", label, "--tasks", "run", plan={"algos": algos}) == 2
+        error = capsys.readouterr().err
+        assert f"{label} on run: warm_critic: got True, which changes nothing; allowed with" in error
+    plan = {"common": idle, "algos": {"gnn-16": {"learning": {"warm_critic": False}}}}
+    assert compare(tmp_path / "out", "--dry-run", "--algos", "cfp", "coarse", "gnn-16", plan=plan) == 0
+
+
+def test_default_of_a_task_is_the_same_task_by_name(tmp_path):
+    for task, option, default in (("shapematch", "target", "star"), ("slot", "variant", "registered")):
+        plan = {"algos": {"mpc": {"environment": {option: default}}}}
+        assert compare(tmp_path / "out", "--dry-run", "--algos", "zero", "mpc", "--tasks", task, plan=plan) == 0
+
+
+@pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "docs").glob("compare-plan*.json")), ids=str)
+def test_plans_of_the_documentation_hold(path, tmp_path):
+    plan = Plan.read(path)
+    assert make_jobs(plan, ["run"], list(plan.algos), [0], tmp_path)
 
 
 def test_plan_file_that_is_none_is_named(tmp_path, capsys):

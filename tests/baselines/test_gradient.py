@@ -93,7 +93,7 @@ def test_windows_cut_the_gradient_but_not_the_loss():
 
 def test_iterations_do_not_depend_on_those_before_even_with_reference_parity():
     environment = EnvironmentConfig(1, 300, 100, parity="reference")
-    algorithm = shorten(Gradient(make("run", environment=environment)), 4)
+    algorithm = shorten(Gradient(make("run", environment=environment, polish=1, polish_grid=4), 1), 4)
     with torch.no_grad():
         algorithm.theta += torch.linspace(0.0, 1.0, 4)
     first, state = algorithm._episode(0.0), algorithm.env.env_state
@@ -184,6 +184,15 @@ def test_only_another_blur_begins_anew(task, level, phases):
     assert len({algorithm.objective.phase(progress / 8) for progress in range(9)}) == phases
 
 
+def test_schedule_of_a_stage_that_gets_the_steps_of_an_earlier_one_does_not_rise_again(monkeypatch):
+    algorithm = Gradient(make(polish=2, polish_grid=4, substeps=1), 1)
+    found = Episode(1.0, 1.0, 0.0, torch.zeros_like(algorithm.theta))
+    monkeypatch.setattr(algorithm, "_episode", lambda progress: found)
+    rates = []
+    algorithm.learn(4 * 30, lambda scalars: rates.append(scalars["train/learning_rate"]))
+    assert rates == pytest.approx([0.05, 0.0275, 0.005, 0.005])
+
+
 def test_polish_starts_from_the_actions_of_the_first_stage():
     actions = 0.5 * torch.rand(30, 2, 4, 4, generator=torch.Generator().manual_seed(0)) - 0.25
     algorithm = Gradient(make(polish=1, polish_grid=4, particles=200), 1, OpenLoop(actions))
@@ -192,6 +201,14 @@ def test_polish_starts_from_the_actions_of_the_first_stage():
     finer = Gradient(make(polish=1, polish_grid=8, particles=200), 1, OpenLoop(actions)).policy.actions
     assert finer.shape == (30, 2, 8, 8)
     assert torch.allclose(finer.mean((2, 3)), actions.mean((2, 3)), atol=0.05)
+
+
+def test_only_polish_takes_place_where_the_result_is_judged():
+    environment = EnvironmentConfig(1, 300, 4, parity="reference")
+    first, polish = (Gradient(make("run", environment=environment, tier=200, polish=1), level) for level in (0, 1))
+    assert first.env.num_particles == 200 and max(first.env.model.shares) > 1 and not first.env.model.pixels
+    assert polish.env.num_particles == 300 and max(polish.env.model.shares) == 1 and polish.env.model.pixels
+    assert first.env.action_layout == polish.env.action_layout == "grid"
 
 
 @pytest.mark.parametrize("task", TASKS)

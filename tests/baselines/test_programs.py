@@ -8,12 +8,16 @@ import pytest
 
 import baselines
 import cfp.evaluate
+import cfp.robustness
 import dittogym
 from baselines import evaluate, robustness, train
+from cfp.actor import build_actor
 from cfp.books import Books
 from cfp.command import parse
+from cfp.errors import ConfigError
 from cfp.evaluation import SeesState
 from cfp.files import read_table
+from cfp.weights import describe, save_policy
 
 COMMON = "--particles 100 --substeps 1 --eval-episodes 2 --no-video --device cpu".split()
 LEVEL = (
@@ -134,7 +138,9 @@ def test_folder_is_evaluated_whatever_trained_it(finished, capsys):
     assert json.loads(capsys.readouterr().out) == json.loads((folder / "results.json").read_text())
     assert cfp.evaluate.main([str(folder), "--episodes", "1", "--device", "cpu"]) == (0 if algo == "cfp" else 2)
     if algo != "cfp":
-        assert "python -m baselines" in capsys.readouterr().err
+        assert "python -m baselines.evaluate takes others" in capsys.readouterr().err
+        assert cfp.robustness.main([str(folder), "--episodes", "1", "--device", "cpu"]) == 2
+        assert "python -m baselines.robustness takes others" in capsys.readouterr().err
 
 
 def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monkeypatch, capsys, stop_at):
@@ -181,6 +187,29 @@ def test_algorithm_is_told_which_scalars_become_a_row(tmp_path, monkeypatch):
     assert told == [24, 48, 72, 96] == [int(row["step"]) for row in read_table(tmp_path / "progress.csv")]
 
 
+def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, monkeypatch, stop_at):
+    config = baselines.registry.configure({"algo": "coarse", "resolutions": [8], "environment": {"substeps": 1}})
+    start = tmp_path / "start.safetensors"
+    save_policy(start, build_actor(config.actor_spec(0)), describe(config, 0, 5))
+    words = ["--sees", "image", "--start-from", str(start), "--steps", "24", "--eval-every", "24"]
+    stop_at(12)
+    assert run("shac", tmp_path / "run", *words) == 128 + signal.SIGINT
+    assert baselines.load(tmp_path / "run").description["steps"] == 0
+    monkeypatch.undo()
+    assert train.main(["--out", str(tmp_path / "run"), "--resume"]) == 0
+    rows = read_table(tmp_path / "run" / "evaluations.csv")
+    assert [row["step"] for row in rows] == ["0", "24"]
+    best = max(rows, key=lambda row: float(row["mean"]))
+    assert baselines.load(tmp_path / "run").description["steps"] == int(best["step"])
+
+
+@pytest.mark.parametrize("algo", ["shac", "distill", "gradient", "zero", "random", "scripted"])
+def test_new_particles_are_refused_where_the_seed_says_them(algo):
+    with pytest.raises(ConfigError, match="resample: got True, which changes nothing; allowed with soft actor-critic"):
+        parse(train.PROGRAM, ["--algo", algo, "--resample"])
+    assert parse(train.PROGRAM, ["--algo", "gnn-16", "--resample"]).run.environment.resample
+
+
 def test_polish_is_judged_on_the_layout_it_is_made_for(finished):
     algo, folder = finished
     rows = [row for row in read_table(folder / "evaluations.csv") if row["stage"] == "2"]
@@ -207,7 +236,7 @@ def test_wrong_algorithm_is_named(tmp_path, capsys):
     assert train.main(["--algo", "alchemy", "--out", str(tmp_path / "a")]) == 2
     assert f"algo: got 'alchemy', allowed {', '.join(baselines.ALGORITHMS)}" in capsys.readouterr().err
     assert cfp.train.main(["--algo", "gradient", "--out", str(tmp_path / "a")]) == 2
-    assert "algo: got 'gradient', allowed 'cfp'" in capsys.readouterr().err
+    assert "algo: got 'gradient', allowed 'cfp'; python -m baselines.train takes others" in capsys.readouterr().err
 
 
 def test_robustness_is_reported_whatever_trained_it(finished):

@@ -12,6 +12,7 @@ import cfp
 from baselines import Shac, StatePolicy, shac_rollout
 from baselines.registry import configure
 from baselines.shac import METRICS
+from baselines.training_reward import RewardConfig
 from cfp.actor import ActorSpec, build_actor
 from cfp.config import EnvironmentConfig, to_json
 from cfp.environments import make_env
@@ -52,6 +53,10 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
         ({"gamma": 1.5}, "gamma: got 1.5"),
         ({"learning_rate": 0.0}, "learning_rate"),
         ({"noise": -0.1}, "noise: got -0.1"),
+        ({"reward": RewardConfig(scale=0.0)}, "scale: got 0.0, allowed more than 0"),
+        ({"reward": RewardConfig(split_weight=-1.0)}, "split_weight: got -1.0, allowed 0 or more"),
+        ({"reward": RewardConfig(split_margin=-0.5)}, "split_margin: got -0.5, allowed 0 or more"),
+        ({"reward": RewardConfig(integrity=-2.0)}, "integrity: got -2.0, allowed 0 or more"),
     ],
 )
 def test_impossible_options_are_named(changes, message):
@@ -194,6 +199,12 @@ def test_episodes_are_cut_at_staggered_ages_and_change_layouts():
     assert algorithm.rollout.episodes.counts["episodes"] == 1 and algorithm.rollout.episodes.limit.tolist() == [8, 8]
     assert algorithm.env.env_state.steps.tolist() == [0, 4]
     assert not torch.equal(algorithm.env.state.x[0], first)
+
+
+def test_no_more_layouts_are_trained_on_than_there_shall_be():
+    algorithm = Shac(make(num_envs=3, layouts=2))
+    x = algorithm.env.state.x
+    assert torch.equal(x[0], x[2]) and not torch.equal(x[0], x[1])
 
 
 def test_restart_of_a_neighbour_leaves_the_particles_that_were_close(monkeypatch):

@@ -18,16 +18,17 @@ from fakes import FakeEnv
 import cfp
 import dittogym
 from cfp import evaluate, plot, train, video
-from cfp.actor import ActorSpec
+from cfp.actor import ActorSpec, build_actor
 from cfp.callbacks import StageCallback
 from cfp.command import started_as
+from cfp.config import EnvironmentConfig
 from cfp.evaluation import compare
 from cfp.files import read_table
 from cfp.policy import ActorPolicy
 from cfp.presets import preset
 from cfp.runner import Runner
 from cfp.vec_env import monitored
-from cfp.weights import policy_file, shipped
+from cfp.weights import describe, policy_file, save_policy, shipped
 
 TINY = (
     "--task shapematch --particles 100 --substeps 1 --num-envs 2 --resolutions 4 8 --steps 150 --handover 70 "
@@ -308,6 +309,30 @@ def test_evaluation_of_a_single_policy_is_that_of_its_run(finished, capsys):
     assert evaluate.main([str(finished), *common, "--particles", "60"]) == 0
     other = json.loads(capsys.readouterr().out)
     assert [row["mean"] for row in other] != [row["mean"] for row in run]
+
+
+def test_single_policy_need_not_have_the_grids_of_its_task(tmp_path, monkeypatch):
+    monkeypatch.setattr("dittogym.tasks.TASKS", dict(dittogym.TASKS))
+    monkeypatch.setattr("dittogym.registration.TASKS", dittogym.tasks.TASKS)
+    tens = replace(dittogym.make_spec("run"), name="tens", coarse=10, fine=20, horizon=2)
+    dittogym.register("tens", lambda: tens)
+    environment = EnvironmentConfig(particles=60, substeps=1)
+    config = cfp.Config(task="tens", resolutions=(4, 8, 16), gate_bias=(-1.0, -2.0), environment=environment)
+    save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(2)), describe(config, 2, 0))
+    command = evaluate.Command(policy=str(tmp_path), episodes=1, device="cpu")
+    opened, _ = command.open(train.PROGRAM)
+    assert (opened.resolutions, opened.gate_bias) == (config.resolutions, config.gate_bias)
+    assert "policy" in evaluate.run(train.PROGRAM, command)
+
+
+def test_other_particles_are_not_those_of_the_reference_s_faults(tmp_path):
+    config = cfp.preset("shapematch", "paper")
+    save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(0)), describe(config, 0, 0))
+    for particles, parity in ((None, "reference"), ("full", "reference"), ("lite", "clean"), (60, "clean")):
+        chosen = evaluate.Selection(policy=str(tmp_path), particles=particles)
+        environment = chosen.open(train.PROGRAM)[0].environment
+        assert (environment.particles, environment.parity) == (particles or "full", parity)
+        assert environment.layout == "grid"  # as the policy acts
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,5 @@
 import json
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -6,11 +7,11 @@ import torch
 
 import cfp
 from cfp.actor import ActorSpec, build_actor
-from cfp.config import Config
-from cfp.errors import CheckpointError
+from cfp.config import Config, EnvironmentConfig
+from cfp.errors import CheckpointError, ConfigError
 from cfp.networks import normalise_image
 from cfp.policy import CFPPolicy, action_space, observation_space
-from cfp.weights import describe, save_policy
+from cfp.weights import check_trained_for, describe, save_policy
 
 
 @pytest.fixture
@@ -65,6 +66,22 @@ def test_description_stands_beside_and_inside_the_weights(saved):
     assert (beside["task"], beside["resolution"], beside["stage"], beside["steps"]) == ("shapematch", 16, 2, 123)
     (folder / "policy.json").unlink()
     assert cfp.load(folder).description["steps"] == 123
+
+
+@pytest.mark.parametrize(
+    ("task", "option", "one", "other", "same"),
+    [
+        ("slot", "variant", None, "registered", True),
+        ("slot", "variant", None, "published", False),
+        ("shapematch", "target", None, "star", True),
+        ("shapematch", "target", "M", "star", False),
+    ],
+)
+def test_default_of_a_task_may_be_named_or_not(task, option, one, other, same):
+    for given, wanted in ((one, other), (other, one)):
+        description = {"task": task, "environment": {option: given}}
+        with nullcontext() if same else pytest.raises(ConfigError, match=f"got a policy for the {option} {given}"):
+            check_trained_for("start_from", description, task, EnvironmentConfig(**{option: wanted}))
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut", "garbage", "foreign", "misfit"])
