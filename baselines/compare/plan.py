@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from baselines.floors import FloorConfig
-from baselines.registry import configure, find
+from baselines.registry import ALGORITHMS, ALIASES, configure, find
 from cfp.config import EVALUATION_SEED, RunConfig, to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.files import parse_json, read_json
@@ -187,7 +187,8 @@ def resolve(plan: Plan, label: str, task: str, preset: str, seed: int, steps: in
         ConfigError: An option is wrong.
     """
     values = plan.options(label, task)
-    algo = values.pop("algo", label)
+    general = values.pop("algo", label)  # of variants; an algorithm's own name means that algorithm
+    algo = plan.own(label, task).get("algo", label if label in {*ALGORITHMS, *ALIASES} else general)
     start: dict[str, Any] = {"algo": algo, "task": task, "preset": preset}
     base = configure(start)
     if steps is not None and hasattr(base, "steps"):

@@ -14,7 +14,7 @@ import pytest
 from baselines.compare import judging, work
 from baselines.compare.__main__ import main
 from baselines.compare.executor import run_process
-from baselines.compare.plan import Plan, judged, make_jobs
+from baselines.compare.plan import Plan, judged, make_jobs, resolve
 from baselines.registry import configure, load
 from cfp.disturbances import make_cases
 from cfp.errors import CheckpointError
@@ -208,6 +208,13 @@ def test_wrong_options_are_named(tmp_path, capsys, options, message):
     assert compare(tmp_path / "out", *options.split(), plan=plan) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_algorithm_for_all_is_that_of_variants():
+    plan = Plan(common={"algo": "coarse"}, algos={"long": {"steps": 9600}, "shac": {"algo": "cem"}})
+    labels = ("zero", "gnn16", "long", "shac")
+    found = [resolve(plan, label, "run", "quick", 0, None, "cpu").algo for label in labels]
+    assert found == ["zero", "gnn-16", "coarse", "cem"]
 
 
 def test_names_in_a_plan_that_mean_nothing_are_reported(tmp_path, capsys):
