@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import tyro
 
@@ -65,6 +65,9 @@ class Selection:
             config = replace(config, environment=config.environment.judged_at(self.particles))
             config.check()
         return config, policies
+
+
+Chosen = TypeVar("Chosen", bound=Selection)
 
 
 @dataclass(frozen=True)
@@ -147,10 +150,29 @@ def run(program: Program, command: Command) -> str:
 
 def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:
     """Command line entry; returns the exit code."""
+    return judge("evaluate", Command, run, arguments, program)
+
+
+def judge(
+    name: str,
+    kind: type[Chosen],
+    run: Callable[[Program, Chosen], str],
+    arguments: Sequence[str] | None,
+    program: Program,
+) -> int:
+    """Command line entry of a program that judges policies and prints what it finds; returns the exit code.
+
+    Args:
+        name: Of the program's module.
+        kind: Its options.
+        run: Does what they say and returns what is printed.
+        arguments: Words of the command line; the process's own if None.
+        program: Whose policies they are.
+    """
     keep_memory()
     try:
-        started = started_as(f"{program.package}.evaluate", arguments)
-        print(run(program, tyro.cli(Command, prog=started, args=arguments)))
+        started = started_as(f"{program.package}.{name}", arguments)
+        print(run(program, tyro.cli(kind, prog=started, args=arguments)))
     except (CFPError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2 if isinstance(error, CFPError) else 1

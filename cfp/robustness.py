@@ -10,20 +10,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import tyro
 from matplotlib.figure import Figure
 
 from cfp import train
-from cfp.command import Program, out_of_memory, started_as
+from cfp.command import Program
 from cfp.config import RunConfig, at_least_one
 from cfp.disturbances import Case, Decides, disturbed_env, idle, make_cases
-from cfp.errors import CFPError, ConfigError
-from cfp.evaluate import Selection
+from cfp.errors import ConfigError
+from cfp.evaluate import Selection, judge
 from cfp.evaluation import Policy, Result, evaluate, judging_seed
 from cfp.files import csv_text, write_json, write_text
 from cfp.plot import write_figure
 from cfp.presets import from_json
-from cfp.process import keep_memory
 from dittogym import make_spec
 from dittogym.spec import TaskSpec
 
@@ -203,16 +201,7 @@ def run(program: Program, command: Command) -> str:
 
 def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:
     """Command line entry; returns the exit code."""
-    keep_memory()
-    try:
-        started = started_as(f"{program.package}.robustness", arguments)
-        print(run(program, tyro.cli(Command, prog=started, args=arguments)))
-    except (CFPError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2 if isinstance(error, CFPError) else 1
-    except (MemoryError, RuntimeError) as error:
-        return out_of_memory(error, "episodes or particles")
-    return 0
+    return judge("robustness", Command, run, arguments, program)
 
 
 if __name__ == "__main__":
