@@ -48,13 +48,15 @@ def read_grey(picture: PictureLike, name: str, others: str = "") -> np.ndarray:
 
 
 def _claimed_size(path: str, name: str) -> tuple[int, int]:
-    """Width and height from the head of a file: a few bytes may claim to be a picture that fills the memory."""
+    """Width and height from the head of a file: a few bytes may claim to be what fills the memory."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow's own about large pictures; there is a limit of ours
             with Image.open(path) as image:
-                return image.size
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
+                size = image.size
+                image.verify()  # OpenCV takes memory for whatever length a chunk of a PNG claims
+                return size
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise ValueError(f"{name} {path!r} cannot be read as an image ({error})") from error
 
 

@@ -104,6 +104,7 @@ def pictures():
 @pytest.mark.filterwarnings("ignore")
 @FUZZ
 @given(cuts=CUTS, changes=CHANGES)
+@example(cuts=0, changes=[(33, 188)])  # in a PNG: a chunk that claims to be 3 GB long
 def test_pictures_of_any_bytes(kind, tmp_path_factory, cuts, changes):
     path = tmp_path_factory.getbasetemp() / f"picture{kind}"
     path.write_bytes(damaged(pictures()[kind], cuts, changes))
