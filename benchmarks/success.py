@@ -35,7 +35,15 @@ def main() -> None:
     successes = done = 0
     while done < arguments.episodes:
         count = min(BATCH, arguments.episodes - done)
-        env = TorchEnv(spec, count, policy.resolution, particles=arguments.particles, action_layout=own.layout)
+        env = TorchEnv(
+            spec,
+            count,
+            policy.resolution,
+            particles=arguments.particles,
+            substeps=own.substeps,
+            dtype=own.dtype,
+            action_layout=own.layout,
+        )
         seed = judging_seed(config) + done
         result = evaluate(
             "", policy, Disturbed(monitored(env), case, seed, policy.description["resolution"]), count,
