@@ -1,17 +1,17 @@
 """Algorithms to compare the coarse-to-fine policy with, behind the same command lines, folders and policies."""
 
-from baselines.actor_critic import StatePolicy
-from baselines.algorithm import Algorithm, Entry
-from baselines.cem import CEM, CEMConfig, CEMPlanner, CEMPlannerConfig
-from baselines.distillation import Distill, DistillConfig
-from baselines.gradient import Gradient, GradientConfig
-from baselines.modular import ModularConfig
-from baselines.modular_policy import SegmentPolicy
-from baselines.mpc import MPC, MPCConfig
-from baselines.open_loop import OpenLoop
-from baselines.planner import Planner, PlannerConfig
+from baselines.common.algorithm import Algorithm, Entry
+from baselines.common.open_loop import OpenLoop
+from baselines.distillation.train import Distill, DistillConfig
+from baselines.modular.policy import SegmentPolicy
+from baselines.modular.train import ModularConfig
+from baselines.planning.cem import CEM, CEMConfig, CEMPlanner, CEMPlannerConfig
+from baselines.planning.gradient import Planner, PlannerConfig
+from baselines.planning.mpc import MPC, MPCConfig
 from baselines.registry import ALGORITHMS, load
-from baselines.shac import Shac, ShacConfig
+from baselines.shac.networks import StatePolicy
+from baselines.shac.train import Shac, ShacConfig
+from baselines.trajectory.optimise import Gradient, GradientConfig
 
 __all__ = [
     "ALGORITHMS",

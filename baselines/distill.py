@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 
 from baselines.train import PROGRAM
-from cfp import command
+from cfp.experiment import cli as command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

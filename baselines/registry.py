@@ -6,21 +6,22 @@ from pathlib import Path
 from typing import Any
 
 import cfp
-from baselines import ladder, modular
-from baselines.algorithm import Entry
-from baselines.cem import CEM
-from baselines.distill_run import DistillRun
-from baselines.distillation import Distill
-from baselines.floors import Random, Scripted, Zero
-from baselines.gradient import Gradient
-from baselines.mpc import MPC
-from baselines.shac import Shac
+from baselines.common import single_level as ladder
+from baselines.common.algorithm import Entry
+from baselines.common.reference_policies import Random, Scripted, Zero
+from baselines.distillation.run import DistillRun
+from baselines.distillation.train import Distill
+from baselines.modular import train as modular
+from baselines.planning.cem import CEM
+from baselines.planning.mpc import MPC
+from baselines.shac.train import Shac
+from baselines.trajectory.optimise import Gradient
 from cfp.config import RunConfig, merge
 from cfp.errors import ConfigError
-from cfp.evaluation import Policy
-from cfp.process import StopSignals
-from cfp.run import Run
-from cfp.runner import Runner
+from cfp.evaluation.rollout import Policy
+from cfp.experiment.cfp_run import Runner
+from cfp.experiment.process import StopSignals
+from cfp.experiment.run import Run
 from cfp.weights import read_policy
 
 ALGORITHMS: dict[str, Entry] = {
@@ -70,7 +71,7 @@ def configure(values: dict[str, Any]) -> RunConfig:
 
 
 def open_run(config: RunConfig, folder: Path, resume: bool, signals: StopSignals) -> Run:
-    """Open a run of any algorithm, see `cfp.run.Run`."""
+    """Open a run of any algorithm, see `cfp.experiment.run.Run`."""
     return find(config.algo).open(config, folder, resume, signals)
 
 

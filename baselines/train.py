@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 
 from baselines.registry import ALGORITHMS, configure, load, open_run
-from cfp import command
+from cfp.experiment import cli as command
 
 PROGRAM = command.Program(
     "baselines",

@@ -9,7 +9,7 @@ import torch
 from tiers import sine, zeros
 
 import dittogym
-from dittogym.soft import soft_silhouette
+from dittogym.observation.smooth import soft_silhouette
 from dittogym.tasks.shapematch import silhouette
 
 STEPS = 30

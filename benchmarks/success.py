@@ -10,10 +10,10 @@ from dataclasses import replace
 
 from baselines.compare.stats import wilson
 from baselines.train import PROGRAM
-from cfp.disturbances import Case, Disturbed
+from cfp.envs.disturbances import Case, Disturbed
+from cfp.envs.vec_env import monitored
 from cfp.evaluate import open_policy
-from cfp.evaluation import evaluate, judging_seed
-from cfp.vec_env import monitored
+from cfp.evaluation.rollout import evaluate, judging_seed
 from dittogym import TorchEnv, make_spec
 
 BATCH = 20

@@ -19,8 +19,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 import dittogym  # noqa: F401  (registers the environments)
 from cfp import CFP, CFPPolicy, Config, preset
-from cfp.environments import make_env
-from cfp.process import keep_memory
+from cfp.envs.make import make_env
+from cfp.experiment.process import keep_memory
 
 
 def make_model(config: Config, level: int, num_envs: int) -> CFP:

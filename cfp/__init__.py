@@ -1,13 +1,13 @@
 """The coarse-to-fine policy (CFP): soft actor-critic on action images whose resolution grows level by level."""
 
-from cfp.actor import ActorSpec
-from cfp.algorithm import CFP
+from cfp.agent.actor import ActorSpec
+from cfp.agent.features import ImageFeatures
+from cfp.agent.policies import ActorPolicy, CFPPolicy
+from cfp.agent.sac import CFP
 from cfp.config import Config
+from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import CFPError, CheckpointError, ConfigError, NonFiniteError
-from cfp.features import ImageFeatures
-from cfp.policy import ActorPolicy, CFPPolicy
 from cfp.presets import preset
-from cfp.vec_env import TorchVecEnv
 from cfp.weights import load
 
 __all__ = [

@@ -9,8 +9,11 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
 
-from cfp.actor import ActorSpec
+from cfp.agent.actor import ActorSpec
+from cfp.agent.networks import RESOLUTIONS
 from cfp.errors import ConfigError
+from cfp.experiment.from_dict import flatten
+from cfp.experiment.from_dict import merge as merge
 from cfp.groups import EnvironmentConfig as EnvironmentConfig
 from cfp.groups import LearningConfig as LearningConfig
 from cfp.groups import NetworkConfig as NetworkConfig
@@ -20,9 +23,6 @@ from cfp.groups import at_least_one as at_least_one
 from cfp.groups import not_negative as not_negative
 from cfp.groups import positive as positive
 from cfp.groups import share as share
-from cfp.merging import flatten
-from cfp.merging import merge as merge
-from cfp.networks import RESOLUTIONS
 from dittogym import make_spec
 from dittogym.tasks import allowed_instead, task_name
 
@@ -145,7 +145,7 @@ class StageConfig:
 
 @dataclass(frozen=True)
 class SACConfig(RunConfig):
-    """A run of `cfp.algorithm.CFP`, whatever its networks."""
+    """A run of `cfp.agent.sac.CFP`, whatever its networks."""
 
     learning: LearningConfig = field(default_factory=LearningConfig)
 

@@ -13,15 +13,15 @@ from typing import Any, TypeVar
 import tyro
 
 from cfp import train
-from cfp.command import Program, out_of_memory, started_as
 from cfp.config import RunConfig, Tier, at_least_one
-from cfp.environments import choose_device
+from cfp.envs.make import choose_device
 from cfp.errors import CFPError, CheckpointError, ConfigError
-from cfp.evaluation import Noise, Policy, compare, format_table, to_rows
-from cfp.merging import merge
+from cfp.evaluation.rollout import Noise, Policy, compare, format_table, to_rows
+from cfp.experiment.cli import Program, out_of_memory, started_as
+from cfp.experiment.from_dict import merge
+from cfp.experiment.process import keep_memory
+from cfp.experiment.run import make_video, read_config, stage_files
 from cfp.presets import from_json
-from cfp.process import keep_memory
-from cfp.run import make_video, read_config, stage_files
 from cfp.weights import policy_file
 
 PROGRAM = replace(train.PROGRAM, configure=partial(from_json, program="evaluate"))

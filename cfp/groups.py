@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
+from cfp.agent.losses import Precision
+from cfp.agent.networks import Interpolation
 from cfp.errors import ConfigError
-from cfp.losses import Precision
-from cfp.networks import Interpolation
 
 Tier: TypeAlias = Literal["full", "lite"] | int | tuple[int, int]
 """Particles: the paper's, about 2,000, a count, or one count for robot and one for object."""

@@ -13,14 +13,14 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from cfp import train
-from cfp.command import Program
 from cfp.config import RunConfig, at_least_one
-from cfp.disturbances import Case, Decides, disturbed_env, idle, make_cases
+from cfp.envs.disturbances import Case, Decides, disturbed_env, idle, make_cases
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection, judge
-from cfp.evaluation import Policy, Result, evaluate, judging_seed
-from cfp.files import csv_text, write_json, write_text
-from cfp.plot import write_figure
+from cfp.evaluation.plots import write_figure
+from cfp.evaluation.rollout import Policy, Result, evaluate, judging_seed
+from cfp.experiment.cli import Program
+from cfp.experiment.files import csv_text, write_json, write_text
 from cfp.presets import from_json
 from dittogym import make_spec
 from dittogym.spec import TaskSpec

@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from cfp import command
+from cfp.experiment import cli as command
+from cfp.experiment.cfp_run import Runner
 from cfp.presets import from_json
-from cfp.runner import Runner
 from cfp.weights import load
 
 PROGRAM = command.Program(

@@ -16,14 +16,14 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from cfp.actor import Actor, ActorSpec
+from cfp.agent.actor import Actor, ActorSpec
+from cfp.agent.networks import RESOLUTIONS
+from cfp.agent.policies import ActorPolicy
 from cfp.config import LARGEST_SEED, Config, EnvironmentConfig, RunConfig, merge
 from cfp.errors import CheckpointError, ConfigError
-from cfp.files import parse_json, write_atomically, write_json
+from cfp.experiment.files import parse_json, write_atomically, write_json
+from cfp.experiment.from_dict import words
 from cfp.groups import TASK_OPTIONS
-from cfp.merging import words
-from cfp.networks import RESOLUTIONS
-from cfp.policy import ActorPolicy
 from dittogym import make_spec
 from dittogym.geometry import NODES
 from dittogym.tasks import fingerprint
@@ -48,7 +48,7 @@ _OPTIONAL = ("layout", "task_file")
 """What some have not: they were not made for one layout; the task comes with the library."""
 REASON = 300
 """Characters of an error of torch that are shown: it lists every layer."""
-SHIPPED = Path(__file__).parent / "policies"
+SHIPPED = Path(__file__).parent / "pretrained"
 """Policies that come with the package, by name."""
 
 

@@ -108,7 +108,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         self.render_mode, self.render_muscles = render_mode, render_muscles
         self._screen = None
         if render_mode == "human":
-            from dittogym.window_system import Screen  # pygame is an extra
+            from dittogym.render.screen import Screen  # pygame is an extra
 
             self._screen = Screen("dittogym: " + self.torch_env.spec.name, RENDER_FPS)
 

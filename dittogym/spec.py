@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor
 
+from dittogym.bodies.shapes import Shape
 from dittogym.geometry import NODES, Box, Obstacle, mark
-from dittogym.observation import SIZE
-from dittogym.shapes import Shape
+from dittogym.observation.raster import SIZE
 from torchmpm import Material, ParticleState, checks
 
 #: Rewards per step of an element whose state is no longer finite; its episode ends.
@@ -82,7 +82,8 @@ class Moment(NamedTuple):
         robot: Number of robot particles; they come first.
         now: Averages after the step.
         start: Averages right after the reset.
-        observation: (B, 3, 64, 64) uint8; floating point from :func:`dittogym.soft.soft_observation` if ``soft``.
+        observation: (B, 3, 64, 64) uint8; floating point if ``soft``, from
+            :func:`dittogym.observation.smooth.soft_observation`.
         memory: What the task remembers, tensors with a leading B.
         soft: Whether smooth terms are wanted, for gradients; then nothing but the terms is used of the outcome.
     """
@@ -188,7 +189,7 @@ class TaskSpec:
         yield_stress: Of the robot, Pa.
         max_actuation: Muscle stress at action 1, Pa.
         judge: The task's own reward terms, termination and success. Asked for soft terms it should return smooth ones,
-            see :class:`Moment` and the helpers in :mod:`dittogym.reward`; a smooth reward needs nothing.
+            see :class:`Moment` and the helpers in :mod:`dittogym.rewards`; a smooth reward needs nothing.
         weights: Weights of the terms that all tasks share, and of the task's own.
         objects: Bodies beside the robot, at most one.
         gravity: (x, y), m/s^2.

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 
-from dittogym.pictures import PictureLike, read_grey
+from dittogym.bodies.images import PictureLike, read_grey
 
 #: The name of a drawn target, the path of an image file, or an array.
 TargetLike: TypeAlias = PictureLike

@@ -11,14 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dittogym import dynamics
+from dittogym import core as dynamics
 from dittogym.action import Layout, to_grid_layout
-from dittogym.dynamics import EnvState
-from dittogym.layout import Layouts, Particles, Seed, particle_counts
+from dittogym.bodies.positions import Layouts, Particles, Seed, particle_counts
+from dittogym.core import EnvState
+from dittogym.observation.smooth import soft_observation
 from dittogym.physics import Physics, merged, physics_values
-from dittogym.render import frame
-from dittogym.reward import measure
-from dittogym.soft import soft_observation
+from dittogym.render.frame import frame
+from dittogym.rewards import measure
 from dittogym.spec import Measurement, TaskSpec
 from dittogym.tasks import make_spec
 from torchmpm import ParticleState, checks
@@ -180,7 +180,7 @@ class TorchEnv:
 
     @property
     def env_state(self) -> EnvState:
-        """Everything that moves, for :mod:`dittogym.dynamics`; see also :meth:`save`. An assignment goes on from there.
+        """Everything that moves, for :mod:`dittogym.core`; see also :meth:`save`. An assignment goes on from there.
 
         Raises:
             RuntimeError: Neither reset nor assigned yet.
@@ -364,7 +364,9 @@ class TorchEnv:
         return observation, reward, outcome.terminated, state.steps >= self.spec.horizon, info
 
     def soft_observation(self) -> Tensor:
-        """The present image as a smooth function of the state, see :func:`dittogym.soft.soft_observation`.
+        """The present image as a smooth function of the state.
+
+        See :func:`dittogym.observation.smooth.soft_observation`.
 
         Returns:
             (B, 3, 64, 64) in the units of the uint8 observation, with the autograd graph of the state.

@@ -11,8 +11,8 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from dittogym.bodies.positions import Seed
 from dittogym.env import RENDER_FPS, RENDER_MODES, as_image, as_numpy, as_tensor, registered_horizon, spaces
-from dittogym.layout import Seed
 from dittogym.spec import TaskSpec
 from dittogym.torch_env import Snapshot, TorchEnv
 from torchmpm import ParticleState, checks

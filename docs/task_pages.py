@@ -12,8 +12,8 @@ import torch
 from PIL import Image
 
 import dittogym
+from dittogym.bodies.positions import particle_counts
 from dittogym.geometry import Obstacle
-from dittogym.layout import particle_counts
 from dittogym.spec import Body, TaskSpec
 from torchmpm import Soil, VelocityRule
 

@@ -12,17 +12,17 @@ from typing import Literal
 
 import tyro
 
-from baselines.compare.collect import Found, find_runs
-from baselines.compare.executor import Report, Resources, run_here, run_local
-from baselines.compare.judging import Judging
+from baselines.compare.evaluations import Judging
+from baselines.compare.local import Report, Resources, run_here, run_local
 from baselines.compare.plan import Job, Plan, check_there, make_jobs
 from baselines.compare.report import write_report
-from baselines.compare.work import describe
+from baselines.compare.results import Found, find_runs
+from baselines.compare.worker import describe
 from baselines.registry import ALGORITHMS
-from cfp.command import started_as
 from cfp.config import Preset, Tier
 from cfp.errors import CFPError, ConfigError
-from cfp.process import StopSignals, keep_memory
+from cfp.experiment.cli import started_as
+from cfp.experiment.process import StopSignals, keep_memory
 
 PATIENCE, CLUSTER_PATIENCE = 30.0, 300.0
 """Seconds to wait for another process that holds a run folder; file servers take a while to give up a lost machine."""
@@ -165,7 +165,7 @@ def _execute(
     command: Command, works: list[dict[str, object]], resources: Resources, signals: StopSignals, told: Report
 ) -> None:
     if command.executor == "ray":
-        from baselines.compare.on_ray import run_ray
+        from baselines.compare.ray import run_ray
 
         run_ray(works, command.address, resources, signals, told)
     elif command.workers:

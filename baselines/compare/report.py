@@ -8,13 +8,14 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from baselines.compare import pictures, tables
-from baselines.compare.collect import Found, Group, group
+from baselines.compare import plots as pictures
+from baselines.compare import tables
+from baselines.compare.results import Found, Group, group
 from baselines.compare.table import Table
 from cfp.config import Tier
-from cfp.files import write_text
-from cfp.page import STYLE
-from cfp.plot import write_figure
+from cfp.evaluation.page import STYLE
+from cfp.evaluation.plots import write_figure
+from cfp.experiment.files import write_text
 
 MORE_STYLE = """
 body { max-width: 76rem; } .wide { overflow-x: auto; } table { font-size: 14px; } th { vertical-align: bottom; }

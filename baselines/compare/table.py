@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from cfp.files import csv_text
+from cfp.experiment.files import csv_text
 
 
 @dataclass(frozen=True)

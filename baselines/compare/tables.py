@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from baselines.common.reference_policies import Zero
 from baselines.compare import paper
-from baselines.compare.collect import Found, Group
+from baselines.compare.results import Found, Group
 from baselines.compare.stats import common_curve, first_reach, interquartile_mean, interval, wilson
 from baselines.compare.table import Column, Table
-from baselines.floors import Zero
 from cfp.config import Tier
 from dittogym import make_spec
 

@@ -15,11 +15,11 @@ import tyro
 from torch import Tensor
 from tqdm import tqdm
 
+from baselines.common.rollout import judge
 from baselines.gradlab.measure import NoGradientError, Probe, Smoothing, measure
 from baselines.gradlab.report import format_table, write
-from baselines.rollout import judge
 from cfp.config import positive
-from cfp.environments import choose_device
+from cfp.envs.make import choose_device
 from cfp.errors import CFPError, ConfigError
 from dittogym import TorchEnv
 from dittogym.tasks import task_name

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from baselines.rollout import Judge, repeat, rollout, to_dtype
-from dittogym.dynamics import EnvState, Model
+from baselines.common.rollout import Judge, repeat, rollout, to_dtype
+from dittogym.core import EnvState, Model
 
 
 class NoGradientError(ValueError):

@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from dittogym.bodies.drawings import BodyLike, with_body
 from dittogym.geometry import Obstacle
-from dittogym.robots import BodyLike, with_body
 from dittogym.spec import TaskSpec
 from dittogym.tasks.catch import catch
 from dittogym.tasks.dig import dig
@@ -83,7 +83,7 @@ def make_spec(
     Args:
         task: A name from :data:`dittogym.TASKS`, ``"MODULE:NAME"`` with a module that registers it on import, or a
             specification.
-        body: A robot of one's own, see :func:`dittogym.robots.with_body`.
+        body: A robot of one's own, see :func:`dittogym.bodies.drawings.with_body`.
         obstacles: Static geometry in place of the task's own, see :mod:`dittogym.geometry`.
         options: Options of that task, such as ``target`` of SHAPE MATCH.
 

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
+from dittogym.bodies.shapes import Disc, Rectangle
 from dittogym.geometry import Obstacle, ceiling, floor, nodes, side_walls
-from dittogym.reward import limited, mean_over_nearest
-from dittogym.shapes import Disc, Rectangle
+from dittogym.rewards import limited, mean_over_nearest
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
 from torchmpm import VelocityRule
 

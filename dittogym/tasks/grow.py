@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
+from dittogym.bodies.shapes import Lattice
 from dittogym.geometry import Obstacle, ceiling, floor, nodes, side_walls
-from dittogym.reward import beyond, distance, drop_widest, pick, share_of
-from dittogym.shapes import Lattice
+from dittogym.rewards import beyond, distance, drop_widest, pick, share_of
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
 from torchmpm import VelocityRule
 

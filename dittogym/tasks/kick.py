@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from dittogym.bodies.shapes import Disc, Rectangle
 from dittogym.geometry import ceiling, floor
-from dittogym.reward import limited, signed_quadratic
-from dittogym.shapes import Disc, Rectangle
+from dittogym.rewards import limited, signed_quadratic
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
 
 #: Displacement of the cube that counts as success (our definition), m.

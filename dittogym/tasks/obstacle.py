@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from dittogym.bodies.shapes import Lattice
 from dittogym.geometry import NODES, Box, Obstacle, ceiling, floor, nodes
-from dittogym.shapes import Lattice
 from dittogym.spec import Body, TaskSpec, Weights, Window
 from dittogym.tasks.run import Forward
 from torchmpm import VelocityRule

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from dittogym.bodies.shapes import Disc
 from dittogym.geometry import Obstacle, ceiling, floor, nodes
-from dittogym.reward import limited, signed_quadratic
-from dittogym.shapes import Disc
+from dittogym.rewards import limited, signed_quadratic
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
 from torchmpm import VelocityRule
 

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dittogym.bodies.shapes import Disc
 from dittogym.geometry import ceiling, floor
-from dittogym.shapes import Disc
-from dittogym.soft import soft_silhouette
+from dittogym.observation.smooth import soft_silhouette
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights
 from dittogym.targets import TargetLike, load_target
 

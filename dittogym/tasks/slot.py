@@ -8,9 +8,9 @@ from typing import Literal
 
 from torch import Tensor
 
+from dittogym.bodies.shapes import Disc, Rectangle
 from dittogym.geometry import NODES, Box, Obstacle, ceiling, floor, nodes
-from dittogym.reward import beyond, distance, limited, mean_over_nearest, signed_quadratic
-from dittogym.shapes import Disc, Rectangle
+from dittogym.rewards import beyond, distance, limited, mean_over_nearest, signed_quadratic
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
 from torchmpm import VelocityRule, fixed
 

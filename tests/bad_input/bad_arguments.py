@@ -10,8 +10,8 @@ from bad_cases import Case
 
 import dittogym
 from dittogym import Outcome, TorchEnv, make_spec
+from dittogym.bodies.shapes import Disc, Figure, Lattice, Rectangle
 from dittogym.geometry import ceiling, solid
-from dittogym.shapes import Disc, Figure, Lattice, Rectangle
 from dittogym.spec import Body as RobotBody
 from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VelocityRule, VonMises, lame, sampling
 

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 import baselines
 from baselines.registry import ALGORITHMS, configure
-from cfp.actor import build_actor
+from cfp.agent.actor import build_actor
 from cfp.config import Config, to_json
 from cfp.errors import CheckpointError, ConfigError
-from cfp.process import peak_memory
+from cfp.experiment.process import peak_memory
 from cfp.weights import describe, save_policy
 from dittogym.targets import load_target
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from cfp.books import Books
+from cfp.experiment.books import Books
 
 
 @pytest.fixture

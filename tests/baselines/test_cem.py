@@ -5,7 +5,7 @@ import torch
 from test_planner import drive, small
 
 from baselines import CEMPlanner, CEMPlannerConfig
-from baselines.rollout import judge_true
+from baselines.common.rollout import judge_true
 from cfp.errors import ConfigError
 
 

@@ -11,14 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from baselines.compare import judging, work
+from baselines.compare import evaluations as judging
+from baselines.compare import worker as work
 from baselines.compare.__main__ import main
-from baselines.compare.executor import run_process
+from baselines.compare.local import run_process
 from baselines.compare.plan import Plan, judged, make_jobs, resolve
 from baselines.registry import configure, load
-from cfp.disturbances import make_cases
+from cfp.envs.disturbances import make_cases
 from cfp.errors import CheckpointError
-from cfp.files import read_table
+from cfp.experiment.files import read_table
 
 ENVIRONMENT = {"particles": 100, "substeps": 1, "num_envs": 1}
 MPC = {"grid": 8, "planner": {"horizon": 3, "commit": 2, "iterations": 1}}
@@ -104,7 +105,7 @@ def test_variant_that_sees_the_image_is_labelled_so(finished):
 def test_more_episodes_are_added_to_those_that_are_there(finished, monkeypatch):
     record = finished / "runs" / "mpc-shapematch-quick-0" / "judged.json"
     before = json.loads(record.read_text())
-    monkeypatch.setattr("baselines.compare.judging.CHUNK", 2)
+    monkeypatch.setattr("baselines.compare.evaluations.CHUNK", 2)
     assert compare(finished, "--algos", "mpc", "--seeds", "0", "--episodes", "3") == 0
     after = json.loads(record.read_text())
     assert after["policy"] == before["policy"]
@@ -265,7 +266,7 @@ def test_ray_that_is_not_installed_names_the_extra(tmp_path, monkeypatch, capsys
 
 def test_process_that_is_killed_is_begun_again_and_then_given_up(tmp_path, monkeypatch):
     kill = "import os; open('count', 'a').write('x'); os.kill(os.getpid(), 9)"
-    monkeypatch.setattr("baselines.compare.executor.MODULE", (sys.executable, "-c", kill))
+    monkeypatch.setattr("baselines.compare.local.MODULE", (sys.executable, "-c", kill))
     monkeypatch.chdir(tmp_path)
     assert run_process({"folder": str(tmp_path)}, 1, 2, lambda: 0) == "failed"
     assert (tmp_path / "count").read_text() == "xxx"
@@ -281,7 +282,7 @@ def test_process_that_is_killed_is_begun_again_and_then_given_up(tmp_path, monke
     ],
 )
 def test_process_that_fails_leaves_its_last_word(tmp_path, monkeypatch, program, told):
-    monkeypatch.setattr("baselines.compare.executor.MODULE", (sys.executable, "-c", program))
+    monkeypatch.setattr("baselines.compare.local.MODULE", (sys.executable, "-c", program))
     monkeypatch.chdir(tmp_path)
     (tmp_path / "error.txt").write_text("of another time")
     (tmp_path / "log.txt").write_text("of another time\n")
@@ -296,7 +297,7 @@ def test_process_is_asked_to_stop_before_it_is_made_to(tmp_path, monkeypatch, ur
         "signal.signal(signal.SIGTERM, lambda *_: (open('ended', 'w').write('checkpoint'), sys.exit(143)))\n"
         "open('ready', 'w').close(); time.sleep(60)"
     )
-    monkeypatch.setattr("baselines.compare.executor.MODULE", (sys.executable, "-c", waiting))
+    monkeypatch.setattr("baselines.compare.local.MODULE", (sys.executable, "-c", waiting))
     monkeypatch.chdir(tmp_path)
     stopped = lambda: urgency if (tmp_path / "ready").exists() else 0  # noqa: E731
     assert run_process({"folder": str(tmp_path)}, 1, 2, stopped) == "stopped"
@@ -332,7 +333,7 @@ def test_comparison_that_is_killed_goes_on(tmp_path):
 
 
 def test_folder_in_use_is_left_alone(finished, monkeypatch):
-    from cfp.claim import claim
+    from cfp.experiment.run_lock import claim
 
     folder = finished / "runs" / "mpc-shapematch-quick-0"
     before = (folder / "judged.json").read_bytes()

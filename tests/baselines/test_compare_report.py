@@ -8,15 +8,15 @@ from html.parser import HTMLParser
 import pytest
 import torch
 
-from baselines.compare import pictures
+from baselines.compare import plots as pictures
 from baselines.compare.__main__ import main
-from baselines.compare.collect import find_runs, group
-from baselines.compare.judging import Judging
+from baselines.compare.evaluations import Judging
 from baselines.compare.plan import Plan, make_jobs
 from baselines.compare.report import make_tables
+from baselines.compare.results import find_runs, group
 from baselines.compare.tables import aggregate_table, cost_table, efficiency_table, paper_table
 from cfp.config import to_json
-from cfp.files import write_json, write_text
+from cfp.experiment.files import write_json, write_text
 from cfp.weights import origin, write_policy
 
 CASES = [case.name for case in Judging(1).cases()]

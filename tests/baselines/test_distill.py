@@ -9,20 +9,21 @@ import torch
 import baselines
 import cfp
 import cfp.train
-from baselines import Distill, OpenLoop, PlannerConfig, Shac, distill, modular_env
-from baselines.compare.work import _train
-from baselines.dagger import Collector, Dataset, Labels, lose
-from baselines.distillation import METRICS
-from baselines.episodes import Episodes
-from baselines.modular_networks import ModularActor
-from baselines.modular_policy import SegmentPolicy
-from baselines.nodes import Nodes
+from baselines import Distill, OpenLoop, PlannerConfig, Shac, distill
+from baselines.common.episodes import Episodes
+from baselines.compare.worker import _train
+from baselines.distillation.dagger import Collector, Dataset, Labels, lose
+from baselines.distillation.teachers import PolicyTeacher, Teacher, project, read_teacher
+from baselines.distillation.train import METRICS
+from baselines.modular.networks import ModularActor
+from baselines.modular.nodes import Nodes
+from baselines.modular.policy import SegmentPolicy
+from baselines.modular.train import env as modular_env
 from baselines.registry import configure
-from baselines.teachers import PolicyTeacher, Teacher, project, read_teacher
 from cfp.config import EnvironmentConfig, ReportConfig, to_json
 from cfp.errors import ConfigError, NonFiniteError
-from cfp.files import read_table
-from cfp.process import StopSignals
+from cfp.experiment.files import read_table
+from cfp.experiment.process import StopSignals
 from cfp.weights import origin, read_policy, write_policy
 from dittogym import TASKS, TorchEnv
 from dittogym.action import patch_field, to_grid_layout

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from baselines.features import RASTER, StateFeatures
-from baselines.training_reward import REACH, SLACK, Pairs, RewardConfig, training_reward
+from baselines.shac.features import RASTER, StateFeatures
+from baselines.shac.reward import REACH, SLACK, Pairs, RewardConfig, training_reward
 from dittogym import TorchEnv
 
 

@@ -8,16 +8,17 @@ import torch
 
 import baselines
 import cfp
-from baselines import floors, train
-from baselines.floors import wave
-from cfp.actor import build_actor
-from cfp.command import parse
+from baselines import train
+from baselines.common import reference_policies as floors
+from baselines.common.reference_policies import wave
+from cfp.agent.actor import build_actor
 from cfp.config import to_json
 from cfp.errors import ConfigError
-from cfp.files import read_table, write_json
+from cfp.experiment.cli import parse
+from cfp.experiment.files import read_table, write_json
 from dittogym import TorchEnv
 from dittogym.action import from_grid_layout, patch_field, to_grid_layout
-from dittogym.reward import action_cost
+from dittogym.rewards import action_cost
 
 TINY = "--particles 100 --substeps 2 --eval-episodes 2 --no-video --device cpu".split()
 IMAGES = np.zeros((2, 3, 64, 64), np.uint8)

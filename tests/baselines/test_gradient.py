@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from baselines import Gradient, OpenLoop
-from baselines.gradient import Episode
 from baselines.registry import configure
+from baselines.trajectory.optimise import Episode
 from cfp.config import EnvironmentConfig, to_json
 from cfp.errors import ConfigError, NonFiniteError
 from dittogym import make_spec

@@ -14,8 +14,8 @@ import pytest
 from test_programs import COMMON, TINY, run
 
 import baselines
-from cfp.files import read_table
-from cfp.state_file import StateFile
+from cfp.experiment.files import read_table
+from cfp.experiment.state_file import StateFile
 
 KILLS = int(os.environ.get("KILLS", "3"))
 SPAN = 3.0

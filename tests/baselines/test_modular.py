@@ -10,19 +10,19 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 import baselines
 import cfp
-from baselines.modular import ModularConfig, ModularRun, preset
-from baselines.modular_env import segmented
-from baselines.modular_networks import ModularActor, ModularCritics
-from baselines.modular_policy import SegmentPolicy
-from baselines.nodes import Nodes, pack, places, unpack
-from baselines.segments import follow
+from baselines.modular.env import segmented
+from baselines.modular.kmeans import follow
+from baselines.modular.networks import ModularActor, ModularCritics
+from baselines.modular.nodes import Nodes, pack, places, unpack
+from baselines.modular.policy import SegmentPolicy
+from baselines.modular.train import ModularConfig, ModularRun, preset
+from cfp.agent.losses import Losses
 from cfp.config import EnvironmentConfig, ReportConfig
-from cfp.disturbances import Case
+from cfp.envs.disturbances import Case
+from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import CheckpointError, ConfigError
-from cfp.losses import Losses
-from cfp.process import StopSignals
+from cfp.experiment.process import StopSignals
 from cfp.robustness import report
-from cfp.vec_env import TorchVecEnv
 from cfp.weights import origin
 from dittogym import TorchEnv
 

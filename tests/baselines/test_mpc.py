@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from baselines import MPC, OpenLoop, PlannerConfig, train
-from baselines.mpc import MPCConfig
+from baselines.planning.mpc import MPCConfig
 from cfp.config import EnvironmentConfig
-from cfp.environments import make_torch_env
+from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
-from cfp.files import read_table
-from cfp.process import StopSignals
-from cfp.run import holds_run
+from cfp.experiment.files import read_table
+from cfp.experiment.process import StopSignals
+from cfp.experiment.run import holds_run
 
 ENVIRONMENT = EnvironmentConfig(num_envs=1, particles=100, substeps=2)
 CONFIG = MPCConfig(

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 
-from baselines.objective import gaussian, make_objective
+from baselines.trajectory.objective import gaussian, make_objective
 from dittogym import TorchEnv
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from baselines.rollout import judge, repeat, rollout, to_dtype
+from baselines.common.rollout import judge, repeat, rollout, to_dtype
 from dittogym import TorchEnv
 
 

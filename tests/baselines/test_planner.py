@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from baselines.planner import Planner, PlannerConfig, _clipped
-from baselines.rollout import judge
+from baselines.common.rollout import judge
+from baselines.planning.gradient import Planner, PlannerConfig, _clipped
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
 

@@ -11,12 +11,12 @@ import cfp.evaluate
 import cfp.robustness
 import dittogym
 from baselines import evaluate, robustness, train
-from cfp.actor import build_actor
-from cfp.books import Books
-from cfp.command import parse
+from cfp.agent.actor import build_actor
 from cfp.errors import ConfigError
-from cfp.evaluation import SeesState
-from cfp.files import read_table
+from cfp.evaluation.rollout import SeesState
+from cfp.experiment.books import Books
+from cfp.experiment.cli import parse
+from cfp.experiment.files import read_table
 from cfp.weights import describe, save_policy
 
 COMMON = "--particles 100 --substeps 1 --eval-episodes 2 --no-video --device cpu".split()

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from baselines import CEM, MPC, PlannerConfig
-from baselines.cem import CEMConfig
-from baselines.mpc import MPCConfig
-from baselines.reduced import Reduced
+from baselines.planning.cem import CEMConfig
+from baselines.planning.mpc import MPCConfig
+from baselines.planning.surrogate import Reduced
 from cfp.config import EnvironmentConfig
 from cfp.errors import ConfigError
 from dittogym import TASKS, TorchEnv

@@ -4,14 +4,14 @@ import pytest
 import torch
 
 import dittogym
-from baselines.floors import wave
-from baselines.modular_env import SegmentedEnv
-from baselines.nodes import LENGTH, SPEED, Nodes, pack, unpack
-from baselines.segments import adjacency, averages, begin, connected, follow, squared_distances
+from baselines.common.reference_policies import wave
+from baselines.modular.env import SegmentedEnv
+from baselines.modular.kmeans import adjacency, averages, begin, connected, follow, squared_distances
+from baselines.modular.nodes import LENGTH, SPEED, Nodes, pack, unpack
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
 from dittogym.action import place, to_grid_layout
-from dittogym.window import in_window
+from dittogym.observation.window import in_window
 
 
 def segmented(task="run", num_envs=2, count=16, graph=True, **options):

@@ -9,16 +9,17 @@ import torch
 
 import baselines
 import cfp
-from baselines import Shac, StatePolicy, shac_rollout
+from baselines import Shac, StatePolicy
 from baselines.registry import configure
-from baselines.shac import METRICS
-from baselines.training_reward import RewardConfig
-from cfp.actor import ActorSpec, build_actor
+from baselines.shac.reward import RewardConfig
+from baselines.shac.train import METRICS
+from baselines.shac.train import rollout as shac_rollout
+from cfp.agent.actor import ActorSpec, build_actor
 from cfp.config import EnvironmentConfig, to_json
-from cfp.environments import make_env
+from cfp.envs.make import make_env
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
-from cfp.evaluation import attached, evaluate
-from cfp.video import film
+from cfp.evaluation.rollout import attached, evaluate
+from cfp.evaluation.video import film
 from cfp.weights import describe, origin, save_policy
 from dittogym import TorchEnv
 

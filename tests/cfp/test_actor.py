@@ -5,9 +5,9 @@ import torch
 from torch import distributions
 from torch.nn import functional as F
 
-from cfp.actor import ActorSpec, Sample, build_actor
-from cfp.environments import make_torch_env
-from cfp.networks import normalise_image, upsample
+from cfp.agent.actor import ActorSpec, Sample, build_actor
+from cfp.agent.networks import normalise_image, upsample
+from cfp.envs.make import make_torch_env
 from cfp.presets import preset
 from dittogym import TASKS, make_spec
 

@@ -12,11 +12,11 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch.nn import functional as F
 
-from cfp.actor import ActorSpec
-from cfp.algorithm import CFP, METRICS, RewardStatistics, clip_each
+from cfp.agent.actor import ActorSpec
+from cfp.agent.policies import CFPPolicy
+from cfp.agent.sac import CFP, METRICS, RewardStatistics, clip_each
+from cfp.envs.vec_env import monitored
 from cfp.errors import NonFiniteError
-from cfp.policy import CFPPolicy
-from cfp.vec_env import monitored
 
 ALPHA, RHO, GAMMA, LIMIT = 0.03, 0.7, 0.9, 0.05
 
@@ -128,7 +128,7 @@ def test_one_update_equals_the_float64_computation(kind, monkeypatch):
     generator = torch.Generator().manual_seed(5)
     noises = [torch.randn(6, 2, r, r, generator=generator, dtype=torch.float64) for r in sizes]
     queue = iter(noises)
-    monkeypatch.setattr("cfp.actor.torch.randn_like", lambda like: next(queue).to(like))
+    monkeypatch.setattr("cfp.agent.actor.torch.randn_like", lambda like: next(queue).to(like))
 
     weights, values, targets = doubles(actor, True), doubles(critic, True), doubles(target, False)
     now, later = (image.double() / 255 * 2 - 1 for image in (batch.observations, batch.next_observations))

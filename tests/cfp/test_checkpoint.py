@@ -6,14 +6,14 @@ from fakes import FakeEnv
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
-from cfp.algorithm import CFP
-from cfp.checkpoint import Checkpoint, model_state
+from cfp.agent.policies import CFPPolicy
+from cfp.agent.sac import CFP
 from cfp.config import Config, to_json
+from cfp.envs.vec_env import monitored
 from cfp.errors import CheckpointError, ConfigError
-from cfp.policy import CFPPolicy
+from cfp.experiment.checkpoint import Checkpoint, model_state
+from cfp.experiment.state_file import Position, check_same
 from cfp.presets import preset
-from cfp.state_file import Position, check_same
-from cfp.vec_env import monitored
 
 CONFIG = Config(resolutions=(4, 8), gate_bias=(-1.0,))
 
@@ -81,7 +81,7 @@ def test_resumed_training_equals_uninterrupted_training_to_the_last_bit(tmp_path
     assert all(torch.equal(*pair) for pair in zip(batch[:5], again[:5], strict=True))
 
 
-@pytest.mark.parametrize("writer", ["cfp.state_file.write_atomically", "cfp.replay.write_atomically"])
+@pytest.mark.parametrize("writer", ["cfp.experiment.state_file.write_atomically", "cfp.agent.replay.write_atomically"])
 def test_checkpoint_survives_a_crash_while_the_next_is_written(tmp_path, monkeypatch, writer):
     checkpoint, model = Checkpoint(tmp_path), make_model()
     model.learn(20)

@@ -3,12 +3,12 @@ import sys
 
 import pytest
 
-from cfp.claim import Claimed, claim
+from cfp.experiment.run_lock import Claimed, claim
 
 HOLD = """
 import sys
 from pathlib import Path
-from cfp.claim import claim
+from cfp.experiment.run_lock import claim
 with claim(Path(sys.argv[1])):
     print(1, flush=True)
     input()

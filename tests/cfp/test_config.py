@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 import dittogym
-from cfp.command import parse
 from cfp.config import Config, merge, to_json
-from cfp.environments import make_env
+from cfp.envs.make import make_env
 from cfp.errors import ConfigError
+from cfp.experiment.cli import parse
+from cfp.experiment.state_file import check_same
 from cfp.presets import TASKS, from_json, preset
-from cfp.state_file import check_same
 from cfp.train import PROGRAM
 from dittogym import make_spec
 

@@ -7,10 +7,10 @@ import pytest
 
 from baselines import train as baselines_train
 from cfp import train
-from cfp.algorithm import CFP
+from cfp.agent.policies import ActorPolicy
+from cfp.agent.sac import CFP
 from cfp.config import Config, merge
-from cfp.estimate import REPEATS, _duration, seconds
-from cfp.policy import ActorPolicy
+from cfp.experiment.estimate import REPEATS, _duration, seconds
 from cfp.presets import preset
 from dittogym import make_spec
 
@@ -62,8 +62,8 @@ def test_what_follows_the_training_is_counted_with_the_policies_own_time(tmp_pat
     monkeypatch.chdir(tmp_path)
     asked, predict = [], ActorPolicy.predict
     monkeypatch.setattr(ActorPolicy, "predict", lambda *given: (asked.append(1), predict(*given))[1])
-    monkeypatch.setattr("cfp.estimate.seconds", lambda action: action() or 1.0)
-    monkeypatch.setattr("cfp.estimate.available", lambda: True)
+    monkeypatch.setattr("cfp.experiment.estimate.seconds", lambda action: action() or 1.0)
+    monkeypatch.setattr("cfp.experiment.estimate.available", lambda: True)
     episode = make_spec("shapematch").horizon
     floor = "--algo zero --particles 100 --substeps 1 --dry-run".split()
     assert baselines_train.main(floor) == 0  # an evaluation; a row for zero, random and the floor; a film
@@ -121,7 +121,7 @@ def test_dry_run_names_wrong_options(capsys):
 
 def test_the_first_time_is_not_timed(monkeypatch):
     now, calls = [0.0], []
-    monkeypatch.setattr("cfp.estimate.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("cfp.experiment.estimate.time.perf_counter", lambda: now[0])
 
     def action():
         now[0] += 100.0 if not calls else 2.0

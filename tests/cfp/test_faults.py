@@ -11,7 +11,7 @@ from test_train import run
 
 import cfp
 from cfp import evaluate
-from cfp.callbacks import StageCallback
+from cfp.experiment.callbacks import StageCallback
 from cfp.weights import read_policy, write_policy
 
 SHORT = "--steps 80 --handover 40 --eval-every 40 --log-every 10".split()

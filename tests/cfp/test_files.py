@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from cfp.errors import CheckpointError
-from cfp.files import ProgressTable, Table, read_table, write_atomically, write_json
+from cfp.experiment.files import ProgressTable, Table, read_table, write_atomically, write_json
 
 
 def test_interrupted_write_leaves_the_old_file(tmp_path):

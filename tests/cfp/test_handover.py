@@ -8,10 +8,10 @@ import torch
 from test_train import run
 
 from cfp import train
-from cfp.command import parse
-from cfp.files import read_table
-from cfp.process import StopSignals
-from cfp.runner import Runner
+from cfp.experiment.cfp_run import Runner
+from cfp.experiment.cli import parse
+from cfp.experiment.files import read_table
+from cfp.experiment.process import StopSignals
 from cfp.train import PROGRAM
 
 MEANS = [1.0, 3.0, 2.0, 2.5, 9.0, 1.0, 5.0, 4.0, 3.0, 2.0]
@@ -21,13 +21,13 @@ MEANS = [1.0, 3.0, 2.0, 2.5, 9.0, 1.0, 5.0, 4.0, 3.0, 2.0]
 def scripted(monkeypatch):
     """Evaluations that return given means, whatever the policy."""
     left = list(MEANS)
-    evaluate = __import__("cfp.run", fromlist=["evaluate"]).evaluate
+    evaluate = __import__("cfp.experiment.run", fromlist=["evaluate"]).evaluate
 
     def pretend(name, *arguments, **options):
         result = evaluate(name, *arguments, **options)
         return replace(result, returns=(left.pop(0),) * 2) if name == "" else result
 
-    monkeypatch.setattr("cfp.run.evaluate", pretend)
+    monkeypatch.setattr("cfp.experiment.run.evaluate", pretend)
 
 
 def test_plateau_hands_over_and_ends_the_run(scripted, tmp_path, capsys):

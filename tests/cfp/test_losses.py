@@ -6,8 +6,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from test_algorithm import make_batch, make_model
 from torch.nn import functional as F
 
-from cfp.actor import ActorSpec, squashed_log_prob
-from cfp.losses import Losses, choose_precision
+from cfp.agent.actor import ActorSpec, squashed_log_prob
+from cfp.agent.losses import Losses, choose_precision
 
 PLAIN = ActorSpec((32,))
 LADDERS = {
@@ -28,10 +28,11 @@ def encode_one_by_one(encoders, *images):
 
 def one_by_one(patch):
     """Let every network compute on its own, through PyTorch's layers."""
-    patch.setattr("cfp.joint.encode", encode_one_by_one)
-    patch.setattr("cfp.joint.decode", lambda heads, latent: [head(latent) for head in heads])
+    patch.setattr("cfp.agent.fused.encode", encode_one_by_one)
+    patch.setattr("cfp.agent.fused.decode", lambda heads, latent: [head(latent) for head in heads])
     patch.setattr(
-        "cfp.joint.perceive", lambda each, values: torch.stack([one(x) for one, x in zip(each, values, strict=True)])
+        "cfp.agent.fused.perceive",
+        lambda each, values: torch.stack([one(x) for one, x in zip(each, values, strict=True)]),
     )
 
 
@@ -108,7 +109,7 @@ def test_bfloat16_leaves_everything_but_the_networks_in_float32(monkeypatch):
         densities.append((squashed_log_prob(noise, std, action), noise, std, action))
         return densities[-1][0]
 
-    monkeypatch.setattr("cfp.actor.squashed_log_prob", note)
+    monkeypatch.setattr("cfp.agent.actor.squashed_log_prob", note)
     model, scalars, gradients = losses_and_gradients(LADDERS["residual"], "bfloat16")
     assert len(densities) == 4  # coarse and residual, for the target and for the actor
     for log_prob, *inputs in densities:
@@ -143,7 +144,7 @@ def test_unknown_precision_is_refused():
 
 
 def test_update_without_a_compiler_says_so_and_runs(monkeypatch, caplog):
-    monkeypatch.setattr("cfp.losses.compiler_found", lambda: False)
+    monkeypatch.setattr("cfp.agent.losses.compiler_found", lambda: False)
     model = make_model(PLAIN, compile=True)
     assert "not compiled, only slower: no C++ compiler" in caplog.text
     assert model.update(make_batch(32))["critic_loss"].isfinite()
@@ -156,7 +157,7 @@ def test_failed_compilation_says_so_once_and_goes_on(monkeypatch, caplog):
 
         return run
 
-    monkeypatch.setattr("cfp.losses.compiler_found", lambda: True)
+    monkeypatch.setattr("cfp.agent.losses.compiler_found", lambda: True)
     monkeypatch.setattr(torch, "compile", refuse)
     losses = Losses(CPU, "float32", compile=True)
     model = make_model(PLAIN)

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from cfp.agent.policies import action_space, observation_space
+from cfp.agent.replay import ReplayArchive, ReplayRing
 from cfp.errors import CheckpointError
-from cfp.policy import action_space, observation_space
-from cfp.replay import ReplayArchive, ReplayRing
 
 
 def make_ring(rows=6, envs=2):

@@ -12,16 +12,16 @@ from scipy import stats
 
 import cfp
 from cfp import robustness
-from cfp.actor import build_actor
+from cfp.agent.actor import build_actor
 from cfp.config import to_json
-from cfp.disturbances import Case, Disturbed, disturbed_env, idle, make_cases
+from cfp.envs.disturbances import Case, Disturbed, disturbed_env, idle, make_cases
+from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from cfp.evaluate import open_policy, open_run
-from cfp.evaluation import Result, ZeroPolicy, evaluate, student
-from cfp.files import write_json
+from cfp.evaluation.rollout import Result, ZeroPolicy, evaluate, student
+from cfp.experiment.files import write_json
 from cfp.presets import preset
 from cfp.train import PROGRAM
-from cfp.vec_env import monitored
 from cfp.weights import describe, save_policy
 from dittogym import make_spec
 from dittogym.action import bicubic

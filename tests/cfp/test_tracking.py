@@ -13,14 +13,14 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from test_train import run
 
 from cfp import train
-from cfp.actor import ActorSpec, build_actor
-from cfp.algorithm import METRICS
-from cfp.books import BOOK_METRICS
-from cfp.callbacks import ROLLOUT_METRICS
-from cfp.files import read_table
-from cfp.pictures import PICTURES, muscles, policy_pictures
-from cfp.run import EVALUATION_COLUMNS
-from cfp.tracking import EVALUATION_METRICS
+from cfp.agent.actor import ActorSpec, build_actor
+from cfp.agent.sac import METRICS
+from cfp.evaluation.pictures import PICTURES, muscles, policy_pictures
+from cfp.experiment.books import BOOK_METRICS
+from cfp.experiment.callbacks import ROLLOUT_METRICS
+from cfp.experiment.files import read_table
+from cfp.experiment.loggers import EVALUATION_METRICS
+from cfp.experiment.run import EVALUATION_COLUMNS
 
 SHORT = "--steps 110 --handover 70 --eval-every 70 --log-every 10".split()  # an episode ends in the first stage
 PAGE = (Path(__file__).parents[2] / "docs" / "scalars.md").read_text()
@@ -112,7 +112,7 @@ def test_films_at_intervals_leave_learning_as_it_was(finished, tmp_path):
 
 
 def test_films_without_the_packages_are_refused_at_once(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("cfp.video.find_spec", lambda name: None)
+    monkeypatch.setattr("cfp.evaluation.video.find_spec", lambda name: None)
     assert run(tmp_path / "run", "--video-every", "30") == 2
     error = capsys.readouterr().err
     assert "video_every: got 30" in error and "pip install 'torchmpm[video]'" in error

@@ -17,17 +17,18 @@ from fakes import FakeEnv
 
 import cfp
 import dittogym
-from cfp import evaluate, plot, train, video
-from cfp.actor import ActorSpec, build_actor
-from cfp.callbacks import StageCallback
-from cfp.command import started_as
+from cfp import evaluate, train
+from cfp.agent.actor import ActorSpec, build_actor
+from cfp.agent.policies import ActorPolicy
 from cfp.config import EnvironmentConfig
-from cfp.evaluation import compare
-from cfp.files import read_table
-from cfp.policy import ActorPolicy
+from cfp.envs.vec_env import monitored
+from cfp.evaluation.rollout import compare, video
+from cfp.evaluation.rollout import plots as plot
+from cfp.experiment.callbacks import StageCallback
+from cfp.experiment.cfp_run import Runner
+from cfp.experiment.cli import started_as
+from cfp.experiment.files import read_table
 from cfp.presets import preset
-from cfp.runner import Runner
-from cfp.vec_env import monitored
 from cfp.weights import describe, policy_file, save_policy, shipped
 
 TINY = (
@@ -99,7 +100,7 @@ def test_policies_are_judged_on_the_device_that_was_chosen(finished, monkeypatch
     program = replace(train.PROGRAM, load=load)
     evaluate.open_run(program, finished, "cuda")
     evaluate.open_policy(program, "run", "cuda", None)
-    monkeypatch.setattr("cfp.runner.load", load)
+    monkeypatch.setattr("cfp.experiment.cfp_run.load", load)
     Runner.load(SimpleNamespace(config=preset("run")), finished)
     assert seen == [*["the one that cuda means"] * 3, "the one that auto means"]
 
@@ -408,7 +409,7 @@ def test_evaluation_without_a_run_is_an_error(tmp_path, capsys):
 
 def test_video_plays_or_tells_how_to_install(finished, tmp_path, monkeypatch, capsys):
     arguments = [str(finished), "--episodes", "1", "--video", str(tmp_path / "film.mp4")]
-    monkeypatch.setattr("cfp.video.find_spec", lambda name: None)
+    monkeypatch.setattr("cfp.evaluation.video.find_spec", lambda name: None)
     assert evaluate.main(arguments) == 0
     assert "pip install 'torchmpm[video]'" in capsys.readouterr().out
     assert evaluate.main([*arguments, "--json"]) == 0

@@ -3,7 +3,7 @@ import pytest
 import torch
 from fakes import FakeEnv
 
-from cfp.vec_env import TorchVecEnv, monitored
+from cfp.envs.vec_env import TorchVecEnv, monitored
 
 
 def actions(env, value=0.0):

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 import cfp
-from cfp.actor import ActorSpec, build_actor
+from cfp.agent.actor import ActorSpec, build_actor
+from cfp.agent.networks import normalise_image
+from cfp.agent.policies import CFPPolicy, action_space, observation_space
 from cfp.config import Config, EnvironmentConfig
 from cfp.errors import CheckpointError, ConfigError
-from cfp.networks import normalise_image
-from cfp.policy import CFPPolicy, action_space, observation_space
 from cfp.weights import check_trained_for, describe, save_policy
 
 

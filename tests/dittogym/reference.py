@@ -11,9 +11,9 @@ import pytest
 import torch
 
 import dittogym
-from dittogym import dynamics
+from dittogym import core as dynamics
 from dittogym.action import patch_field, place
-from dittogym.window import in_window
+from dittogym.observation.window import in_window
 from torchmpm import muscle
 from torchmpm.grid import PAD
 from torchmpm.solver import grid_velocity

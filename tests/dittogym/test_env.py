@@ -167,7 +167,7 @@ def test_render_modes(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array'"):
         make_vec(render_mode="human")
     monkeypatch.setitem(sys.modules, "pygame", None)
-    monkeypatch.delitem(sys.modules, "dittogym.window_system", raising=False)
+    monkeypatch.delitem(sys.modules, "dittogym.render.screen", raising=False)
     with pytest.raises(ImportError, match=r"needs pygame: pip install 'torchmpm\[human\]'"):
         dittogym.Env("run", render_mode="human")
 

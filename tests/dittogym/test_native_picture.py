@@ -9,7 +9,8 @@ import torch
 from tiny import TASKS, actions, tiny
 
 import dittogym
-from dittogym import dynamics, native
+from dittogym import core as dynamics
+from dittogym.observation import native
 from torchmpm import ParticleState
 from torchmpm.backends import compiler_found
 

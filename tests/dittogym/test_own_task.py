@@ -15,8 +15,8 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from tiny import SMALL, actions, tiny
 
 import dittogym
+from dittogym.bodies.shapes import Disc, Rectangle
 from dittogym.geometry import Obstacle, ceiling, floor
-from dittogym.shapes import Disc, Rectangle
 from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
 from dittogym.tasks import fingerprint
 from torchmpm import Elastic, VelocityRule

@@ -12,7 +12,7 @@ from tiny import SMALL, TASKS, actions, assert_same_bits, everything, stir, tiny
 import dittogym
 from dittogym import TorchEnv
 from dittogym.physics import NAMES
-from dittogym.render import CONTRACT
+from dittogym.render.frame import CONTRACT
 from torchmpm import ParticleState
 
 DT = 1e-4

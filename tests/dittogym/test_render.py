@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dittogym import TorchEnv
-from dittogym.render import CONTRACT, GROUND, ROBOT, SOLID, TARGET, Canvas
+from dittogym.render.frame import CONTRACT, GROUND, ROBOT, SOLID, TARGET, Canvas
 
 
 def near(image: np.ndarray, colour) -> np.ndarray:

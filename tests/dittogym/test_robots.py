@@ -10,10 +10,10 @@ import torch
 from tiny import SMALL, TASKS, tiny
 
 import dittogym
-from dittogym import layout
+from dittogym.bodies import positions as layout
+from dittogym.bodies.shapes import Disc, Figure, Lattice, Rectangle
 from dittogym.geometry import ceiling, floor, solid
-from dittogym.render import SOLID
-from dittogym.shapes import Disc, Figure, Lattice, Rectangle
+from dittogym.render.frame import SOLID
 from dittogym.spec import Body
 from torchmpm import sampling
 

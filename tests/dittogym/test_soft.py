@@ -9,13 +9,13 @@ from tiny import TASKS, actions, stir, tiny
 from torch import Tensor
 
 from dittogym import TorchEnv
-from dittogym import observation as obs
-from dittogym.dynamics import EnvState, observe
+from dittogym.core import EnvState, observe
 from dittogym.geometry import Box
-from dittogym.reward import measure
-from dittogym.soft import ON_COUNT, ON_WIDTH, soft_observation, soft_share, soft_silhouette
+from dittogym.observation import raster as obs
+from dittogym.observation.smooth import ON_COUNT, ON_WIDTH, soft_observation, soft_share, soft_silhouette
+from dittogym.observation.window import window_origin
+from dittogym.rewards import measure
 from dittogym.tasks.shapematch import silhouette
-from dittogym.window import window_origin
 from torchmpm import ParticleState
 
 

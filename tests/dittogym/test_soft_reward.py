@@ -10,9 +10,9 @@ from tiny import TASKS, actions, assert_same_bits, everything, stir, tiny
 from torch import Tensor
 
 from dittogym import Outcome, TorchEnv, make_spec
-from dittogym.dynamics import EnvState, judge, observe
-from dittogym.reward import FADE, beyond, limited, mean_over_nearest, nearest, split_penalty
-from dittogym.soft import soft_observation
+from dittogym.core import EnvState, judge, observe
+from dittogym.observation.smooth import soft_observation
+from dittogym.rewards import FADE, beyond, limited, mean_over_nearest, nearest, split_penalty
 from dittogym.tasks.grow import GOAL
 from dittogym.tasks.slot import FALLEN, FAR_SIDE
 from torchmpm import ParticleState

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import dittogym
-from dittogym import observation as obs
-from dittogym.window import window_origin
+from dittogym.observation import raster as obs
+from dittogym.observation.window import window_origin
 from torchmpm import Grid
 from torchmpm.boundary import constrain, faces
 from torchmpm.grid import PAD

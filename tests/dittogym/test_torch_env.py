@@ -9,7 +9,9 @@ import pytest
 import torch
 
 import dittogym
-from dittogym import TorchEnv, dynamics, layout
+from dittogym import TorchEnv
+from dittogym import core as dynamics
+from dittogym.bodies import positions as layout
 from dittogym.spec import FAILURE_REWARD
 
 TASKS = ("run", "shapematch")

@@ -1,0 +1,61 @@
+"""Ablations of the coarse-to-fine policy: one level of its ladder, trained alone for the whole budget."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from typing import Literal
+
+import cfp
+from baselines.common.algorithm import Entry
+from cfp.config import Config
+from cfp.errors import ConfigError
+from cfp.experiment.cfp_run import Runner
+from dittogym.tasks import task_name
+
+
+@dataclass(frozen=True)
+class LevelConfig(Config):
+    """One level: `cfp.config.Config` without a second. ``--resolutions 4``, 8 or 16 is the study of resolutions."""
+
+    @property
+    def name(self) -> str:
+        """Of the run, for a folder; names the action grid."""
+        grid = "-".join(map(str, self.resolutions))
+        return f"{self.algo}{grid}-{task_name(self.task)}-{self.preset}-{self.seed}"
+
+    def check(self) -> None:
+        """Check what the types cannot, see `cfp.config.RunConfig.check`."""
+        if len(self.resolutions) != 1:
+            raise ConfigError(f"resolutions: got {self.resolutions}, allowed is one; --algo cfp trains a ladder")
+        super().check()
+
+
+def preset(algo: Literal["coarse", "fine"], task: str, name: str) -> LevelConfig:
+    """The first stage of `cfp.preset`, for all its steps, on the task's coarse or fine action grid.
+
+    Args:
+        algo: ``"coarse"``: stage 1 goes on and on; ``"fine"``: from scratch on the finest grid, no coarse policy.
+        task: Which task.
+        name: Of the preset.
+
+    Raises:
+        ConfigError: No such task or preset.
+    """
+    ladder = cfp.preset(task, name)
+    level = replace(
+        ladder,
+        algo=algo,
+        handover=(),
+        resolutions=ladder.resolutions[:1] if algo == "coarse" else ladder.resolutions[-1:],
+        random_steps=ladder.random_steps[:1],
+        alpha=ladder.alpha[:1],
+        gate_bias=(),
+        gate_penalty=(),
+    )
+    return LevelConfig(**{option.name: getattr(level, option.name) for option in fields(level)})
+
+
+def entry(algo: Literal["coarse", "fine"]) -> Entry:
+    """For the registry."""
+    return Entry("image", partial(preset, algo), Runner, cfp.load)

@@ -1,0 +1,1 @@
+"""Distillation of planners and privileged policies into image policies (DAgger)."""

@@ -1,0 +1,307 @@
+"""Distillation: the image networks of the coarse-to-fine policy learn what a policy or planner that sees more does."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from torch import nn
+
+import cfp
+from baselines.common.algorithm import SEEDED, Algorithm, Callback, Sees, grid_size
+from baselines.common.episodes import Episodes
+from baselines.distillation.dagger import Collector, Dataset, Labels, lose
+from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
+from baselines.planning.gradient import PlannerConfig
+from baselines.shac.networks import quieten
+from cfp.agent.actor import build_actor
+from cfp.agent.policies import ActorPolicy
+from cfp.config import EnvironmentConfig, LadderConfig, RunConfig, Tier, at_least_one, positive, share, training_layouts
+from cfp.envs.make import make_torch_env
+from cfp.errors import NonFiniteError
+from cfp.weights import KIND, load, save_policy
+from dittogym import make_spec
+
+FINAL_RATE = 0.1
+"""Share of the learning rate that is left at the end of its straight decay."""
+
+METRICS: dict[str, str] = {
+    "rollout/return": "mean undiscounted return of the episodes that ended in the last round, None for none",
+    "train/loss": "mean square by which actions differ from the teacher's, mean over the round's updates",
+    "train/fresh_loss": "the same on the labels of the round before anything was learned from them, None for no labels",
+    "train/share": "share of the round that the teacher led",
+    "train/labels": "labels in the data set",
+    "train/learning_rate": "Adam's step size",
+    "train/episodes": "episodes ended in this stage",
+    "train/terminated": "those that ended before their time",
+    "train/nonfinite": "simulations that were not finite and were reset",
+}
+"""Every scalar that `Distill.learn` logs, and what it means."""
+
+
+@dataclass(frozen=True)
+class DistillConfig(LadderConfig):
+    """A distillation; num_envs robots move side by side. Levels are listed coarsest first.
+
+    The environment options say how the result is judged; tier says where it is taught.
+    """
+
+    algo: str = "distill"
+    """Which algorithm."""
+    teacher: str = "shac"
+    """mpc (plans from every state), shac or gradient (trained first), or a policy: a run folder, policy.safetensors."""
+    tier: Tier = "lite"
+    """Particles of the simulations that are taught in."""
+    round: int = 64
+    """Control steps between two lessons."""
+    updates: int = 48
+    """Gradient steps in a lesson."""
+    batch_size: int = 256
+    """Labels in a gradient step."""
+    student_noise: bool = True
+    """The student moves with the noise of its policy."""
+    student_rate: float = 1e-3
+    """Adam's step size at the beginning of each level; it falls to a tenth."""
+    max_grad_norm: float = 1.0
+    """Largest norm of the gradient."""
+    share: float = 0.7
+    """Factor by which the share of legs that the teacher leads falls from round to round; it begins at 1."""
+    leg: int = 8
+    """Control steps after which it is drawn anew who leads a robot."""
+    faults: float = 0.0
+    """Share of entries that become 0 in half of the images that the student sees and of the actions that it takes, so
+    that it learns to do without them."""
+    capacity: int = 100_000
+    """Labels that are kept; an image takes 12 KiB, an action on the smaller grid of teacher and student 8 R R bytes."""
+    age: int = 400
+    """Control steps after which an episode is cut; the first ones are cut at staggered ages."""
+    layouts: int = 64
+    """Particle layouts that are gone through."""
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    planner_grid: int | Literal["coarse", "fine"] = "coarse"
+    """Action grid of the teacher mpc."""
+
+    def idle(self) -> dict[str, str]:
+        """What concerns plans; layouts are counted from the seed."""
+        plans = {} if self.teacher == "mpc" else dict.fromkeys(("planner.", "planner_grid"), "teacher mpc")
+        return super().idle() | plans | SEEDED
+
+    def check(self) -> None:
+        """Check what the types cannot, see `LadderConfig.check`."""
+        super().check()
+        self.planner.check()
+        at_least_one(
+            round=self.round,
+            updates=self.updates,
+            batch_size=self.batch_size,
+            leg=self.leg,
+            capacity=self.capacity,
+            age=self.age,
+            layouts=self.layouts,
+        )
+        training_layouts("layouts", self.layouts * len(self.resolutions), self.environment.num_envs)
+        positive(student_rate=self.student_rate, max_grad_norm=self.max_grad_norm)
+        share(share=self.share, faults=self.faults)
+
+
+class Distill(Algorithm):
+    """Supervised learning of the teacher's actions in the states that the student gets into.
+
+    The mean action is learned, by least squares after tanh: what differs little in the muscles costs little. The width
+    stays about 0.1 before tanh, so that the policy can be evaluated with noise, and refined by soft actor-critic.
+
+    Args:
+        config: The run's options.
+        level: Index of the level.
+        start: Policy of the levels before, which are frozen.
+        teacher: File of the teacher's policy, if it is not the one that the options name.
+    """
+
+    name: ClassVar[str] = "distill"
+    sees: ClassVar[Sees] = "image"
+
+    def __init__(
+        self, config: DistillConfig, level: int = 0, start: ActorPolicy | None = None, teacher: Path | None = None
+    ) -> None:
+        self.config, self.level = config, level
+        own = replace(config, environment=config.environment.learned_at(config.tier))
+        self.env = make_torch_env(own, make_spec(config.task).patch)
+        self.spec = config.actor_spec(level)
+        with self._luck():
+            self.actor = build_actor(self.spec)
+        quieten(self.actor)
+        if start is not None:
+            self.actor.get_submodule("coarse").load_state_dict(start.actor.state_dict())
+        self.actor.to(self.env.device)
+        learning = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
+        self.adam = torch.optim.Adam(learning, config.student_rate)
+        episodes = Episodes(self.env, config.seed + level * config.layouts, config.age, config.layouts)
+        grid = self.spec.resolutions[-1]
+        self.collector = Collector(self.env, self._teacher(own, teacher), episodes, config.leg, config.faults, grid)
+        self.dataset, self.rounds = Dataset(config.capacity), 0
+        self.period = config.round * self.env.num_envs
+
+    @staticmethod
+    def preset(task: str, name: str) -> DistillConfig:
+        """Defaults of a task, with the networks of the same preset of the coarse-to-fine policy.
+
+        Both teach at the lite tier; ``quick`` is judged there, ``paper`` in the paper's environment. SHAPE MATCH, whose
+        episodes are alike and whose actions are fine, gets fewer labels and more, smaller updates.
+
+        Raises:
+            ConfigError: No such task or preset.
+        """
+        base, silhouette = cfp.preset(task, name), task == "shapematch"
+        steps = 24_000 if silhouette else 48_000
+        return DistillConfig(
+            task=task,
+            preset=base.preset,
+            environment=replace(base.environment, num_envs=16),
+            report=replace(base.report, eval_every=steps // 8, checkpoint_every=steps // 16, log_every=1),
+            steps=steps,
+            handover=(steps // 2,),
+            resolutions=base.resolutions,
+            gate_bias=base.gate_bias,
+            network=base.network,
+            teacher="gradient" if silhouette else "shac",
+            round=30 if silhouette else 64,
+            updates=160 if silhouette else 48,
+            batch_size=64 if silhouette else 256,
+            student_noise=not base.report.eval_deterministic,
+            student_rate=2e-3 if silhouette else 1e-3,
+            share=0.8 if silhouette else 0.7,
+            faults=0.2,
+            planner=PlannerConfig(iterations=30, learning_rate=0.1) if silhouette else PlannerConfig(),
+            planner_grid=16 if silhouette else "coarse",
+        )
+
+    @contextmanager
+    def _luck(self) -> Iterator[None]:
+        """Torch's generator, seeded for what happens next and put back afterwards."""
+        with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
+            source = np.random.SeedSequence((self.config.seed, self.level, self.num_timesteps))
+            torch.manual_seed(int(source.generate_state(1)[0]))
+            yield
+
+    def _teacher(self, own: RunConfig, path: Path | None) -> Teacher:
+        config = self.config
+        if path is None and config.teacher == "mpc":
+            size = grid_size(config.task, config.planner_grid)
+            return PlannerTeacher(make_torch_env(own, size), config.planner, config.seed)
+        policy = read_teacher(path or config.teacher, config.task, config.environment)
+        theirs = EnvironmentConfig(**policy.description["environment"])
+        return PolicyTeacher(policy, theirs.layout, config.environment.layout)
+
+    @property
+    def policy(self) -> ActorPolicy:
+        """What has been learned so far."""
+        policy = ActorPolicy(self.spec, self.config.report.eval_deterministic)
+        policy.actor.load_state_dict(self.actor.state_dict())
+        return policy.to(self.env.device)
+
+    def attached(self, env: Any) -> ActorPolicy:
+        """What has been learned so far; it looks at images only, whatever ``env`` is. Built once, not in every step."""
+        return self.policy
+
+    def learn(self, total_timesteps: int, callback: Callback) -> Distill:
+        """Do as many rounds as cover the steps.
+
+        Raises:
+            NonFiniteError: The loss is not finite.
+        """
+        end = self.num_timesteps + total_timesteps
+        while self.num_timesteps < end:
+            with self._luck():
+                scalars = self._round()
+            self.num_timesteps += self.period
+            callback(scalars)
+        return self
+
+    def _round(self) -> dict[str, float | None]:
+        config, share = self.config, self.config.share**self.rounds
+        student = partial(self.actor, deterministic=not config.student_noise)
+        labels = self._kept(self.collector.collect(config.round, share, student))
+        self.dataset.add(labels)
+        self.rounds += 1
+        with torch.no_grad():
+            part = slice(0, None, max(1, len(labels.actions) // config.batch_size))
+            # A round may lie within a plan that the student does not follow: then nothing in it was labelled.
+            labelled = len(labels.actions) > 0
+            fresh = float(self._loss(labels.observations[part], labels.actions[part])) if labelled else None
+        rate = self._rate()
+        self.adam.param_groups[0]["lr"] = rate
+        losses = [self._improve() for _ in range(config.updates)]
+        return self.collector.episodes.scalars() | {
+            "train/loss": sum(losses) / len(losses),
+            "train/fresh_loss": fresh,
+            "train/share": share,
+            "train/labels": float(len(self.dataset)),
+            "train/learning_rate": rate,
+        }
+
+    def _kept(self, labels: Labels) -> Labels:
+        """Labels as they are kept: on the whole patch an action takes more than an image."""
+        size = self.spec.action_size
+        if labels.actions.shape[-1] <= size:
+            return labels
+        return labels._replace(actions=project(labels.actions, size, self.env.spec.patch))
+
+    def _rate(self) -> float:
+        bounds = (0, *self.config.ends())
+        done = self.num_timesteps / (bounds[self.level + 1] - bounds[self.level])
+        return self.config.student_rate * (1.0 - (1.0 - FINAL_RATE) * min(done, 1.0))
+
+    def _loss(self, observations: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """Mean square difference of the mean action from the teacher's, both on the grid that is carried out."""
+        device, size = self.env.device, self.spec.action_size
+        wanted = project(actions.to(device), size, self.env.spec.patch)
+        return (self.actor(observations.to(device), deterministic=True) - wanted).square().mean()
+
+    def _improve(self) -> float:
+        labels = self.dataset.sample(self.config.batch_size)
+        loss = self._loss(lose(labels.observations, self.config.faults), labels.actions)
+        if not math.isfinite(value := float(loss.detach())):
+            raise NonFiniteError(
+                f"the loss became {value} after {self.num_timesteps} environment steps of the stage; "
+                "the last checkpoint is untouched"
+            )
+        self.adam.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.adam.param_groups[0]["params"], self.config.max_grad_norm)
+        self.adam.step()
+        return value
+
+    def save(self, path: Path, description: dict[str, Any]) -> None:
+        """Write the policy, as one of CFP."""
+        save_policy(
+            path, self.actor, description | {"kind": KIND, "network": asdict(self.spec), "trained_by": self.name}
+        )
+
+    @classmethod
+    def load(cls, path: Path, device: str = "cpu") -> ActorPolicy:
+        """Load a policy."""
+        return load(path, device)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks, optimiser, labels, episodes in progress and the teacher's plans."""
+        return {
+            "actor": self.actor.state_dict(),
+            "adam": self.adam.state_dict(),
+            "dataset": self.dataset.state_dict(),
+            "collector": self.collector.state_dict(),
+            "rounds": self.rounds,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Undo `state_dict`."""
+        for name in ("actor", "adam", "dataset", "collector"):
+            getattr(self, name).load_state_dict(state[name])
+        self.dataset.rounds = [self._kept(labels) for labels in self.dataset.rounds]  # checkpoints from before differ
+        self.rounds = state["rounds"]

@@ -1,0 +1,133 @@
+"""Networks that treat a robot's segments alike: a graph network and a Transformer, as actor and as critics."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from baselines.modular.nodes import unpack
+from cfp.agent.actor import Sample, SquashedActor, draw
+from cfp.agent.networks import at_least_float32, initialise
+
+Kind = Literal["gnn", "transformer"]
+WIDTH = 128
+"""Numbers that a node carries through the network."""
+ROUNDS = 3
+"""Rounds of messages, or layers of attention."""
+HEADS = 4
+
+
+class GraphTrunk(nn.Module):
+    """Three rounds of messages between neighbours, with the same weights in each.
+
+    ``h <- h + ELU(W h + V mean of the neighbours' h)``.
+
+    Args:
+        inputs: Numbers of a node.
+    """
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.embed = nn.Sequential(nn.Linear(inputs, WIDTH), nn.ELU(), nn.Linear(WIDTH, WIDTH), nn.ELU())
+        self.own, self.message = nn.Linear(WIDTH, WIDTH), nn.Linear(WIDTH, WIDTH)
+
+    def forward(self, nodes: Tensor, edges: Tensor) -> Tensor:
+        """What nodes (B, K, inputs) know (B, K, 128) after the messages along edges (B, K, K), 0 or 1."""
+        share = edges / edges.sum(-1, keepdim=True).clamp_min(1.0)
+        known: Tensor = self.embed(nodes)
+        for _ in range(ROUNDS):
+            known = known + F.elu(self.own(known) + self.message(share @ known))
+        return known
+
+
+class AttentionTrunk(nn.Module):
+    """Three layers of self-attention over all nodes, pre-norm, without positions.
+
+    Args:
+        inputs: Numbers of a node.
+    """
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.embed = nn.Linear(inputs, WIDTH)
+        layer = nn.TransformerEncoderLayer(WIDTH, HEADS, 2 * WIDTH, dropout=0.0, batch_first=True, norm_first=True)
+        self.layers = nn.TransformerEncoder(layer, ROUNDS, nn.LayerNorm(WIDTH), enable_nested_tensor=False)
+
+    def forward(self, nodes: Tensor, edges: Tensor | None) -> Tensor:
+        """What nodes (B, K, inputs) know of each other, (B, K, 128)."""
+        known: Tensor = self.layers(self.embed(nodes))
+        return known
+
+
+class Trunk(nn.Module):
+    """Either trunk, reading rows of `baselines.modular.nodes.Nodes`.
+
+    Args:
+        kind: Which.
+        features: Numbers of a row without neighbours.
+        more: Numbers that are given beside a row.
+    """
+
+    def __init__(self, kind: Kind, features: int, more: int = 0) -> None:
+        super().__init__()
+        self.kind, self.features = kind, features
+        self.trunk = (GraphTrunk if kind == "gnn" else AttentionTrunk)(features + more)
+
+    def forward(self, rows: Tensor, *more: Tensor) -> Tensor:
+        """What nodes know (B, K, 128), from rows (B, K, columns) and more numbers of each (B, K, ...)."""
+        edges = unpack(rows[..., self.features :], rows.shape[1]) if self.kind == "gnn" else None
+        known: Tensor = self.trunk(torch.cat((rows[..., : self.features], *more), -1), edges)
+        return known
+
+
+class ModularActor(SquashedActor):
+    """A tanh-Gaussian of two muscles for every segment, with the weights of all segments shared.
+
+    Args:
+        kind: Of the trunk.
+        features: Numbers of a node.
+    """
+
+    def __init__(self, kind: Kind, features: int) -> None:
+        super().__init__()
+        self.trunk = Trunk(kind, features)
+        self.head = nn.Sequential(nn.Linear(WIDTH, WIDTH), nn.ELU(), nn.Linear(WIDTH, 4))
+        initialise(self)
+
+    def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
+        """Draw actions (B, K, 2) for rows (B, K, columns)."""
+        mean, width = at_least_float32(self.head(self.trunk(observation))).chunk(2, -1)
+        return Sample(*draw(mean, width, deterministic), None)
+
+
+class ModularCritics(nn.Module):
+    """Two critics that share nothing: a trunk that is told the nodes' actions, the mean over nodes, a perceptron.
+
+    Args:
+        kind: Of the trunks.
+        features: Numbers of a node.
+    """
+
+    optimizer: torch.optim.Optimizer
+
+    def __init__(self, kind: Kind, features: int) -> None:
+        super().__init__()
+        self.trunks = nn.ModuleList(Trunk(kind, features, 2) for _ in range(2))
+        self.values = nn.ModuleList(
+            nn.Sequential(nn.Linear(WIDTH, 256), nn.ELU(), nn.Linear(256, 256), nn.ELU(), nn.Linear(256, 1))
+            for _ in range(2)
+        )
+        initialise(self)
+
+    def forward(self, observation: Tensor, action: Tensor) -> tuple[Tensor, ...]:
+        """Both Q-values, (B, 1) each, of rows (B, K, columns) and actions (B, K, 2) or (B, 2 K)."""
+        values = action.reshape(*observation.shape[:2], 2)
+        pairs = zip(self.trunks, self.values, strict=True)
+        return tuple(at_least_float32(value(trunk(observation, values).mean(1))) for trunk, value in pairs)
+
+    def set_training_mode(self, mode: bool) -> None:
+        """Switch between training and evaluation; without effect on these layers, asked for by stable-baselines3."""
+        self.train(mode)

@@ -1,0 +1,1 @@
+"""Receding-horizon planners: by gradients and by the cross-entropy method."""

@@ -1,0 +1,1 @@
+"""Short-horizon actor-critic (SHAC; Xu et al., ICLR 2022)."""

@@ -1,0 +1,1 @@
+"""Open-loop optimisation of a whole sequence of actions by gradients."""

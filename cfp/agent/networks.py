@@ -1,0 +1,204 @@
+"""The convolutional networks of the coarse-to-fine policy: encoder, heads, critics.
+
+Every network reads the observation as an image (3, 64, 64) and every action is an image (2, R, R): channel 0 drives
+the x-muscles, channel 1 the y-muscles. Sizes follow the reference implementation of DittoGym (ICLR 2024), Section 4.2
+and Appendix B; parameter totals are held by a test.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from cfp.agent import fused as joint
+from dittogym.action import bicubic
+
+Interpolation = Literal["half_pixel", "aligned"]
+
+IMAGE_SIZE = 64
+"""Rows and columns of the observation and of every action that enters an encoder."""
+
+LATENT = 32 * 4 * 4
+
+_STRETCH, _KEEP = (4, 2, 1), (3, 1, 1)  # (kernel, stride, padding): doubles the size, keeps the size
+_DECODERS: dict[int, tuple[tuple[tuple[int, int, int], ...], tuple[int, ...]]] = {
+    8: ((_STRETCH, _KEEP, _KEEP), (32, 16, 8, 2)),
+    16: ((_STRETCH, _STRETCH, _KEEP), (32, 16, 8, 2)),
+    32: ((_STRETCH, _STRETCH, _STRETCH), (32, 16, 8, 2)),
+    64: ((_STRETCH, _STRETCH, _STRETCH, _STRETCH), (32, 16, 8, 4, 2)),
+}
+RESOLUTIONS = (4, *_DECODERS)
+"""Action grids R for which a head exists."""
+
+
+def upsample(action: Tensor, size: int, interpolation: Interpolation) -> Tensor:
+    """Bicubic interpolation (kernel parameter -0.75) of an action image (B, 2, R, R) to (B, 2, size, size).
+
+    The reference implementation aligns corners here but uses half-pixel centres in the environment, so that a closed
+    gate does not reproduce the coarse force field there; ``"half_pixel"`` uses the environment's rule everywhere.
+    """
+    if action.shape[-1] == size:
+        return action
+    return bicubic(action, size, align_corners=interpolation == "aligned")
+
+
+def normalise_image(observation: Tensor) -> Tensor:
+    """Map uint8 pixels 0..255 to [-1, 1]: ``s / 255 * 2 - 1``. A floating-point image is taken as mapped already."""
+    if observation.is_floating_point():
+        return observation
+    return observation.float().mul_(2.0 / 255.0).sub_(1.0)
+
+
+def at_least_float32(output: Tensor) -> Tensor:
+    """The output of a network in the precision that densities, losses and statistics need."""
+    return output.to(torch.promote_types(output.dtype, torch.float32))
+
+
+def initialise(module: nn.Module) -> nn.Module:
+    """Xavier-uniform linear layers with zero bias; convolutions keep PyTorch's default, as in the reference."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear):
+            nn.init.xavier_uniform_(layer.weight)
+            nn.init.zeros_(layer.bias)
+    return module
+
+
+class Encoder(nn.Module):
+    """Three convolutions from (B, C, 64, 64) to a latent image (B, w, 4, 4).
+
+    Two constant channels, (row - 32)/32 and (column - 32)/32, are appended to the input (the paper's "position
+    embedding channel"); they are neither trained nor saved.
+
+    Args:
+        channels: Feature channels C of the input.
+        width: Channels w of the first and last layer (the middle one has 2w).
+    """
+
+    patches: Tensor
+    """What the first layer sees of the coordinates at its 15 x 15 places, (2 x 8 x 8, 225)."""
+
+    def __init__(self, channels: int, width: int) -> None:
+        """Create the layers."""
+        super().__init__()
+        self.first = nn.Conv2d(channels + 2, width, 8, stride=4)
+        self.rest = nn.Sequential(
+            nn.ELU(),
+            nn.Conv2d(width, 2 * width, 4, stride=2),
+            nn.ELU(),
+            nn.Conv2d(2 * width, width, 3),
+            nn.ELU(),
+        )
+        line = (torch.arange(IMAGE_SIZE) - IMAGE_SIZE / 2) / (IMAGE_SIZE / 2)
+        grid = torch.stack(torch.meshgrid(line, line, indexing="ij"))
+        self.register_buffer("patches", F.unfold(grid[None], 8, stride=4)[0], persistent=False)
+
+    def forward(self, *images: Tensor) -> Tensor:
+        """Encode images (B, c, 64, 64), stacked along their channels, with values about [-1, 1], to (B, w, 4, 4)."""
+        return joint.encode([self], *images)
+
+
+class PairEncoder(nn.Module):
+    """Encode observation and action together, to a latent of 32 x 4 x 4.
+
+    Merged: the action is stacked after the observation's channels. Split: two narrow encoders whose latents are
+    concatenated; used where action and observation do not show the same place (DIG).
+    """
+
+    def __init__(self, split: bool) -> None:
+        """Create one encoder (5 channels, width 32) or two (3 and 2 channels, width 16)."""
+        super().__init__()
+        widths = ((3, 16), (2, 16)) if split else ((5, 32),)
+        self.encoders = nn.ModuleList(Encoder(channels, width) for channels, width in widths)
+
+    def forward(self, image: Tensor, patch: Tensor) -> Tensor:
+        """Encode a normalised observation (B, 3, 64, 64) and an upsampled action (B, 2, 64, 64)."""
+        if len(self.encoders) == 1:
+            latent: Tensor = self.encoders[0](image, patch)
+            return latent
+        return torch.cat([self.encoders[0](image), self.encoders[1](patch)], dim=1)
+
+
+def make_head(resolution: int) -> nn.Sequential:
+    """Decoder from the latent (B, 32, 4, 4) to an action-shaped output (B, 2, R, R); no activation at the end."""
+    if resolution == 4:
+        return nn.Sequential(
+            nn.Flatten(),
+            nn.Linear(LATENT, 128),
+            nn.ELU(),
+            nn.Linear(128, 128),
+            nn.ELU(),
+            nn.Linear(128, 2 * 4 * 4),
+            nn.Unflatten(1, (2, 4, 4)),
+        )
+    shapes, channels = _DECODERS[resolution]
+    layers: list[nn.Module] = []
+    for (kernel, stride, padding), before, after in zip(shapes, channels[:-1], channels[1:], strict=True):
+        layers += [nn.ConvTranspose2d(before, after, kernel, stride, padding), nn.ELU()]
+    return nn.Sequential(*layers[:-1])
+
+
+class Critic(nn.Module):
+    """One action-value network with its own encoder: (observation, action) -> Q, (B, 1)."""
+
+    def __init__(self, split: bool) -> None:
+        """Create encoder and a 512-256-256-1 perceptron."""
+        super().__init__()
+        self.encoder = PairEncoder(split)
+        self.value = nn.Sequential(
+            nn.Flatten(),
+            nn.Linear(LATENT, 256),
+            nn.ELU(),
+            nn.Linear(256, 256),
+            nn.ELU(),
+            nn.Linear(256, 1),
+        )
+        initialise(self)
+
+    def forward(self, image: Tensor, patch: Tensor) -> Tensor:
+        """Q-value (B, 1) of a normalised observation (B, 3, 64, 64) and an upsampled action (B, 2, 64, 64)."""
+        value: Tensor = self.value(self.encoder(image, patch))
+        return value
+
+
+class TwinCritic(nn.Module):
+    """Two critics that share nothing, neither with each other nor with the actor.
+
+    Args:
+        resolution: Action grid R.
+        split: Separate encoders for observation and action (DIG).
+        interpolation: See `ActorSpec`.
+    """
+
+    optimizer: torch.optim.Optimizer
+
+    def __init__(self, resolution: int, split: bool, interpolation: Interpolation) -> None:
+        """Create both critics."""
+        super().__init__()
+        self.resolution, self.interpolation = resolution, interpolation
+        self.critics = nn.ModuleList(Critic(split) for _ in range(2))
+
+    def forward(self, observation: Tensor, action: Tensor) -> tuple[Tensor, ...]:
+        """Both Q-values, (B, 1) each, of uint8 observations (B, 3, 64, 64) and actions (B, 2, R, R) or (B, 2 R R)."""
+        image = normalise_image(observation)
+        field = action.reshape(-1, 2, self.resolution, self.resolution)
+        patch = upsample(field, IMAGE_SIZE, self.interpolation)
+        return tuple(at_least_float32(self._judge(image, patch)))
+
+    def _judge(self, image: Tensor, patch: Tensor) -> Tensor:
+        """What `Critic.forward` gives for each critic, (2, B, 1), computed for both together."""
+        critics = cast(list[Critic], list(self.critics))
+        encoders = list(zip(*(critic.encoder.encoders for critic in critics), strict=True))
+        inputs = [(image, patch)] if len(encoders) == 1 else [(image,), (patch,)]
+        parts = [
+            joint.encode(alike, *images).unflatten(1, (len(alike), -1))
+            for alike, images in zip(encoders, inputs, strict=True)
+        ]
+        latents = torch.cat(parts, dim=2).transpose(0, 1)  # (2, B, 32, 4, 4)
+        return joint.perceive([critic.value for critic in critics], latents)
+
+    def set_training_mode(self, mode: bool) -> None:
+        """Switch between training and evaluation; without effect on these layers, asked for by stable-baselines3."""
+        self.train(mode)

@@ -1,0 +1,318 @@
+"""CFP: soft actor-critic with the update rule of the DittoGym reference implementation (paper, Appendix B).
+
+What differs from stable-baselines3's SAC: rewards are centred and scaled by running statistics, every parameter
+tensor's gradient is clipped by itself, the gate of a residual actor is penalised, the temperature is a constant, the
+random phase and the start of the updates are two settings, and nothing that is not finite is stored or learned from.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
+from torch import Tensor, nn
+
+from cfp.agent.actor import Actor
+from cfp.agent.composition import Composition
+from cfp.agent.losses import Losses, Precision
+from cfp.agent.networks import TwinCritic, upsample
+from cfp.agent.policies import CFPPolicy, NetworkPolicy
+from cfp.agent.replay import ReplayRing
+from cfp.errors import NonFiniteError
+
+METRICS: dict[str, str] = {
+    "train/critic_loss": "sum of both critics' mean squared errors, in normalised rewards",
+    "train/actor_loss": "mean of alpha log pi - min Q, plus the gate penalty",
+    "train/q": "mean of min(Q1, Q2) at the actor's own actions, in normalised rewards",
+    "train/q_target": "mean of the critics' regression target",
+    "train/entropy": "mean of -log pi of the sampled (in stage 2: residual) action, summed over all 2 R R entries",
+    "train/reward_mean": "running mean of raw rewards that is subtracted before learning",
+    "train/reward_std": "running standard deviation of raw rewards that they are divided by",
+    "train/gate": "mean gate of the residual actor: 0 keeps the coarse action, 1 replaces it",
+    "train/gate_penalty": "gate penalty inside the actor loss",
+    "train/n_updates": "gradient updates so far in this stage",
+    "train/learning_rate": "learning rate of the critics, and of the actor unless it has its own",
+}
+"""Every scalar that `CFP.train` logs, and what it means."""
+REFINING_METRICS: dict[str, str] = {
+    "train/drift": "mean square by which sampled actions differ from the mean ones of the policy that is refined",
+}
+"""What it logs besides where a policy is refined."""
+
+
+class RewardStatistics(nn.Module):
+    """Running mean and variance of raw rewards, updated from every replay batch before they are used.
+
+    ``M <- m M + (1 - m) mean(r)``, ``V <- m V + (1 - m) var(r)`` (unbiased), starting at 0 and 1;
+    ``normalised r = (r - M) / (sqrt(V) + 1e-8)``.
+    """
+
+    mean: Tensor
+    variance: Tensor
+
+    def __init__(self, momentum: float = 0.99) -> None:
+        """Start at mean 0 and variance 1."""
+        super().__init__()
+        self.momentum = momentum
+        self.register_buffer("mean", torch.zeros(()))
+        self.register_buffer("variance", torch.ones(()))
+
+    def forward(self, rewards: Tensor) -> Tensor:
+        """Update the statistics with a batch of raw rewards (any shape) and return the rewards normalised."""
+        with torch.no_grad():
+            self.mean.lerp_(rewards.mean(), 1 - self.momentum)
+            self.variance.lerp_(rewards.var(), 1 - self.momentum)
+            return (rewards - self.mean) / (self.variance.sqrt() + 1e-8)
+
+
+def clip_each(parameters: list[nn.Parameter], limit: float) -> None:
+    """Scale the gradient of every parameter tensor, each by itself, to a norm of at most ``limit``."""
+    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    norms = torch.stack(torch._foreach_norm(gradients))
+    torch._foreach_mul_(gradients, list((limit / (norms + 1e-6)).clamp(max=1.0).unbind()))
+
+
+class CFP(SAC):
+    """Soft actor-critic as the coarse-to-fine policy uses it, on stable-baselines3's loop and replay buffer.
+
+    Stage 1 is a `CFPPolicy` with a plain actor; stage 2 one with a residual actor whose coarser level is frozen. The
+    coarse action is drawn anew in every update, and the entropy counts the residual part only, as in the reference.
+
+    Args:
+        policy: `CFPPolicy` or its name, or another `cfp.agent.policies.NetworkPolicy`.
+        env: A vectorised environment with actions in [-1, 1]; (2, R, R) for `CFPPolicy`.
+        learning_rate: Adam's step size.
+        buffer_size: Transitions in the replay ring.
+        update_start: Updates begin when more transitions than this are stored.
+        random_steps: Actions are uniform in [-1, 1] while fewer environment steps than this have been taken.
+        batch_size: Transitions in an update.
+        tau: Polyak factor of the target critics.
+        gamma: Discount factor.
+        gradient_steps: Updates after each batched environment step.
+        alpha: Temperature, a constant.
+        gate_penalty: Weight rho of ``mean ||g||_2 / R`` in the actor loss (stage 2).
+        reward_momentum: Momentum of the reward statistics.
+        actor_rate: Adam's step size for the actor; None: ``learning_rate``.
+        anchor: Weight, in the actor loss, of the mean square by which actions differ from those of `origin`.
+        actor_start: The actor is not updated while fewer environment steps than this have been taken.
+        max_grad_norm: Largest gradient norm of one parameter tensor.
+        precision: Of convolutions and matrix products in an update, see
+            `cfp.agent.losses.choose_precision`. Acting is always in float32.
+        compile: Run the losses through ``torch.compile``.
+        sac_options: Further options of stable-baselines3's SAC.
+
+    Attributes:
+        origin: Actor that is refined, None for none; it has the same action grid and does not change.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CFPPolicy": CFPPolicy}
+    reward_statistics: RewardStatistics
+
+    def __init__(
+        self,
+        policy: str | type[NetworkPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 200_000,
+        *,
+        update_start: int = 256,
+        random_steps: int = 500,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        gradient_steps: int = 1,
+        alpha: float = 0.01,
+        gate_penalty: float = 0.0,
+        reward_momentum: float = 0.99,
+        max_grad_norm: float = 10.0,
+        actor_rate: float | None = None,
+        actor_start: int = 0,
+        anchor: float = 0.0,
+        precision: Precision = "float32",
+        compile: bool = False,
+        **sac_options: Any,
+    ) -> None:
+        """Create networks, replay buffer and reward statistics."""
+        self.random_steps = random_steps
+        self.gate_penalty = gate_penalty
+        self.reward_momentum = reward_momentum
+        self.max_grad_norm = max_grad_norm
+        self.actor_rate, self.actor_start, self.anchor = actor_rate, actor_start, anchor
+        self.origin: Actor | None = None
+        self.precision, self.compile = precision, compile
+        sac_options.setdefault("replay_buffer_class", ReplayRing)
+        spec = (sac_options.get("policy_kwargs") or {}).get("spec")
+        noisy = sac_options.get("action_noise") is not None  # then what is executed has no parts
+        ring = {"seed": sac_options.get("seed"), "composition": Composition.of(spec) if spec and not noisy else None}
+        sac_options.setdefault("replay_buffer_kwargs", ring)
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts=update_start,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            gradient_steps=gradient_steps,
+            ent_coef=alpha,
+            **sac_options,
+        )
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.reward_statistics = RewardStatistics(self.reward_momentum).to(self.device)
+        self.losses = Losses(self.device, self.precision, self.compile)
+
+    def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
+        """Actor, critics and target critics with their own types."""
+        assert isinstance(self.policy, NetworkPolicy)
+        return self.policy.networks()
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Do some updates: critics, then actor, then target critics.
+
+        Args:
+            gradient_steps: How many.
+            batch_size: Transitions in each.
+
+        Raises:
+            NonFiniteError: A loss is not finite; the optimiser step is not taken.
+        """
+        assert self.replay_buffer is not None
+        actor, critic, _ = self.networks()
+        self.policy.set_training_mode(True)
+        self._update_learning_rate([actor.optimizer, critic.optimizer])
+        if self.actor_rate is not None:
+            actor.optimizer.param_groups[0]["lr"] = self.actor_rate
+        for _ in range(gradient_steps):
+            scalars = self.update(self.replay_buffer.sample(batch_size))
+            self._n_updates += 1
+            values = torch.stack(tuple(scalars.values())).tolist()  # one wait for the device, not one for each
+            for name, value in zip(scalars, values, strict=True):
+                self.logger.record_mean(f"train/{name}", value)
+        self.logger.record("train/n_updates", self._n_updates)
+
+    def update(self, batch: ReplayBufferSamples) -> dict[str, Tensor]:
+        """Do one update on a ``batch``; what it is judged by, scalars by name, see `METRICS`."""
+        _, critic, target = self.networks()
+        now, later = map(self.losses.prepare, (batch.observations, batch.next_observations))
+        scalars = self._update_critic(now, later, batch)
+        if self.num_timesteps >= self.actor_start:
+            scalars |= self._update_actor(now)
+        with torch.no_grad():
+            torch._foreach_lerp_(list(target.parameters()), list(critic.parameters()), self.tau)
+        scalars["reward_mean"] = self.reward_statistics.mean
+        scalars["reward_std"] = self.reward_statistics.variance.sqrt()
+        return scalars
+
+    def _update_critic(self, now: Tensor, later: Tensor, batch: ReplayBufferSamples) -> dict[str, Tensor]:
+        actor, critic, target = self.networks()
+        rewards = self.reward_statistics(batch.rewards)
+        goes_on = 1 - batch.dones
+        wanted = self.losses.critic_target(actor, target, later, rewards, goes_on, self.ent_coef_tensor, self.gamma)
+        loss = self.losses.critic_loss(critic, now, batch.actions, wanted)
+        self._descend(loss, critic.optimizer, list(critic.parameters()), "critic")
+        return {"critic_loss": loss.detach(), "q_target": wanted.mean()}
+
+    def _update_actor(self, now: Tensor) -> dict[str, Tensor]:
+        actor, critic, _ = self.networks()
+        critic.requires_grad_(False)  # spares the critics' weight gradients, which would be thrown away
+        loss, scalars = self.losses.actor_loss(
+            actor, critic, now, self.ent_coef_tensor, self.gate_penalty, self.origin, self.anchor
+        )
+        self._descend(loss, actor.optimizer, actor.trainable_parameters(), "actor")
+        critic.requires_grad_(True)
+        return scalars | {"actor_loss": loss.detach()}
+
+    def _descend(self, loss: Tensor, optimizer: torch.optim.Optimizer, weights: list[nn.Parameter], name: str) -> None:
+        if not torch.isfinite(loss):
+            raise NonFiniteError(
+                f"the {name} loss became {loss.item()} at update {self._n_updates + 1} "
+                f"({self.num_timesteps} environment steps into the stage); the last checkpoint is untouched"
+            )
+        optimizer.zero_grad()
+        loss.backward()
+        clip_each(weights, self.max_grad_norm)
+        optimizer.step()
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Actions to execute, and what the replay memory stores of them."""
+        composition = getattr(self.replay_buffer, "composition", None)
+        if self.num_timesteps >= self.random_steps and composition is not None:
+            actions, stored = self._act_in_parts(composition)
+            self._check_finite("action", actions)  # here, as environments refuse it with an error of their own
+            return actions, stored
+        # stable-baselines3 ties the random phase to the start of the updates; here they are two settings.
+        actions, stored = super()._sample_action(self.random_steps, action_noise, n_envs)
+        if self.num_timesteps < self.random_steps:
+            return self._random(actions, stored, composition)
+        self._check_finite("action", actions)
+        return actions, stored
+
+    def _random(
+        self, actions: np.ndarray, stored: np.ndarray, composition: Composition | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Of uniform actions (B, 2, A, A), those of the random phase, and what is stored of them."""
+        grid = self.networks()[0].resolution
+        if grid == self.action_resolution:
+            return actions, stored
+        # As coarse as the level acts: of independent pixels little would be left in the field.
+        corner = torch.as_tensor(stored[..., :grid, :grid], dtype=torch.float32)
+        assert isinstance(self.policy, CFPPolicy)
+        actions = stored = upsample(corner, self.action_resolution, self.policy.spec.interpolation).numpy()
+        if composition is not None:
+            stored = composition.alone(corner).numpy()
+        return actions, stored
+
+    @torch.no_grad()
+    def _act_in_parts(self, composition: Composition) -> tuple[np.ndarray, np.ndarray]:
+        """Act as ``predict`` does, keeping the images that the actions were blended from."""
+        assert self._last_obs is not None
+        self.policy.set_training_mode(False)
+        observation, _ = self.policy.obs_to_tensor(self._last_obs)
+        assert isinstance(observation, Tensor)
+        sample = self.networks()[0].sample(observation)
+        return sample.action.cpu().numpy(), composition.join(sample.parts).cpu().numpy()
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        self._check_finite("reward", reward)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _check_finite(self, name: str, values: np.ndarray) -> None:
+        finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
+        if not finite.all():
+            raise NonFiniteError(
+                f"the {name} of environment {int(np.argmin(finite))} is not finite at step {self.num_timesteps} of "
+                "the stage; nothing of this step was stored and the last checkpoint is untouched"
+            )
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        modules, tensors = super()._get_torch_save_params()
+        return [*modules, "reward_statistics"], tensors
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "reward_statistics", "losses", "origin"]
+
+    @property
+    def action_resolution(self) -> int:
+        """Rows and columns of an action."""
+        assert isinstance(self.action_space, spaces.Box)
+        return int(self.action_space.shape[-1])

@@ -1,0 +1,1 @@
+"""Environments for training: the `VecEnv` adapter and the disturbances of robustness tests."""

@@ -1,0 +1,51 @@
+"""What a policy does with one observation, as pictures."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from cfp.agent.actor import Actor
+
+PICTURES: dict[str, str] = {
+    "picture/observation": "what the first training robot shows: red occupancy, green and blue velocity in x and y",
+    "picture/action": "the mean action for it, x-muscles left, y-muscles right: red pulls, blue pushes, white rests",
+    "picture/gate": "the gate of a residual actor in the same way: white keeps the coarse action, red replaces it",
+}
+"""Pictures of every evaluation (TensorBoard only), and what they show."""
+
+SIZE = 192
+"""Rows of a picture, pixels."""
+
+
+@torch.no_grad()
+def policy_pictures(actor: Actor, observation: Tensor) -> dict[str, np.ndarray]:
+    """Pictures, uint8 (H, W, 3), of one observation and what an actor makes of it without noise.
+
+    Args:
+        actor: The network; no random number is drawn.
+        observation: uint8 (1, 3, 64, 64).
+    """
+    sample = actor.sample(observation, deterministic=True)
+    pictures = {
+        "picture/observation": _enlarged(observation[0].permute(1, 2, 0).cpu().numpy()),
+        "picture/action": muscles(sample.action[0]),
+    }
+    if sample.gate is not None:
+        pictures["picture/gate"] = muscles(sample.gate[0])
+    return pictures
+
+
+def muscles(image: Tensor) -> np.ndarray:
+    """Both channels of an image (2, R, R) in [-1, 1] side by side, from blue through white to red, uint8 (H, W, 3)."""
+    values = image.float().clamp(-1, 1).cpu().numpy()
+    fading = 1 - np.abs(values)
+    colours = np.stack([np.where(values < 0, fading, 1), fading, np.where(values > 0, fading, 1)], axis=-1)
+    left, right = (_enlarged((255 * colour).round().astype(np.uint8)) for colour in colours)
+    return np.concatenate([left, np.zeros((SIZE, 2, 3), np.uint8), right], axis=1)
+
+
+def _enlarged(pixels: np.ndarray) -> np.ndarray:
+    return np.asarray(cv2.resize(np.ascontiguousarray(pixels), (SIZE, SIZE), interpolation=cv2.INTER_NEAREST))

@@ -1,0 +1,75 @@
+"""The learning curve of a run as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from cfp.config import RunConfig
+from cfp.experiment.files import read_table, write_atomically
+
+
+def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Path:
+    """Draw ``curve.png``: training and evaluation returns over environment steps, all levels after one another.
+
+    Args:
+        run: The run folder with ``progress.csv`` and ``evaluations.csv``.
+        config: The run's options.
+        baselines: Mean returns of untrained policies by name, drawn as horizontal lines.
+
+    Returns:
+        The path of the picture.
+    """
+    figure = Figure(figsize=(8, 4.5), dpi=150, layout="constrained")
+    axes = figure.add_subplot()
+    training = read_table(run / "progress.csv", ("step", "stage"))
+    evaluations = read_table(run / "evaluations.csv", ("step", "mean", "std"))
+    steps, values = _column(training, "rollout/return")
+    if steps:
+        axes.plot(steps, values, color="tab:gray", alpha=0.8, label="training episodes (with noise)")
+    steps, means = _column(evaluations, "mean")
+    _, stds = _column(evaluations, "std")
+    how = "without noise" if config.report.eval_deterministic else "with noise"
+    axes.plot(steps, means, "o-", color="tab:blue", markersize=3, label=f"evaluation ({how}), mean ± std")
+    low = [mean - std for mean, std in zip(means, stds, strict=True)]
+    high = [mean + std for mean, std in zip(means, stds, strict=True)]
+    axes.fill_between(steps, low, high, color="tab:blue", alpha=0.2, linewidth=0)
+    for (name, value), style in zip(baselines.items(), ("--", ":", "-."), strict=False):
+        axes.axhline(value, color="black", linestyle=style, linewidth=1, label=name)
+    for stage, step in _handovers(training):
+        before, after = config.resolution(stage - 1), config.resolution(stage)
+        axes.axvline(step, color="tab:green", linewidth=1)
+        label = f" {before}x{before} → {after}x{after}"
+        axes.text(step, 0.01, label, color="tab:green", fontsize=8, transform=axes.get_xaxis_transform())
+    axes.set(xlabel="environment steps", ylabel="return of an episode")
+    axes.set_title(f"{config.algo} on {config.task}, seed {config.seed}")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    path = run / "curve.png"
+    write_figure(path, figure)
+    return path
+
+
+def write_figure(path: Path, figure: Figure) -> None:
+    """Write a figure as PNG, atomically."""
+    content = BytesIO()
+    FigureCanvasAgg(figure).print_png(content)
+    write_atomically(path, lambda file: file.write(content.getvalue()))
+
+
+def _column(rows: Sequence[dict[str, str]], name: str) -> tuple[list[float], list[float]]:
+    """Steps and values of a column, where it has a value."""
+    pairs = [(float(row["step"]), float(row[name])) for row in rows if row.get(name)]
+    return [step for step, _ in pairs], [value for _, value in pairs]
+
+
+def _handovers(rows: Sequence[dict[str, str]]) -> list[tuple[int, float]]:
+    """Number and last step of every stage but the newest; a run that starts from a policy lacks the first ones."""
+    last: dict[int, float] = {}
+    for row in rows:
+        last[int(row["stage"])] = float(row["step"])
+    return list(last.items())[:-1]

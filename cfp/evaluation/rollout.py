@@ -1,0 +1,262 @@
+"""Returns of a policy on environments of its own, and the untrained policies it is compared with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.type_aliases import PolicyPredictor
+from stable_baselines3.common.vec_env import VecEnv
+
+from cfp.config import EVALUATION_SEED, RunConfig
+from cfp.envs.make import make_env
+from cfp.envs.vec_env import TorchVecEnv
+
+Noise = Literal["default", "with", "without", "both"]
+"""With action noise or without; default: as the run that trained a policy evaluates it."""
+
+
+class Policy(PolicyPredictor, Protocol):
+    """A trained policy of any kind, as it comes from its file."""
+
+    @property
+    def sees_image(self) -> bool:
+        """Whether it looks at the pixels of the observation."""
+
+    @property
+    def resolution(self) -> int:
+        """Rows and columns of its actions."""
+
+    @property
+    def deterministic_by_default(self) -> bool:
+        """Whether the run that trained it evaluates it without noise."""
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """What it is and comes from; ``layout`` is the seed of the one particle layout it was made for, if so."""
+
+
+@runtime_checkable
+class SeesState(Protocol):
+    """A policy that looks at the state of the simulation beside or instead of the image."""
+
+    def attached(self, env: Any) -> PolicyPredictor:
+        """The same policy, looking at a `dittogym.TorchEnv`."""
+
+
+def attached(policy: PolicyPredictor, env: VecEnv) -> PolicyPredictor:
+    """A policy for an environment of `make_env`: one that sees the state is shown it, any other stays as it is."""
+    inner = env.unwrapped
+    if isinstance(policy, SeesState) and isinstance(inner, TorchVecEnv):
+        return policy.attached(inner.torch_env)
+    return policy
+
+
+@dataclass(frozen=True)
+class Result:
+    """Undiscounted returns of some episodes.
+
+    Attributes:
+        name: Of the policy.
+        resolution: Its action grid R.
+        returns: One sum of raw rewards per episode; those of element 0 first, so that equal places are equal layouts.
+        success: Share of successful episodes, None where the task does not define success.
+    """
+
+    name: str
+    resolution: int
+    returns: tuple[float, ...]
+    success: float | None = None
+
+    @property
+    def mean(self) -> float:
+        """Mean return."""
+        return float(np.mean(self.returns))
+
+    @property
+    def std(self) -> float:
+        """Standard deviation of the returns over the episodes (of this sample, not of its mean)."""
+        return float(np.std(self.returns))
+
+    @property
+    def interval(self) -> float | None:
+        """Half the width of the 95 % confidence interval of the mean (Student's t); None for one episode."""
+        count = len(self.returns)
+        if count < 2:
+            return None
+        return student(count - 1) * float(np.std(self.returns, ddof=1)) / math.sqrt(count)
+
+
+def student(degrees: int, level: float = 0.95) -> float:
+    """The t within which a share ``level`` of Student's distribution lies on both sides of 0.
+
+    With ``t = sqrt(degrees) tan(angle)`` the density in the angle is proportional to ``cos(angle)^(degrees - 1)``.
+    """
+    angle = np.linspace(0.0, np.pi / 2, 20_001)
+    density = np.cos(angle) ** (degrees - 1)
+    share = np.concatenate([[0.0], np.cumsum(density[1:] + density[:-1])])
+    return float(math.sqrt(degrees) * np.tan(np.interp(level, share / share[-1], angle)))
+
+
+def judging_seed(config: RunConfig) -> int:
+    """Of layouts that neither trained a policy nor chose the best one."""
+    return config.seed + 2 * EVALUATION_SEED
+
+
+class ZeroPolicy:
+    """Leaves every muscle slack.
+
+    Args:
+        resolution: Action grid R.
+    """
+
+    def __init__(self, resolution: int) -> None:
+        self.resolution = resolution
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Actions (B, 2, R, R) for a batch of observations, as stable-baselines3's ``predict``."""
+        return self._actions(len(observation)), state
+
+    def _actions(self, count: int) -> np.ndarray:
+        return np.zeros((count, 2, self.resolution, self.resolution), np.float32)
+
+
+class RandomPolicy(ZeroPolicy):
+    """Uniform actions in [-1, 1], independent in every cell and step.
+
+    Args:
+        resolution: Action grid R.
+        seed: Seed of its own generator.
+    """
+
+    def __init__(self, resolution: int, seed: int) -> None:
+        super().__init__(resolution)
+        self.generator = np.random.default_rng(seed)
+
+    def _actions(self, count: int) -> np.ndarray:
+        actions = self.generator.uniform(-1, 1, (count, 2, self.resolution, self.resolution))
+        return actions.astype(np.float32)
+
+
+def evaluate(
+    name: str, policy: PolicyPredictor, env: VecEnv, episodes: int, *, deterministic: bool, seed: int
+) -> Result:
+    """Run episodes without learning.
+
+    Neither the environments of a training run nor torch's generator are touched. The same seed gives the same episodes,
+    element i of the batch starts from layout ``seed + i``; with reference parity, whose resets show what was before,
+    only in environments that have just been made.
+
+    Args:
+        name: Of the policy, for the result.
+        policy: Anything with stable-baselines3's ``predict``; shown the state if it asks for it, see `SeesState`.
+        env: Environments used for evaluation only.
+        episodes: How many.
+        deterministic: Act without noise.
+        seed: Of the first element's layout and of the noise.
+    """
+    elements: list[int] = []
+    successes: list[bool] = []
+
+    def note(local: dict[str, Any], _: dict[str, Any]) -> None:
+        if not local["done"]:
+            return
+        elements.append(local["i"])
+        if "is_success" in local["info"]:
+            successes.append(bool(local["info"]["is_success"]))
+
+    watching = attached(policy, env)
+    env.seed(seed)
+    cuda = list(range(torch.cuda.device_count()))
+    with torch.random.fork_rng(devices=cuda):
+        torch.manual_seed(seed)
+        returns, _ = evaluate_policy(
+            watching,
+            env,
+            episodes,
+            deterministic=deterministic,
+            callback=note,
+            return_episode_rewards=True,
+        )
+    assert isinstance(returns, list)
+    # They come in the order in which episodes end.
+    ordered = [value for _, value in sorted(zip(elements, returns, strict=True), key=lambda pair: pair[0])]
+    success = float(np.mean(successes)) if successes else None
+    action_space = env.action_space
+    assert action_space.shape is not None
+    return Result(name, action_space.shape[-1], tuple(map(float, ordered)), success)
+
+
+def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, noise: Noise = "default") -> list[Result]:
+    """Evaluate trained policies beside zero and random action, all on the same particle layouts.
+
+    A policy made for a single layout is evaluated there too, in a row of its own.
+
+    Args:
+        config: The run's options.
+        policies: By name, each with its own resolution. Zero and random action use the first stage's.
+        episodes: Episodes of each.
+        noise: Whether trained policies act with their noise; ``"both"`` gives each a row with and one without.
+    """
+    coarsest = config.resolution(0)
+    seed = judging_seed(config)
+    untrained = {"zero action": ZeroPolicy(coarsest), "random action": RandomPolicy(coarsest, config.seed)}
+
+    def judged(name: str, policy: Policy | ZeroPolicy | RandomPolicy, deterministic: bool) -> Result:
+        env = make_env(config, policy.resolution, episodes)
+        return evaluate(name, policy, env, episodes, deterministic=deterministic, seed=seed)
+
+    results = [judged(name, policy, True) for name, policy in untrained.items()]
+    for name, trained in policies.items():
+        deterministic = trained.deterministic_by_default if noise == "default" else noise == "without"
+        grid = trained.description.get("resolution", trained.resolution)
+        for quiet in (False, True) if noise == "both" else (deterministic,):
+            label = f"{name}, {'mean' if quiet else 'noisy'}" if noise == "both" else name
+            results.append(replace(judged(label, trained, quiet), resolution=grid))
+        if "layout" in trained.description:
+            alone, own = make_env(config, trained.resolution, 1), trained.description["layout"]
+            results.append(evaluate("  own layout", trained, alone, 1, deterministic=deterministic, seed=own))
+    return results
+
+
+def to_rows(results: list[Result]) -> list[dict[str, Any]]:
+    """Results as JSON values."""
+    return [
+        {
+            "policy": result.name,
+            "action": f"{result.resolution}x{result.resolution}",
+            "episodes": len(result.returns),
+            "mean": round(result.mean, 3),
+            "std": round(result.std, 3),
+            "interval": None if result.interval is None else round(result.interval, 3),
+            "returns": [round(value, 3) for value in result.returns],
+            "success": result.success,
+        }
+        for result in results
+    ]
+
+
+def format_table(config: RunConfig, results: list[Result]) -> str:
+    """Results as a plain text table: mean return, its 95 % confidence interval, and the spread of the episodes."""
+    counts = {len(result.returns) for result in results}
+    title = f"{config.task}, return over {'/'.join(map(str, sorted(counts)))} episodes"
+    lines = [title, f"{'policy':<16}{'action':>8}{'mean':>10}{'± 95 %':>9}{'± std':>9}{'lowest':>10}{'highest':>10}"]
+    for result in results:
+        grid = f"{result.resolution}x{result.resolution}"
+        interval = "–" if result.interval is None else f"{result.interval:.1f}"
+        spread = f"{result.mean:>10.1f}{interval:>9}{result.std:>9.1f}"
+        spread += f"{min(result.returns):>10.1f}{max(result.returns):>10.1f}"
+        success = "" if result.success is None else f"   success {result.success:.0%}"
+        lines.append(f"{result.name:<16}{grid:>8}{spread}{success}")
+    return "\n".join(lines)

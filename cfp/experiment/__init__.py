@@ -1,0 +1,1 @@
+"""One training run: command line, run folder, callbacks, checkpoints and loggers."""

@@ -1,0 +1,135 @@
+"""What a run shows while it trains, beside its tables: TensorBoard, and Weights & Biases for those who ask for it."""
+
+from __future__ import annotations
+
+import importlib
+import uuid
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.logger import Image, KVWriter
+
+from cfp.config import RunConfig, to_json
+from cfp.errors import ConfigError
+from cfp.evaluation.video import available
+from cfp.experiment.files import EventFile, write_text
+
+EVALUATION_METRICS: dict[str, str] = {
+    "eval/return": "mean undiscounted return of an evaluation's episodes (the column mean of evaluations.csv)",
+    "eval/std": "standard deviation of these returns",
+    "eval/success": "share of successes among them, where the task defines success",
+}
+"""Scalars of an evaluation in TensorBoard."""
+
+
+def check_trackers(config: RunConfig) -> None:
+    """Refuse what needs a package that is not installed, before anything is written.
+
+    Raises:
+        ConfigError: Naming the option and the extra to install.
+    """
+    report = config.report
+    if report.wandb != "off":
+        import_wandb(report.wandb)
+    if report.video_every and not available():
+        raise ConfigError(
+            f"video_every: got {report.video_every}, allowed 0 without imageio and its ffmpeg; install them with: "
+            "pip install 'torchmpm[video]'"
+        )
+
+
+def import_wandb(mode: str) -> ModuleType:
+    """The package of Weights & Biases, which nothing else imports.
+
+    Raises:
+        ConfigError: It is not installed.
+    """
+    try:
+        return importlib.import_module("wandb")
+    except ImportError as error:
+        raise ConfigError(
+            f"wandb: got {mode!r}, allowed without the package wandb is only 'off'; install it with: "
+            "pip install 'torchmpm[wandb]'"
+        ) from error
+
+
+class WandbWriter(KVWriter):
+    """A logger output to Weights & Biases; a resumed run goes on in the same curve.
+
+    Args:
+        config: The run's options; its ``report`` says whether anything leaves the machine.
+        folder: Of the run; keeps the identity of the curve and, offline, all of it.
+
+    Raises:
+        ConfigError: The package is not installed.
+    """
+
+    def __init__(self, config: RunConfig, folder: Path) -> None:
+        report = config.report
+        self.wandb = import_wandb(report.wandb)
+        identity = folder / "wandb-id.txt"
+        if not identity.exists():
+            write_text(identity, uuid.uuid4().hex[:8])
+        self.run = self.wandb.init(
+            project=report.wandb_project,
+            name=config.name,
+            id=identity.read_text().strip(),
+            resume="allow",
+            mode=report.wandb,
+            dir=str(folder),
+            config=to_json(config),
+        )
+        # The steps of a resumed run may begin before the last one that was sent, which its own counter refuses.
+        self.run.define_metric("step")
+        self.run.define_metric("*", step_metric="step")
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """Send one point; what does not exist yet (None) is left out."""
+        values = {name: self._convert(value) for name, value in key_values.items() if value is not None}
+        self.run.log({**values, "step": step})
+
+    def _convert(self, value: Any) -> Any:
+        return self.wandb.Image(value.image) if isinstance(value, Image) else value
+
+    def film(self, path: Path, step: int) -> None:
+        """Send a video."""
+        self.run.log({"video": self.wandb.Video(str(path), format="mp4"), "step": step})
+
+    def close(self) -> None:
+        """End the session."""
+        self.run.finish()
+
+
+class Tracker:
+    """The places to which a run's rows go besides its tables, and pictures and films that only they take.
+
+    Args:
+        config: The run's options.
+        folder: Of the run.
+        step: The step this session starts at.
+
+    Attributes:
+        writers: For stable-baselines3's logger.
+    """
+
+    def __init__(self, config: RunConfig, folder: Path, step: int) -> None:
+        self.wandb = WandbWriter(config, folder) if config.report.wandb != "off" else None
+        events = EventFile(folder / "tensorboard", step)
+        self.writers: list[KVWriter] = [events, self.wandb] if self.wandb else [events]
+
+    def show(self, step: int, values: Mapping[str, float | np.ndarray | None]) -> None:
+        """Write scalars and pictures, uint8 (H, W, 3), at once and without a row in a table."""
+        given = {name: value for name, value in values.items() if value is not None}
+        wrapped = {
+            name: Image(value, "HWC") if isinstance(value, np.ndarray) else value for name, value in given.items()
+        }
+        for writer in self.writers:
+            writer.write(dict(wrapped), dict.fromkeys(wrapped, ()), step)
+
+    def film(self, step: int, path: Path) -> None:
+        """Show a video to those who take files; TensorBoard does not."""
+        if self.wandb:
+            self.wandb.film(path, step)

@@ -1,0 +1,1 @@
+"""Where particles start: shapes, drawings and initial positions."""

@@ -1,0 +1,126 @@
+"""Robots of one's own: from a picture, an outline or any shape, put in the place of a task's robot."""
+
+from __future__ import annotations
+
+import math
+import os
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+
+from dittogym.bodies.images import read_grey
+from dittogym.bodies.shapes import Figure, Shape
+from dittogym.spec import Body, TaskSpec
+from torchmpm import sampling
+
+#: A path or an array (picture), (K, 2) corners (outline), a shape, or a body.
+BodyLike: TypeAlias = "str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, float]] | Shape | Body"
+
+#: Grey values above this belong to the robot.
+THRESHOLD = 127
+#: Pixels along the longer side of an outline.
+OUTLINE_PIXELS = 512
+#: Points with which the spread of a shape is measured.
+PROBE = 4096
+
+
+def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
+    """The task with another robot.
+
+    Pictures and outlines keep the area of the task's own robot, and so its number of particles, its weight and the look
+    of its matter; they stand where it stood: same centre in x, same lowest point. A shape lies where it says, and is
+    filled as densely as the task's own robot. A body is taken as it is.
+
+    Args:
+        spec: The task.
+        body: The path of an image or an array (H, W), (H, W, 3), (H, W, 4), bright pixels belong to the robot; corners
+            (K, 2) of an outline with x to the right and y upwards, in any unit; a shape of
+            :mod:`dittogym.bodies.shapes` in world coordinates; or a :class:`dittogym.spec.Body`.
+
+    Raises:
+        ValueError: Not readable as one of these, empty, out of the window, in the place of the task's object, or so
+            long that the task would end at once.
+    """
+    own = spec.robot
+    if isinstance(body, Body):
+        robot = body
+    elif isinstance(body, Shape):
+        robot = replace(own, shape=body, count=max(1, round(own.count * body.area / own.shape.area)))
+    else:
+        robot = replace(own, shape=_figure(body, own.shape))
+    spec = replace(spec, robot=robot)
+    _check_place(spec)
+    return spec
+
+
+def _figure(body: str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, float]], own: Shape) -> Figure:
+    """A picture or an outline with the area and in the place of another shape."""
+    mask = _mask(body)
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    mask = mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    pixel = math.sqrt(own.area / mask.sum())
+    left = own.corner[0] + 0.5 * (own.size[0] - mask.shape[1] * pixel)
+    return Figure(mask, (left, own.corner[1]), pixel)
+
+
+def _mask(body: str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, float]]) -> np.ndarray:
+    if not isinstance(body, (str, os.PathLike)):
+        kinds = "a path, an array, an outline (K, 2), a Shape or a Body"
+        try:
+            body = np.asarray(body)
+        except ValueError as error:  # rows of different lengths
+            raise ValueError(f"body must be {kinds}, got {body!r}") from error
+        if body.ndim < 2:
+            raise ValueError(f"body must be {kinds}, got {body.tolist()!r}")
+        if body.ndim == 2 and body.shape[1] == 2 and body.dtype.kind in "fiu":
+            return _filled(body.astype(np.float64))
+    grey = read_grey(body, "body", others="an outline (K, 2)")
+    mask: np.ndarray = grey > THRESHOLD
+    if not mask.any():
+        raise ValueError(f"body must have pixels brighter than {THRESHOLD}, got none")
+    corners = mask[[0, 0, -1, -1], [0, -1, 0, -1]]
+    if corners.all() and not mask.all():
+        warnings.warn("all corners of the body's picture belong to it: bright pixels are the robot", stacklevel=2)
+    return mask
+
+
+def _filled(corners: np.ndarray) -> np.ndarray:
+    if len(corners) < 3 or not np.isfinite(corners).all():
+        raise ValueError(f"body must have at least 3 finite corners, got {corners.tolist()}")
+    size = np.ptp(corners, axis=0).max()
+    pixels = (corners - corners.min(0)) * (OUTLINE_PIXELS / size if size > 0 else 1.0)
+    height, width = np.ceil(pixels.max(0)).astype(int)[::-1] + 1
+    image, outline = np.zeros((height, width), np.uint8), np.zeros((height, width), np.uint8)
+    path = [np.round(pixels).astype(np.int32)]
+    cv2.fillPoly(image, path, 1)
+    cv2.polylines(outline, path, isClosed=True, color=1)
+    if not (image > outline).any():
+        raise ValueError(f"body must have corners that enclose an area, got {corners.tolist()}")
+    return np.flipud(image).astype(bool)
+
+
+def _check_place(spec: TaskSpec) -> None:
+    shape = spec.robot.shape
+    (left, bottom), (width, height) = shape.corner, shape.size
+    points = shape.positions(sampling.sobol(PROBE, seed=0))
+    window = spec.window.left if spec.window.follow is None else float(points[:, 0].mean()) - spec.window.follow
+    if left <= window or left + width >= window + 1.0 or bottom <= 0.0 or bottom + height >= 1.0:
+        raise ValueError(
+            f"body must lie inside the window ({window:.3f} < x < {window + 1:.3f}, 0 < y < 1), got "
+            f"{left:.3f} < x < {left + width:.3f}, {bottom:.3f} < y < {bottom + height:.3f}"
+        )
+    for other in spec.objects:
+        low, high = np.array(other.shape.corner), np.array(other.shape.corner) + other.shape.size
+        if ((points > low) & (points < high)).all(1).any():
+            raise ValueError(
+                f"body must leave the place of the object free, {low.round(4).tolist()} to {high.round(4).tolist()}"
+            )
+    split = float(np.sqrt(points.var(0).sum()))
+    if spec.split_limit is not None and split >= spec.split_limit:
+        raise ValueError(
+            f"body must be more compact: its spread is {split:.3f} m, and {spec.name} ends at {spec.split_limit} m"
+        )

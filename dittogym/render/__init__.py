@@ -1,0 +1,1 @@
+"""Pictures for people: RGB frames and the window on the screen."""

@@ -1,0 +1,157 @@
+"""Pictures of a simulation as arrays; no window system, no files."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from dittogym.action import place
+from dittogym.geometry import Box
+from dittogym.observation.window import in_window
+from torchmpm import Soil, checks
+
+if TYPE_CHECKING:
+    from dittogym.core import EnvState, Model
+
+GROUND = (248, 246, 240)
+SOLID = (112, 119, 130)
+GRID = (226, 224, 217)
+TARGET = (247, 198, 98)
+ROBOT, OBJECT, GROUND_BODY = (38, 121, 140), (222, 122, 60), (150, 118, 86)
+CONTRACT, RELAX, EXPAND = np.array((206, 60, 52)), np.array((190, 190, 190)), np.array((52, 92, 200))
+#: Distance of the marks on the ground that show how far the window has moved, m.
+MARK = 0.1
+#: Radius of a dot at full size, m.
+FULL_SIZE_RADIUS = 0.0015
+#: Pictures are drawn this many times larger, then averaged down.
+OVERSAMPLING = 2
+#: Pixels per side of the largest picture.
+LARGEST = 8192
+
+
+def frame(model: Model, state: EnvState, index: int, field: Tensor | None, size: int) -> np.ndarray:
+    """Draw one element of a batch: the whole window, obstacles, target and particles coloured by body.
+
+    Args:
+        model: The task.
+        state: The batch.
+        index: Which element.
+        field: (B, 2, P, P) actuation on the patch, to colour the robot by; ``None`` for plain colours.
+        size: Pixels per side.
+
+    Returns:
+        (size, size, 3) uint8 RGB.
+
+    Raises:
+        IndexError: ``index`` is not in the batch.
+        ValueError: ``size`` is below 16 or above 8192.
+    """
+    if not isinstance(index, (int, np.integer)) or not 0 <= index < len(state.steps):
+        raise IndexError(f"index must be between 0 and {len(state.steps) - 1}, got {index!r}")
+    index = int(index)
+    checks.whole("size", size, 16, LARGEST)
+    spec = model.spec
+    particles = state.particles[index].detach()
+    origin = state.origin[index].detach().cpu().double().numpy()
+    canvas = Canvas(size * OVERSAMPLING, origin)
+    canvas.marks()
+    if spec.goal is not None:
+        canvas.goal(spec.goal)
+    if spec.target is not None:
+        canvas.target(spec.target, state.centre[index].detach().cpu().double().numpy())
+    for obstacle in spec.obstacles:
+        for box in obstacle.shown:
+            canvas.box(box, filled=bool(obstacle.drawn) or box.ground)
+    x = particles.x[0].cpu().double().numpy()
+    counts = [body.count for body in model.solver.bodies]
+    kinds = [ROBOT, *(GROUND_BODY if isinstance(body.material, Soil) else OBJECT for body in spec.objects)]
+    colours = np.repeat(np.array(kinds), counts, axis=0)
+    if field is not None:
+        colours[: model.robot] = _muscle_colours(model, state, index, field)
+    parts = [part for _, part in model.solver.parts()]
+    for part, share in reversed(list(zip(parts, model.shares, strict=True))):  # the robot last, on top
+        canvas.dots(x[part], colours[part], radius=_radius(share, size * OVERSAMPLING))
+    return cv2.resize(canvas.image, (size, size), interpolation=cv2.INTER_AREA)
+
+
+class Canvas:
+    """An image of the window that is drawn into by world coordinates.
+
+    Args:
+        pixels: Pixels per side.
+        origin: Lower left corner of the window in the world, m.
+    """
+
+    def __init__(self, pixels: int, origin: np.ndarray) -> None:
+        self.pixels, self.origin = pixels, origin
+        self.image = np.full((pixels, pixels, 3), GROUND, np.uint8)
+
+    def marks(self) -> None:
+        """Vertical lines at round world positions, so that the motion of the window is seen."""
+        for k in range(int(np.ceil(self.origin[0] / MARK)), int(np.floor((self.origin[0] + 1.0) / MARK)) + 1):
+            column = round((k * MARK - self.origin[0]) * self.pixels)
+            cv2.line(self.image, (column, 0), (column, self.pixels), GRID, 1 if k % 5 else 4)
+
+    def box(self, box: Box, *, filled: bool) -> None:
+        """A box, or only its outline."""
+        left, right = np.clip((np.array((box.left, box.right)) - self.origin[0]) * self.pixels, -9, self.pixels + 9)
+        low, high = np.clip((np.array((box.bottom, box.top)) - self.origin[1]) * self.pixels, -9, self.pixels + 9)
+        corners = (round(left), round(self.pixels - high)), (round(right), round(self.pixels - low))
+        cv2.rectangle(self.image, *corners, SOLID, cv2.FILLED if filled else 3)
+
+    def goal(self, goal: tuple[float, float]) -> None:
+        """A disc at a point of the world."""
+        middle = (np.array(goal) - self.origin) * self.pixels
+        if not self._near(middle):
+            return
+        cv2.circle(self.image, (round(middle[0]), round(self.pixels - middle[1])), self.pixels // 60, TARGET, -1)
+
+    def target(self, target: np.ndarray, centre: np.ndarray) -> None:
+        """The picture to match, half a window wide, around the robot's centre."""
+        middle = (centre - self.origin) * self.pixels
+        if not self._near(middle):
+            return
+        width = self.pixels // 2
+        mask = cv2.resize(target.astype(np.uint8), (width, width), interpolation=cv2.INTER_NEAREST)
+        outlines, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)  # of bodies and of their holes
+        corner = np.array((round(middle[0]) - width // 2, self.pixels - round(middle[1]) - width // 2))
+        shifted = [outline + corner for outline in outlines]
+        cv2.fillPoly(self.image, shifted, TARGET)  # all at once: what lies in two of them stays empty
+
+    def _near(self, middle: np.ndarray) -> bool:
+        """Whether a figure around here may be seen; OpenCV cannot be given numbers of any size."""
+        return bool((np.abs(middle) < 4 * self.pixels).all())
+
+    def dots(self, position: np.ndarray, colours: np.ndarray, radius: int) -> None:
+        """Filled circles at world positions (N, 2); what is off the picture or not finite is left out."""
+        column = (position[:, 0] - self.origin[0]) * self.pixels
+        row = (1.0 - (position[:, 1] - self.origin[1])) * self.pixels
+        seen = (column >= 0) & (column < self.pixels) & (row >= 0) & (row < self.pixels)
+        column, row, colours = column[seen].astype(int), row[seen].astype(int), colours[seen]
+        for dy in range(-radius, radius + 1):
+            half = int(np.sqrt(radius**2 - dy**2))
+            for dx in range(-half, half + 1):
+                r, c = row + dy, column + dx
+                ok = (r >= 0) & (r < self.pixels) & (c >= 0) & (c < self.pixels)
+                self.image[r[ok], c[ok]] = colours[ok]
+
+
+def _radius(share: float, pixels: int) -> int:
+    """Dots just large enough to close a body at its initial density."""
+    return max(1, round(FULL_SIZE_RADIUS * np.sqrt(share) * pixels))
+
+
+def _muscle_colours(model: Model, state: EnvState, index: int, field: Tensor) -> np.ndarray:
+    spec = model.spec
+    one = slice(index, index + 1)
+    centre = in_window(spec.reach, state.centre[one], state.origin[one])
+    nodes = place(field[one], centre, model.solver.grid.resolution)[0].sum(0).cpu().double().numpy()
+    relative = (state.particles.x[index, : model.robot] - state.origin[index]).detach().cpu().double().numpy()
+    finite = np.isfinite(relative).all(1, keepdims=True)
+    at = np.clip(np.where(finite, relative, 0.0) * len(nodes), 0, len(nodes) - 1).astype(int)
+    strength = float(state.physics["max_actuation"][index]) if "max_actuation" in state.physics else spec.max_actuation
+    pull = np.clip(nodes[at[:, 0], at[:, 1]] / (2 * strength), -1, 1)[:, None]
+    return RELAX + np.abs(pull) * (np.where(pull > 0, CONTRACT, EXPAND) - RELAX)
