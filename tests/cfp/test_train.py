@@ -22,8 +22,9 @@ from cfp.agent.actor import ActorSpec, build_actor
 from cfp.agent.policies import ActorPolicy
 from cfp.config import EnvironmentConfig
 from cfp.envs.vec_env import monitored
-from cfp.evaluation.rollout import compare, video
-from cfp.evaluation.rollout import plots as plot
+from cfp.evaluation import plots as plot
+from cfp.evaluation import video
+from cfp.evaluation.rollout import compare
 from cfp.experiment.callbacks import StageCallback
 from cfp.experiment.cfp_run import Runner
 from cfp.experiment.cli import started_as
