@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from baselines.compare import paper
-from baselines.compare.jobs import Job, read_record
 from baselines.registry import load
 from cfp.config import RunConfig, Tier
 from cfp.envs.disturbances import Case, make_cases
 from cfp.envs.make import choose_device, make_env
-from cfp.evaluation.rollout import Policy, Result, evaluate, judging_seed
-from cfp.experiment.files import write_json
+from cfp.errors import CheckpointError
+from cfp.evaluation.rollout import Result, evaluate, judging_seed
+from cfp.files import parse_json, write_json
 from cfp.robustness import report
 
 RECORD = "final_evaluation.json"
@@ -25,13 +27,14 @@ PAPER_CASES = 3
 """How many of `make_cases` the paper reports: unperturbed, action dropout, observation dropout."""
 
 Noise = Literal["paper", "with", "without"]
+Robustness = Literal["none", "paper", "all"]
 Entry = dict[str, Any]
 """``returns`` of some episodes, and how many of them were ``successes`` (None if the task does not define success)."""
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """How policies are evaluated; the same for all policies of a comparison.
+    """How policies are evaluated; but for the episodes in SLOT the same for all policies of a comparison.
 
     Attributes:
         episodes: Number of episodes, on the same layouts for all policies.
@@ -42,7 +45,7 @@ class Protocol:
 
     episodes: int
     tier: Tier = "lite"
-    robustness: Literal["none", "paper", "all"] = "paper"
+    robustness: Robustness = "paper"
     noise: Noise = "paper"
 
     def cases(self) -> list[Case]:
@@ -57,24 +60,14 @@ class Protocol:
         """First layout and number of layouts of each batch of episodes."""
         return [(first, min(BATCH, self.episodes - first)) for first in range(0, self.episodes, BATCH)]
 
-    def key(self, what: str, task: str) -> str:
-        """Key of an entry in the record: evaluations with other particles or other noise have another one."""
-        return f"{what}, particles {self.tier}, {'without' if self.deterministic(task) else 'with'} noise"
+    def key(self, task: str, layouts: str, case: Case | None = None) -> str:
+        """Key of an entry in the record; other particles or other noise make another entry."""
+        noise = "without" if self.deterministic(task) else "with"
+        return f"{f'{case.name}, ' if case else ''}{layouts}, particles {self.tier}, {noise} noise"
 
-    def batch_key(self, task: str, first: int, count: int, case: Case | None = None) -> str:
-        """Key of a batch of episodes, unperturbed or in a disturbed case."""
-        layouts = f"layouts {first} to {first + count - 1}"
-        return self.key(layouts if case is None else f"{case.name}, {layouts}", task)
-
-    def to_json(self) -> dict[str, Any]:
-        """JSON values for `from_json`."""
-        return asdict(self)
-
-    @classmethod
-    def from_json(cls, values: dict[str, Any]) -> Protocol:
-        """Inverse of `to_json`."""
-        tier = values["tier"]
-        return cls(**{**values, "tier": tuple(tier) if isinstance(tier, list) else tier})
+    def batch_keys(self, task: str, case: Case | None = None) -> list[str]:
+        """Keys of all batches of episodes, unperturbed or in a disturbed case."""
+        return [self.key(task, f"layouts {first} to {first + count - 1}", case) for first, count in self.batches()]
 
 
 @dataclass(frozen=True)
@@ -101,15 +94,15 @@ class Record:
     """The entries in ``final_evaluation.json`` of a run folder that belong to the policy that is there now.
 
     Args:
-        job: The run.
+        folder: The run folder.
 
     Raises:
         CheckpointError: There is no policy, or the record is damaged.
     """
 
-    def __init__(self, job: Job) -> None:
-        self.path = job.folder / RECORD
-        self.policy = hashlib.sha256((job.folder / "policy.safetensors").read_bytes()).hexdigest()
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / RECORD
+        self.policy = hashlib.sha256((folder / "policy.safetensors").read_bytes()).hexdigest()
         record = read_record(self.path, policy=str, entries=dict) if self.path.exists() else {}
         self.entries: dict[str, Any] = record["entries"] if record.get("policy") == self.policy else {}
 
@@ -120,6 +113,26 @@ class Record:
             write_json(self.path, {"policy": self.policy, "entries": self.entries})
 
 
+def read_record(path: Path, **types: type) -> dict[str, Any]:
+    """Read a JSON object that a comparison has written into a run folder.
+
+    Args:
+        path: The file.
+        types: Names of values that it must hold, and their types.
+
+    Raises:
+        CheckpointError: The file cannot be read, or a value is missing or of another type.
+    """
+    try:
+        record: dict[str, Any] = parse_json(path.read_text())
+        for name, kind in types.items():
+            if not isinstance(record[name], kind):
+                raise ValueError(f"{name} must be of type {kind.__name__}, got {json.dumps(record[name])}")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(f"{path}: cannot be read ({type(error).__name__}: {error})") from error
+    return record
+
+
 def evaluation_config(config: RunConfig, tier: Tier) -> RunConfig:
     """Options of the environment of a final evaluation: seed 0 for all runs, so that all play the same layouts.
 
@@ -128,11 +141,12 @@ def evaluation_config(config: RunConfig, tier: Tier) -> RunConfig:
     return replace(config, seed=0, environment=config.environment.judged_at(tier))
 
 
-def evaluate_run(job: Job, protocol: Protocol, check_stop: Callable[[], None]) -> None:
+def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop: Callable[[], None]) -> None:
     """Evaluate the policy of a run as far as that has not been done.
 
     Args:
-        job: The run.
+        config: Options of the run.
+        folder: The run folder.
         protocol: How to evaluate.
         check_stop: Called between two batches of episodes; raises to stop.
 
@@ -140,61 +154,54 @@ def evaluate_run(job: Job, protocol: Protocol, check_stop: Callable[[], None]) -
         CheckpointError: There is no policy, or it is damaged.
         ConfigError: The environment refuses an option.
     """
-    record, task = Record(job), job.config.task
-    config, deterministic = evaluation_config(job.config, protocol.tier), protocol.deterministic(task)
-    policy = load(job.folder / "policy.safetensors", choose_device(job.config.device))
+    record, task, deterministic = Record(folder), config.task, protocol.deterministic(config.task)
+    policy = load(folder / "policy.safetensors", choose_device(config.device))
+    config = evaluation_config(config, protocol.tier)
 
     def play(seed: int, count: int) -> Entry:
         env = make_env(config, policy.resolution, count)
         return _entry(evaluate("", policy, env, count, deterministic=deterministic, seed=seed))
 
     def play_disturbed(first: int, count: int, case: Case) -> Entry | None:
-        shifted = replace(config, seed=config.seed + first)
-        results = report(shifted, policy, [case], count, deterministic=deterministic)
+        results = report(replace(config, seed=first), policy, [case], count, deterministic=deterministic)
         return _entry(results[0]) if results else None
 
-    for first, count in protocol.batches():
+    for key, (first, count) in zip(protocol.batch_keys(task), protocol.batches(), strict=True):
         check_stop()
-        seed = judging_seed(config) + first
-        record.add(protocol.batch_key(task, first, count), lambda seed=seed, count=count: play(seed, count))
+        record.add(key, partial(play, judging_seed(config) + first, count))
     if "layout" in policy.description:
-        layout = policy.description["layout"]
-        record.add(protocol.key("own layout", task), lambda: play(layout, 1))
+        record.add(protocol.key(task, "own layout"), partial(play, policy.description["layout"], 1))
     for case in protocol.cases()[1:]:
-        for batch in protocol.batches():
+        for key, (first, count) in zip(protocol.batch_keys(task, case), protocol.batches(), strict=True):
             check_stop()
-            record.add(
-                protocol.batch_key(task, *batch, case), lambda batch=batch, case=case: play_disturbed(*batch, case)
-            )
+            record.add(key, partial(play_disturbed, first, count, case))
 
 
-def read_evaluation(job: Job, protocol: Protocol) -> FinalEvaluation | None:
+def read_evaluation(task: str, folder: Path, protocol: Protocol) -> FinalEvaluation | None:
     """What has been found so far; None without a policy or a whole batch of episodes.
 
     Raises:
         CheckpointError: The record is damaged.
     """
-    if not (job.folder / "policy.safetensors").exists():
+    if not (folder / "policy.safetensors").exists():
         return None
-    entries, task, batches = Record(job).entries, job.config.task, protocol.batches()
+    entries, cases, batches = Record(folder).entries, protocol.cases(), len(protocol.batches())
 
-    def found(case: Case | None = None) -> list[Entry | None]:
-        keys = [protocol.batch_key(task, *batch, case) for batch in batches]
-        return [entries[key] for key in keys if key in entries]
+    def find(case: Case | None = None) -> list[Entry | None]:
+        return [entries[key] for key in protocol.batch_keys(task, case) if key in entries]
 
-    parts = [part for part in found() if part is not None]
+    parts = [part for part in find() if part is not None]
     if not parts:
         return None
-    returns = [value for part in parts for value in part["returns"]]
-    successes, own = [part["successes"] for part in parts], entries.get(protocol.key("own layout", task))
-    disturbed = {case.name: found(case) for case in protocol.cases()[1:]}
-    cases: dict[str, float | None] = {case.name: sum(returns) / len(returns) for case in protocol.cases()[:1]}
+    returns, successes = _returns(parts), [part["successes"] for part in parts]
+    own, disturbed = entries.get(protocol.key(task, "own layout")), {case.name: find(case) for case in cases[1:]}
+    means = {name: _mean(_returns(found)) if len(found) == batches else None for name, found in disturbed.items()}
     return FinalEvaluation(
-        tuple(returns),
-        None if None in successes else sum(successes),
-        None if own is None else own["returns"][0],
-        cases | {name: _mean_return(parts, len(batches)) for name, parts in disturbed.items()},
-        all(len(each) == len(batches) for each in (parts, *disturbed.values())),
+        returns=tuple(returns),
+        successes=None if None in successes else sum(successes),
+        own_layout=own and own["returns"][0],
+        cases={case.name: _mean(returns) for case in cases[:1]} | means,
+        complete=len(parts) == batches and all(len(found) == batches for found in disturbed.values()),
     )
 
 
@@ -203,7 +210,9 @@ def _entry(result: Result) -> Entry:
     return {"returns": list(result.returns), "successes": successes}
 
 
-def _mean_return(parts: list[Entry | None], batches: int) -> float | None:
-    """Mean return of a case; None if it changes nothing, or a batch is missing."""
-    returns = [value for part in parts if part is not None for value in part["returns"]]
-    return sum(returns) / len(returns) if returns and len(parts) == batches else None
+def _returns(parts: list[Entry] | list[Entry | None]) -> list[float]:
+    return [value for part in parts if part is not None for value in part["returns"]]
+
+
+def _mean(values: list[float]) -> float | None:
+    return sum(values) / len(values) if values else None

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 
-from baselines.compare.worker import Outcome, Request
+from baselines.compare.jobs import Job
+from baselines.compare.worker import Outcome
 from cfp.experiment.process import StopSignals
 
 POLL = 0.5
@@ -22,18 +23,20 @@ class Resources:
         cpus: Number of cores; None: an equal share of this machine's, or one on a cluster.
         gpus: Number of GPUs, also a fraction of one; on a cluster only.
         retries: How many more times a run is started whose process or node was lost, over all causes together.
+        lock_timeout: Seconds to wait for another process that holds the run folder.
     """
 
     cpus: int | None = None
     gpus: float = 0.0
     retries: int = 2
+    lock_timeout: float = 30.0
 
 
 class Executor(ABC):
     """Carries out runs, like a `concurrent.futures.Executor` whose tasks can be asked to stop."""
 
     @abstractmethod
-    def submit(self, request: Request) -> Future[Outcome]:
+    def submit(self, job: Job) -> Future[Outcome]:
         """Begin a run as soon as there is room for it; it may be over when this returns."""
 
     @abstractmethod
@@ -44,40 +47,34 @@ class Executor(ABC):
     def shutdown(self, kill: bool) -> None:
         """Free all resources; ``kill`` ends the runs in progress at once."""
 
-    def __enter__(self) -> Executor:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self.shutdown(kill=kind is not None)
-
 
 def execute(
-    executor: Executor,
-    requests: Sequence[Request],
-    signals: StopSignals,
-    on_outcome: Callable[[int, Outcome], None],
+    executor: Executor, jobs: Sequence[Job], signals: StopSignals, on_outcome: Callable[[Job, Outcome], None]
 ) -> None:
     """Carry out runs, until all are over or have stopped.
 
     Args:
-        executor: Carries them out.
-        requests: The runs.
+        executor: Carries them out; shut down at the end.
+        jobs: The runs.
         signals: Whether the user wants to stop.
-        on_outcome: Called with the index of each run as it ends, and how it ended.
+        on_outcome: Called as each run ends, with how it ended.
     """
-    pending: dict[Future[Outcome], int] = {}
+    pending: dict[Future[Outcome], Job] = {}
+    stopping, complete = False, False
 
     def collect(timeout: float) -> None:
         for future in wait(pending, timeout, FIRST_COMPLETED).done:
             on_outcome(pending.pop(future), future.result())
 
-    stopping = False
-    with executor:
-        for index, request in enumerate(requests):
-            pending[executor.submit(request)] = index
+    try:
+        for job in jobs:
+            pending[executor.submit(job)] = job
             collect(timeout=0)
         while pending:
             collect(POLL)
             if signals.number and not stopping:
                 stopping = True
                 executor.stop()
+        complete = True
+    finally:
+        executor.shutdown(kill=not complete)

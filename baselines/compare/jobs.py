@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from baselines.common.reference_policies import FloorConfig
+from baselines.compare.evaluations import Protocol, read_record
 from baselines.compare.plan import Plan
 from baselines.registry import ALGORITHMS, ALIASES, configure, find
 from cfp.config import EVALUATION_SEED, RunConfig, to_json
-from cfp.errors import CheckpointError, ConfigError
-from cfp.experiment.files import parse_json
+from cfp.errors import ConfigError
+from cfp.experiment.from_dict import flatten
 from cfp.experiment.run import holds_run, read_config
-from cfp.experiment.state_file import flatten
 from cfp.groups import TASK_OPTIONS
 from cfp.weights import is_of_another_task, is_same_task, read_policy
 from dittogym.tasks import task_name
@@ -36,11 +36,13 @@ class Job:
         label: Name of the algorithm in the report: its own, or that of a variant in the plan file.
         config: Options of the run.
         folder: Run folder.
+        protocol: How its policy is evaluated.
     """
 
     label: str
     config: RunConfig
     folder: Path
+    protocol: Protocol
 
     @property
     def name(self) -> str:
@@ -55,7 +57,7 @@ class Job:
     @property
     def untrained(self) -> bool:
         """Whether it evaluates a reference policy, which learns nothing and does not depend on the seed."""
-        return isinstance(self.config, FloorConfig)
+        return is_reference(self.config)
 
     @property
     def trained(self) -> bool:
@@ -73,12 +75,18 @@ class Job:
         return "begun" if holds_run(self.folder) else "missing"
 
 
+def is_reference(config: RunConfig) -> bool:
+    """Whether options are those of a reference policy, which learns nothing."""
+    return isinstance(config, FloorConfig)
+
+
 def make_jobs(
     plan: Plan,
     tasks: Sequence[str],
     labels: Sequence[str],
     seeds: Sequence[int],
     folder: Path,
+    protocol: Callable[[RunConfig], Protocol],
     *,
     preset: str = "quick",
     steps: int | None = None,
@@ -94,6 +102,7 @@ def make_jobs(
         labels: Algorithms and variants.
         seeds: Seeds of the runs.
         folder: Folder of the run folders.
+        protocol: From the options of a run to how its policy is evaluated.
         preset: Preset of all runs.
         steps: Environment steps of algorithms that have this option, unless the plan gives it.
         device: Device of all runs.
@@ -113,7 +122,7 @@ def make_jobs(
         for task in tasks:
             for label in labels:
                 config = resolve(plan, label, task, preset, seed, steps, device)
-                job = Job(label, config, folder / f"{label}-{task_name(task)}-{preset}-{seed}")
+                job = Job(label, config, folder / f"{label}-{task_name(task)}-{preset}-{seed}", protocol(config))
                 if seed == seeds[0] or not job.untrained:
                     jobs.append(job)
     _check_same_task(jobs)
@@ -202,24 +211,3 @@ def read_sessions(folder: Path) -> dict[str, Any]:
     """
     path = folder / "sessions.json"
     return read_record(path, finished=int, sessions=list) if path.exists() else {"finished": False, "sessions": []}
-
-
-def read_record(path: Path, **types: type) -> dict[str, Any]:
-    """Read a JSON object that a comparison has written into a run folder.
-
-    Args:
-        path: The file.
-        types: Names of values that it must hold, and their types.
-
-    Raises:
-        CheckpointError: The file cannot be read, or a value is missing or of another type.
-    """
-    try:
-        record = parse_json(path.read_text())
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{path}: cannot be read ({error})") from error
-    for name, kind in types.items():
-        if not isinstance(record, dict) or not isinstance(record.get(name), kind):
-            raise CheckpointError(f"{path}: cannot be read (it holds no {name} of type {kind.__name__})")
-    values: dict[str, Any] = record
-    return values

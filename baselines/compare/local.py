@@ -9,12 +9,12 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
 
 from baselines.compare.executor import Executor, Resources
-from baselines.compare.worker import EXIT_CODES, Outcome, Request, run
-from cfp.experiment.files import write_text
+from baselines.compare.jobs import Job
+from baselines.compare.worker import EXIT_CODES, Outcome, encode, run
 from cfp.experiment.process import StopSignals
+from cfp.files import write_text
 
 WORKER = (sys.executable, "-m", "baselines.compare.worker")
 POLL = 0.2
@@ -41,15 +41,18 @@ class InProcessExecutor(Executor):
 
     Args:
         signals: Whether the user wants to stop.
+        resources: What a run gets.
     """
 
-    def __init__(self, signals: StopSignals) -> None:
-        self.signals = signals
+    def __init__(self, signals: StopSignals, resources: Resources) -> None:
+        self.signals, self.lock_timeout = signals, resources.lock_timeout
 
-    def submit(self, request: Request) -> Future[Outcome]:
+    def submit(self, job: Job) -> Future[Outcome]:
         """Carry out a run, see `Executor.submit`."""
         future: Future[Outcome] = Future()
-        future.set_result("stopped" if self.signals.number else run(request, self.signals, own_process=False))
+        future.set_result(
+            "stopped" if self.signals.number else run(job, self.signals, self.lock_timeout, own_process=False)
+        )
         return future
 
     def stop(self) -> None:
@@ -69,13 +72,13 @@ class LocalExecutor(Executor):
 
     def __init__(self, workers: int, resources: Resources) -> None:
         self.threads = resources.cpus or max(1, (os.cpu_count() or 1) // workers)
-        self.retries = resources.retries
+        self.resources = resources
         self._pool = ThreadPoolExecutor(workers)
         self._stop, self._kill = threading.Event(), threading.Event()
 
-    def submit(self, request: Request) -> Future[Outcome]:
+    def submit(self, job: Job) -> Future[Outcome]:
         """Queue a run, see `Executor.submit`."""
-        return self._pool.submit(self._run, request)
+        return self._pool.submit(self._run, job)
 
     def stop(self) -> None:
         """Ask the processes to stop with a checkpoint."""
@@ -88,32 +91,36 @@ class LocalExecutor(Executor):
             self._kill.set()
         self._pool.shutdown()
 
-    def _run(self, request: Request) -> Outcome:
-        for attempt in range(1 + self.retries):
+    def _run(self, job: Job) -> Outcome:
+        for attempt in range(1 + self.resources.retries):
             if self._stop.is_set():
                 return "stopped"
             try:
-                return run_process(request, self.threads, lambda: self._stop.is_set() + self._kill.is_set())
+                return run_process(job, self.threads, self.resources.lock_timeout, self._urgency)
             except ProcessKilled as error:
                 reason = f"{error} ({attempt + 1} times)"
-        write_text(Path(request.folder) / "error.txt", reason + "\n")
+        write_text(job.folder / "error.txt", reason + "\n")
         return "failed"
 
+    def _urgency(self) -> int:
+        return self._stop.is_set() + self._kill.is_set()
 
-def run_process(request: Request, threads: int, urgency: Callable[[], int] = lambda: 0) -> Outcome:
+
+def run_process(job: Job, threads: int, lock_timeout: float, urgency: Callable[[], int] = lambda: 0) -> Outcome:
     """Carry out a run in a process of its own, whose output is appended to ``log.txt`` in the run folder.
 
     The process is in a session of its own: Ctrl-C reaches this process only, which then asks it to stop, once.
 
     Args:
-        request: The run.
+        job: The run.
         threads: Number of threads of its numerical libraries.
+        lock_timeout: Seconds to wait for another process that holds the run folder.
         urgency: Whether to stop the process: 0 not, 1 with a checkpoint, 2 at once.
 
     Raises:
         ProcessKilled: A signal that was not sent from here ended the process.
     """
-    folder = Path(request.folder)
+    folder = job.folder
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "error.txt").unlink(missing_ok=True)
     environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, "OMP_NUM_THREADS": str(threads)}
@@ -124,7 +131,7 @@ def run_process(request: Request, threads: int, urgency: Callable[[], int] = lam
         )
     assert process.stdin is not None
     try:
-        process.stdin.write(request.encode())
+        process.stdin.write(encode(job, lock_timeout))
         process.stdin.flush()
     except BrokenPipeError:
         pass  # the process has ended already; its exit code says how

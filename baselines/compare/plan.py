@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cfp.errors import ConfigError
-from cfp.experiment.files import read_json
+from cfp.files import read_json
 
 Options = dict[str, Any]
 """Options of a run by name, in the form of its ``config.json``."""

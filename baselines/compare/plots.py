@@ -113,10 +113,10 @@ def final_returns(groups: Sequence[Group]) -> Figure:
         for place, group in enumerate(shown):
             style, (low, high) = styles[group.label, group.observes], group.interval
             axes.plot(group.scores, [place] * len(group.scores), style.marker, color=style.colour, alpha=0.35)
-            if low is not None:
+            if low is not None and high is not None:
                 axes.plot([low, high], [place, place], color=style.colour, linewidth=2.5)
-            mean = {"color": style.colour, "markersize": 8, "markeredgecolor": "black"}
-            axes.plot([group.iqm], [place], style.marker, **mean)
+            mean = float(interquartile_mean(group.scores))
+            axes.plot(mean, place, style.marker, color=style.colour, markersize=8, markeredgecolor="black")
             if place and group.observes != shown[place - 1].observes:
                 axes.axhline(place - 0.5, color="black", linewidth=1)
         _bar_names(axes, [f"{group.label} ({group.observes})" for group in shown])

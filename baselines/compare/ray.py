@@ -8,22 +8,23 @@ from pathlib import Path
 from typing import Any
 
 from baselines.compare.executor import Executor, Resources
+from baselines.compare.jobs import Job
 from baselines.compare.local import ProcessKilled, run_process
-from baselines.compare.worker import Outcome, Request
+from baselines.compare.worker import Outcome
 from cfp.errors import ConfigError
-from cfp.experiment.files import write_text
+from cfp.files import write_text
 
 
 class RayExecutor(Executor):
     """Carries out runs as tasks of a Ray cluster.
 
-    The run folders must be on a file system that all nodes share, and all nodes must have this package. A run whose node
-    is lost continues on another one from its last checkpoint; the lock on its folder keeps two nodes from working on it
-    at once. Ray starts a run again for lost nodes and killed processes alike, so that ``retries`` bounds both together.
+    The run folders must be on a file system that all nodes share, and all nodes must have this package. A run whose
+    node is lost continues on another one from its last checkpoint; the lock on its folder keeps two nodes from working
+    on it at once. Ray counts lost nodes and killed processes together, so that ``retries`` bounds their sum.
 
     Args:
-        address: Address of the cluster; None: what ``RAY_ADDRESS`` names, else the cluster last started on this machine,
-            else a new one.
+        address: Address of the cluster; None: what ``RAY_ADDRESS`` names, else the cluster last started on this
+            machine, else a new one.
         resources: What a run gets.
 
     Raises:
@@ -44,7 +45,7 @@ class RayExecutor(Executor):
                 ray.init(address=address, log_to_driver=False, configure_logging=False)
             except ConnectionError as error:
                 raise ConfigError(f"address: got {address!r}, where no Ray cluster answers ({error})") from error
-        self._threads = resources.cpus or 1
+        self._threads, self._lock_timeout = resources.cpus or 1, resources.lock_timeout
         self._task = ray.remote(run_process).options(
             num_cpus=self._threads,
             num_gpus=resources.gpus,
@@ -54,11 +55,11 @@ class RayExecutor(Executor):
         )
         self._references: list[Any] = []
 
-    def submit(self, request: Request) -> Future[Outcome]:
+    def submit(self, job: Job) -> Future[Outcome]:
         """Queue a run, see `Executor.submit`."""
-        reference, future = self._task.remote(request, self._threads), Future[Outcome]()
+        reference, future = self._task.remote(job, self._threads, self._lock_timeout), Future[Outcome]()
         self._references.append(reference)
-        reference.future().add_done_callback(partial(self._finish, future, Path(request.folder)))
+        reference.future().add_done_callback(partial(self._finish, future, job.folder))
         return future
 
     def stop(self) -> None:

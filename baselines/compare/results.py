@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from baselines.compare.evaluations import FinalEvaluation, Protocol, read_evaluation
+from baselines.compare.evaluations import FinalEvaluation, read_evaluation
 from baselines.compare.jobs import Job, read_sessions
 from baselines.compare.stats import Curve, interquartile_mean, score_interval
 from cfp.config import Tier
 from cfp.errors import CheckpointError
-from cfp.experiment.files import read_table
+from cfp.tables import read_table
 
 OBSERVATIONS = ("image", "state", "simulator", "nothing")
 """What policies observe, in the order of tables."""
@@ -138,17 +138,18 @@ class Group:
         return [run.curve for run in self.runs if len(run.curve[0])]
 
 
-def read_results(jobs: Iterable[Job], protocol: Callable[[Job], Protocol]) -> list[RunResult]:
-    """Read all run folders.
-
-    Args:
-        jobs: The runs of the comparison.
-        protocol: From a run to how its policy is evaluated.
+def read_result(job: Job) -> RunResult:
+    """Read the folder of a run.
 
     Raises:
-        CheckpointError: A file in a run folder is damaged.
+        CheckpointError: A file in it is damaged.
     """
-    return [_read_result(job, protocol(job)) for job in jobs]
+    evaluation, state, error = read_evaluation(job.config.task, job.folder, job.protocol), job.state, ""
+    if state == "finished" and (evaluation is None or not evaluation.complete):
+        state = "unevaluated"
+    if (job.folder / "error.txt").exists():
+        error = (job.folder / "error.txt").read_text().strip()
+    return RunResult(job, state, error, _read_curve(job.folder), _read_cost(job.folder), evaluation)
 
 
 def group_results(runs: Sequence[RunResult]) -> list[Group]:
@@ -159,14 +160,6 @@ def group_results(runs: Sequence[RunResult]) -> list[Group]:
     tasks = list(dict.fromkeys(task for task, _, _ in members))
     keys = sorted(members, key=lambda key: (tasks.index(key[0]), OBSERVATIONS.index(key[1])))
     return [Group(*key, tuple(members[key])) for key in keys]
-
-
-def _read_result(job: Job, protocol: Protocol) -> RunResult:
-    error, evaluation, state = job.folder / "error.txt", read_evaluation(job, protocol), job.state
-    if state == "finished" and (evaluation is None or not evaluation.complete):
-        state = "unevaluated"
-    reason = error.read_text().strip() if error.exists() else ""
-    return RunResult(job, state, reason, _read_curve(job.folder), _read_cost(job.folder), evaluation)
 
 
 def _read_curve(folder: Path) -> Curve:

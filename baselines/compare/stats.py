@@ -34,7 +34,7 @@ def bootstrap_interval(
         seed: Seed of the generator.
 
     Returns:
-        Lower and upper end, scalars or (T,); None if no stratum has two runs, because nothing is known about the spread.
+        Lower and upper end, scalars or (T,); None if no stratum has two runs.
     """
     resampled = [np.asarray(scores, float) for scores in strata if len(scores) > 1]
     single = [float(scores[0]) for scores in strata if len(scores) == 1]  # the same in every resample

@@ -98,7 +98,7 @@ def returns_table(groups: Sequence[Group], episodes: int) -> Table:
     _rank(rows, ("task", "sees"))
     untrained = ", ".join(dict.fromkeys(group.label for group in groups if group.job.untrained))
     description = (
-        f"Each policy plays the same layouts, which neither trained nor selected it ({episodes} of them, more in SLOT). "
+        f"Each policy plays the same layouts, which neither trained nor selected it ({episodes}, more in SLOT). "
         "The score of a run is its mean return; IQM is the interquartile mean over seeds (up to three seeds: the mean) "
         "with a 95 % bootstrap interval; std is that of the scores. The interval is about other trainings on these "
         f"layouts, not about other layouts. {f'One run stands for all seeds of {untrained}. ' if untrained else ''}"
@@ -124,7 +124,7 @@ def aggregate_table(groups: Sequence[Group]) -> Table:
         strata = [[paper.normalised(each.task, score) for score in each.scores] for each in members]
         if not strata:
             continue
-        scores, (low, high) = sum(strata, []), score_interval(strata)
+        scores, (low, high) = [score for scores in strata for score in scores], score_interval(strata)
         row = {"sees": observes, "algo": label, "tasks": len(strata), "runs": len(scores)}
         row |= {"iqm": float(interquartile_mean(scores)), "low": low, "high": high, "all": len(strata) == len(tasks)}
         rows.append(row)
@@ -175,8 +175,8 @@ def efficiency_table(groups: Sequence[Group], tier: Tier) -> Table:
         rows.append(row)
     description = (
         "Environment steps until a run's own evaluation first reaches a fraction of the way from a resting robot (the "
-        "final evaluation of zero) to the highest point of any mean curve among the algorithms that observe the same in "
-        "this task: median of the seeds that reach it, and their number. No entry where no curve rises above rest."
+        "final evaluation of zero) to the highest point of any mean curve among the algorithms that observe the same "
+        "in this task: median of the seeds that reach it, and their number. No entry where no curve rises above rest."
     )
     if unknown := ", ".join(dict.fromkeys(group.task for group in trained if group.task not in rest)):
         description += f" The return at rest is unknown in {unknown}: add zero to --algos."
@@ -244,9 +244,9 @@ def cost_table(groups: Sequence[Group]) -> Table:
         )
     description = (
         "Training without its evaluations and without that of a teacher that is trained first, which has columns of "
-        "its own: mean over seeds. An episode is the task's whole length of steps; robots that train side by side share "
-        "the time. Memory is the most that a run's process held, evaluations included. Right: the paper's Table 4, one "
-        "robot at full size on an RTX 4090."
+        "its own: mean over seeds. An episode is the task's whole length of steps; robots that train side by side "
+        "share the time. Memory is the most that a run's process held, evaluations included. Right: the paper's Table 4, "
+        "one robot at full size on an RTX 4090."
     )
     return Table("cost", "Cost", description, COST, rows)
 

@@ -15,15 +15,15 @@ from baselines.compare.worker import _train
 from baselines.distillation.dagger import Collector, Dataset, Labels, lose
 from baselines.distillation.teachers import PolicyTeacher, Teacher, project, read_teacher
 from baselines.distillation.train import METRICS
+from baselines.modular import env as modular_env
 from baselines.modular.networks import ModularActor
 from baselines.modular.nodes import Nodes
 from baselines.modular.policy import SegmentPolicy
-from baselines.modular.train import env as modular_env
 from baselines.registry import configure
 from cfp.config import EnvironmentConfig, ReportConfig, to_json
 from cfp.errors import ConfigError, NonFiniteError
-from cfp.experiment.files import read_table
 from cfp.experiment.process import StopSignals
+from cfp.tables import read_table
 from cfp.weights import origin, read_policy, write_policy
 from dittogym import TASKS, TorchEnv
 from dittogym.action import patch_field, to_grid_layout
