@@ -50,9 +50,8 @@ class InProcessExecutor(Executor):
     def submit(self, job: Job) -> Future[Outcome]:
         """Carry out a run, see `Executor.submit`."""
         future: Future[Outcome] = Future()
-        future.set_result(
-            "stopped" if self.signals.number else run(job, self.signals, self.lock_timeout, own_process=False)
-        )
+        stopped = self.signals.number
+        future.set_result("stopped" if stopped else run(job, self.signals, self.lock_timeout, own_process=False))
         return future
 
     def stop(self) -> None:

@@ -37,9 +37,9 @@ def bootstrap_interval(
         Lower and upper end, scalars or (T,); None if no stratum has two runs.
     """
     resampled = [np.asarray(scores, float) for scores in strata if len(scores) > 1]
-    single = [float(scores[0]) for scores in strata if len(scores) == 1]  # the same in every resample
     if not resampled:
         return None
+    single = [scores[0] for scores in strata if len(scores) == 1]  # the same in every resample
 
     def statistic(*samples: np.ndarray, axis: int) -> np.ndarray:
         constant = np.broadcast_to(np.array(single), (*samples[0].shape[:-1], len(single)))

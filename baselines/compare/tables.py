@@ -245,8 +245,8 @@ def cost_table(groups: Sequence[Group]) -> Table:
     description = (
         "Training without its evaluations and without that of a teacher that is trained first, which has columns of "
         "its own: mean over seeds. An episode is the task's whole length of steps; robots that train side by side "
-        "share the time. Memory is the most that a run's process held, evaluations included. Right: the paper's Table 4, "
-        "one robot at full size on an RTX 4090."
+        "share the time. Memory is the most that a run's process held, evaluations included. Right: the paper's Table "
+        "4, one robot at full size on an RTX 4090."
     )
     return Table("cost", "Cost", description, COST, rows)
 

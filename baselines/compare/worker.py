@@ -41,8 +41,10 @@ def encode(job: Job, lock_timeout: float) -> bytes:
 def decode(line: str) -> tuple[Job, float]:
     """Inverse of `encode`."""
     values: dict[str, Any] = json.loads(line)
-    protocol, config = Protocol(**values["protocol"]), configure(values["config"])
-    return Job(values["label"], config, Path(values["folder"]), protocol), values["lock_timeout"]
+    protocol, tier = values["protocol"], values["protocol"]["tier"]
+    protocol["tier"] = tuple(tier) if isinstance(tier, list) else tier
+    job = Job(values["label"], configure(values["config"]), Path(values["folder"]), Protocol(**protocol))
+    return job, values["lock_timeout"]
 
 
 def run(job: Job, signals: StopSignals, lock_timeout: float, *, own_process: bool = True) -> Outcome:
