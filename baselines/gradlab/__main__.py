@@ -18,9 +18,9 @@ from tqdm import tqdm
 from baselines.common.rollout import judge
 from baselines.gradlab.measure import NoGradientError, Probe, Smoothing, measure
 from baselines.gradlab.report import format_table, write
-from cfp.config import positive
 from cfp.envs.make import choose_device
 from cfp.errors import CFPError, ConfigError
+from cfp.validation import check_positive
 from dittogym import TorchEnv
 from dittogym.tasks import task_name
 
@@ -78,7 +78,7 @@ class Lab:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, allowed {least} or more")
         if self.samples < 4 or self.samples % 2:
             raise ConfigError(f"samples: got {self.samples}, allowed an even number, 4 or more")
-        positive(sigma=self.sigma, amplitude=self.amplitude)
+        check_positive(sigma=self.sigma, amplitude=self.amplitude)
         growing = all(early < late for early, late in pairwise((0, *self.horizons)))
         if not self.horizons or not growing:
             raise ConfigError(f"horizons: got {self.horizons}, allowed are growing numbers from 1")

@@ -13,8 +13,8 @@ from torch import Tensor
 from baselines.common.rollout import Judge, judge_true
 from baselines.planning.gradient import PlanConfig, PlannerBase
 from baselines.planning.mpc import MPC, PlannedConfig, planned
-from cfp.config import positive
 from cfp.errors import ConfigError
+from cfp.validation import check_positive
 from dittogym import TorchEnv
 from dittogym.action import bicubic
 from dittogym.core import EnvState
@@ -42,7 +42,7 @@ class CEMPlannerConfig(PlanConfig):
     def check(self) -> None:
         """Check what the types cannot, see `PlanConfig.check`."""
         super().check()
-        positive(iterations=self.iterations, deviation=self.deviation, cells=self.cells)
+        check_positive(iterations=self.iterations, deviation=self.deviation, cells=self.cells)
         if not 2 <= self.elites <= self.candidates:
             raise ConfigError(f"elites: got {self.elites}, allowed 2 to the candidates, {self.candidates}")
         for name in ("persistence", "inertia"):

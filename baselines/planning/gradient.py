@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from baselines.common.rollout import Judge, Judgement, judge, rollout
-from cfp.config import not_negative, positive
 from cfp.errors import ConfigError
+from cfp.validation import check_at_least, check_positive
 from dittogym import TorchEnv
 from dittogym.core import EnvState, Model
 from dittogym.rewards import measure
@@ -43,7 +43,7 @@ class PlanConfig:
         """
         if not 1 <= self.commit <= self.horizon:
             raise ConfigError(f"commit: got {self.commit}, allowed 1 to the horizon, {self.horizon}")
-        not_negative(noise=self.noise, forgone=self.forgone, margin=self.margin)
+        check_at_least(0, noise=self.noise, forgone=self.forgone, margin=self.margin)
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class PlannerConfig(PlanConfig):
     def check(self) -> None:
         """Check what the types cannot, see `PlanConfig.check`."""
         super().check()
-        positive(iterations=self.iterations, learning_rate=self.learning_rate, clip=self.clip)
+        check_positive(iterations=self.iterations, learning_rate=self.learning_rate, clip=self.clip)
 
 
 Config = TypeVar("Config", bound=PlanConfig)

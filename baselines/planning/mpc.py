@@ -14,9 +14,9 @@ from baselines.common.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.common.open_loop import OpenLoop
 from baselines.planning.gradient import PlanConfig, Planner, PlannerBase, PlannerConfig
 from baselines.planning.surrogate import Reduced
-from cfp.config import EnvironmentConfig, ReportConfig, Tier
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
+from cfp.sections import EnvironmentConfig, Particles, ReportConfig
 from dittogym import make_spec
 
 METRICS: dict[str, str] = {
@@ -35,7 +35,7 @@ class PlannedConfig(GridConfig):
     The environment options say where plans are carried out and judged; tier says where they are tried.
     """
 
-    tier: Tier | None = None
+    tier: Particles | None = None
     """Particles of the simulations that plans are tried in, at most the environment's; None: as many."""
     planner: PlanConfig = field(default_factory=PlanConfig)
 
@@ -50,7 +50,6 @@ class PlannedConfig(GridConfig):
     def check(self) -> None:
         """Check what the types cannot, see `RunConfig.check`."""
         super().check()
-        self.planner.check()
         if self.environment.num_envs != 1:
             raise ConfigError(f"num_envs: got {self.environment.num_envs}, allowed 1: an episode is planned for itself")
         if self.environment.resample:
@@ -112,8 +111,8 @@ class MPC(Algorithm):
         self.actions = torch.zeros(0, *self.env.action_shape)
         self.total, self.reward, self.over = 0.0, 0.0, False
 
-    def _reduced(self, config: PlannedConfig, tier: Tier) -> Reduced:
-        own = replace(config, environment=config.environment.learned_at(tier))
+    def _reduced(self, config: PlannedConfig, tier: Particles) -> Reduced:
+        own = replace(config, environment=config.environment.for_training(tier))
         small = make_torch_env(own, config.resolution(0), 1)
         small.reset(seed=config.seed)
         try:

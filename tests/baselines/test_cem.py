@@ -117,7 +117,7 @@ def test_plans_that_are_not_finite_are_counted_and_no_elites(monkeypatch) -> Non
         ({"elites": 9}, "elites: got 9, allowed 2 to the candidates, 8"),
         ({"elites": 1}, "elites: got 1, allowed 2"),
         ({"persistence": 1.0}, "persistence: got 1.0, allowed 0 or more, less than 1"),
-        ({"deviation": 0.0}, "deviation: got 0.0, allowed more than 0"),
+        ({"deviation": 0.0}, "deviation must be positive, got 0.0"),
         ({"commit": 4}, "commit: got 4, allowed 1 to the horizon, 3"),
     ],
 )

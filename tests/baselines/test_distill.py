@@ -20,10 +20,11 @@ from baselines.modular.networks import ModularActor
 from baselines.modular.nodes import Nodes
 from baselines.modular.policy import SegmentPolicy
 from baselines.registry import configure
-from cfp.config import EnvironmentConfig, ReportConfig, to_json
+from cfp.config import to_json
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.files import read_table
 from cfp.experiment.process import StopSignals
+from cfp.sections import EnvironmentConfig, ReportConfig
 from cfp.weights import origin, read_policy, write_policy
 from dittogym import TASKS, TorchEnv
 from dittogym.action import patch_field, to_grid_layout
@@ -92,8 +93,8 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"share": 1.5}, "share: got 1.5, allowed 0 to 1"),
-        ({"faults": -0.1}, "faults: got -0.1, allowed 0 to 1"),
+        ({"share": 1.5}, "share must be between 0 and 1, got 1.5"),
+        ({"faults": -0.1}, "faults must be between 0 and 1, got -0.1"),
         ({"updates": 0}, "updates: got 0"),
         ({"student_rate": 0.0}, "student_rate: got 0.0"),
         ({"gate_bias": ()}, "gate_bias: got 0 values"),

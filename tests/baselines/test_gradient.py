@@ -9,8 +9,9 @@ import torch
 from baselines import Gradient, OpenLoop
 from baselines.registry import configure
 from baselines.trajectory.optimise import Episode
-from cfp.config import EnvironmentConfig, to_json
+from cfp.config import to_json
 from cfp.errors import ConfigError, NonFiniteError
+from cfp.sections import EnvironmentConfig
 from dittogym import make_spec
 
 TASKS = ("shapematch", "run", "grow", "kick", "dig", "obstacle", "catch", "slot")

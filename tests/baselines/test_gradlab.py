@@ -139,7 +139,7 @@ def test_command_writes_the_same_twice(tmp_path, capsys) -> None:
         ("--samples 5", "samples: got 5, allowed an even number"),
         ("--horizons 4 2", r"horizons: got \(4, 2\), allowed are growing"),
         ("--widths 0", "widths: got"),
-        ("--sigma 0", "sigma: got 0.0, allowed more than 0"),
+        ("--sigma 0", "sigma must be positive, got 0.0"),
         ("--warmup -1", "warmup: got -1, allowed 0 or more"),
         ("--task shapematch --warmup 30", "warmup: got 30, allowed at most 29"),
         ("--device tpu", "device: got 'tpu'"),

@@ -178,8 +178,8 @@ def test_clipping_does_not_count_steps_after_the_end(ends: int) -> None:
     ("options", "message"),
     [
         ({"commit": 17}, "commit: got 17, allowed 1 to the horizon, 16"),
-        ({"iterations": 0}, "iterations: got 0, allowed more than 0"),
-        ({"noise": -0.1}, "noise: got -0.1, allowed 0 or more"),
+        ({"iterations": 0}, "iterations must be positive, got 0"),
+        ({"noise": -0.1}, "noise must be at least 0, got -0.1"),
         ({"forgone": float("nan")}, "forgone: got nan"),
     ],
 )

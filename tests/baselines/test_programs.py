@@ -205,7 +205,7 @@ def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, mon
 
 @pytest.mark.parametrize("algo", ["shac", "distill", "gradient", "zero", "random", "scripted"])
 def test_new_particles_are_refused_where_the_seed_says_them(algo):
-    with pytest.raises(ConfigError, match="resample: got True, which changes nothing; allowed with soft actor-critic"):
+    with pytest.raises(ConfigError, match="resample requires soft actor-critic"):
         parse(train.PROGRAM, ["--algo", algo, "--resample"])
     assert parse(train.PROGRAM, ["--algo", "gnn-16", "--resample"]).run.environment.resample
 

@@ -9,8 +9,8 @@ from baselines import CEM, MPC, PlannerConfig
 from baselines.planning.cem import CEMConfig
 from baselines.planning.mpc import MPCConfig
 from baselines.planning.surrogate import Reduced
-from cfp.config import EnvironmentConfig
 from cfp.errors import ConfigError
+from cfp.sections import EnvironmentConfig
 from dittogym import TASKS, TorchEnv
 
 ENVIRONMENT = EnvironmentConfig(num_envs=1, particles=600, substeps=2)

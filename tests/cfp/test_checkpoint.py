@@ -6,25 +6,27 @@ from fakes import FakeEnv
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
+from cfp.agent.hyperparameters import Hyperparameters
 from cfp.agent.policies import CFPPolicy
 from cfp.agent.sac import CFP
-from cfp.config import Config, to_json
+from cfp.config import to_json
 from cfp.envs.vec_env import monitored
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.checkpoint import Checkpoint, model_state
 from cfp.experiment.state_file import Position, check_same
 from cfp.presets import preset
 
-CONFIG = Config(resolutions=(4, 8), gate_bias=(-1.0,))
+CONFIG = replace(preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,))
 
 
 def make_model(level=1):
     # The ring (20 rows) wraps around, and 7 does not divide anything: episodes are in progress at every checkpoint.
     env = monitored(FakeEnv(num_envs=2, resolution=CONFIG.action_size(level), horizon=7))
     spec = CONFIG.actor_spec(level)
-    options = {"buffer_size": 40, "batch_size": 4, "update_start": 6, "random_steps": 10, "seed": 3, "device": "cpu"}
-    options |= {"precision": "bfloat16"}
-    model = CFP(CFPPolicy, env, gate_penalty=0.1, policy_kwargs={"spec": spec}, **options)
+    hyperparameters = Hyperparameters(
+        buffer_size=40, batch_size=4, update_start=6, random_steps=10, precision="bfloat16", gate_penalty=0.1
+    )
+    model = CFP(CFPPolicy, env, hyperparameters, policy_kwargs={"spec": spec}, seed=3, device="cpu")
     model.set_logger(Logger(None, []))
     return model
 
