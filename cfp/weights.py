@@ -21,7 +21,7 @@ from cfp.agent.policies import ActorPolicy
 from cfp.agent.spec import RESOLUTIONS, ActorSpec
 from cfp.config import LARGEST_SEED, Config, RunConfig
 from cfp.errors import CheckpointError, ConfigError
-from cfp.experiment.files import parse_json, write_atomically, write_json
+from cfp.files import parse_json, write_atomically, write_json
 from cfp.from_dict import type_name, update_from_dict
 from cfp.sections import TASK_OPTIONS, EnvironmentConfig
 from dittogym import make_spec

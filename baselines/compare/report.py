@@ -14,7 +14,7 @@ from baselines.compare.results import Found, Group, group
 from baselines.compare.table import Table
 from cfp.evaluation.page import STYLE
 from cfp.evaluation.plots import write_figure
-from cfp.experiment.files import write_text
+from cfp.files import write_text
 from cfp.sections import Particles
 
 MORE_STYLE = """

@@ -11,8 +11,8 @@ import numpy as np
 
 from baselines.compare.evaluations import Judged, Judging, read
 from baselines.compare.plan import Job, read_sessions
-from cfp.experiment.files import read_table
 from cfp.sections import Particles
+from cfp.tables import read_table
 
 Curve = tuple[np.ndarray, np.ndarray]
 """Steps (N,) and values (N,)."""

@@ -16,10 +16,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from baselines.common.rollout import judge
-from baselines.gradlab.measure import NoGradientError, Probe, Smoothing, measure
+from baselines.gradlab.measure import Probe, Smoothing, measure
 from baselines.gradlab.report import format_table, write
 from cfp.envs.make import choose_device
-from cfp.errors import CFPError, ConfigError
+from cfp.errors import ConfigError
+from cfp.experiment.cli import run_command
 from cfp.validation import check_positive
 from dittogym import TorchEnv
 from dittogym.tasks import task_name
@@ -171,12 +172,7 @@ def run(lab: Lab) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
-    try:
-        print(run(parse(sys.argv[1:] if arguments is None else arguments)))
-    except (CFPError, NoGradientError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command(lambda: print(run(parse(sys.argv[1:] if arguments is None else arguments))))
 
 
 if __name__ == "__main__":

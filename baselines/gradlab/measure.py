@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from baselines.common.rollout import Judge, repeat, rollout, to_dtype
+from cfp.errors import CFPError
 from dittogym.core import EnvState, Model
 
 
-class NoGradientError(ValueError):
+class NoGradientError(CFPError):
     """The reward does not depend on the actions in a differentiable way."""
 
 

@@ -18,6 +18,7 @@ from cfp.validation import check_positive
 from dittogym import TorchEnv
 from dittogym.action import bicubic
 from dittogym.core import EnvState
+from torchmpm import tree
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class CEMPlanner(PlannerBase[CEMPlannerConfig]):
     @torch.no_grad()
     def _search(self, start: EnvState, plan: Tensor) -> Tensor:
         config, batch = self.config, plan.shape[1]
-        many = start.map(lambda tensor: tensor.repeat_interleave(config.candidates, 0))
+        many = tree.map(lambda tensor: tensor.repeat_interleave(config.candidates, 0), start)
         mean, deviation = plan, torch.full_like(plan, config.deviation)
         best, chosen = plan.new_full((batch,), -torch.inf), torch.zeros_like(plan)
         for _ in range(config.iterations):

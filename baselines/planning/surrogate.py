@@ -10,6 +10,7 @@ from torch import Tensor
 from dittogym import TorchEnv
 from dittogym.core import EnvState
 from dittogym.physics import PER_PARTICLE
+from torchmpm import tree
 
 CANDIDATES = 16
 """Nearest particles among which each looks for one that no other has taken."""
@@ -51,7 +52,7 @@ class Reduced:
             for name, value in state.physics.items()
         }
         memory = {**state.memory, **self._own}
-        self.small.env_state = replace(state, particles=state.particles.map(pick), physics=physics, memory=memory)
+        self.small.env_state = replace(state, particles=tree.map(pick, state.particles), physics=physics, memory=memory)
 
 
 def _nearest(large: TorchEnv, small: TorchEnv) -> Tensor:

@@ -13,7 +13,7 @@ import torch
 
 from cfp.config import RunConfig, to_json
 from cfp.errors import CheckpointError, ConfigError
-from cfp.experiment.files import parse_json, write_atomically
+from cfp.files import parse_json, write_atomically
 from cfp.from_dict import flatten
 
 VERSION = 1

@@ -128,17 +128,19 @@ POLICIES = [
         changes={"deterministic": "yes"},
     ),
     policy("for a layout by name", "layout: got 'x', allowed 0 to", changes={"layout": "x"}),
-    policy("for no environment", "environment must be an object, got None", changes={"environment": None}),
+    policy("for no environment", "environment: got None, allowed an object", changes={"environment": None}),
     policy("for an unknown environment", "environment.colour is not an option", changes={"environment": {"colour": 1}}),
     policy("without a network", "do not fit", changes={"network": {}}),
     policy(
         "with an unknown network", "do not fit", "network.colour is not an option", changes={"network": {"colour": 1}}
     ),
-    policy("with a grid of 7", "resolution: got 7, allowed 4, 8", changes={"network": {"resolutions": [7]}}),
+    policy(
+        "with a grid of 7", "resolutions must be increasing values of (4, 8", changes={"network": {"resolutions": [7]}}
+    ),
     policy("with grids in a text", "do not fit", changes={"network": {"resolutions": "8, 16"}}),
     policy(
         "with a patch of a mile",
-        "patch: got 1000000",
+        "and 128, got 1000000",
         "to 128",
         changes={"network": {"resolutions": [8], "patch": 10**6}},
     ),
@@ -290,11 +292,11 @@ CONFIGS = [
     file_of_options(
         "with a rate of NaN", '{"learning": {"learning_rate": NaN}}', "learning_rate must be finite, got nan"
     ),
-    file_of_options("with an infinite temperature", '{"alpha": [Infinity, 0]}', "alpha: got (inf, 0.0)", "finite"),
+    file_of_options("with an infinite temperature", '{"alpha": [Infinity, 0]}', "alpha must be finite, got (inf, 0.0)"),
     file_of_options("with half particles", '{"environment": {"particles": [1.5, 2]}}', "a list of 2, each an integer"),
     file_of_options("with a dtype in a list", '{"environment": {"dtype": ["float32"]}}', "'float32' or 'float64'"),
     file_of_options(
-        "with a target of a number", '{"environment": {"target": 3}}', "target: got 3, allowed text or null"
+        "with a target of a number", '{"environment": {"target": 3}}', "target must be a string or null, got 3"
     ),
     file_of_options("that says where to write", '{"out": "/etc"}', "out is not an option"),
     Case(

@@ -22,9 +22,9 @@ from baselines.modular.policy import SegmentPolicy
 from baselines.registry import configure
 from cfp.config import to_json
 from cfp.errors import ConfigError, NonFiniteError
-from cfp.experiment.files import read_table
 from cfp.experiment.process import StopSignals
 from cfp.sections import EnvironmentConfig, ReportConfig
+from cfp.tables import read_table
 from cfp.weights import origin, read_policy, write_policy
 from dittogym import TASKS, TorchEnv
 from dittogym.action import patch_field, to_grid_layout
@@ -95,9 +95,9 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
     [
         ({"share": 1.5}, "share must be between 0 and 1, got 1.5"),
         ({"faults": -0.1}, "faults must be between 0 and 1, got -0.1"),
-        ({"updates": 0}, "updates: got 0"),
-        ({"student_rate": 0.0}, "student_rate: got 0.0"),
-        ({"gate_bias": ()}, "gate_bias: got 0 values"),
+        ({"updates": 0}, "updates must be at least 1, got 0"),
+        ({"student_rate": 0.0}, "student_rate must be positive, got 0.0"),
+        ({"gate_bias": ()}, "gate_bias must have 1 values"),
     ],
 )
 def test_impossible_options_are_named(changes, message):

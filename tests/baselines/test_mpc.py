@@ -10,10 +10,10 @@ from baselines import MPC, OpenLoop, PlannerConfig, train
 from baselines.planning.mpc import MPCConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
-from cfp.experiment.files import read_table
 from cfp.experiment.process import StopSignals
 from cfp.experiment.run import holds_run
 from cfp.sections import EnvironmentConfig
+from cfp.tables import read_table
 
 ENVIRONMENT = EnvironmentConfig(num_envs=1, particles=100, substeps=2)
 CONFIG = MPCConfig(

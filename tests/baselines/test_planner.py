@@ -180,7 +180,7 @@ def test_clipping_does_not_count_steps_after_the_end(ends: int) -> None:
         ({"commit": 17}, "commit: got 17, allowed 1 to the horizon, 16"),
         ({"iterations": 0}, "iterations must be positive, got 0"),
         ({"noise": -0.1}, "noise must be at least 0, got -0.1"),
-        ({"forgone": float("nan")}, "forgone: got nan"),
+        ({"forgone": float("nan")}, "forgone must be at least 0, got nan"),
     ],
 )
 def test_bad_options(options: dict, message: str) -> None:

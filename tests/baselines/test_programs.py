@@ -16,7 +16,7 @@ from cfp.errors import ConfigError
 from cfp.evaluation.rollout import SeesState
 from cfp.experiment.books import Books
 from cfp.experiment.cli import parse
-from cfp.experiment.files import read_table
+from cfp.tables import read_table
 from cfp.weights import describe, save_policy
 
 COMMON = "--particles 100 --substeps 1 --eval-episodes 2 --no-video --device cpu".split()
@@ -236,7 +236,7 @@ def test_wrong_algorithm_is_named(tmp_path, capsys):
     assert train.main(["--algo", "alchemy", "--out", str(tmp_path / "a")]) == 2
     assert f"algo: got 'alchemy', allowed {', '.join(baselines.ALGORITHMS)}" in capsys.readouterr().err
     assert cfp.train.main(["--algo", "gradient", "--out", str(tmp_path / "a")]) == 2
-    assert "algo: got 'gradient', allowed 'cfp'; python -m baselines.train takes others" in capsys.readouterr().err
+    assert "algo must be 'cfp', got 'gradient'; python -m baselines.train" in capsys.readouterr().err
 
 
 def test_robustness_is_reported_whatever_trained_it(finished):

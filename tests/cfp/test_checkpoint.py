@@ -9,11 +9,10 @@ from stable_baselines3.common.logger import Logger
 from cfp.agent.hyperparameters import Hyperparameters
 from cfp.agent.policies import CFPPolicy
 from cfp.agent.sac import CFP
-from cfp.config import to_json
 from cfp.envs.vec_env import monitored
-from cfp.errors import CheckpointError, ConfigError
+from cfp.errors import CheckpointError
 from cfp.experiment.checkpoint import Checkpoint, model_state
-from cfp.experiment.state_file import Position, check_same
+from cfp.experiment.state_file import Position
 from cfp.presets import preset
 
 CONFIG = replace(preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,))
@@ -138,15 +137,6 @@ def test_damaged_state_is_refused_with_its_name(tmp_path, damage):
         torch.save({"version": 99}, path)
     with pytest.raises(CheckpointError, match=r"state\.pt"):
         Checkpoint(tmp_path).load()
-
-
-def test_checkpoint_from_before_an_option_existed_is_resumed():
-    stored, given = to_json(preset("shapematch")), preset("shapematch")
-    del stored["learning"]["precision"], stored["learning"]["compile"]
-    check_same(stored, given)
-    other = replace(given, learning=replace(given.learning, precision="bfloat16"))
-    with pytest.raises(ConfigError, match="precision: the run was started with 'float32', got 'bfloat16'"):
-        check_same(stored, other)
 
 
 def test_state_of_another_network_is_refused(tmp_path):
