@@ -141,7 +141,6 @@ POLICIES = [
     policy(
         "with a patch of a mile",
         "and 128, got 1000000",
-        "to 128",
         changes={"network": {"resolutions": [8], "patch": 10**6}},
     ),
     policy("with another ladder", "do not fit", changes={"network": {"resolutions": [16]}}),
