@@ -12,7 +12,9 @@ from torch import Tensor
 import cfp
 from baselines.common.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.common.open_loop import OpenLoop
-from baselines.planning.gradient import PlanConfig, Planner, PlannerBase, PlannerConfig
+from baselines.planning.base import Planner, PlannerConfig
+from baselines.planning.cem import CEMPlanner, CEMPlannerConfig
+from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.planning.surrogate import Reduced
 from cfp.config import EnvironmentConfig, ReportConfig, Tier
 from cfp.envs.make import make_torch_env
