@@ -15,11 +15,10 @@ import tyro
 from cfp import train
 from cfp.config import RunConfig, Tier, at_least_one
 from cfp.envs.make import choose_device
-from cfp.errors import CFPError, CheckpointError, ConfigError
+from cfp.errors import CheckpointError, ConfigError
 from cfp.evaluation.rollout import Noise, Policy, compare, format_table, to_rows
-from cfp.experiment.cli import Program, out_of_memory, started_as
+from cfp.experiment.cli import Program, program_name, run_command
 from cfp.experiment.from_dict import merge
-from cfp.experiment.process import keep_memory
 from cfp.experiment.run import make_video, read_config, stage_files
 from cfp.presets import from_json
 from cfp.weights import policy_file
@@ -169,16 +168,8 @@ def judge(
         arguments: Words of the command line; the process's own if None.
         program: Whose policies they are.
     """
-    keep_memory()
-    try:
-        started = started_as(f"{program.package}.{name}", arguments)
-        print(run(program, tyro.cli(kind, prog=started, args=arguments)))
-    except (CFPError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2 if isinstance(error, CFPError) else 1
-    except (MemoryError, RuntimeError) as error:
-        return out_of_memory(error, "episodes or particles")
-    return 0
+    started = program_name(f"{program.package}.{name}", arguments)
+    return run_command(lambda: print(run(program, tyro.cli(kind, prog=started, args=arguments))))
 
 
 if __name__ == "__main__":

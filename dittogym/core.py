@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -16,9 +16,8 @@ from dittogym.observation.window import in_window, window_origin
 from dittogym.physics import Physics, part_of
 from dittogym.rewards import action_cost, measure, split_penalty
 from dittogym.spec import FAILURE_REWARD, Measurement, Moment, Outcome, TaskSpec
-from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VonMises, diagnostics
+from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VonMises, diagnostics, tree
 from torchmpm.rollout import Segment
-from torchmpm.state import choose
 
 #: Terms that the engine adds to those of a task.
 RESERVED = {"split", "action", "alive", "failure"}
@@ -26,6 +25,7 @@ RESERVED = {"split", "action", "alive", "failure"}
 RESERVED_INFO = {"com", "split", "finite", "object_com", "reward_terms", "is_success", "true_reward"}
 
 
+@tree.register
 @dataclass(frozen=True, eq=False)
 class EnvState:
     """Everything that an episode needs to go on; leading dimension B throughout.
@@ -48,33 +48,13 @@ class EnvState:
     physics: Physics
     steps: Tensor
 
-    def map(self, function: Callable[..., Tensor], *others: EnvState) -> EnvState:
-        """Apply ``function`` to every tensor, together with the same tensor of ``others``."""
-
-        def entries(name: str) -> dict[str, Tensor]:
-            maps = [getattr(state, name) for state in (self, *others)]
-            return {key: function(*(m[key] for m in maps)) for key in maps[0]}
-
-        def field(name: str) -> Tensor:
-            return function(*(getattr(state, name) for state in (self, *others)))
-
-        return EnvState(
-            particles=self.particles.map(function, *(other.particles for other in others)),
-            origin=field("origin"),
-            centre=field("centre"),
-            start=self.start.map(function, *(other.start for other in others)),
-            memory=entries("memory"),
-            physics=entries("physics"),
-            steps=field("steps"),
-        )
-
     def where(self, mask: Tensor, other: EnvState) -> EnvState:
         """Whole batch elements from this state where ``mask`` (B,) holds, from ``other`` elsewhere."""
-        return self.map(lambda mine, theirs: choose(mask, mine, theirs), other)
+        return tree.where(mask, self, other)
 
     def detach(self) -> EnvState:
         """The same numbers, cut off from the autograd graph."""
-        return self.map(Tensor.detach)
+        return tree.detach(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +224,7 @@ class Shield:
         return view
 
     def _stop(self, gradient: Tensor) -> Tensor:
-        return gradient if self.finite is None else choose(self.finite, gradient, torch.zeros_like(gradient))
+        return gradient if self.finite is None else tree.where(self.finite, gradient, torch.zeros_like(gradient))
 
 
 def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState, Tensor]:
@@ -262,7 +242,7 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
     """
     shield = Shield()
     if torch.is_grad_enabled():
-        shielded, action = state.map(shield), shield(action)
+        shielded, action = tree.map(shield, state), shield(action)
         state = shielded if shield.used else state  # which need not be stacked anew
     spec, solver = model.spec, model.solver_for(state.physics)
     field = patch_field(action, spec.patch, state.physics.get("max_actuation", spec.max_actuation))

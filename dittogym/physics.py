@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dittogym.spec import TaskSpec
-from torchmpm.state import choose
+from torchmpm import tree
 
 #: Values by name, (B,) or (B, N) each; ``gravity`` (B, 2).
 Physics: TypeAlias = Mapping[str, Tensor]
@@ -89,7 +89,7 @@ def merged(spec: TaskSpec, old: Physics, new: Physics, mask: Tensor, like: Tenso
     own = defaults(spec, like)
     names = [name for name in NAMES if name in old or name in new]
     pairs = {name: _alike(new.get(name, own[name]), old.get(name, own[name])) for name in names}
-    return {name: choose(mask, *pair) for name, pair in pairs.items()}
+    return {name: tree.where(mask, *pair) for name, pair in pairs.items()}
 
 
 def part_of(value: float | Tensor, particles: slice) -> float | Tensor:

@@ -68,11 +68,6 @@ class Measurement(NamedTuple):
     object_com: Tensor | None = None
     object_velocity: Tensor | None = None
 
-    def map(self, function: Callable[..., Tensor], *others: Measurement) -> Measurement:
-        """Apply ``function`` to every field that is there, together with the same field of ``others``."""
-        there = {name: mine for name, mine in self._asdict().items() if mine is not None}
-        return Measurement(**{n: function(mine, *(getattr(o, n) for o in others)) for n, mine in there.items()})
-
 
 class Moment(NamedTuple):
     """What a task's own terms may look at after a step.

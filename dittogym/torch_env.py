@@ -21,9 +21,8 @@ from dittogym.render.frame import frame
 from dittogym.rewards import measure
 from dittogym.spec import Measurement, TaskSpec
 from dittogym.tasks import make_spec
-from torchmpm import ParticleState, checks
+from torchmpm import ParticleState, checks, tree
 from torchmpm.rollout import Segment, check_repetition
-from torchmpm.state import choose
 
 Parity = Literal["clean", "reference"]
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -237,7 +236,9 @@ class TorchEnv:
     def save(self) -> Snapshot:
         """A copy of the present moment, to which :meth:`load` returns; keeps the autograd graph."""
         state, observation = self._moment()
-        return Snapshot(self.spec.name, self._counts, self.model.shares, state.map(Tensor.clone), observation.clone())
+        return Snapshot(
+            self.spec.name, self._counts, self.model.shares, tree.map(Tensor.clone, state), observation.clone()
+        )
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Go on from a saved moment, to the last bit as if nothing had happened since.
@@ -268,12 +269,12 @@ class TorchEnv:
                 "(task, particles, what each stands for, dtype, device)"
             )
         index = torch.arange(self.num_envs, device=self.device) % size
-        state, observation = theirs.map(lambda t: t[index]), snapshot.observation[index]
+        state, observation = tree.map(lambda t: t[index], theirs), snapshot.observation[index]
         if not bool(chosen.all()):
             mine, seen = self._moment()
             physics = merged(self.spec, mine.physics, state.physics, chosen, self._like)
             state = replace(state, physics=physics).where(chosen, replace(mine, physics=physics))
-            observation = choose(chosen, observation, seen)
+            observation = tree.where(chosen, observation, seen)
         self._env_state, self._observation, self._field = state, observation.clone(), None
         return observation
 
@@ -318,7 +319,7 @@ class TorchEnv:
             fresh = replace(fresh, centre=old.centre.detach(), memory=memory)
         if old is not None and not everyone:
             kept = merged(self.spec, physics, old.physics, ~mask, self._like)
-            observation = choose(mask, observation, self._moment()[1])
+            observation = tree.where(mask, observation, self._moment()[1])
             fresh = replace(fresh, physics=kept).where(mask, replace(old, physics=kept))
         # Gradients in these constants reach back to this reset only, not to those before it.
         self._physics = {name: value.detach().clone() for name, value in physics.items()}

@@ -4,7 +4,7 @@ State goes in, state comes out: :class:`ParticleState` holds everything that mov
 description of grid, bodies and boundary) advances it, and no function keeps a tensor behind.
 """
 
-from torchmpm import diagnostics, sampling
+from torchmpm import diagnostics, sampling, tree
 from torchmpm.boundary import VelocityRule, fixed
 from torchmpm.grid import Grid
 from torchmpm.material import Elastic, Material, Soil, VonMises, lame
@@ -33,4 +33,5 @@ __all__ = [
     "sampling",
     "segment_for",
     "trajectory",
+    "tree",
 ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from numbers import Integral
 from typing import Any
@@ -11,18 +10,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchmpm import checks
+from torchmpm import checks, tree
 from torchmpm.rollout import transforming
 
 #: Trailing shape of every field after the leading (B, N).
 _TRAILING = {"x": (2,), "v": (2,), "C": (2, 2), "F": (2, 2), "Jp": ()}
 
 
-def choose(mask: Bool[Tensor, " B"], one: Tensor, other: Tensor) -> Tensor:
-    """Whole batch elements of tensors (B, ...): from ``one`` where ``mask`` (B,) holds, from ``other`` elsewhere."""
-    return torch.where(mask.view(-1, *[1] * (one.ndim - 1)), one, other)
-
-
+@tree.register
 @dataclass(frozen=True, eq=False)
 class ParticleState:
     """Positions, velocities and deformation of B independent simulations with N particles each.
@@ -116,15 +111,15 @@ class ParticleState:
 
     def to(self, *args: Any, **kwargs: Any) -> ParticleState:
         """Copy to another dtype or device; ``args`` and ``kwargs`` are those of :meth:`torch.Tensor.to`."""
-        return self.map(lambda t: t.to(*args, **kwargs))
+        return tree.map(lambda t: t.to(*args, **kwargs), self)
 
     def detach(self) -> ParticleState:
         """The same numbers, cut off from the autograd graph."""
-        return self.map(Tensor.detach)
+        return tree.detach(self)
 
     def clone(self) -> ParticleState:
         """An independent copy, for branching a simulation."""
-        return self.map(Tensor.clone)
+        return tree.map(Tensor.clone, self)
 
     def __reduce__(self) -> tuple[type[ParticleState], tuple[Tensor, ...]]:
         """Pickle the fields alone: copies would not share memory with a copy of :meth:`stack`."""
@@ -141,11 +136,11 @@ class ParticleState:
             if not -self.batch_size <= index < self.batch_size:
                 raise IndexError(f"index {index} is out of range for a batch of {self.batch_size}")
             index = slice(index, index + 1 or None)
-        return self.map(lambda t: t[index])
+        return tree.map(lambda t: t[index], self)
 
     def where(self, mask: Bool[Tensor, " B"], other: ParticleState) -> ParticleState:
         """Take whole batch elements: this state where ``mask`` (B,) holds, ``other`` elsewhere."""
-        return self.map(lambda mine, theirs: choose(mask, mine, theirs), other)
+        return tree.where(mask, self, other)
 
     def planes(self) -> tuple[Tensor, ...]:
         """The 13 component planes, each (B, N): x, v, C and F row by row, Jp."""
@@ -183,10 +178,6 @@ class ParticleState:
             if field.requires_grad or field.untyped_storage()._cdata != memory:
                 return torch.stack(self.planes())
         return stacked
-
-    def map(self, function: Callable[..., Tensor], *others: ParticleState) -> ParticleState:
-        """Apply ``function`` to every field, together with the same field of ``others``."""
-        return ParticleState(*(function(*(getattr(s, f.name) for s in (self, *others))) for f in fields(self)))
 
 
 torch.serialization.add_safe_globals([ParticleState])  # its tensors are all that a file holds of it

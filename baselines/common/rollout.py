@@ -12,7 +12,7 @@ from dittogym import core as dynamics
 from dittogym.action import Layout, to_grid_layout
 from dittogym.core import EnvState, Model
 from dittogym.observation.smooth import soft_observation
-from torchmpm import trajectory
+from torchmpm import trajectory, tree
 
 
 class Judgement(NamedTuple):
@@ -111,9 +111,9 @@ def rollout(
 
 def repeat(state: EnvState, copies: int) -> EnvState:
     """The first simulation of a state, ``copies`` times."""
-    return state.map(lambda t: t[:1].expand(copies, *t.shape[1:]))
+    return tree.map(lambda t: t[:1].expand(copies, *t.shape[1:]), state)
 
 
 def to_dtype(state: EnvState, dtype: torch.dtype) -> EnvState:
     """The same state in another floating point type."""
-    return state.map(lambda t: t.to(dtype) if t.is_floating_point() else t)
+    return tree.map(lambda t: t.to(dtype) if t.is_floating_point() else t, state)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,9 +19,9 @@ from baselines.compare.results import Found, find_runs
 from baselines.compare.worker import describe
 from baselines.registry import ALGORITHMS
 from cfp.config import Preset, Tier
-from cfp.errors import CFPError, ConfigError
-from cfp.experiment.cli import started_as
-from cfp.experiment.process import StopSignals, keep_memory
+from cfp.errors import ConfigError
+from cfp.experiment.cli import program_name, run_command
+from cfp.experiment.process import StopSignals
 
 PATIENCE, CLUSTER_PATIENCE = 30.0, 300.0
 """Seconds to wait for another process that holds a run folder; file servers take a while to give up a lost machine."""
@@ -186,20 +185,9 @@ def _report(command: Command, jobs: Sequence[Job]) -> list[Found]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
-    keep_memory()
-    try:
-        about = f"Algorithms: {', '.join(ALGORITHMS)}.\n\n{inspect.getdoc(Command)}"
-        started = started_as("baselines.compare", arguments)
-        return compare(tyro.cli(Command, prog=started, description=about, args=arguments))
-    except CFPError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("stopped at once; the same command goes on", file=sys.stderr)
-        return 128 + signal.SIGINT
+    about = f"Algorithms: {', '.join(ALGORITHMS)}.\n\n{inspect.getdoc(Command)}"
+    started = program_name("baselines.compare", arguments)
+    return run_command(lambda: compare(tyro.cli(Command, prog=started, description=about, args=arguments)))
 
 
 if __name__ == "__main__":

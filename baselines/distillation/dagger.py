@@ -15,7 +15,7 @@ from baselines.distillation.teachers import Teacher, project
 from cfp.envs import disturbances
 from dittogym import TorchEnv
 from dittogym import core as dynamics
-from torchmpm.state import choose
+from torchmpm import tree
 
 
 class Labels(NamedTuple):
@@ -150,7 +150,7 @@ class Collector:
             images.append(seen[counts].cpu())
             actions.append(told[counts].cpu())
             own = self._enlarged(lose(student(lose(seen, self.faults)), self.faults, self.grid))
-            seen = self._step(choose(follows, self._enlarged(told), own))
+            seen = self._step(tree.where(follows, self._enlarged(told), own))
         return Labels(torch.cat(images), torch.cat(actions))
 
     def _enlarged(self, action: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from baselines.common.algorithm import SEEDED, Algorithm, Callback, Sees, grid_s
 from baselines.common.episodes import Episodes
 from baselines.distillation.dagger import Collector, Dataset, Labels, lose
 from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
-from baselines.planning.gradient import PlannerConfig
+from baselines.planning.gradient import GradientPlannerConfig
 from baselines.shac.networks import quieten
 from cfp.agent.actor import build_actor
 from cfp.agent.policies import ActorPolicy
@@ -84,7 +84,7 @@ class DistillConfig(LadderConfig):
     """Control steps after which an episode is cut; the first ones are cut at staggered ages."""
     layouts: int = 64
     """Particle layouts that are gone through."""
-    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    planner: GradientPlannerConfig = field(default_factory=GradientPlannerConfig)
     planner_grid: int | Literal["coarse", "fine"] = "coarse"
     """Action grid of the teacher mpc."""
 
@@ -178,7 +178,7 @@ class Distill(Algorithm):
             student_rate=2e-3 if silhouette else 1e-3,
             share=0.8 if silhouette else 0.7,
             faults=0.2,
-            planner=PlannerConfig(iterations=30, learning_rate=0.1) if silhouette else PlannerConfig(),
+            planner=GradientPlannerConfig(iterations=30, learning_rate=0.1) if silhouette else GradientPlannerConfig(),
             planner_grid=16 if silhouette else "coarse",
         )
 

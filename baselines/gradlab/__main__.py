@@ -17,7 +17,8 @@ from torch import Tensor
 from baselines.gradlab.measure import ReturnFunction, measure
 from baselines.gradlab.report import format_table, write
 from cfp.envs.make import choose_device
-from cfp.errors import CFPError, ConfigError
+from cfp.errors import ConfigError
+from cfp.experiment.cli import run_command
 from dittogym import TorchEnv
 from dittogym.tasks import task_name
 
@@ -142,12 +143,7 @@ def run(config: GradLabConfig) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
-    try:
-        print(run(parse(sys.argv[1:] if arguments is None else arguments)))
-    except (CFPError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command(lambda: print(run(parse(sys.argv[1:] if arguments is None else arguments))))
 
 
 if __name__ == "__main__":

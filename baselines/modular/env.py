@@ -12,7 +12,7 @@ from torch import Tensor
 from baselines.modular.kmeans import begin, follow
 from baselines.modular.nodes import Nodes, places
 from dittogym import TorchEnv
-from torchmpm.state import choose
+from torchmpm import tree
 
 
 class SegmentedEnv:
@@ -79,11 +79,11 @@ class SegmentedEnv:
         field = self.nodes.act(self.env, self.labels, action)
         _, reward, terminated, truncated, info = self.env.step(field)
         labels = follow(places(self.env), self.labels, self.nodes.count)
-        self._labels = choose(info["finite"], labels, self.labels)
+        self._labels = tree.where(info["finite"], labels, self.labels)
         return self._look(info["finite"]), reward, terminated, truncated, info
 
     def _look(self, mask: Tensor) -> Tensor:
-        self._seen = choose(mask, self.nodes(self.env, self.labels), self._seen)
+        self._seen = tree.where(mask, self.nodes(self.env, self.labels), self._seen)
         return self._seen
 
     def render(self, index: int = 0) -> np.ndarray:

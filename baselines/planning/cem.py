@@ -16,6 +16,7 @@ from cfp.errors import ConfigError
 from dittogym import TorchEnv
 from dittogym.action import bicubic
 from dittogym.core import EnvState
+from torchmpm import tree
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class CEMPlanner(Planner[CEMPlannerConfig]):
     @torch.no_grad()
     def _search(self, state: EnvState, plan: Tensor) -> Tensor:
         config, batch = self.config, plan.shape[1]
-        states = state.map(lambda tensor: tensor.repeat_interleave(config.candidates, 0))
+        states = tree.map(lambda tensor: tensor.repeat_interleave(config.candidates, 0), state)
         mean, std = plan, torch.full_like(plan, config.initial_std)
         best = BestPlans(plan)
         for _ in range(config.iterations):

@@ -10,6 +10,7 @@ from torch import Tensor
 from dittogym import TorchEnv
 from dittogym.core import EnvState
 from dittogym.physics import PER_PARTICLE
+from torchmpm import tree
 
 NEIGHBOURS = 16
 """Nearest particles among which each particle looks for one that is not taken yet."""
@@ -53,7 +54,7 @@ class Surrogate:
             for name, value in state.physics.items()
         }
         memory = {**state.memory, **self._particle_memory}
-        self.env.env_state = replace(state, particles=state.particles.map(select), physics=physics, memory=memory)
+        self.env.env_state = replace(state, particles=tree.map(select, state.particles), physics=physics, memory=memory)
 
 
 def _nearest_particles(large: TorchEnv, small: TorchEnv) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cfp.config import not_negative, positive
 from dittogym import TorchEnv
-from torchmpm.state import choose
+from torchmpm import tree
 
 SPEED = 60.0
 """Reward for a mean speed of 1 m/s."""
@@ -80,8 +80,8 @@ class Pairs:
     def renewed(self, anew: Tensor, x: Tensor) -> Pairs:
         """The same pairs, but chosen again among the particles (B, N, 2) of the simulations of a mask (B,)."""
         fresh = Pairs.of(x)
-        other, distance = choose(anew, fresh.other, self.other), choose(anew, fresh.distance, self.distance)
-        return Pairs(self.one, other, distance, choose(anew, fresh.counts, self.counts))
+        other, distance = tree.where(anew, fresh.other, self.other), tree.where(anew, fresh.distance, self.distance)
+        return Pairs(self.one, other, distance, tree.where(anew, fresh.counts, self.counts))
 
     def drift(self, x: Tensor) -> Tensor:
         """Mean square of ``(d - d_0) / REACH - SLACK`` where positive, over pairs, (B,), for particles (B, N, 2)."""

@@ -13,7 +13,7 @@ from baselines.common.episodes import Episodes
 from baselines.shac.reward import Pairs, training_reward
 from cfp.errors import NonFiniteError
 from dittogym import TorchEnv
-from torchmpm.state import choose
+from torchmpm import tree
 
 if TYPE_CHECKING:
     from baselines.shac.train import ShacConfig
@@ -92,7 +92,7 @@ class Rollout:
             if bool(out.any()):
                 self.episodes.restart(out, terminated, info["finite"])
                 pairs = pairs.renewed(out, self._places())
-                after = choose(out, self.look(), after)
+                after = tree.where(out, self.look(), after)
             now = after
         targets = self._targets(rewards, values, ends)
         loss = -total.mean() / self.config.window

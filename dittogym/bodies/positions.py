@@ -12,9 +12,8 @@ from torch import Tensor
 from dittogym.observation.window import window_origin
 from dittogym.physics import real_tensor
 from dittogym.spec import Body, TaskSpec
-from torchmpm import Grid, checks, sampling
+from torchmpm import Grid, checks, sampling, tree
 from torchmpm.sampling import Points
-from torchmpm.state import choose
 
 #: ``"full"``, ``"lite"``, the number of robot particles, or the numbers for robot and object.
 Particles: TypeAlias = "str | int | tuple[int, ...]"
@@ -172,7 +171,7 @@ class Layouts:
             assert self._positions is not None
             return self._positions.clone()
         if self._positions is not None:
-            positions = choose(torch.as_tensor(mask, device=like.device), positions, self._positions)
+            positions = tree.where(torch.as_tensor(mask, device=like.device), positions, self._positions)
         self._check_inside(positions)
         # Gradients in given positions reach back to this reset only, not to the one that uses them next.
         self._samplers, self._positions = samplers, positions.detach().clone()

@@ -85,7 +85,7 @@ TRAIN = [
     Case(
         "train with a memory of years",
         command(cfp.train.main, TINY + NEW + "--buffer-size 99999999999999"),
-        ("not enough memory: take fewer num_envs", "a smaller buffer_size"),
+        ("not enough memory", "buffer_size"),
         Refused,
         leaves="new",
     ),

@@ -15,10 +15,10 @@ from baselines.compare.worker import _train
 from baselines.distillation.dagger import Collector, Dataset, Labels, lose
 from baselines.distillation.teachers import PolicyTeacher, Teacher, project, read_teacher
 from baselines.distillation.train import METRICS
+from baselines.modular import env as modular_env
 from baselines.modular.networks import ModularActor
 from baselines.modular.nodes import Nodes
 from baselines.modular.policy import SegmentPolicy
-from baselines.modular.train import env as modular_env
 from baselines.registry import configure
 from cfp.config import EnvironmentConfig, ReportConfig, to_json
 from cfp.errors import ConfigError, NonFiniteError

@@ -11,9 +11,9 @@ import baselines
 import cfp
 from baselines import Shac, StatePolicy
 from baselines.registry import configure
+from baselines.shac import rollout as shac_rollout
 from baselines.shac.reward import RewardConfig
 from baselines.shac.train import METRICS
-from baselines.shac.train import rollout as shac_rollout
 from cfp.agent.actor import ActorSpec, build_actor
 from cfp.config import EnvironmentConfig, to_json
 from cfp.envs.make import make_env

@@ -263,18 +263,3 @@ def test_wrong_option_is_one_line_and_exit_code_two(folder, capsys, arguments, m
 def test_folder_without_a_run_is_an_error(tmp_path, capsys):
     assert robustness.main([str(tmp_path)]) == 2
     assert "there is no run" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("program", [cfp.evaluate, robustness])
-def test_lack_of_memory_is_one_line(folder, capsys, monkeypatch, program):
-    def fail(*_):
-        raise error
-
-    monkeypatch.setattr(program, "run", fail)
-    for error in (MemoryError("backend"), RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried")):
-        assert program.main([str(folder)]) == 1
-        told = capsys.readouterr().err
-        assert told == f"error: not enough memory: take fewer episodes or particles ({error})\n"
-    error = RuntimeError("something else")
-    with pytest.raises(RuntimeError, match="something else"):
-        program.main([str(folder)])

@@ -22,11 +22,12 @@ from cfp.agent.actor import ActorSpec, build_actor
 from cfp.agent.policies import ActorPolicy
 from cfp.config import EnvironmentConfig
 from cfp.envs.vec_env import monitored
-from cfp.evaluation.rollout import compare, video
-from cfp.evaluation.rollout import plots as plot
+from cfp.evaluation import plots as plot
+from cfp.evaluation import video
+from cfp.evaluation.rollout import compare
 from cfp.experiment.callbacks import StageCallback
 from cfp.experiment.cfp_run import Runner
-from cfp.experiment.cli import started_as
+from cfp.experiment.cli import program_name
 from cfp.experiment.files import read_table
 from cfp.presets import preset
 from cfp.weights import describe, policy_file, save_policy, shipped
@@ -85,7 +86,7 @@ def test_interrupt_that_is_not_held_back_is_one_line(tmp_path, monkeypatch, caps
 
     monkeypatch.setattr(Runner, place, interrupt)
     assert run(tmp_path / "a", "--steps", "20", "--handover", "10") == 130
-    assert capsys.readouterr().err.splitlines()[-1] == "stopped; --resume goes on"
+    assert capsys.readouterr().err.splitlines()[-1] == "stopped at once"
 
 
 def test_policies_are_judged_on_the_device_that_was_chosen(finished, monkeypatch):
@@ -95,7 +96,7 @@ def test_policies_are_judged_on_the_device_that_was_chosen(finished, monkeypatch
         seen.append(device)
         return cfp.load(path, "cpu")
 
-    for module in ("runner", "evaluate"):
+    for module in ("experiment.cfp_run", "evaluate"):
         monkeypatch.setattr(f"cfp.{module}.choose_device", lambda name: f"the one that {name} means")
     program = replace(train.PROGRAM, load=load)
     evaluate.open_run(program, finished, "cuda")
@@ -274,7 +275,7 @@ def test_help_names_the_program_that_was_started(tmp_path, monkeypatch, capsys):
     ):
         done = subprocess.run([sys.executable, *command], cwd=tmp_path, env=PROCESS, capture_output=True, text=True)
         assert done.returncode == 2 and name in " ".join(done.stderr.replace("│", " ").split())
-    assert started_as("cfp.train", []) == "python -m cfp.train"
+    assert program_name("cfp.train", []) == "python -m cfp.train"
 
 
 def test_evaluation_of_a_folder(finished, capsys):

@@ -10,15 +10,14 @@ from tiny import SMALL, TASKS, actions, assert_same_bits, everything, stir, tiny
 
 from dittogym import TorchEnv
 from dittogym.torch_env import Snapshot
+from torchmpm import tree
 
 STEPS = 3
 
 
 def contents(snapshot: Snapshot) -> list[torch.Tensor]:
     """Copies of all tensors of a snapshot."""
-    found: list[torch.Tensor] = []
-    snapshot.state.map(lambda tensor: found.append(tensor.detach().clone()) or tensor)
-    return [*found, snapshot.observation.clone()]
+    return [tensor.detach().clone() for tensor in (*tree.leaves(snapshot.state), snapshot.observation)]
 
 
 def go_on(env: TorchEnv, drive: torch.Tensor) -> list[Any]:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 import dittogym
+from torchmpm import tree
 
 TASKS = tuple(dittogym.TASKS)
 #: Tasks whose window stays where it is.
@@ -57,6 +58,4 @@ def assert_same_bits(ours: Any, theirs: Any) -> None:
 
 def everything(env: dittogym.TorchEnv) -> list[torch.Tensor]:
     """Every number that an environment's future depends on."""
-    found: list[torch.Tensor] = []
-    env.env_state.map(lambda tensor: found.append(tensor) or tensor)
-    return found
+    return tree.leaves(env.env_state)

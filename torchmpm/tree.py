@@ -1,0 +1,97 @@
+"""States as pytrees: nested containers of tensors that functions map over leaf by leaf.
+
+Dataclasses registered here, tuples, named tuples, lists and dictionaries are all containers. The registry is the one
+that ``torch.func``, ``torch.utils.checkpoint`` and ``torch.compile`` consult. It lives in ``torch.utils._pytree``: no
+release of torch offers it under a public name, and a second registry would not be seen by those functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+Tree = TypeVar("Tree")
+
+
+def register(cls: type[Tree]) -> type[Tree]:
+    """Class decorator that registers a dataclass as a pytree whose children are its fields.
+
+    Instances rebuilt from leaves skip ``__init__`` and its checks, because transforms such as ``torch.func.vmap`` put
+    leaves of other shapes in their place.
+
+    Args:
+        cls: A dataclass all of whose fields are containers of tensors.
+
+    Returns:
+        The same class.
+    """
+    names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
+
+    def flatten(instance: Tree) -> tuple[list[Any], None]:
+        return [getattr(instance, name) for name in names], None
+
+    def flatten_with_keys(instance: Tree) -> tuple[list[tuple[Any, Any]], None]:
+        return [(pytree.GetAttrKey(name), getattr(instance, name)) for name in names], None
+
+    def unflatten(children: Any, _: None) -> Tree:
+        instance = object.__new__(cls)
+        for name, child in zip(names, children, strict=True):
+            object.__setattr__(instance, name, child)
+        return instance
+
+    pytree.register_pytree_node(cls, flatten, unflatten, flatten_with_keys_fn=flatten_with_keys)
+    return cls
+
+
+def map(function: Callable[..., Any], tree: Tree, *others: Tree) -> Tree:
+    """Apply a function to every tensor of a tree, together with the tensors in the same place of other trees.
+
+    Args:
+        function: Called as ``function(tensor, *other_tensors)``.
+        tree: The tree; leaves that are not tensors are kept.
+        others: Trees of the same structure.
+
+    Returns:
+        A tree of the same structure.
+
+    Raises:
+        ValueError: The structures differ.
+    """
+
+    def apply(leaf: Any, *other_leaves: Any) -> Any:
+        return function(leaf, *other_leaves) if isinstance(leaf, Tensor) else leaf
+
+    return pytree.tree_map(apply, tree, *others)
+
+
+def leaves(tree: Any) -> list[Tensor]:
+    """All tensors of a tree, in order."""
+    return [leaf for leaf in pytree.tree_leaves(tree) if isinstance(leaf, Tensor)]
+
+
+def detach(tree: Tree) -> Tree:
+    """The same tree with every tensor detached from the autograd graph."""
+    return map(Tensor.detach, tree)
+
+
+def where(mask: Tensor, tree: Tree, other: Tree) -> Tree:
+    """Select whole batch elements: those of ``tree`` where the mask holds, those of ``other`` elsewhere.
+
+    Args:
+        mask: (B,) bool.
+        tree: A tensor (B, ...) or a tree of them.
+        other: A tree of the same structure and shapes.
+
+    Returns:
+        A tree of the same structure and shapes.
+    """
+
+    def select(chosen: Tensor, otherwise: Tensor) -> Tensor:
+        return torch.where(mask.view(-1, *[1] * (chosen.ndim - 1)), chosen, otherwise)
+
+    return map(select, tree, other)
