@@ -83,7 +83,7 @@ class PolicyTeacher(Teacher):
 class PlannerTeacher(Teacher):
     """The gradient planner, from wherever the student has got to.
 
-    It plans for all robots at once, every `GradientPlannerConfig.commit` steps, each plan from what is left of the one before.
+    It plans for all robots at once, every `PlannerConfig.commit` steps, each plan from what is left of the one before.
 
     Args:
         env: Of its own, with its action grid; it follows the one that it is asked about.
