@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 
 from baselines.gradlab.measure import STEP_SIZES, HorizonResult
 from cfp.evaluation.plots import write_figure
-from cfp.experiment.files import csv_text, write_json, write_text
+from cfp.files import write_json, write_text
+from cfp.tables import csv_text
 
 MAX_DIFFERENCE_ERROR, MIN_COSINE = 0.05, 0.99
 """Largest error of finite differences, and smallest cosine between precisions, of a gradient taken to be right."""
