@@ -25,7 +25,7 @@ def learning(algo, name, options, *words):
 
 
 def distilling(name, options, *words):
-    common = "--particles 100 --substeps 1 --tier 100 --eval-episodes 1 --no-video --device cpu"
+    common = "--particles 100 --substeps 1 --train-particles 100 --eval-episodes 1 --no-video --device cpu"
     return Case(f"distill with {name}", command(baselines.distill.main, common + NEW + options), words, Refused)
 
 
@@ -56,7 +56,7 @@ TRAIN = [
         "a late handover",
         "--resolutions 4 8 --random-steps 9 9 --handover 50",
         "handover must increase",
-        "between 0 and the number of steps, 20",
+        "between 0 and the steps, 20",
     ),
     training("a grid of 5", "--resolutions 5", "resolutions must be increasing values of (4, 8,"),
     training("a negative temperature", "--alpha -1", "alpha must be at least 0, got -1.0"),
@@ -80,8 +80,8 @@ TRAIN = [
     training("a variant of another task", "--variant published", "task 'shapematch' has no option 'variant'"),
     training("a policy that is not there", "--start-from none", "none.safetensors: there is no policy"),
     training("a policy of another task", "--start-from run", "start_from: got a policy for run, allowed shapematch"),
-    training("an algorithm of baselines", "--algo shac", "algo must be 'cfp', got 'shac'; python -m baselines.train"),
-    training("robots on judging layouts", "--num-envs 10001", "num_envs must be at most 10000, got 10001"),
+    training("an algorithm of baselines", "--algo shac", "algo: got 'shac', allowed 'cfp'; python -m baselines.train"),
+    training("robots on judging layouts", "--num-envs 10001", "num_envs: got 10001 layouts, allowed 10000: further"),
     Case(
         "train with a memory of years",
         command(cfp.train.main, TINY + NEW + "--buffer-size 99999999999999"),
@@ -117,9 +117,9 @@ OTHERS = [
     learning("gradient", "no iterations", "--iterations 0", "iterations must be at least 1, got 0"),
     learning("gradient", "a negative window", "--window -1", "window must be at least 0, got -1"),
     learning("gradient", "a grid of 99", "--grid 99", "resolution must be 'coarse', 'fine' or 1 to 64, got 99"),
-    learning("mpc", "two robots", "--num-envs 2", "num_envs: got 2, allowed 1"),
-    learning("mpc", "a horizon before its end", "--horizon 2 --commit 3", "commit: got 3, allowed 1 to the horizon, 2"),
-    learning("cem", "one elite", "--elites 1", "elites: got 1, allowed 2 to the candidates"),
+    learning("mpc", "two robots", "--num-envs 2", "num_envs", "got 2"),
+    learning("mpc", "a horizon before its end", "--horizon 2 --commit 3", "commit", "got 3"),
+    learning("cem", "one elite", "--elites 1", "elites", "got 1"),
     learning("shac", "an endless discount", "--gamma nan", "gamma must be finite, got nan"),
     learning(
         "shac", "a policy of the state", "--start-from run", "start_from: got a policy, allowed with sees 'image'"
@@ -127,24 +127,35 @@ OTHERS = [
     learning("gnn-16", "a layout of images", "--action-layout grid", "action_layout requires algo"),
     learning("coarse", "an anchor", "--anchor 3", "anchor requires refine"),
     learning("shac", "an image without a clock", "--sees image --no-clock", "clock requires sees state"),
-    learning("gradient", "polish for nothing", "--polish-rate 1", "polish_rate requires polish"),
     learning(
-        "gradient", "a blur of rewards", "--task run --blur 1", "blur requires a task", "a task that has a target"
+        "gradient",
+        "polish for nothing",
+        "--polish-learning-rate 1",
+        "polish_learning_rate: got 1.0",
+        "allowed with polish",
     ),
+    learning("gradient", "a blur of rewards", "--task run --blur 1", "blur: got (1.0,)", "a task that has a target"),
     learning("zero", "two robots", "--num-envs 2", "num_envs requires algorithms that learn"),
     distilling("plans of no planner", "--iterations 9", "iterations requires teacher mpc"),
     learning("zero", "a grid of none", "--grid 0", "resolution must be 'coarse', 'fine' or 1 to 64, got 0"),
     distilling("an unknown teacher", "--teacher socrates", "teacher: got 'socrates'", "mpc, shac, gradient"),
     distilling("a teacher of another task", "--teacher run", "teacher: got a policy for run, allowed shapematch"),
-    distilling("a share of 2", "--share 2", "share must be between 0 and 1, got 2.0"),
-    learning("shac", "judging layouts", "--layouts 50000", "layouts must be at most 9996, got 50000"),
-    distilling("judging layouts", "--layouts 5000", "layouts must be at most 9984, got 10000"),
+    distilling("a decay of 2", "--beta-decay 2", "beta_decay must be between 0 and 1, got 2.0"),
+    learning(
+        "shac",
+        "judging layouts",
+        "--num-layouts 50000",
+        "num_layouts: got 50000 layouts, allowed 9996: further ones judge",
+    ),
+    distilling(
+        "judging layouts", "--num-layouts 5000", "num_layouts: got 10000 layouts, allowed 9984: further ones judge"
+    ),
     distilling("no labels", "--capacity 0", "capacity must be at least 1, got 0"),
     evaluating("nothing", "", "policy: got None and the folder None, allowed is one of the two"),
     evaluating("a folder that is not there", "{folder}/none", "none: there is no run (no config.json)"),
     evaluating("an unknown policy", "--policy alchemy", "none of that name is shipped (catch, grow, run, "),
     evaluating("no episodes", "--policy run --episodes 0", "episodes must be at least 1, got 0"),
-    evaluating("with seed -1", "--policy run --seed -1", "seed must be between 0 and"),
+    evaluating("with seed -1", "--policy run --seed -1", "seed: got -1, allowed 0 to"),
     evaluating("with noise maybe", "--policy run --noise maybe", "'maybe'", "--noise", "without"),
     evaluating("no particles", "--policy run --particles 0", "particles must be at least 1", "got 0"),
     evaluating("an empty folder", "{folder}", "there is no run", main=baselines.evaluate.main),
@@ -160,7 +171,7 @@ OTHERS = [
     comparing("a seed twice", "--seeds 1 1", "seeds: got 1 1, allowed one or more, each once"),
     comparing("without seeds", "--seeds", "seeds: got none, allowed one or more"),
     comparing("seed -1", "--seeds -1", "seeds: got -1, allowed 0 to 8999"),
-    comparing("no episodes", "--episodes 0", "episodes: got 0, allowed 1 or more"),
+    comparing("no episodes", "--episodes 0", "episodes must be at least 1, got 0"),
     comparing("minus one worker", "--workers -1", "workers: got -1, allowed 0 or more"),
     comparing(
         "parts of a GPU at home", "--gpus-per-run 0.5", "gpus_per_run: got 0.5, allowed with --executor ray only"
