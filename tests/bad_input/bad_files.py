@@ -128,7 +128,7 @@ POLICIES = [
         changes={"deterministic": "yes"},
     ),
     policy("for a layout by name", "layout: got 'x', allowed 0 to", changes={"layout": "x"}),
-    policy("for no environment", "environment must be an object, got None", changes={"environment": None}),
+    policy("for no environment", "environment: got None, allowed an object", changes={"environment": None}),
     policy("for an unknown environment", "environment.colour is not an option", changes={"environment": {"colour": 1}}),
     policy("without a network", "do not fit", changes={"network": {}}),
     policy(

@@ -197,7 +197,7 @@ def test_array_job_does_one_run_and_no_report(tmp_path):
         ("--tasks swim --algos mpc", "task must be catch"),
         ("--algos mpc mpc", "algos: got mpc mpc, allowed one or more, each once"),
         ("--seeds 9500 --algos mpc", "seeds: got 9500, allowed 0 to 8999"),
-        ("--episodes 0", "episodes must be at least 1, got 0"),
+        ("--episodes 0", "episodes: got 0, allowed 1 or more"),
         ("--gpus-per-run 1", "gpus_per_run: got 1.0, allowed with --executor ray only"),
         ("--algos mpc --seeds 0 --only 1", "only: got 1, allowed 0 to 0"),
         ("--only 0 --report-only", "only: got 0, allowed without --report-only"),

@@ -101,9 +101,9 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
     [
         ({"beta_decay": 1.5}, "beta_decay must be between 0 and 1, got 1.5"),
         ({"dropout": -0.1}, "dropout must be between 0 and 1, got -0.1"),
-        ({"updates": 0}, "updates: got 0"),
-        ({"student_learning_rate": 0.0}, "student_learning_rate: got 0.0"),
-        ({"gate_bias": ()}, "gate_bias: got 0 values"),
+        ({"updates": 0}, "updates must be at least 1, got 0"),
+        ({"student_learning_rate": 0.0}, "student_learning_rate must be positive, got 0.0"),
+        ({"gate_bias": ()}, "gate_bias must have 1 values"),
     ],
 )
 def test_impossible_options_are_named(changes, message):

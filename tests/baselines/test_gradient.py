@@ -43,8 +43,8 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"iterations": 0}, "iterations: got 0"),
-        ({"window": -1}, "window: got -1"),
+        ({"iterations": 0}, "iterations must be at least 1, got 0"),
+        ({"window": -1}, "window must be at least 0, got -1"),
         ({"polish_learning_rate": 0.0}, "polish_learning_rate"),
         ({"blur": ()}, "blur"),
     ],

@@ -52,10 +52,10 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"window": 0}, "window: got 0"),
-        ({"gamma": 1.5}, "gamma: got 1.5"),
+        ({"window": 0}, "window must be at least 1, got 0"),
+        ({"gamma": 1.5}, "gamma must be between 0 and 1, got 1.5"),
         ({"learning_rate": 0.0}, "learning_rate"),
-        ({"noise": -0.1}, "noise: got -0.1"),
+        ({"noise": -0.1}, "noise must be at least 0, got -0.1"),
         ({"reward": RewardConfig(scale=0.0)}, "scale must be positive, got 0.0"),
         ({"reward": RewardConfig(split_weight=-1.0)}, "split_weight must be at least 0, got -1.0"),
         ({"reward": RewardConfig(split_margin=-0.5)}, "split_margin must be at least 0, got -0.5"),
