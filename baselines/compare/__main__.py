@@ -21,10 +21,11 @@ from baselines.compare.report import write_report
 from baselines.compare.results import RunResult, read_result
 from baselines.compare.worker import Outcome
 from baselines.registry import ALGORITHMS
-from cfp.config import Preset, RunConfig, Tier
+from cfp.config import Preset, RunConfig
 from cfp.errors import ConfigError
 from cfp.experiment.cli import program_name, run_command
 from cfp.experiment.process import Stopped, StopSignals
+from cfp.sections import Particles
 
 LOCK_TIMEOUT, CLUSTER_LOCK_TIMEOUT = 30.0, 300.0
 """Seconds to wait for another process that holds a run folder; file servers take a while to give up a lost machine."""
@@ -56,7 +57,7 @@ class Command:
     """cpu, cuda, or auto."""
     episodes: int = 10
     """Episodes of the final evaluation of each policy."""
-    tier: Tier = "lite"
+    tier: Particles = "lite"
     """Particles of the final evaluation, for all policies."""
     noise: Noise = "paper"
     """Action noise of all policies in the final evaluation: with, without, or as in the paper, that is without in

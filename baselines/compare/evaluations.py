@@ -12,13 +12,14 @@ from typing import Any, Literal
 
 from baselines.compare import paper
 from baselines.registry import load
-from cfp.config import RunConfig, Tier
+from cfp.config import RunConfig
 from cfp.envs.disturbances import Case, make_cases
 from cfp.envs.make import choose_device, make_env
 from cfp.errors import CheckpointError
 from cfp.evaluation.rollout import Result, evaluate, judging_seed
 from cfp.files import parse_json, write_json
 from cfp.robustness import report
+from cfp.sections import Particles
 
 RECORD = "final_evaluation.json"
 BATCH = 10
@@ -38,13 +39,13 @@ class Protocol:
 
     Attributes:
         episodes: Number of episodes, on the same layouts for all policies.
-        tier: Particles, see `cfp.config.EnvironmentConfig`.
+        tier: Particles, see `cfp.sections.EnvironmentConfig`.
         robustness: Disturbed cases: none, those of the paper, or all of `cfp.envs.disturbances.make_cases`.
         noise: Whether policies act with their action noise; ``paper``: except in the tasks in `paper.WITHOUT_NOISE`.
     """
 
     episodes: int
-    tier: Tier = "lite"
+    tier: Particles = "lite"
     robustness: Robustness = "paper"
     noise: Noise = "paper"
 
@@ -133,12 +134,12 @@ def read_record(path: Path, **types: type) -> dict[str, Any]:
     return record
 
 
-def evaluation_config(config: RunConfig, tier: Tier) -> RunConfig:
+def evaluation_config(config: RunConfig, tier: Particles) -> RunConfig:
     """Options of the environment of a final evaluation: seed 0 for all runs, so that all play the same layouts.
 
     The environment depends on ``tier`` and not on the particles of the run, so that it is the same for all runs.
     """
-    return replace(config, seed=0, environment=config.environment.judged_at(tier))
+    return replace(config, seed=0, environment=config.environment.for_evaluation(tier))
 
 
 def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop: Callable[[], None]) -> None:

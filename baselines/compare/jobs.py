@@ -14,9 +14,9 @@ from baselines.compare.plan import Plan
 from baselines.registry import ALGORITHMS, ALIASES, configure, find
 from cfp.config import EVALUATION_SEED, RunConfig, to_json
 from cfp.errors import ConfigError
-from cfp.experiment.from_dict import flatten
 from cfp.experiment.run import holds_run, read_config
-from cfp.groups import TASK_OPTIONS
+from cfp.from_dict import flatten
+from cfp.sections import TASK_OPTIONS
 from cfp.weights import is_of_another_task, is_same_task, read_policy
 from dittogym.tasks import task_name
 
@@ -145,7 +145,9 @@ def resolve(plan: Plan, label: str, task: str, preset: str, seed: int, steps: in
         values.setdefault("steps", steps)
     report = {"video": False, **values.pop("report", {})}
     try:
-        config = configure({**start, "seed": seed, "device": device, **values, "report": report}).adapted(base, values)
+        config = configure({**start, "seed": seed, "device": device, **values, "report": report}).with_derived(
+            base, values
+        )
         config.check()
         # Options for all algorithms may have no effect on some of them.
         config.check_effect(base, flatten(plan.own_options(label, task)))

@@ -6,9 +6,9 @@ the steps, three seeds, training returns. A resting robot was measured in the re
 
 from __future__ import annotations
 
-from cfp.config import Tier
+from cfp.sections import Particles
 
-TIER: Tier = "full"
+TIER: Particles = "full"
 """Particles of the paper's figures."""
 
 COLUMNS = ("cfp", "coarse", "fine", "gnn-16", "gnn-64", "transformer-16", "transformer-64")

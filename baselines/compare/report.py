@@ -13,10 +13,10 @@ from baselines.compare import paper, plots, tables
 from baselines.compare.evaluations import Protocol
 from baselines.compare.results import Group, RunResult, group_results
 from baselines.compare.table import Table
-from cfp.config import Tier
 from cfp.evaluation.page import STYLE
 from cfp.evaluation.plots import write_figure
 from cfp.files import write_text
+from cfp.sections import Particles
 
 TABLE_STYLE = """
 body { max-width: 76rem; } .wide { overflow-x: auto; } table { font-size: 14px; } th { vertical-align: bottom; }
@@ -133,7 +133,7 @@ def _curve_caption(groups: Sequence[Group]) -> str:
         "The runs' own evaluations during training: interquartile mean over seeds and its 95 % bootstrap band, on "
         "steps where all seeds have values. The style of a line tells what is observed."
     )
-    particles: dict[str, Tier] = {group.label: group.particles for group in groups}
+    particles: dict[str, Particles] = {group.label: group.particles for group in groups}
     if len(set(particles.values())) > 1:
         listed = ", ".join(f"{label} {value}" for label, value in particles.items())
         text += f" The numbers of particles differ: {listed}."

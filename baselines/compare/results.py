@@ -11,8 +11,8 @@ import numpy as np
 from baselines.compare.evaluations import FinalEvaluation, read_evaluation
 from baselines.compare.jobs import Job, read_sessions
 from baselines.compare.stats import Curve, interquartile_mean, score_interval
-from cfp.config import Tier
 from cfp.errors import CheckpointError
+from cfp.sections import Particles
 from cfp.tables import read_table
 
 OBSERVATIONS = ("image", "state", "simulator", "nothing")
@@ -112,7 +112,7 @@ class Group:
         return score_interval([self.scores])
 
     @property
-    def particles(self) -> Tier:
+    def particles(self) -> Particles:
         """Particles of the evaluations during training."""
         return self.job.config.environment.particles
 

@@ -12,7 +12,7 @@ from baselines.compare import paper
 from baselines.compare.results import Group, RunResult
 from baselines.compare.stats import align_curves, first_step_at, interquartile_mean, score_interval, wilson_interval
 from baselines.compare.table import Column, Row, Table, columns
-from cfp.config import Tier
+from cfp.sections import Particles
 from dittogym import make_spec
 
 MILESTONES = (0.5, 0.75, 0.9)
@@ -152,7 +152,7 @@ EFFICIENCY = (
 )
 
 
-def efficiency_table(groups: Sequence[Group], tier: Tier) -> Table:
+def efficiency_table(groups: Sequence[Group], tier: Particles) -> Table:
     """Steps until the evaluations of a run reach the milestones between a resting robot and the best curve.
 
     Args:
@@ -222,7 +222,7 @@ def cost_table(groups: Sequence[Group]) -> Table:
         costs, speed, config = group.costs, group.speed, group.job.config
         if speed is None:
             continue
-        tier = getattr(config, "tier", None)
+        tier = getattr(config, "train_particles", None)
         seconds, memory = paper.COST.get(group.label, (None, None)) if group.task == "run" else (None, None)
         rows.append(
             _group(group)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from cfp.config import not_negative, positive
+from cfp.validation import check_at_least, check_positive
 from dittogym import TorchEnv
 from torchmpm import tree
 
@@ -32,7 +32,7 @@ class RewardConfig:
     """Cost of the square by which the robot's spread, as a share of the task's limit, exceeds split_margin."""
     split_margin: float = 0.85
     """Share of the limit on the spread from which it costs; no matter in tasks without a limit."""
-    integrity: float = 300.0
+    integrity_weight: float = 300.0
     """Cost of particles that were close when the window, or the episode within it, began and drift apart; see
     `Pairs`."""
     scale: float = 0.05
@@ -44,8 +44,10 @@ class RewardConfig:
         Raises:
             ConfigError: Naming the option, what was given and what is allowed.
         """
-        not_negative(split_weight=self.split_weight, split_margin=self.split_margin, integrity=self.integrity)
-        positive(scale=self.scale)
+        check_at_least(
+            0, split_weight=self.split_weight, split_margin=self.split_margin, integrity_weight=self.integrity_weight
+        )
+        check_positive(scale=self.scale)
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,6 @@ def training_reward(
     if limit is not None and config.split_weight:
         excess = (info["split"] / limit - config.split_margin).clamp_min(0.0)
         reward = reward - config.split_weight * excess.square()
-    if config.integrity:
-        reward = reward - config.integrity * pairs.drift(env.state.x[:, : env.model.robot])
+    if config.integrity_weight:
+        reward = reward - config.integrity_weight * pairs.drift(env.state.x[:, : env.model.robot])
     return config.scale * torch.where(info["finite"], reward, terms["failure"])
