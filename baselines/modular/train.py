@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 import cfp
 from baselines.common.algorithm import Entry
+from baselines.common.policies import StateBasedPolicy
 from baselines.modular.env import SegmentedEnv
 from baselines.modular.networks import Kind, ModularActor, ModularCritics
 from baselines.modular.nodes import Nodes
@@ -158,7 +159,7 @@ class ModularSAC(CFP):
     ) -> tuple[np.ndarray, np.ndarray]:
         return actions, stored
 
-    def attached(self, env: Any) -> SegmentPolicy:
+    def attached(self, env: Any) -> StateBasedPolicy:
         """The present policy, looking at an environment."""
         assert isinstance(self.policy, ModularPolicy)
         actor = cast(ModularActor, self.networks()[0])
@@ -175,7 +176,7 @@ class ModularRun(SACRun):
     def make_model(self, level: int) -> CFP:
         """Networks, replay memory and environment."""
         env = SegmentedEnv(make_torch_env(self.config, self.config.resolution(level)), self.config.nodes)
-        networks = {"kind": self.config.kind, "features": self.config.nodes.features(env.env.spec)}
+        networks = {"kind": self.config.kind, "features": self.config.nodes.num_features(env.env.spec)}
         return self.build(level, VecMonitor(TorchVecEnv(env, env.spaces)), ModularPolicy, networks)
 
     def keep(self, model: CFP, level: int, step: int) -> None:
