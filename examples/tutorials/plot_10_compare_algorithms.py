@@ -21,7 +21,7 @@ import matplotlib.pyplot as plt
 
 folder = tempfile.TemporaryDirectory()
 out, plan = Path(folder.name) / "compare", Path(folder.name) / "plan.json"
-quick = {"iterations": 30, "tier": 500, "grid": 8, "learning_rate": 0.1}
+quick = {"iterations": 30, "train_particles": 500, "grid": 8, "learning_rate": 0.1}
 plan.write_text(json.dumps({"algos": {"gradient": quick}}))
 command = [sys.executable, "-m", "baselines.compare", "--tasks", "shapematch", "--algos", "zero", "random", "gradient"]
 command += ["--seeds", "0", "1", "--plan", str(plan), "--out", str(out), "--episodes", "3", "--robustness", "none"]
