@@ -12,7 +12,7 @@ from cfp.experiment import cli as command
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
     words = ["--algo", "distill", *(sys.argv[1:] if arguments is None else arguments)]
-    return command.main(PROGRAM, words, command.started_as("baselines.distill", arguments))
+    return command.main(PROGRAM, words, command.program_name("baselines.distill", arguments))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
-"""The rules of the house, read from the syntax trees of the packages: who imports whom, and no hidden global state."""
+"""The rules of the architecture, read from syntax trees: who imports whom, sizes, and no hidden global state."""
 
 import ast
 import runpy
 import sys
 from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -11,13 +12,23 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 #: A package may import itself and those to its left.
 ORDER = ("torchmpm", "dittogym", "cfp", "baselines")
-#: All that the physics may know besides itself.
-PHYSICS_KNOWS = {"jaxtyping", "numpy", "torch", *sys.stdlib_module_names}
-#: And the one place that may know more, because it is imported only where that is there.
-CUDA_KERNELS, CUDA_KERNELS_KNOW = Path("torchmpm/native/cuda"), {"triton"}
-#: Packages that keep their hands off everything the whole process shares.
+#: Everything that the physics may import besides itself.
+PHYSICS_IMPORTS = {"jaxtyping", "numpy", "torch", *sys.stdlib_module_names}
+#: The CUDA kernels are imported only where Triton is installed.
+CUDA_KERNELS, CUDA_IMPORTS = Path("torchmpm/native/cuda"), {"triton"}
+#: What the folders inside a package may not import: the method knows nothing of the programs around it.
+FORBIDDEN = {
+    "cfp.agent": ("cfp.experiment", "cfp.evaluation", "cfp.envs"),
+    "cfp.envs": ("cfp.experiment", "cfp.evaluation", "cfp.agent"),
+    "cfp.evaluation": ("cfp.experiment",),
+    "dittogym.tasks": ("dittogym.core", "dittogym.torch_env"),
+    "dittogym.observation": ("dittogym.core", "dittogym.tasks"),
+    "baselines.common": ("baselines.compare", "baselines.registry"),
+}
+LARGEST_FOLDER, LONGEST_FUNCTION, LONGEST_FILE = 16, 60, 350
+#: Packages that touch nothing that the whole process shares.
 PURE = ("torchmpm", "dittogym")
-#: Loading these formats can run code from the file; to name their errors is harmless.
+#: Loading these formats can run code from the file; naming their errors is harmless.
 UNSAFE_MODULES = {"cloudpickle", "dill", "joblib", "marshal", "pickle", "shelve"}
 HARMLESS = {"PickleError", "PicklingError", "UnpicklingError"}
 
@@ -92,16 +103,52 @@ def used(tree: ast.AST) -> Iterator[tuple[ast.expr, str]]:
 
 
 def direction_faults(source: str, path: Path) -> list[str]:
-    """Imports that run against the order of the packages, or reach out of the physics."""
+    """Imports that run against the order of the packages or of their folders, or out of the physics."""
     faults, package = [], path.parts[0]
-    known = PHYSICS_KNOWS | (CUDA_KERNELS_KNOW if path.is_relative_to(CUDA_KERNELS) else set())
+    folder = ".".join(path.parts[:2])
+    known = PHYSICS_IMPORTS | (CUDA_IMPORTS if path.is_relative_to(CUDA_KERNELS) else set())
     for line, name in imported(ast.parse(source)):
         top = name.split(".")[0]
         if top in ORDER:
-            if ORDER.index(top) > ORDER.index(package):
-                faults.append(f"{line}: {package} imports {name}")
+            backwards = ORDER.index(top) > ORDER.index(package)
+            if backwards or f"{name}.".startswith(tuple(f"{other}." for other in FORBIDDEN.get(folder, ()))):
+                faults.append(f"{line}: {folder if not backwards else package} imports {name}")
         elif package == "torchmpm" and top not in known:
             faults.append(f"{line}: torchmpm imports {name}")
+    return faults
+
+
+def import_graph(sources: dict[str, str]) -> dict[str, set[str]]:
+    """Modules that each module imports anywhere, in functions and for types too; a package's name is its __init__."""
+
+    def module_of(name: str) -> str | None:
+        while name and name not in sources:
+            name = name.rpartition(".")[0]
+        return name or None
+
+    return {
+        name: {found for _, other in imported(ast.parse(source)) if (found := module_of(other)) not in (None, name)}
+        for name, source in sources.items()
+    }
+
+
+def circle(sources: dict[str, str]) -> list[str]:
+    """Modules of one import circle; empty if there is none."""
+    try:
+        TopologicalSorter(import_graph(sources)).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def size_faults(source: str) -> list[str]:
+    """Functions and methods that are too long."""
+    faults = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            lines = (node.end_lineno or node.lineno) - node.lineno + 1
+            if lines > LONGEST_FUNCTION:
+                faults.append(f"{node.lineno}: {node.name} has {lines} lines")
     return faults
 
 
@@ -145,61 +192,100 @@ def unsafe_loading_faults(source: str) -> list[str]:
     return faults
 
 
-def modules(*packages: str) -> list[Path]:
-    return [path for package in packages for path in sorted((ROOT / package).rglob("*.py"))]
+def files(*packages: str) -> list[Path]:
+    return [path.relative_to(ROOT) for package in packages for path in sorted((ROOT / package).rglob("*.py"))]
 
 
-def label(path: Path) -> str:
-    return str(path.relative_to(ROOT))
+def module_name(path: Path) -> str:
+    return ".".join(path.with_suffix("").parts).removesuffix(".__init__")
+
+
+def faults_of(check, *packages: str) -> dict[str, list[str]]:
+    found = {str(path): check((ROOT / path).read_text()) for path in files(*packages)}
+    return {path: faults for path, faults in found.items() if faults}
 
 
 def test_every_package_is_walked() -> None:
-    assert {path.relative_to(ROOT).parts[0] for path in modules(*ORDER)} == set(ORDER)
+    assert {path.parts[0] for path in files(*ORDER)} == set(ORDER)
 
 
-@pytest.mark.parametrize("path", modules(*ORDER), ids=label)
-def test_imports_run_one_way(path: Path) -> None:
-    assert direction_faults(path.read_text(), path.relative_to(ROOT)) == []
+def test_imports_run_one_way() -> None:
+    found = {str(path): direction_faults((ROOT / path).read_text(), path) for path in files(*ORDER)}
+    assert {path: faults for path, faults in found.items() if faults} == {}
+
+
+def test_no_import_circle() -> None:
+    assert circle({module_name(path): (ROOT / path).read_text() for path in files(*ORDER)}) == []
+
+
+def test_sizes() -> None:
+    assert faults_of(size_faults, *ORDER) == {}
+    for path in files(*ORDER):
+        assert len((ROOT / path).read_text().splitlines()) <= LONGEST_FILE, path
+    for folder in {path.parent for path in files(*ORDER)}:
+        assert len(list((ROOT / folder).glob("*.py"))) <= LARGEST_FOLDER, folder
+
+
+def test_every_module_says_what_it_is() -> None:
+    assert faults_of(lambda source: [] if ast.get_docstring(ast.parse(source)) else ["no docstring"], *ORDER) == {}
+
+
+def test_nothing_global_is_touched() -> None:
+    assert faults_of(global_state_faults, *PURE) == {}
+
+
+def test_files_are_loaded_safely() -> None:
+    assert faults_of(unsafe_loading_faults, *ORDER) == {}
 
 
 @pytest.mark.parametrize("package", ORDER)
-def test_the_picture_of_the_house_shows_every_file(package: str) -> None:
-    house = runpy.run_path(str(ROOT / "docs/house.py"))
-    floor, below = house["survey"](package), ORDER[: ORDER.index(package)]
-    assert house["PACKAGES"] == ORDER[::-1]
-    assert set(floor.own) <= set(below) and (not below or floor.own)
-    files = {path.stem for path in (ROOT / package).glob("*.py")} - {"__init__"}
-    assert {room for room in floor.rooms if not room.endswith("/")} == files
-    assert all(floor.rooms.values()), "a module without a docstring"
-
-
-@pytest.mark.parametrize("path", modules(*PURE), ids=label)
-def test_nothing_global_is_touched(path: Path) -> None:
-    assert global_state_faults(path.read_text()) == []
-
-
-@pytest.mark.parametrize("path", modules(*ORDER), ids=label)
-def test_files_are_loaded_safely(path: Path) -> None:
-    assert unsafe_loading_faults(path.read_text()) == []
+def test_the_diagram_shows_every_module(package: str) -> None:
+    architecture = runpy.run_path(str(ROOT / "docs/architecture.py"))
+    shown, below = architecture["read_package"](package), ORDER[: ORDER.index(package)]
+    assert architecture["PACKAGES"] == ORDER[::-1]
+    assert set(shown.internal) <= set(below) and (not below or shown.internal)
+    modules = {f"{folder.path}/{name}.py" for folder in shown.folders for name in folder.modules}
+    assert modules == {str(path) for path in files(package) if path.name != "__init__.py"}
+    assert all(folder.summary for folder in shown.folders)
 
 
 @pytest.mark.parametrize(
-    ("source", "package", "faults"),
+    ("source", "path", "faults"),
     [
-        ("import torch\nfrom torchmpm.grid import Grid\nfrom . import grid", "torchmpm", []),
-        ("def f():\n    from dittogym import TorchEnv", "torchmpm", ["2: torchmpm imports dittogym.TorchEnv"]),
-        ("import gymnasium", "torchmpm", ["1: torchmpm imports gymnasium"]),
-        ("import importlib\nimportlib.import_module('cv2')", "torchmpm", ["2: torchmpm imports cv2"]),
-        ("import triton", "torchmpm/native", ["1: torchmpm imports triton"]),
-        ("import triton", "torchmpm/native/cuda", []),
-        ("import cv2, torchmpm", "dittogym", []),
-        ("import cfp.train as t", "dittogym", ["1: dittogym imports cfp.train"]),
-        ("import baselines", "cfp", ["1: cfp imports baselines"]),
-        ("import cfp, dittogym, torchmpm", "baselines", []),
+        ("import torch\nfrom torchmpm.grid import Grid\nfrom . import grid", "torchmpm/a.py", []),
+        ("def f():\n    from dittogym import TorchEnv", "torchmpm/a.py", ["2: torchmpm imports dittogym.TorchEnv"]),
+        ("import gymnasium", "torchmpm/a.py", ["1: torchmpm imports gymnasium"]),
+        ("import importlib\nimportlib.import_module('cv2')", "torchmpm/a.py", ["2: torchmpm imports cv2"]),
+        ("import triton", "torchmpm/native/a.py", ["1: torchmpm imports triton"]),
+        ("import triton", "torchmpm/native/cuda/a.py", []),
+        ("import cv2, torchmpm", "dittogym/a.py", []),
+        ("import cfp.train as t", "dittogym/a.py", ["1: dittogym imports cfp.train"]),
+        ("import cfp, dittogym, torchmpm", "baselines/a.py", []),
+        ("from cfp import experiment", "cfp/agent/a.py", ["1: cfp.agent imports cfp.experiment"]),
+        ("from cfp import experiments", "cfp/agent/a.py", []),
     ],
 )
-def test_direction_checker(source: str, package: str, faults: list[str]) -> None:
-    assert direction_faults(source, Path(package)) == faults
+def test_direction_checker(source: str, path: str, faults: list[str]) -> None:
+    assert direction_faults(source, Path(path)) == faults
+
+
+def test_circle_checker() -> None:
+    lazy = {"a": "from b import f", "b": "def f():\n    import a"}
+    assert set(circle(lazy)) == {"a", "b"}
+    types = {
+        "p": "",
+        "p.a": "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from p.b import B",
+        "p.b": "import p.a",
+    }
+    assert set(circle(types)) == {"p.a", "p.b"}
+    assert set(circle({"p": "from p.a import A", "p.a": "from p import A"})) == {"p", "p.a"}
+    assert circle({"p": "from p.a import A", "p.a": "import p.b", "p.b": "import numpy"}) == []
+
+
+def test_size_checker() -> None:
+    long = "def f():\n" + "    x = 1\n" * LONGEST_FUNCTION
+    assert size_faults(long) == [f"1: f has {LONGEST_FUNCTION + 1} lines"]
+    assert size_faults(long.rpartition("    x")[0]) == []
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,10 +18,11 @@ from baselines.compare.report import write_report
 from baselines.compare.results import Found, find_runs
 from baselines.compare.worker import describe
 from baselines.registry import ALGORITHMS
-from cfp.config import Preset, Tier
-from cfp.errors import CFPError, ConfigError
-from cfp.experiment.cli import started_as
-from cfp.experiment.process import StopSignals, keep_memory
+from cfp.config import Preset
+from cfp.errors import ConfigError
+from cfp.experiment.cli import program_name, run_command
+from cfp.experiment.process import StopSignals
+from cfp.sections import Particles
 
 PATIENCE, CLUSTER_PATIENCE = 30.0, 300.0
 """Seconds to wait for another process that holds a run folder; file servers take a while to give up a lost machine."""
@@ -54,7 +54,7 @@ class Command:
     """cpu, cuda, or auto."""
     episodes: int = 10
     """Episodes of the final evaluation of each policy."""
-    tier: Tier = "lite"
+    tier: Particles = "lite"
     """Particles of the final evaluation, for all."""
     slot_episodes: int = 100
     """Least episodes in SLOT, of all seeds of an algorithm together, for the success rate."""
@@ -186,20 +186,9 @@ def _report(command: Command, jobs: Sequence[Job]) -> list[Found]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
-    keep_memory()
-    try:
-        about = f"Algorithms: {', '.join(ALGORITHMS)}.\n\n{inspect.getdoc(Command)}"
-        started = started_as("baselines.compare", arguments)
-        return compare(tyro.cli(Command, prog=started, description=about, args=arguments))
-    except CFPError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("stopped at once; the same command goes on", file=sys.stderr)
-        return 128 + signal.SIGINT
+    about = f"Algorithms: {', '.join(ALGORITHMS)}.\n\n{inspect.getdoc(Command)}"
+    started = program_name("baselines.compare", arguments)
+    return run_command(lambda: compare(tyro.cli(Command, prog=started, description=about, args=arguments)))
 
 
 if __name__ == "__main__":

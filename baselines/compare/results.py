@@ -11,8 +11,8 @@ import numpy as np
 
 from baselines.compare.evaluations import Judged, Judging, read
 from baselines.compare.plan import Job, read_sessions
-from cfp.config import Tier
-from cfp.experiment.files import read_table
+from cfp.sections import Particles
+from cfp.tables import read_table
 
 Curve = tuple[np.ndarray, np.ndarray]
 """Steps (N,) and values (N,)."""
@@ -101,7 +101,7 @@ class Group:
         return self.runs[0].job.untrained
 
     @property
-    def particles(self) -> Tier:
+    def particles(self) -> Particles:
         """Of the evaluations while it trains."""
         return self.runs[0].job.config.environment.particles
 

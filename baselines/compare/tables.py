@@ -12,7 +12,7 @@ from baselines.compare import paper
 from baselines.compare.results import Found, Group
 from baselines.compare.stats import common_curve, first_reach, interquartile_mean, interval, wilson
 from baselines.compare.table import Column, Table
-from cfp.config import Tier
+from cfp.sections import Particles
 from dittogym import make_spec
 
 SHARES = (0.5, 0.75, 0.9)
@@ -152,7 +152,7 @@ def aggregate_table(groups: Sequence[Group]) -> Table:
     return Table("aggregate", "All tasks together", about, columns, rows)
 
 
-def efficiency_table(groups: Sequence[Group], tier: Tier) -> Table:
+def efficiency_table(groups: Sequence[Group], tier: Particles) -> Table:
     """Steps until the evaluations of a run reach shares of the way from rest to the best that see the same.
 
     Args:
@@ -215,7 +215,7 @@ def cost_table(groups: Sequence[Group]) -> Table:
         costs, speed, config = group.costs, group.speed, group.runs[0].job.config
         if speed is None:
             continue
-        tier = getattr(config, "tier", None)
+        tier = getattr(config, "train_particles", None)
         memories = [cost.memory / 2**20 for cost in costs if cost.memory]
         theirs = paper.COST.get(group.label, (None, None)) if group.task == "run" else (None, None)
         rows.append(

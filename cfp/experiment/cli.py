@@ -7,7 +7,7 @@ import json
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,11 @@ from cfp.config import RunConfig, to_json
 from cfp.errors import CFPError, ConfigError, NonFiniteError
 from cfp.evaluation.rollout import Policy
 from cfp.experiment.estimate import estimate
-from cfp.experiment.files import read_json
-from cfp.experiment.from_dict import merge
 from cfp.experiment.process import Stopped, StopSignals, keep_memory
 from cfp.experiment.run import Run, holds_run, read_config
 from cfp.experiment.run_lock import claim
+from cfp.files import read_json
+from cfp.from_dict import update_from_dict
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Command:
     Ctrl-C writes a checkpoint and stops; --resume goes on.
     """
 
-    run: RunConfig = field(default_factory=RunConfig)
+    run: RunConfig
     out: Path | None = None
     """Folder of the run; in runs/, named by algorithm, task, preset and seed, if not given."""
     resume: bool = False
@@ -73,8 +73,38 @@ class _Choice:
     config: Path | None = None
 
 
-def started_as(module: str, arguments: Sequence[str] | None) -> str:
-    """What the user has typed to start a program: its module, or a file of his own that hands its command line on."""
+def run_command(command: Callable[[], int | None]) -> int:
+    """Run a program; turn an expected error into one line on the standard error, and any outcome into an exit code.
+
+    Args:
+        command: Does what the command line says and returns the exit code; None means 0.
+
+    Returns:
+        The exit code: what ``command`` returned; 2 for bad input (a `CFPError`); 1 for a failure (`NonFiniteError`,
+        `OSError`, not enough memory); 128 plus the number of the signal that stopped the program.
+    """
+    keep_memory()
+    try:
+        return command() or 0
+    except Stopped as stopped:
+        print(stopped)
+        return 128 + stopped.number
+    except KeyboardInterrupt:
+        print("stopped at once", file=sys.stderr)
+        return 128 + signal.SIGINT
+    except (CFPError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1 if isinstance(error, NonFiniteError | OSError) else 2
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "allocate memory" not in str(error):  # how torch reports it
+            raise
+        advice = "reduce num_envs, episodes, particles or buffer_size"
+        print(f"error: not enough memory: {advice} ({error})", file=sys.stderr)
+        return 1
+
+
+def program_name(module: str, arguments: Sequence[str] | None) -> str:
+    """How the user started a program: ``python -m MODULE``, or ``python FILE`` for a script that calls its ``main``."""
     own = arguments is None and getattr(sys.modules["__main__"], "__spec__", None) is None
     return f"python {sys.argv[0]}" if own else f"python -m {module}"
 
@@ -99,7 +129,7 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
     def read(defaults: RunConfig) -> Command:
         command = tyro.cli(
             Command,
-            prog=started or started_as(f"{program.package}.train", arguments),
+            prog=started or program_name(f"{program.package}.train", arguments),
             description=f"{program.about}\n\n{inspect.getdoc(Command)}",
             args=list(arguments),
             default=Command(defaults),
@@ -113,11 +143,11 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
         if (folder / "config.json").exists():
             past = read_config(folder, program.configure)
             # What a file says otherwise than the run is refused, not left out.
-            command = read(past if choice.config is None else merge(past, values))
+            command = read(past if choice.config is None else update_from_dict(past, values))
             command.run.check()
             return replace(command, out=folder)
     command = read(base)
-    run = command.run.adapted(preset, values.keys() | _named(arguments))
+    run = command.run.with_derived(preset, values.keys() | _named(arguments))
     run.check()
     run.check_effect(preset)
     return replace(command, run=run, out=command.out or _default_folder(run))
@@ -146,63 +176,31 @@ def _default_folder(config: RunConfig) -> Path:
 
 def main(program: Program, arguments: Sequence[str] | None = None, started: str | None = None) -> int:
     """Do what a command line says; returns the exit code, see `parse`."""
-    started = started or started_as(f"{program.package}.train", arguments)
-    try:
-        command = parse(program, sys.argv[1:] if arguments is None else arguments, started)
-        assert command.out is not None
-        folder = command.out
-        if folder.exists() and not folder.is_dir():
-            raise ConfigError(f"out: {folder} is a file, allowed is a folder")
-        if command.resume and not holds_run(folder):
-            print(f"{folder} holds no run yet: starting afresh")
-        config = command.run
-        if command.dry_run:
-            begun = folder if command.resume else None
-            print(json.dumps(to_json(config), indent=2), estimate(program, config, begun), sep="\n")
-            return 0
-        print(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed} -> {folder}")
-        keep_memory()
-        return _train(program, config, folder, command.resume)
-    except Stopped as stopped:
-        print(f"{stopped}; go on with: {started} --resume --out {folder}")
-        return 128 + stopped.number
-    except CFPError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1 if isinstance(error, NonFiniteError) else 2
-    except OSError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except (MemoryError, RuntimeError) as error:
-        return out_of_memory(error, "num_envs, particles or a smaller buffer_size")
+    words = sys.argv[1:] if arguments is None else arguments
+    return run_command(lambda: _train(program, words, started or program_name(f"{program.package}.train", arguments)))
 
 
-def out_of_memory(error: MemoryError | RuntimeError, fewer: str) -> int:
-    """Say in one line that there was not enough memory; returns the exit code.
-
-    Args:
-        error: What was raised.
-        fewer: Of what to take less.
-
-    Raises:
-        RuntimeError: It is about something else.
-    """
-    if isinstance(error, RuntimeError) and "allocate memory" not in str(error):  # torch's word for the same
-        raise error
-    print(f"error: not enough memory: take fewer {fewer} ({error})", file=sys.stderr)
-    return 1
-
-
-def _train(program: Program, config: RunConfig, folder: Path, resume: bool) -> int:
-    """Train, evaluate, draw and film; returns the exit code."""
-    try:
-        with claim(folder):
-            with StopSignals() as signals:
-                run = program.run(config, folder, resume, signals)
-                if config.environment.backend == "compile":
-                    print("compiling the physics; the first time on a machine this takes half a minute ...")
+def _train(program: Program, arguments: Sequence[str], started: str) -> None:
+    """Train, evaluate, draw and film."""
+    command = parse(program, arguments, started)
+    folder, config = command.out, command.run
+    assert folder is not None
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"out: {folder} is a file, allowed is a folder")
+    if command.resume and not holds_run(folder):
+        print(f"{folder} holds no run yet: starting afresh")
+    if command.dry_run:
+        print(json.dumps(to_json(config), indent=2))
+        print(estimate(program, config, folder if command.resume else None))
+        return
+    print(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed} -> {folder}")
+    with claim(folder):
+        with StopSignals() as signals:
+            run = program.run(config, folder, command.resume, signals)
+            if config.environment.backend == "compile":
+                print("compiling the physics; the first time on a machine this takes half a minute ...")
+            try:
                 run.train()
-            run.finish()
-    except KeyboardInterrupt:  # a second Ctrl-C, or one after training
-        print("stopped; --resume goes on", file=sys.stderr)
-        return 128 + signal.SIGINT
-    return 0
+            except Stopped as stopped:
+                raise Stopped(stopped.number, f"resume with: {started} --resume --out {folder}") from None
+        run.finish()

@@ -37,14 +37,15 @@ def peak_memory() -> int | None:
 
 
 class Stopped(Exception):
-    """Training was asked to stop and has written its checkpoint.
+    """A signal asked the program to stop, and all work done so far has been saved.
 
     Args:
         number: The signal.
+        hint: How to continue, for the message.
     """
 
-    def __init__(self, number: int) -> None:
-        super().__init__(f"stopped by {signal.Signals(number).name}")
+    def __init__(self, number: int, hint: str = "") -> None:
+        super().__init__(f"stopped by {signal.Signals(number).name}" + (f"; {hint}" if hint else ""))
         self.number = number
 
 

@@ -19,11 +19,11 @@ from baselines.compare.plan import Plan, judged, make_jobs, resolve
 from baselines.registry import configure, load
 from cfp.envs.disturbances import make_cases
 from cfp.errors import CheckpointError
-from cfp.experiment.files import read_table
+from cfp.tables import read_table
 
 ENVIRONMENT = {"particles": 100, "substeps": 1, "num_envs": 1}
 MPC = {"grid": 8, "planner": {"horizon": 3, "commit": 2, "iterations": 1}}
-SHAC = {"tier": 100, "steps": 48, "window": 6, "grid": 8, "age": 20, "critic_updates": 2}
+SHAC = {"train_particles": 100, "steps": 48, "window": 6, "grid": 8, "max_episode_steps": 20, "critic_updates": 2}
 PLAN = {
     "common": {"environment": ENVIRONMENT, "report": {"eval_episodes": 1}},
     "algos": {
@@ -159,7 +159,7 @@ def test_runs_of_the_paper_are_judged_in_the_same_sound_world_at_every_tier():
         configs = [configure({"algo": algo, "preset": "paper"}) for algo in ("zero", "cfp")]
         configs.append(replace(configs[0], environment=replace(configs[0].environment, particles=tier)))
         places = [judged(config, tier).environment for config in configs]
-        assert {(place.particles, place.parity, place.layout) for place in places} == {(tier, parity, "grid")}
+        assert {(place.particles, place.parity, place.action_indexing) for place in places} == {(tier, parity, "grid")}
 
 
 def test_what_was_judged_in_another_world_is_judged_again():
@@ -194,7 +194,7 @@ def test_array_job_does_one_run_and_no_report(tmp_path):
     ("options", "message"),
     [
         ("--algos alchemy", "algo: got 'alchemy', allowed cfp"),
-        ("--tasks swim --algos mpc", "task: got 'swim'"),
+        ("--tasks swim --algos mpc", "task must be catch"),
         ("--algos mpc mpc", "algos: got mpc mpc, allowed one or more, each once"),
         ("--seeds 9500 --algos mpc", "seeds: got 9500, allowed 0 to 8999"),
         ("--episodes 0", "episodes: got 0, allowed 1 or more"),
@@ -234,7 +234,7 @@ def test_options_without_effect_are_refused_where_they_are_for_one_algorithm(tmp
         (label,) = algos
         assert compare(tmp_path / "out", "--algos", label, "--tasks", "run", plan={"algos": algos}) == 2
         error = capsys.readouterr().err
-        assert f"{label} on run: warm_critic: got True, which changes nothing; allowed with" in error
+        assert f"{label} on run: warm_critic requires " in error
     plan = {"common": idle, "algos": {"gnn-16": {"learning": {"warm_critic": False}}}}
     assert compare(tmp_path / "out", "--dry-run", "--algos", "cfp", "coarse", "gnn-16", plan=plan) == 0
 

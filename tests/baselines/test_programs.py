@@ -16,7 +16,7 @@ from cfp.errors import ConfigError
 from cfp.evaluation.rollout import SeesState
 from cfp.experiment.books import Books
 from cfp.experiment.cli import parse
-from cfp.experiment.files import read_table
+from cfp.tables import read_table
 from cfp.weights import describe, save_policy
 
 COMMON = "--particles 100 --substeps 1 --eval-episodes 2 --no-video --device cpu".split()
@@ -39,14 +39,14 @@ TINY = {
     "coarse": (LEVEL, 44, ["stage 1"]),
     "fine": (LEVEL, 44, ["stage 1"]),
     "distill": (
-        "--teacher mpc --planner-grid 4 --horizon 2 --commit 2 --iterations 1 --num-envs 2 --tier 100 "
-        "--resolutions 4 8 --steps 60 --handover 30 --round 5 --updates 2 --batch-size 4 --eval-every 20 "
+        "--teacher mpc --planner-grid 4 --horizon 2 --commit 2 --iterations 1 --num-envs 2 --train-particles 100 "
+        "--resolutions 4 8 --steps 60 --handover 30 --rollout-steps 5 --updates 2 --batch-size 4 --eval-every 20 "
         "--checkpoint-every 10 --log-every 10 --backend eager",
         50,
         ["stage 1", "stage 2"],
     ),
     "gradient": (
-        "--iterations 5 --grid 4 --tier 100 --polish 3 --polish-grid 8 "
+        "--iterations 5 --grid 4 --train-particles 100 --polish 3 --polish-grid 8 "
         "--eval-every 90 --checkpoint-every 30 --log-every 30",
         180,
         ["stage 1", "stage 2", "  own layout"],
@@ -63,7 +63,7 @@ TINY = {
         ["stage 1", "  own layout"],
     ),
     "shac": (
-        "--tier 100 --num-envs 2 --steps 96 --window 6 --grid 8 --age 20 --critic-updates 2 "
+        "--train-particles 100 --num-envs 2 --steps 96 --window 6 --grid 8 --max-episode-steps 20 --critic-updates 2 "
         "--eval-every 48 --checkpoint-every 12 --log-every 24",
         60,
         ["stage 1"],
@@ -205,7 +205,7 @@ def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, mon
 
 @pytest.mark.parametrize("algo", ["shac", "distill", "gradient", "zero", "random", "scripted"])
 def test_new_particles_are_refused_where_the_seed_says_them(algo):
-    with pytest.raises(ConfigError, match="resample: got True, which changes nothing; allowed with soft actor-critic"):
+    with pytest.raises(ConfigError, match="resample requires soft actor-critic"):
         parse(train.PROGRAM, ["--algo", algo, "--resample"])
     assert parse(train.PROGRAM, ["--algo", "gnn-16", "--resample"]).run.environment.resample
 
@@ -236,7 +236,7 @@ def test_wrong_algorithm_is_named(tmp_path, capsys):
     assert train.main(["--algo", "alchemy", "--out", str(tmp_path / "a")]) == 2
     assert f"algo: got 'alchemy', allowed {', '.join(baselines.ALGORITHMS)}" in capsys.readouterr().err
     assert cfp.train.main(["--algo", "gradient", "--out", str(tmp_path / "a")]) == 2
-    assert "algo: got 'gradient', allowed 'cfp'; python -m baselines.train takes others" in capsys.readouterr().err
+    assert "algo must be 'cfp', got 'gradient'; python -m baselines.train" in capsys.readouterr().err
 
 
 def test_robustness_is_reported_whatever_trained_it(finished):

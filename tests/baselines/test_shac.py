@@ -14,12 +14,14 @@ from baselines.registry import configure
 from baselines.shac import rollout as shac_rollout
 from baselines.shac.reward import RewardConfig
 from baselines.shac.train import METRICS
-from cfp.agent.actor import ActorSpec, build_actor
-from cfp.config import EnvironmentConfig, to_json
+from cfp.agent.actor import build_actor
+from cfp.agent.spec import ActorSpec
+from cfp.config import to_json
 from cfp.envs.make import make_env
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
 from cfp.evaluation.rollout import attached, evaluate
 from cfp.evaluation.video import film
+from cfp.sections import EnvironmentConfig
 from cfp.weights import describe, origin, save_policy
 from dittogym import TorchEnv
 
@@ -28,7 +30,7 @@ TASKS = ("shapematch", "run", "grow", "kick", "dig", "obstacle", "catch", "slot"
 
 def make(task="run", **changes):
     environment = EnvironmentConfig(changes.pop("num_envs", 2), 300, changes.pop("substeps", 4))
-    defaults = {"environment": environment, "tier": 300, "device": "cpu", "window": 4, "critic_updates": 2}
+    defaults = {"environment": environment, "train_particles": 300, "device": "cpu", "window": 4, "critic_updates": 2}
     return replace(Shac.preset(task, "quick"), **defaults | changes)
 
 
@@ -42,22 +44,22 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
     config = Shac.preset(task, preset)
     config.check()
     assert configure(json.loads(json.dumps(to_json(config)))) == config
-    learned = config.environment.learned_at(config.tier)
+    learned = config.environment.for_training(config.train_particles)
     assert (learned.particles, learned.parity) == ("lite", "clean")
-    assert learned.layout == config.environment.layout == ("grid" if preset == "paper" else "image")
+    assert learned.action_indexing == config.environment.action_indexing == ("grid" if preset == "paper" else "image")
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"window": 0}, "window: got 0"),
-        ({"gamma": 1.5}, "gamma: got 1.5"),
+        ({"window": 0}, "window must be at least 1, got 0"),
+        ({"gamma": 1.5}, "gamma must be between 0 and 1, got 1.5"),
         ({"learning_rate": 0.0}, "learning_rate"),
-        ({"noise": -0.1}, "noise: got -0.1"),
-        ({"reward": RewardConfig(scale=0.0)}, "scale: got 0.0, allowed more than 0"),
-        ({"reward": RewardConfig(split_weight=-1.0)}, "split_weight: got -1.0, allowed 0 or more"),
-        ({"reward": RewardConfig(split_margin=-0.5)}, "split_margin: got -0.5, allowed 0 or more"),
-        ({"reward": RewardConfig(integrity=-2.0)}, "integrity: got -2.0, allowed 0 or more"),
+        ({"noise": -0.1}, "noise must be at least 0, got -0.1"),
+        ({"reward": RewardConfig(scale=0.0)}, "scale must be positive, got 0.0"),
+        ({"reward": RewardConfig(split_weight=-1.0)}, "split_weight must be at least 0, got -1.0"),
+        ({"reward": RewardConfig(split_margin=-0.5)}, "split_margin must be at least 0, got -0.5"),
+        ({"reward": RewardConfig(integrity_weight=-2.0)}, "integrity_weight must be at least 0, got -2.0"),
     ],
 )
 def test_impossible_options_are_named(changes, message):
@@ -66,7 +68,9 @@ def test_impossible_options_are_named(changes, message):
 
 
 def test_training_makes_the_robot_run():
-    config = make(substeps=100, window=16, steps=480, age=32, learning_rate=1e-2, noise=0.0, tier=500)
+    config = make(
+        substeps=100, window=16, steps=480, max_episode_steps=32, learning_rate=1e-2, noise=0.0, train_particles=500
+    )
     algorithm, rows = Shac(config), []
     before = speed(algorithm)
     algorithm.learn(config.steps, rows.append)
@@ -118,7 +122,7 @@ def look_in_double(algorithm):
 
 @pytest.mark.parametrize("sees", ["state", "image"])
 def test_resumed_training_is_the_same_to_the_last_bit(sees):
-    config = make(sees=sees, age=6)
+    config = make(sees=sees, max_episode_steps=6)
     whole, first, second = Shac(config), Shac(config), Shac(config)
     ignore = lambda _: None  # noqa: E731
     whole.learn(48, ignore)
@@ -193,7 +197,7 @@ def test_actor_that_has_diverged_does_not_act():
 
 
 def test_episodes_are_cut_at_staggered_ages_and_change_layouts():
-    algorithm = Shac(make(age=8, layouts=3))
+    algorithm = Shac(make(max_episode_steps=8, num_layouts=3))
     first = algorithm.env.state.x[0].clone()
     assert algorithm.rollout.episodes.limit.tolist() == [4, 8]
     algorithm.rollout.play(algorithm.actor, lambda seen: algorithm.value(algorithm.target, seen))
@@ -203,13 +207,13 @@ def test_episodes_are_cut_at_staggered_ages_and_change_layouts():
 
 
 def test_no_more_layouts_are_trained_on_than_there_shall_be():
-    algorithm = Shac(make(num_envs=3, layouts=2))
+    algorithm = Shac(make(num_envs=3, num_layouts=2))
     x = algorithm.env.state.x
     assert torch.equal(x[0], x[2]) and not torch.equal(x[0], x[1])
 
 
 def test_restart_of_a_neighbour_leaves_the_particles_that_were_close(monkeypatch):
-    algorithm, seen, reward = Shac(make(age=8, window=6, substeps=20)), [], shac_rollout.training_reward
+    algorithm, seen, reward = Shac(make(max_episode_steps=8, window=6, substeps=20)), [], shac_rollout.training_reward
 
     def watch(*given):
         seen.append(given[-1])
@@ -218,12 +222,12 @@ def test_restart_of_a_neighbour_leaves_the_particles_that_were_close(monkeypatch
     monkeypatch.setattr(shac_rollout, "training_reward", watch)
     algorithm.rollout.play(algorithm.actor, lambda seen: algorithm.value(algorithm.target, seen))
     assert algorithm.env.env_state.steps.tolist() == [2, 6]  # the first robot began anew after four steps
-    for first, last in zip(*((pairs.other, pairs.distance) for pairs in (seen[0], seen[-1])), strict=True):
+    for first, last in zip(*((pairs.neighbours, pairs.distance) for pairs in (seen[0], seen[-1])), strict=True):
         assert torch.equal(first[1], last[1]) and not torch.equal(first[0], last[0])
 
 
 def test_return_is_that_of_all_episodes_since_the_last_row():
-    algorithm, rows = Shac(make(age=4)), []  # a window is as long as an episode
+    algorithm, rows = Shac(make(max_episode_steps=4)), []  # a window is as long as an episode
     algorithm.learn(8, rows.append)
     first = list(algorithm.rollout.episodes.ended)
     again = Shac(algorithm.config)
@@ -306,7 +310,7 @@ def test_policy_of_the_state_says_what_it_needs(tmp_path):
     with pytest.raises(RuntimeError, match="call attached"):
         policy.predict(np.zeros((1, 3, 64, 64), np.uint8))
     kick = TorchEnv("kick", 1, particles=100)
-    with pytest.raises(ValueError, match="env: got 'kick'"):
+    with pytest.raises(ValueError, match="got 'kick'"):
         policy.attached(kick)
     path = tmp_path / "policy.safetensors"
     algorithm.save(path, origin(algorithm.config, "shac", 0, 0))

@@ -18,18 +18,19 @@ from fakes import FakeEnv
 import cfp
 import dittogym
 from cfp import evaluate, train
-from cfp.agent.actor import ActorSpec, build_actor
+from cfp.agent.actor import build_actor
 from cfp.agent.policies import ActorPolicy
-from cfp.config import EnvironmentConfig
+from cfp.agent.spec import ActorSpec
 from cfp.envs.vec_env import monitored
 from cfp.evaluation import plots as plot
 from cfp.evaluation import video
 from cfp.evaluation.rollout import compare
 from cfp.experiment.callbacks import StageCallback
 from cfp.experiment.cfp_run import Runner
-from cfp.experiment.cli import started_as
-from cfp.experiment.files import read_table
+from cfp.experiment.cli import program_name
 from cfp.presets import preset
+from cfp.sections import EnvironmentConfig
+from cfp.tables import read_table
 from cfp.weights import describe, policy_file, save_policy, shipped
 
 TINY = (
@@ -86,7 +87,7 @@ def test_interrupt_that_is_not_held_back_is_one_line(tmp_path, monkeypatch, caps
 
     monkeypatch.setattr(Runner, place, interrupt)
     assert run(tmp_path / "a", "--steps", "20", "--handover", "10") == 130
-    assert capsys.readouterr().err.splitlines()[-1] == "stopped; --resume goes on"
+    assert capsys.readouterr().err.splitlines()[-1] == "stopped at once"
 
 
 def test_policies_are_judged_on_the_device_that_was_chosen(finished, monkeypatch):
@@ -96,7 +97,7 @@ def test_policies_are_judged_on_the_device_that_was_chosen(finished, monkeypatch
         seen.append(device)
         return cfp.load(path, "cpu")
 
-    for module in ("runner", "evaluate"):
+    for module in ("experiment.cfp_run", "evaluate"):
         monkeypatch.setattr(f"cfp.{module}.choose_device", lambda name: f"the one that {name} means")
     program = replace(train.PROGRAM, load=load)
     evaluate.open_run(program, finished, "cuda")
@@ -242,8 +243,8 @@ def test_damaged_checkpoint_is_an_error_that_names_it(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--task", "jump"], "task: got 'jump', allowed catch, dig"),
-        (["--preset", "slow"], "preset: got 'slow', allowed quick, paper"),
+        (["--task", "jump"], "task must be catch, dig"),
+        (["--preset", "slow"], "preset must be quick or paper for shapematch, got 'slow'"),
         (["--particles", "0"], "particles"),
         (["--target", "no/such.png"], "target"),
         (["--num-envs", "0"], "num_envs: got 0"),
@@ -275,7 +276,7 @@ def test_help_names_the_program_that_was_started(tmp_path, monkeypatch, capsys):
     ):
         done = subprocess.run([sys.executable, *command], cwd=tmp_path, env=PROCESS, capture_output=True, text=True)
         assert done.returncode == 2 and name in " ".join(done.stderr.replace("│", " ").split())
-    assert started_as("cfp.train", []) == "python -m cfp.train"
+    assert program_name("cfp.train", []) == "python -m cfp.train"
 
 
 def test_evaluation_of_a_folder(finished, capsys):
@@ -319,7 +320,7 @@ def test_single_policy_need_not_have_the_grids_of_its_task(tmp_path, monkeypatch
     tens = replace(dittogym.make_spec("run"), name="tens", coarse=10, fine=20, horizon=2)
     dittogym.register("tens", lambda: tens)
     environment = EnvironmentConfig(particles=60, substeps=1)
-    config = cfp.Config(task="tens", resolutions=(4, 8, 16), gate_bias=(-1.0, -2.0), environment=environment)
+    config = replace(cfp.preset("tens"), resolutions=(4, 8, 16), gate_bias=(-1.0, -2.0), environment=environment)
     save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(2)), describe(config, 2, 0))
     command = evaluate.Command(policy=str(tmp_path), episodes=1, device="cpu")
     opened, _ = command.open(train.PROGRAM)
@@ -334,7 +335,7 @@ def test_other_particles_are_not_those_of_the_reference_s_faults(tmp_path):
         chosen = evaluate.Selection(policy=str(tmp_path), particles=particles)
         environment = chosen.open(train.PROGRAM)[0].environment
         assert (environment.particles, environment.parity) == (particles or "full", parity)
-        assert environment.layout == "grid"  # as the policy acts
+        assert environment.action_indexing == "grid"  # as the policy acts
 
 
 @pytest.mark.parametrize(
