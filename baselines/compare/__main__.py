@@ -26,6 +26,7 @@ from cfp.errors import ConfigError
 from cfp.experiment.cli import program_name, run_command
 from cfp.experiment.process import Stopped, StopSignals
 from cfp.sections import Particles
+from cfp.validation import check_at_least
 
 LOCK_TIMEOUT, CLUSTER_LOCK_TIMEOUT = 30.0, 300.0
 """Seconds to wait for another process that holds a run folder; file servers take a while to give up a lost machine."""
@@ -91,11 +92,8 @@ class Command:
         Raises:
             ConfigError: Naming the option, what was given and what is allowed.
         """
-        minima = {"episodes": 1, "slot_episodes": 1, "workers": 0, "gpus_per_run": 0, "retries": 0, "cpus_per_run": 1}
-        for name, minimum in minima.items():
-            value = getattr(self, name)
-            if value is not None and value < minimum:
-                raise ConfigError(f"{name} must be at least {minimum}, got {value}")
+        check_at_least(1, episodes=self.episodes, slot_episodes=self.slot_episodes, cpus_per_run=self.cpus_per_run or 1)
+        check_at_least(0, workers=self.workers, gpus_per_run=self.gpus_per_run, retries=self.retries)
         if self.gpus_per_run and self.executor == "local":
             raise ConfigError(f"gpus_per_run must be 0 without --executor ray, got {self.gpus_per_run}")
         if self.only is not None and self.report_only:

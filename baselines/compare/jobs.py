@@ -112,11 +112,12 @@ def make_jobs(
     """
     for name, values in (("tasks", tasks), ("algos", labels), ("seeds", seeds)):
         if not values or len(set(values)) < len(values):
-            given = " ".join(map(str, values)) or "none"
-            raise ConfigError(f"{name}: got {given}, allowed are one or more different values")
+            raise ConfigError(
+                f"{name} must be one or more different values, got {' '.join(map(str, values)) or 'none'}"
+            )
     for seed in seeds:
         if not 0 <= seed <= LARGEST_SEED:
-            raise ConfigError(f"seeds: got {seed}, allowed 0 to {LARGEST_SEED}")
+            raise ConfigError(f"seeds must be between 0 and {LARGEST_SEED}, got {seed}")
     jobs = []
     for seed in seeds:
         for task in tasks:
@@ -165,8 +166,8 @@ def _check_same_task(jobs: Sequence[Job]) -> None:
             mine, theirs = (getattr(each.config.environment, name) for each in (job, other))
             if mine != theirs and not _names_default(task, name, mine, theirs):
                 raise ConfigError(
-                    f"{name}: got {mine!r} for {job.label} and {theirs!r} for {other.label} on {task}, allowed is the "
-                    "same value for all algorithms of a task"
+                    f"{name} must be the same for all algorithms on {task}, got {mine!r} for {job.label} and {theirs!r} "
+                    f"for {other.label}"
                 )
 
 
@@ -188,20 +189,20 @@ def check_folder(job: Job) -> None:
     if not holds_run(job.folder):
         return
     if not (job.folder / "config.json").exists():
-        raise ConfigError(f"out: {job.folder} holds files of a run, but no config.json")
+        raise ConfigError(f"out: {job.folder} holds files of a run but no config.json")
     there = read_config(job.folder, configure)
     old, new = (flatten(json.loads(json.dumps(to_json(config)))) for config in (there, job.config))
     for name in {**old, **new}:
         if name not in IRRELEVANT_OPTIONS and old.get(name) != new.get(name):
             raise ConfigError(
-                f"{name}: the run in {job.folder} has {old.get(name)!r}, got {new.get(name)!r}; allowed is the same "
-                "value, or another --out"
+                f"{name} must be {old.get(name)!r} as in the run in {job.folder}, got {new.get(name)!r}; or name "
+                "another --out"
             )
     policy = job.folder / "policy.safetensors"
     if policy.exists() and is_of_another_task(read_policy(policy)[1], job.config.task):
         raise ConfigError(
             f"task: the file that defines {job.config.task!r} has changed since the run in {job.folder} was trained; "
-            "allowed is the same file, or another --out"
+            "name another --out"
         )
 
 

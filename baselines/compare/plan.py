@@ -46,7 +46,7 @@ class Plan:
         except (OSError, ValueError) as error:
             raise ConfigError(f"plan: {path} cannot be read as JSON ({error})") from error
         if not set(values) <= {"common", "tasks", "algos"}:
-            raise ConfigError(f"plan: {path} holds {', '.join(values)}, allowed are common, tasks and algos")
+            raise ConfigError(f"plan: {path} must hold common, tasks and algos only, got {', '.join(values)}")
         _check_options("common", values.get("common", {}))
         for part in ("tasks", "algos"):
             for name, options in _check_object(part, values.get(part, {})).items():
@@ -77,14 +77,14 @@ class Plan:
 
 def _check_object(name: str, value: Any) -> Options:
     if not isinstance(value, dict):
-        raise ConfigError(f"plan: {name}: got {value!r}, allowed is a JSON object")
+        raise ConfigError(f"plan: {name} must be a JSON object, got {value!r}")
     return value
 
 
 def _check_options(name: str, value: Any) -> None:
     for option in COMMAND_LINE_OPTIONS:
         if option in _check_object(name, value):
-            raise ConfigError(f"plan: {name}: got {option}, which is given on the command line")
+            raise ConfigError(f"plan: {name} must not hold {option}, which the command line gives")
 
 
 def _merge(base: Options, values: Options) -> Options:

@@ -36,7 +36,7 @@ class RayExecutor(Executor):
             import ray
         except ImportError as error:
             raise ConfigError(
-                "executor: got 'ray', which is not installed; pip install 'torchmpm[ray]', or use --executor local"
+                "executor ray requires Ray, which is not installed: pip install 'torchmpm[ray]'"
             ) from error
         self._ray: Any = ray
         self._owned = not ray.is_initialized()
@@ -44,7 +44,7 @@ class RayExecutor(Executor):
             try:
                 ray.init(address=address, log_to_driver=False, configure_logging=False)
             except ConnectionError as error:
-                raise ConfigError(f"address: got {address!r}, where no Ray cluster answers ({error})") from error
+                raise ConfigError(f"address: no Ray cluster answers at {address!r} ({error})") from error
         self._threads, self._lock_timeout = resources.cpus or 1, resources.lock_timeout
         self._task = ray.remote(run_process).options(
             num_cpus=self._threads,

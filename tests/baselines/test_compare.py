@@ -71,7 +71,7 @@ def test_other_options_are_refused_and_named(finished, capsys):
     }
     assert compare(finished, "--algos", "mpc", "--seeds", "0", plan=plan) == 2
     error = capsys.readouterr().err
-    assert "planner.horizon: the run in" in error and "mpc-shapematch-quick-0 has 3, got 4" in error
+    assert "planner.horizon must be 3 as in the run in" in error and "mpc-shapematch-quick-0, got 4" in error
     assert contents(finished) == before
 
 

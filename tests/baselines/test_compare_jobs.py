@@ -16,13 +16,16 @@ from baselines.compare.plan import Plan
     [
         ("--algos alchemy", "algo: got 'alchemy', allowed cfp"),
         ("--tasks swim --algos mpc", "task must be catch"),
-        ("--algos mpc mpc", "algos: got mpc mpc"),
-        ("--seeds 9500 --algos mpc", "seeds: got 9500, allowed 0 to 8999"),
+        ("--algos mpc mpc", "algos must be one or more different values, got mpc mpc"),
+        ("--seeds 9500 --algos mpc", "seeds must be between 0 and 8999, got 9500"),
         ("--episodes 0", "episodes must be at least 1, got 0"),
         ("--gpus-per-run 1", "gpus_per_run must be 0 without --executor ray, got 1.0"),
         ("--algos mpc --seeds 0 --only 1", "only must be between 0 and 0, got 1"),
         ("--only 0 --report-only", "only cannot be combined with --report-only"),
-        ("--algos mpc other", "target: got 'M' for other and None for mpc on shapematch"),
+        (
+            "--algos mpc other",
+            "target must be the same for all algorithms on shapematch, got 'M' for other and None for mpc",
+        ),
     ],
 )
 def test_wrong_options_are_named(tmp_path, capsys, options, message):
@@ -74,6 +77,6 @@ def test_plans_of_the_documentation_hold(path, tmp_path):
 
 def test_plan_file_that_is_none_is_named(tmp_path, capsys):
     assert compare(tmp_path / "out", plan={"runs": {}}) == 2
-    assert "holds runs, allowed are common, tasks and algos" in capsys.readouterr().err
+    assert "must hold common, tasks and algos only, got runs" in capsys.readouterr().err
     assert main(["--plan", str(tmp_path / "missing.json")]) == 2
     assert "cannot be read as JSON" in capsys.readouterr().err
