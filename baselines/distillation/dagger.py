@@ -136,7 +136,7 @@ class Collector:
             student: From images (B, 3, 64, 64) to actions (B, 2, R, R).
         """
         env, images, actions = self.env, [], []
-        self.episodes.ended = []
+        self.episodes.recent_returns = []
         seen = dynamics.observe(env.model, env.env_state)
         for _ in range(steps):
             told = self.teacher.act(env, seen)
@@ -159,8 +159,7 @@ class Collector:
     def _step(self, action: Tensor) -> Tensor:
         """Carry out an action, begin new episodes where they are over, return the images."""
         seen, reward, terminated, _, info = self.env.step(action)
-        self.episodes.returns += reward
-        out = self.episodes.over(terminated | ~info["finite"])
+        out = self.episodes.record(reward, terminated | ~info["finite"])
         if bool(out.any()):
             self.episodes.restart(out, terminated, info["finite"])
             self.lost = self.lost | out
