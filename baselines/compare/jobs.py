@@ -166,8 +166,8 @@ def _check_same_task(jobs: Sequence[Job]) -> None:
             mine, theirs = (getattr(each.config.environment, name) for each in (job, other))
             if mine != theirs and not _names_default(task, name, mine, theirs):
                 raise ConfigError(
-                    f"{name} must be the same for all algorithms on {task}, got {mine!r} for {job.label} and {theirs!r} "
-                    f"for {other.label}"
+                    f"{name} must be the same for all algorithms on {task}, got {mine!r} for {job.label} "
+                    f"and {theirs!r} for {other.label}"
                 )
 
 
