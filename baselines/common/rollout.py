@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dittogym import core as dynamics
-from dittogym.action import Layout, to_grid_layout
+from dittogym.action import ActionIndexing, to_grid_indexing
 from dittogym.core import EnvState, Model
 from dittogym.observation.smooth import soft_observation
 from torchmpm import trajectory, tree
@@ -77,7 +77,7 @@ def rollout(
     actions: Tensor,
     judge: Judge = judge,
     *,
-    layout: Layout = "image",
+    layout: ActionIndexing = "image",
     checkpointed: bool = True,
 ) -> Rollout:
     """Drive simulations through some control steps.
@@ -92,7 +92,7 @@ def rollout(
     """
 
     def step(before: Judgement, action: Tensor) -> Judgement:
-        state, field = dynamics.transition(model, before.state, to_grid_layout(action, layout))
+        state, field = dynamics.transition(model, before.state, to_grid_indexing(action, layout))
         after, over = judge(model, state, field), before.ended
         earned, true = (torch.where(over, 0.0, reward) for reward in (after.reward, after.true_reward))
         return Judgement(after.state, earned, true, over | after.ended)

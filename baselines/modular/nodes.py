@@ -9,7 +9,7 @@ from torch import Tensor
 
 from baselines.modular.kmeans import adjacency, averages, squared_distances
 from dittogym import TorchEnv
-from dittogym.action import from_grid_layout, patch_corner
+from dittogym.action import from_grid_indexing, patch_corner
 from dittogym.observation.window import in_window
 from dittogym.spec import TaskSpec
 from torchmpm import checks
@@ -112,7 +112,7 @@ class Nodes:
         centres, _ = averages(places(env), labels, self.count)
         nearest = squared_distances(place.to(centres), centres).argmin(-1)
         field = values.to(centres).gather(1, nearest[..., None].expand(-1, -1, 2))
-        return from_grid_layout(field.transpose(1, 2).unflatten(2, (size, size)), env.action_layout)
+        return from_grid_indexing(field.transpose(1, 2).unflatten(2, (size, size)), env.action_layout)
 
 
 def places(env: TorchEnv) -> Tensor:

@@ -10,7 +10,7 @@ from baselines.modular.kmeans import adjacency, averages, begin, connected, foll
 from baselines.modular.nodes import LENGTH, SPEED, Nodes, pack, unpack
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
-from dittogym.action import place, to_grid_layout
+from dittogym.action import place, to_grid_indexing
 from dittogym.observation.window import in_window
 
 
@@ -134,7 +134,7 @@ def test_nodes_of_the_grid_get_the_value_of_the_nearest_segment(task, layout):
     action = env.nodes.act(env.env, env.labels, values)
     state, spec = env.env.env_state, env.env.spec
     centre = in_window(spec.reach, state.centre, state.origin)
-    field = place(to_grid_layout(action, layout), centre, 128)
+    field = place(to_grid_indexing(action, layout), centre, 128)
     robot = state.particles.x[:, : env.env.model.robot]
     centres, _ = averages(robot, env.labels, 16)
     for point in robot[0, ::50]:
