@@ -15,7 +15,7 @@ from pathlib import Path
 
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from cfp.experiment.files import Table, read_table
+from cfp.tables import Table, read_table
 from dittogym import TASKS
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 import dittogym  # noqa: F401  registers the environments
-from cfp.experiment.files import Table
+from cfp.tables import Table
 from torchmpm import diagnostics
 
 

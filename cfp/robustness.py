@@ -20,8 +20,9 @@ from cfp.evaluate import Selection, judge
 from cfp.evaluation.plots import write_figure
 from cfp.evaluation.rollout import Policy, Result, evaluate, judging_seed
 from cfp.experiment.cli import Program
-from cfp.experiment.files import csv_text, write_json, write_text
+from cfp.files import write_json, write_text
 from cfp.presets import from_json
+from cfp.tables import csv_text
 from dittogym import make_spec
 from dittogym.spec import TaskSpec
 

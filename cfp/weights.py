@@ -21,8 +21,8 @@ from cfp.agent.networks import RESOLUTIONS
 from cfp.agent.policies import ActorPolicy
 from cfp.config import LARGEST_SEED, Config, EnvironmentConfig, RunConfig, merge
 from cfp.errors import CheckpointError, ConfigError
-from cfp.experiment.files import parse_json, write_atomically, write_json
 from cfp.experiment.from_dict import words
+from cfp.files import parse_json, write_atomically, write_json
 from cfp.groups import TASK_OPTIONS
 from dittogym import make_spec
 from dittogym.geometry import NODES

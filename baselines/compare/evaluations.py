@@ -15,7 +15,7 @@ from cfp.config import RunConfig, Tier
 from cfp.envs.disturbances import Case, make_cases
 from cfp.envs.make import choose_device, make_env
 from cfp.evaluation.rollout import Policy, Result, evaluate, judging_seed
-from cfp.experiment.files import write_json
+from cfp.files import write_json
 from cfp.robustness import report
 from cfp.weights import policy_file
 

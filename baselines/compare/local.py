@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from baselines.compare.worker import BUSY, FINISHED, work
-from cfp.experiment.files import write_text
 from cfp.experiment.process import StopSignals
+from cfp.files import write_text
 
 MODULE = (sys.executable, "-m", "baselines.compare.worker")
 POLL = 0.2

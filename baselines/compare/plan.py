@@ -12,9 +12,9 @@ from baselines.common.reference_policies import FloorConfig
 from baselines.registry import ALGORITHMS, ALIASES, configure, find
 from cfp.config import EVALUATION_SEED, RunConfig, to_json
 from cfp.errors import CheckpointError, ConfigError
-from cfp.experiment.files import parse_json, read_json
 from cfp.experiment.run import holds_run, read_config
 from cfp.experiment.state_file import flatten
+from cfp.files import parse_json, read_json
 from cfp.groups import TASK_OPTIONS
 from cfp.weights import is_of_another_task, is_same_task, read_policy
 from dittogym.tasks import task_name

@@ -8,8 +8,8 @@ from typing import Any
 
 from baselines.compare.local import Report, Resources, run_process
 from cfp.errors import ConfigError
-from cfp.experiment.files import write_text
 from cfp.experiment.process import StopSignals
+from cfp.files import write_text
 
 
 def run_ray(

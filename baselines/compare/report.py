@@ -15,7 +15,7 @@ from baselines.compare.table import Table
 from cfp.config import Tier
 from cfp.evaluation.page import STYLE
 from cfp.evaluation.plots import write_figure
-from cfp.experiment.files import write_text
+from cfp.files import write_text
 
 MORE_STYLE = """
 body { max-width: 76rem; } .wide { overflow-x: auto; } table { font-size: 14px; } th { vertical-align: bottom; }

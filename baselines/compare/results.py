@@ -12,7 +12,7 @@ import numpy as np
 from baselines.compare.evaluations import Judged, Judging, read
 from baselines.compare.plan import Job, read_sessions
 from cfp.config import Tier
-from cfp.experiment.files import read_table
+from cfp.tables import read_table
 
 Curve = tuple[np.ndarray, np.ndarray]
 """Steps (N,) and values (N,)."""

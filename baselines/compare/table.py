@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from cfp.experiment.files import csv_text
+from cfp.tables import csv_text
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,9 @@ from baselines.compare.plan import Job, check_there, read_sessions
 from baselines.registry import configure, open_run
 from cfp.config import RunConfig, to_json
 from cfp.envs.make import choose_device
-from cfp.experiment.files import write_json, write_text
 from cfp.experiment.process import Stopped, StopSignals, keep_memory, peak_memory
 from cfp.experiment.run_lock import Claimed, claim
+from cfp.files import write_json, write_text
 
 FINISHED, FAILED, BUSY = 0, 1, 3
 """Exit codes; stopped is 128 and the number of the signal."""

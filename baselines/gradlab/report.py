@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 
 from baselines.gradlab.measure import Row
 from cfp.evaluation.plots import write_figure
-from cfp.experiment.files import csv_text, write_json, write_text
+from cfp.files import write_json, write_text
+from cfp.tables import csv_text
 
 #: Largest error of finite differences, and smallest cosine between precisions, of a gradient that is right.
 DIFFERENCE_LIMIT, COSINE_LIMIT = 0.05, 0.99

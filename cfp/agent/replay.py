@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cfp.agent.composition import Composition
 from cfp.errors import CheckpointError
-from cfp.experiment.files import write_atomically
+from cfp.files import write_atomically
 
 FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 _COMPRESSED = ("observations", "next_observations")  # images shrink thirtyfold, actions are noise

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from cfp.config import RunConfig, to_json
 from cfp.evaluation.rollout import Result
-from cfp.experiment.files import write_text
+from cfp.files import write_text
 
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }

@@ -10,7 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cfp.config import RunConfig
-from cfp.experiment.files import read_table, write_atomically
+from cfp.files import write_atomically
+from cfp.tables import read_table
 
 
 def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Path:

@@ -17,11 +17,11 @@ from cfp.config import RunConfig, to_json
 from cfp.errors import CFPError, ConfigError, NonFiniteError
 from cfp.evaluation.rollout import Policy
 from cfp.experiment.estimate import estimate
-from cfp.experiment.files import read_json
 from cfp.experiment.from_dict import merge
 from cfp.experiment.process import Stopped, StopSignals, keep_memory
 from cfp.experiment.run import Run, holds_run, read_config
 from cfp.experiment.run_lock import claim
+from cfp.files import read_json
 
 
 @dataclass(frozen=True)

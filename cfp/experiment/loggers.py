@@ -10,12 +10,14 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.logger import Image, KVWriter
+from stable_baselines3.common.logger import Image, KVWriter, TensorBoardOutputFormat, filter_excluded_keys
+from torch.utils.tensorboard import SummaryWriter
 
 from cfp.config import RunConfig, to_json
 from cfp.errors import ConfigError
 from cfp.evaluation.video import available
-from cfp.experiment.files import EventFile, write_text
+from cfp.files import write_text
+from cfp.tables import Table
 
 EVALUATION_METRICS: dict[str, str] = {
     "eval/return": "mean undiscounted return of an evaluation's episodes (the column mean of evaluations.csv)",
@@ -23,6 +25,39 @@ EVALUATION_METRICS: dict[str, str] = {
     "eval/success": "share of successes among them, where the task defines success",
 }
 """Scalars of an evaluation in TensorBoard."""
+
+
+class ProgressTable(KVWriter):
+    """A logger output that appends to ``progress.csv`` (stable-baselines3's own starts the file anew).
+
+    Wall-clock values are left out, so that two runs with one seed write the same file.
+    """
+
+    def __init__(self, table: Table) -> None:
+        """Write into a table."""
+        self.table = table
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """Append one row."""
+        values = filter_excluded_keys(key_values, key_excluded, "csv")
+        self.table.add({"step": step, **{key: values[key] for key in sorted(values)}})
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+class EventFile(TensorBoardOutputFormat):
+    """TensorBoard events that, on a resumed run, replace what was logged past the checkpoint.
+
+    Args:
+        folder: Where event files go.
+        step: The step this session starts at.
+    """
+
+    def __init__(self, folder: Path, step: int) -> None:
+        """Open a new event file."""
+        self.writer = SummaryWriter(log_dir=str(folder), purge_step=step + 1 if step else None)
+        self._is_closed = False
 
 
 def check_trackers(config: RunConfig) -> None:

@@ -25,10 +25,11 @@ from cfp.evaluation.rollout import Policy, Result, compare, evaluate, format_tab
 from cfp.evaluation.video import VideoUnavailable, film, film_episode, write_video
 from cfp.experiment.books import Books
 from cfp.experiment.estimate import Cost
-from cfp.experiment.files import ProgressTable, Table, copy_atomically, read_json, read_table, write_json
-from cfp.experiment.loggers import Tracker, check_trackers
+from cfp.experiment.loggers import ProgressTable, Tracker, check_trackers
 from cfp.experiment.process import Plateau, StopSignals
 from cfp.experiment.state_file import Position, StateFile, check_same
+from cfp.files import copy_atomically, read_json, write_json
+from cfp.tables import Table, read_table
 from cfp.weights import is_of_another_task, read_policy
 
 EVALUATION_COLUMNS: dict[str, str] = {

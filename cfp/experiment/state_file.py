@@ -13,8 +13,8 @@ import torch
 
 from cfp.config import RunConfig, merge, to_json
 from cfp.errors import CheckpointError, ConfigError
-from cfp.experiment.files import parse_json, write_atomically
 from cfp.experiment.from_dict import flatten as flatten
+from cfp.files import parse_json, write_atomically
 
 VERSION = 1
 

@@ -19,7 +19,7 @@ from baselines.compare.plan import Plan, judged, make_jobs, resolve
 from baselines.registry import configure, load
 from cfp.envs.disturbances import make_cases
 from cfp.errors import CheckpointError
-from cfp.experiment.files import read_table
+from cfp.tables import read_table
 
 ENVIRONMENT = {"particles": 100, "substeps": 1, "num_envs": 1}
 MPC = {"grid": 8, "planner": {"horizon": 3, "commit": 2, "iterations": 1}}

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from baselines.compare.__main__ import main
-from cfp.experiment.files import read_table
+from cfp.tables import read_table
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own warnings
 ROOT = Path(__file__).parents[2]

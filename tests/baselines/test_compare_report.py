@@ -16,7 +16,7 @@ from baselines.compare.report import make_tables
 from baselines.compare.results import find_runs, group
 from baselines.compare.tables import aggregate_table, cost_table, efficiency_table, paper_table
 from cfp.config import to_json
-from cfp.experiment.files import write_json, write_text
+from cfp.files import write_json, write_text
 from cfp.weights import origin, write_policy
 
 CASES = [case.name for case in Judging(1).cases()]

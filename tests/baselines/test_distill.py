@@ -22,8 +22,8 @@ from baselines.modular.policy import SegmentPolicy
 from baselines.registry import configure
 from cfp.config import EnvironmentConfig, ReportConfig, to_json
 from cfp.errors import ConfigError, NonFiniteError
-from cfp.experiment.files import read_table
 from cfp.experiment.process import StopSignals
+from cfp.tables import read_table
 from cfp.weights import origin, read_policy, write_policy
 from dittogym import TASKS, TorchEnv
 from dittogym.action import patch_field, to_grid_indexing

@@ -15,7 +15,8 @@ from cfp.agent.actor import build_actor
 from cfp.config import to_json
 from cfp.errors import ConfigError
 from cfp.experiment.cli import parse
-from cfp.experiment.files import read_table, write_json
+from cfp.files import write_json
+from cfp.tables import read_table
 from dittogym import TorchEnv
 from dittogym.action import from_grid_indexing, patch_field, to_grid_indexing
 from dittogym.rewards import action_cost

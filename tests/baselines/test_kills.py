@@ -14,8 +14,8 @@ import pytest
 from test_programs import COMMON, TINY, run
 
 import baselines
-from cfp.experiment.files import read_table
 from cfp.experiment.state_file import StateFile
+from cfp.tables import read_table
 
 KILLS = int(os.environ.get("KILLS", "3"))
 SPAN = 3.0

@@ -11,9 +11,9 @@ from baselines.planning.mpc import MPCConfig
 from cfp.config import EnvironmentConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
-from cfp.experiment.files import read_table
 from cfp.experiment.process import StopSignals
 from cfp.experiment.run import holds_run
+from cfp.tables import read_table
 
 ENVIRONMENT = EnvironmentConfig(num_envs=1, particles=100, substeps=2)
 CONFIG = MPCConfig(

@@ -16,7 +16,7 @@ from cfp.errors import ConfigError
 from cfp.evaluation.rollout import SeesState
 from cfp.experiment.books import Books
 from cfp.experiment.cli import parse
-from cfp.experiment.files import read_table
+from cfp.tables import read_table
 from cfp.weights import describe, save_policy
 
 COMMON = "--particles 100 --substeps 1 --eval-episodes 2 --no-video --device cpu".split()

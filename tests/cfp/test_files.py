@@ -5,7 +5,9 @@ from pathlib import Path
 import pytest
 
 from cfp.errors import CheckpointError
-from cfp.experiment.files import ProgressTable, Table, read_table, write_atomically, write_json
+from cfp.experiment.loggers import ProgressTable
+from cfp.files import write_atomically, write_json
+from cfp.tables import Table, read_table
 
 
 def test_interrupted_write_leaves_the_old_file(tmp_path):

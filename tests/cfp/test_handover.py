@@ -10,8 +10,8 @@ from test_train import run
 from cfp import train
 from cfp.experiment.cfp_run import Runner
 from cfp.experiment.cli import parse
-from cfp.experiment.files import read_table
 from cfp.experiment.process import StopSignals
+from cfp.tables import read_table
 from cfp.train import PROGRAM
 
 MEANS = [1.0, 3.0, 2.0, 2.5, 9.0, 1.0, 5.0, 4.0, 3.0, 2.0]

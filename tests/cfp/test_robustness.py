@@ -19,7 +19,7 @@ from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from cfp.evaluate import open_policy, open_run
 from cfp.evaluation.rollout import Result, ZeroPolicy, evaluate, student
-from cfp.experiment.files import write_json
+from cfp.files import write_json
 from cfp.presets import preset
 from cfp.train import PROGRAM
 from cfp.weights import describe, save_policy

@@ -18,9 +18,9 @@ from cfp.agent.sac import METRICS
 from cfp.evaluation.pictures import PICTURES, muscles, policy_pictures
 from cfp.experiment.books import BOOK_METRICS
 from cfp.experiment.callbacks import ROLLOUT_METRICS
-from cfp.experiment.files import read_table
 from cfp.experiment.loggers import EVALUATION_METRICS
 from cfp.experiment.run import EVALUATION_COLUMNS
+from cfp.tables import read_table
 
 SHORT = "--steps 110 --handover 70 --eval-every 70 --log-every 10".split()  # an episode ends in the first stage
 PAGE = (Path(__file__).parents[2] / "docs" / "scalars.md").read_text()

@@ -28,8 +28,8 @@ from cfp.evaluation.rollout import compare
 from cfp.experiment.callbacks import StageCallback
 from cfp.experiment.cfp_run import Runner
 from cfp.experiment.cli import program_name
-from cfp.experiment.files import read_table
 from cfp.presets import preset
+from cfp.tables import read_table
 from cfp.weights import describe, policy_file, save_policy, shipped
 
 TINY = (

@@ -1,0 +1,107 @@
+"""Writing files so that a crash at any moment leaves either the old file or the new one, whole."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+LARGEST_JSON = 2**20
+"""Bytes of a JSON file that is read."""
+
+
+def write_atomically(path: Path, write: Callable[[BinaryIO], Any]) -> None:
+    """Write a file aside, flush it to disk, and move it into place.
+
+    Args:
+        path: Where it ends up; the folder is created.
+        write: Called with the open binary file.
+
+    Raises:
+        OSError: The disk is full or the folder cannot be written; it names the file, and the old one, if any, is
+            untouched.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(path.name + ".part")
+    aside.unlink(missing_ok=True)  # where it is a link, its target must not be written to
+    try:
+        with names_file(path), open(aside, "xb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError:
+        aside.unlink(missing_ok=True)  # on a full disk every byte counts
+        raise
+    os.replace(aside, path)
+    _sync_folder(path.parent)
+
+
+@contextmanager
+def names_file(path: Path) -> Iterator[None]:
+    """Add the name of the file to an error of the system that lacks it, as that of a full disk does."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
+
+
+def copy_atomically(source: Path, target: Path) -> None:
+    """Copy a file, as `write_atomically` writes one."""
+    content = source.read_bytes()
+    write_atomically(target, lambda file: file.write(content))
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename itself durable; some systems (Windows) cannot open a folder and need nothing here."""
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object from a file of moderate size.
+
+    Raises:
+        OSError: It is missing, or not a file that can be read.
+        ValueError: It is not JSON in UTF-8, not an object, or larger than `LARGEST_JSON`.
+    """
+    if path.exists() and not path.is_file():
+        raise OSError("it is not a file")  # a pipe or a device might never end
+    with open(path, "rb") as file:
+        content = file.read(LARGEST_JSON + 1)
+    if len(content) > LARGEST_JSON:
+        raise ValueError(f"it is larger than {LARGEST_JSON} bytes")
+    value = parse_json(content.decode())
+    if not isinstance(value, dict):
+        raise ValueError(f"it holds {type(value).__name__}, allowed an object with named values")
+    return value
+
+
+def parse_json(text: str) -> Any:
+    """Parse JSON of any depth.
+
+    Raises:
+        ValueError: It is not JSON.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON with an indent, atomically."""
+    write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write UTF-8 text, atomically."""
+    write_atomically(path, lambda file: file.write(text.encode()))

@@ -1,0 +1,96 @@
+"""CSV tables that grow row by row and survive a crash."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cfp.errors import CheckpointError
+from cfp.files import names_file, write_text
+
+
+def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> str:
+    """A table as CSV.
+
+    Args:
+        rows: Values by column; other values are left out.
+        columns: In their order.
+    """
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+class Table:
+    """A CSV file that grows row by row, also over several sessions, and can take new columns on the way.
+
+    Args:
+        path: The file; what it holds is kept.
+        last_step: Rows whose ``step`` is beyond this are dropped: they belong to work that a resumed run repeats.
+        numbers: Columns that hold a number in every row that is there.
+
+    Raises:
+        CheckpointError: The file is damaged.
+    """
+
+    def __init__(self, path: Path, last_step: int | None = None, numbers: Sequence[str] = ("step",)) -> None:
+        """Read the file if it is there."""
+        self.path = path
+        self.rows = read_table(path, numbers)
+        if last_step is not None:
+            self.rows = [row for row in self.rows if float(row["step"]) <= last_step]
+        self.columns = list(dict.fromkeys(key for row in self.rows for key in row))
+        if self.columns or path.exists():
+            self._rewrite()
+
+    def add(self, row: dict[str, Any]) -> None:
+        """Append one row; a key seen for the first time becomes a new column, empty in older rows."""
+        text = {key: "" if value is None else str(value) for key, value in row.items()}
+        self.rows.append(text)
+        new = [key for key in text if key not in self.columns]
+        if new:
+            self.columns += new
+            self._rewrite()
+            return
+        with names_file(self.path), open(self.path, "a", newline="") as file:
+            csv.DictWriter(file, self.columns, lineterminator="\n").writerow(text)
+
+    def _rewrite(self) -> None:
+        write_text(self.path, csv_text(self.rows, self.columns))
+
+
+def read_table(path: Path, numbers: Sequence[str] = ("step",)) -> list[dict[str, str]]:
+    """Rows of a CSV file as text, none if it does not exist; a last line cut short by a crash is left out.
+
+    Args:
+        path: The file.
+        numbers: Columns that hold a number in every row.
+
+    Raises:
+        CheckpointError: It is no such table.
+    """
+    if not path.exists():
+        return []
+    try:
+        with open(path, newline="") as file:
+            text = file.read()
+        complete = text[: text.rfind("\n") + 1]
+        rows = [row for row in csv.DictReader(io.StringIO(complete)) if row.get("step")]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise CheckpointError(f"{path}: cannot be read ({error})") from error
+    for row in rows:
+        for name in numbers:
+            _check_number(path, name, row.get(name))
+    return rows
+
+
+def _check_number(path: Path, column: str, text: str | None) -> None:
+    try:
+        float(text or "")
+    except ValueError as error:
+        raise CheckpointError(f"{path}: got {text!r} in column {column}, allowed is a number") from error
