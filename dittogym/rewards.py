@@ -157,7 +157,7 @@ def signed_quadratic(z: Tensor, k: float) -> Tensor:
 
 
 def distance(x: Tensor, point: Tensor) -> Tensor:
-    """Distances (B, N) of particles ``x`` (B, N, 2) from ``point`` (B, 2), m; where they coincide the derivative is 0."""
+    """Distances (B, N) of ``x`` (B, N, 2) from ``point`` (B, 2), m, whose derivative is 0 where they coincide."""
     squared = _squared_distance(x, point)
     same = squared == 0
     return torch.where(same, 0.0, torch.where(same, 1.0, squared).sqrt())
@@ -169,7 +169,7 @@ def _squared_distance(x: Tensor, point: Tensor) -> Tensor:
 
 
 def nearest(x: Tensor, point: Tensor, fraction: float) -> Tensor:
-    """The particles nearest to a point, without the one of them with the largest \\|x\\|.
+    """The particles nearest to a point, without the one of them with the largest absolute x.
 
     Args:
         x: (B, N, 2) positions of the particles, m.
@@ -188,7 +188,7 @@ def count_of(fraction: float, x: Tensor) -> int:
 
 
 def drop_widest(index: Tensor, x: Tensor) -> Tensor:
-    """Remove the particle with the largest \\|x\\| from ``index`` (B, K), unless it is the only one: (B, K - 1)."""
+    """Remove the particle with the largest absolute x from ``index`` (B, K), unless it is the only one: (B, K - 1)."""
     batch, count = index.shape
     if count == 1:
         return index

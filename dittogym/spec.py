@@ -13,7 +13,7 @@ from dittogym.bodies.shapes import Shape
 from dittogym.contract import Memory, Moment, Outcome
 from dittogym.geometry import NODES, Box, Obstacle, mark
 from dittogym.observation.image import SIZE
-from dittogym.window import Centre, Window
+from dittogym.window import FIXED, Centre, Window
 from torchmpm import Material, checks
 
 
@@ -104,7 +104,7 @@ class TaskSpec:
     lam: float = 50.0
     gravity: tuple[float, float] = (0.0, 0.0)
     damping: float = 1.0
-    window: Window = Window()
+    window: Window = FIXED
     view: Centre = (None, None)
     reach: Centre = (None, None)
     patch: int = 64

@@ -250,8 +250,8 @@ class TorchEnv:
         chosen = self._mask(mask, "mask")
         theirs = snapshot.state
         size = len(theirs.steps)
-        kind = (snapshot.task, snapshot.counts, snapshot.particle_weight)
-        kind += (theirs.particles.dtype, theirs.particles.device)
+        x = theirs.particles.x
+        kind = (snapshot.task, snapshot.counts, snapshot.particle_weight, x.dtype, x.device)
         own = (self.spec.name, self._counts, self.model.particle_weight, self.dtype, self.device)
         if kind != own or size not in (1, self.num_envs):
             raise ValueError(

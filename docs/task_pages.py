@@ -14,7 +14,7 @@ from PIL import Image
 import dittogym
 from dittogym.bodies.positions import particle_counts
 from dittogym.geometry import Obstacle
-from dittogym.spec import Body, TaskSpec
+from dittogym.spec import BodySpec, TaskSpec
 from torchmpm import Soil, VelocityRule
 
 DOCS = Path(__file__).resolve().parent
@@ -149,7 +149,7 @@ def numbers(spec: TaskSpec) -> list[tuple[str, str]]:
     return rows
 
 
-def matter(body: Body) -> str:
+def matter(body: BodySpec) -> str:
     """What an object is made of."""
     return "soil" if isinstance(body.material, Soil) else "elastic"
 

@@ -15,7 +15,7 @@ import tyro
 from torch import Tensor
 from tqdm import tqdm
 
-from baselines.common.rollout import judge
+from baselines.common.rollout import soft_step
 from baselines.gradlab.measure import Probe, Smoothing, measure
 from baselines.gradlab.report import format_table, write
 from cfp.config import positive
@@ -162,7 +162,7 @@ def run(lab: Lab) -> str:
         for action in drive[: lab.warmup]:
             env.step(action[None])
     with tqdm(total=total_steps(lab, horizons), unit=" steps", disable=None) as bar:
-        probe = Probe(env.model, env.env_state, judge, lab.chunk, bar.update)
+        probe = Probe(env.model, env.env_state, soft_step, lab.chunk, bar.update)
         directions, smoothing = normal(lab.directions), Smoothing(normal(lab.samples), lab.sigma)
         rows, errors = measure(probe, drive[lab.warmup :], horizons, lab.widths, directions, smoothing)
     config = dataclasses.asdict(lab) | {"out": str(lab.out)}

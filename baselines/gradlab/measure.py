@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from baselines.common.rollout import Judge, repeat, rollout, to_dtype
+from baselines.common.rollout import StepFunction, repeat, rollout, to_dtype
 from cfp.errors import CFPError
-from dittogym.core import EnvState, Model
+from dittogym.model import EnvState, Model
 
 
 class NoGradientError(CFPError):
@@ -34,7 +34,7 @@ class Probe:
 
     model: Model
     start: EnvState
-    judge: Judge
+    judge: StepFunction
     chunk: int
     advance: Callable[[int], object]
 

@@ -10,8 +10,8 @@ from torch import Tensor
 from baselines.modular.kmeans import adjacency, averages, squared_distances
 from dittogym import TorchEnv
 from dittogym.action import from_grid_indexing, patch_corner
-from dittogym.observation.window import in_window
 from dittogym.spec import TaskSpec
+from dittogym.window import centre_in_window
 from torchmpm import checks
 
 LENGTH, SPEED = 0.1, 0.5
@@ -63,7 +63,7 @@ class Nodes:
 
     def __call__(self, env: TorchEnv, labels: Tensor) -> Tensor:
         """Rows (B, K, columns), float32, of the environment's present state with labels (B, N)."""
-        state, robot = env.env_state, env.model.robot
+        state, robot = env.env_state, env.model.num_robot_particles
         x, v = places(env), state.particles.v[:, :robot].clamp(-FASTEST, FASTEST)
         com = x.mean(1)[:, None]
         offset = x - com
@@ -105,7 +105,7 @@ class Nodes:
         if env.action_resolution != size:
             raise ValueError(f"env: got an action grid of {env.action_resolution}, allowed {size}, the task's patch")
         grid = env.model.solver.grid.resolution
-        corner = patch_corner(in_window(env.spec.reach, state.centre, state.origin), size, grid)
+        corner = patch_corner(centre_in_window(env.spec.reach, state.centre, state.origin), size, grid)
         along = torch.arange(size, device=env.device)
         nodes = torch.stack(torch.meshgrid(along, along, indexing="ij"), -1).flatten(0, 1)
         place = state.origin[:, None] + (corner[:, None] + nodes) / grid
@@ -119,11 +119,11 @@ def places(env: TorchEnv) -> Tensor:
     """Where the robot's particles are seen, (B, N, 2), m: at most `BEYOND` outside the window, which is 1 m wide."""
     state = env.env_state
     low = state.origin[:, None] - BEYOND
-    return state.particles.x[:, : env.model.robot].clamp(low, low + 1.0 + 2.0 * BEYOND)
+    return state.particles.x[:, : env.model.num_robot_particles].clamp(low, low + 1.0 + 2.0 * BEYOND)
 
 
 def _has_object(spec: TaskSpec) -> bool:
-    return any(body.moves_visibly for body in spec.objects)
+    return not all(body.hidden_velocity for body in spec.objects)
 
 
 def pack(edges: Tensor) -> Tensor:

@@ -10,14 +10,14 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from baselines.common.rollout import Judge, judge_true
+from baselines.common.rollout import StepFunction
 from baselines.planning.gradient import PlanConfig, PlannerBase
 from baselines.planning.mpc import MPC, PlannedConfig, planned
 from cfp.config import positive
 from cfp.errors import ConfigError
-from dittogym import TorchEnv
+from dittogym import TorchEnv, core
 from dittogym.action import bicubic
-from dittogym.core import EnvState
+from dittogym.model import EnvState
 from torchmpm import tree
 
 
@@ -68,7 +68,7 @@ class CEMPlanner(PlannerBase[CEMPlannerConfig]):
         env: TorchEnv,
         config: CEMPlannerConfig | None = None,
         *,
-        judge: Judge = judge_true,
+        judge: StepFunction = core.step,
         seed: int = 0,
     ) -> None:
         super().__init__(env, config, judge=judge, seed=seed)

@@ -9,12 +9,14 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from baselines.common.rollout import Judge, Judgement, judge, rollout
+from baselines.common.rollout import StepFunction, rollout, soft_step
 from cfp.config import not_negative, positive
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
-from dittogym.core import EnvState, Model
-from dittogym.rewards import measure
+from dittogym.contract import measure
+from dittogym.core import StepResult
+from dittogym.model import EnvState, Model
+from torchmpm import tree
 
 SAFE_SPREAD = 0.8
 """Share of the limit of its spread up to which a robot is not in danger of being torn."""
@@ -95,7 +97,7 @@ class PlannerBase(ABC, Generic[Config]):
         env: TorchEnv,
         config: Config | None = None,
         *,
-        judge: Judge = judge,
+        judge: StepFunction = soft_step,
         seed: int = 0,
     ) -> None:
         self.config = config = config or self.options()
@@ -148,7 +150,7 @@ class PlannerBase(ABC, Generic[Config]):
 
     def plan(self) -> Tensor:
         """Make new plans from the environment's present state: actions (T, B, 2, R, R)."""
-        config, start = self.config, self.env.env_state.detach()
+        config, start = self.config, tree.detach(self.env.env_state)
         left = self._left(start)
         length = min(config.horizon, left) if left else config.horizon
         kept = self._ahead[self._position :][:length]
@@ -164,15 +166,15 @@ class PlannerBase(ABC, Generic[Config]):
         """Control steps to the end of the youngest episode."""
         return max(self.env.spec.horizon - int(start.steps.min()), 0)
 
-    def _careful(self, model: Model, state: EnvState, field: Tensor) -> Judgement:
+    def _careful(self, model: Model, state: EnvState, action: Tensor) -> StepResult:
         """What a step is worth, less the cost of being nearly torn: the true penalty comes when it is too late."""
-        judgement, limit = self.judge(model, state, field), model.spec.split_limit
+        result, limit = self.judge(model, state, action), model.spec.split_limit
         if limit is None:
-            return judgement
-        excess = measure(judgement.state.particles, model.robot).split / limit - SAFE_SPREAD
+            return result
+        excess = measure(result.state.particles, model.num_robot_particles).split / limit - SAFE_SPREAD
         cost = self.config.margin * excess.clamp_min(0.0).square()
-        reward, true_reward = judgement.reward - cost, judgement.true_reward - cost.detach()
-        return judgement._replace(reward=reward, true_reward=true_reward)
+        reward, true_reward = result.reward - cost, result.true_reward - cost.detach()
+        return result._replace(reward=reward, true_reward=true_reward)
 
     def _judge(self, start: EnvState, plan: Tensor) -> tuple[Tensor, Tensor]:
         """Smooth return, and true return less what ending forgoes, of plans (T, B, 2, R, R): (B,) each."""

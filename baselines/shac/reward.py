@@ -117,5 +117,5 @@ def training_reward(
         excess = (info["split"] / limit - config.split_margin).clamp_min(0.0)
         reward = reward - config.split_weight * excess.square()
     if config.integrity:
-        reward = reward - config.integrity * pairs.drift(env.state.x[:, : env.model.robot])
+        reward = reward - config.integrity * pairs.drift(env.state.x[:, : env.model.num_robot_particles])
     return config.scale * torch.where(info["finite"], reward, terms["failure"])

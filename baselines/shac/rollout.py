@@ -101,7 +101,7 @@ class Rollout:
 
     def _places(self) -> Tensor:
         """The robots' particles (B, N, 2), m."""
-        return self.env.state.x[:, : self.env.model.robot].detach()
+        return self.env.state.x[:, : self.env.model.num_robot_particles].detach()
 
     def _act(self, mean: Tensor) -> Tensor:
         """Actions with noise; a gradient that is not finite ends here, for the whole simulation."""

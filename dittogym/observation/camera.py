@@ -57,6 +57,11 @@ class Camera:
     native: bool
     _drawings: dict[tuple[torch.dtype, torch.device], Drawing] = field(default_factory=dict, repr=False)
 
+    @property
+    def bodies(self) -> tuple[tuple[int, float, bool], ...]:
+        """By body, number of particles, full-size particles that one stands for, whether its velocity is hidden."""
+        return tuple(zip(self.counts, self.particle_weight, self.hidden_velocity, strict=True))
+
     def __getstate__(self) -> dict[str, object]:
         """Copies and pickles leave out the functions of the loaded library."""
         return {**vars(self), "_drawings": {}}

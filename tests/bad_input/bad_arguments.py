@@ -12,7 +12,7 @@ import dittogym
 from dittogym import Outcome, TorchEnv, make_spec
 from dittogym.bodies.shapes import Disc, Figure, Lattice, Rectangle
 from dittogym.geometry import ceiling, solid
-from dittogym.spec import Body as RobotBody
+from dittogym.spec import BodySpec as RobotBody
 from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VelocityRule, VonMises, lame, sampling
 
 ID = "dittogym/run-coarse-v0"

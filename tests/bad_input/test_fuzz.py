@@ -15,7 +15,7 @@ from cfp.config import Config, to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.process import peak_memory
 from cfp.weights import describe, save_policy
-from dittogym.targets import load_target
+from dittogym.tasks.targets import load_target
 
 LARGEST_GROWTH = 2**30
 """Bytes by which the memory may grow at most while a file of a few kilobytes is refused."""

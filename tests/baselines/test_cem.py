@@ -5,8 +5,8 @@ import torch
 from test_planner import drive, small
 
 from baselines import CEMPlanner, CEMPlannerConfig
-from baselines.common.rollout import judge_true
 from cfp.errors import ConfigError
+from dittogym import core
 
 
 def quick(**options) -> CEMPlannerConfig:
@@ -23,10 +23,11 @@ def test_planned_episode_beats_rest() -> None:
 def wanted(target: torch.Tensor):
     """Judge a step by how close the muscles' field is to a pattern of every simulation (B, 1, 1, 1), or all."""
 
-    def judge(model, state, field):
-        pattern = target.repeat_interleave(len(field) // len(target), 0)
-        value = -(field / 45.0 - pattern).square().mean((1, 2, 3))
-        return judge_true(model, state, field)._replace(reward=value, true_reward=value)
+    def judge(model, state, action):
+        result = core.step(model, state, action)
+        pattern = target.repeat_interleave(len(action) // len(target), 0)
+        value = -(result.actuation / 45.0 - pattern).square().mean((1, 2, 3))
+        return result._replace(reward=value, true_reward=value)
 
     return judge
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from baselines.common.rollout import judge
+from baselines.common.rollout import soft_step
 from baselines.planning.gradient import Planner, PlannerConfig, _clipped
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
@@ -91,9 +91,10 @@ def test_state_of_a_planner_goes_on_the_same() -> None:
 
 @pytest.mark.parametrize(("layout", "place"), [("image", (0, 0)), ("grid", (0, 3))])
 def test_action_layout_is_the_environments(layout: str, place: tuple[int, int]) -> None:
-    def upper_left(model, state, field):
-        value = field[:, 0, :8, -8:].mean((1, 2))  # small x, large y
-        return judge(model, state, field)._replace(reward=value, true_reward=value.detach())
+    def upper_left(model, state, action):
+        result = soft_step(model, state, action)
+        value = result.actuation[:, 0, :8, -8:].mean((1, 2))  # small x, large y
+        return result._replace(reward=value, true_reward=value.detach())
 
     env = small(action_layout=layout)
     config = PlannerConfig(horizon=1, commit=1, iterations=1, noise=0.0)
@@ -102,9 +103,10 @@ def test_action_layout_is_the_environments(layout: str, place: tuple[int, int]) 
 
 
 def test_ending_the_episode_forgoes_what_comes_after() -> None:
-    def ends_if_contracted(model, state, field):
-        value = field[:, 0].mean((1, 2)) / 45.0
-        return judge(model, state, field)._replace(reward=value, true_reward=1.0 + value.detach(), ended=value > 0.3)
+    def ends_if_contracted(model, state, action):
+        result = soft_step(model, state, action)
+        value = result.actuation[:, 0].mean((1, 2)) / 45.0
+        return result._replace(reward=value, true_reward=1.0 + value.detach(), terminated=value > 0.3)
 
     chosen = {}
     for forgone in (0.0, 5.0):

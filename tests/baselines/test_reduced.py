@@ -30,7 +30,10 @@ def test_stands_for_the_same_robot(task: str) -> None:
     for _ in range(3):
         large.step(0.5 * torch.ones(2, *large.action_shape))
     reduced.follow(large.env_state)
-    robot, body = small.state.x[:, : small.model.robot], large.state.x[:, : large.model.robot]
+    robot, body = (
+        small.state.x[:, : small.model.num_robot_particles],
+        large.state.x[:, : large.model.num_robot_particles],
+    )
     torch.testing.assert_close(robot.mean(1), body.mean(1), atol=4e-3, rtol=0)
     torch.testing.assert_close(robot.std(1), body.std(1), atol=4e-3, rtol=0)
     mass = [
@@ -47,9 +50,12 @@ def test_stands_for_the_same_robot(task: str) -> None:
 def test_each_stands_for_another() -> None:
     large, small = make("kick", 400), make("kick", 300, seed=5)
     chosen = Reduced(large, small).chosen
-    count = large.model.robot
+    count = large.model.num_robot_particles
     assert all(len(set(row.tolist())) == len(row) for row in chosen)
-    assert bool((chosen[:, : small.model.robot] < count).all() and (chosen[:, small.model.robot :] >= count).all())
+    assert bool(
+        (chosen[:, : small.model.num_robot_particles] < count).all()
+        and (chosen[:, small.model.num_robot_particles :] >= count).all()
+    )
 
 
 def test_takes_over_constants_of_particles() -> None:

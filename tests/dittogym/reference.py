@@ -134,7 +134,7 @@ def _first_grid(data: dict[str, np.ndarray], env: dittogym.TorchEnv, recorded: t
 def episode_errors(data: dict[str, np.ndarray]) -> dict[str, float]:
     """Largest difference over the recorded episode, in the measure that :data:`EPISODE` names."""
     env = make(data)
-    robot = env.model.robot
+    robot = env.model.num_robot_particles
     rows: dict[str, list[Any]] = {name: [] for name in EPISODE}
     for t in range(len(data["actions"])):
         observation, reward, terminated, _, info = env.step(action(data, env, t))

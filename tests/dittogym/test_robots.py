@@ -125,7 +125,7 @@ def test_a_shape_lies_where_it_says_and_is_as_dense() -> None:
 def test_a_body_is_taken_as_it_is() -> None:
     body = Body(Disc((0.1, 0.2), 0.1), count=77, mass=3.5)
     env = tiny("kick", body=body, particles="full")
-    assert env.spec.robot is body and env.model.robot == 77
+    assert env.spec.robot is body and env.model.num_robot_particles == 77
     assert env.model.solver.bodies[0].mass == 3.5
 
 

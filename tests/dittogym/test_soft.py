@@ -9,8 +9,8 @@ from tiny import TASKS, actions, stir, tiny
 from torch import Tensor
 
 from dittogym import TorchEnv
-from dittogym.core import EnvState, observe
 from dittogym.geometry import Box
+from dittogym.model import EnvState, observe
 from dittogym.observation import raster as obs
 from dittogym.observation.smooth import ON_COUNT, ON_WIDTH, soft_observation, soft_share, soft_silhouette
 from dittogym.observation.window import window_origin
@@ -33,7 +33,7 @@ def moment(env: TorchEnv, x: Tensor, v: Tensor) -> EnvState:
     """The present moment with particles at ``x`` (B, N, 2), window and centre along with them."""
     state = env.env_state
     particles = ParticleState(x, v, state.particles.C, state.particles.F, state.particles.Jp)
-    com = measure(particles, env.model.robot).com
+    com = measure(particles, env.model.num_robot_particles).com
     origin = window_origin(env.spec, com)
     return replace(state, particles=particles, centre=com, origin=origin)
 
@@ -129,7 +129,7 @@ def test_background_moves_without_steps() -> None:
 
 def test_soil_has_no_velocity_and_broken_particles_are_not_seen() -> None:
     env = stirred("dig")
-    robot = env.model.robot
+    robot = env.model.num_robot_particles
     x, v = (t.detach().clone().requires_grad_() for t in (env.state.x, env.state.v))
     with torch.no_grad():
         x[0, 3], v[1, 5] = torch.nan, torch.inf

@@ -10,7 +10,7 @@ from tiny import TASKS, actions, assert_same_bits, everything, stir, tiny
 from torch import Tensor
 
 from dittogym import Outcome, TorchEnv, make_spec
-from dittogym.core import EnvState, judge, observe
+from dittogym.model import EnvState, judge, observe
 from dittogym.observation.smooth import soft_observation
 from dittogym.rewards import FADE, beyond, limited, mean_over_nearest, nearest, split_penalty
 from dittogym.tasks.grow import GOAL
@@ -50,7 +50,7 @@ def at_threshold(task: str) -> tuple[TorchEnv, Tensor, Tensor]:
     env = tiny(task, 2)
     env.reset(seed=0)
     stir(env)
-    x, v, robot = env.state.x.clone(), env.state.v.clone(), env.model.robot
+    x, v, robot = env.state.x.clone(), env.state.v.clone(), env.model.num_robot_particles
     if task == "grow":
         x[0] += torch.tensor(GOAL) + 0.02 - x[0][env.env_state.memory["tip"][0]].mean(0)
     elif task == "slot":
@@ -95,7 +95,7 @@ def jumps(values: list[float]) -> float:
 def test_soft_rewards_pass_thresholds_without_a_jump(task: str) -> None:
     """Tearing the robot, reaching GROW's goal, SLOT's cap falling, in 50 small steps."""
     env, x, _ = at_threshold(task)
-    robot = env.model.robot
+    robot = env.model.num_robot_particles
     soft, true = [], []
     for k in range(50):
         z = x.clone()

@@ -43,18 +43,27 @@ class Picture(ctypes.Structure):
     ]
 
 
-class View(Protocol):
+class Camera(Protocol):
     """What the function reads of a :class:`dittogym.observation.camera.Camera`."""
 
-    view: Centre
-    boxes: tuple[Box, ...]
-    counts: tuple[int, ...]
-    particle_weight: tuple[float, ...]
-    hidden_velocity: tuple[bool, ...]
-    pixels: bool
+    @property
+    def view(self) -> Centre:
+        """Centre of the image."""
+
+    @property
+    def boxes(self) -> tuple[Box, ...]:
+        """What is shown besides particles."""
+
+    @property
+    def bodies(self) -> tuple[tuple[int, float, bool], ...]:
+        """By body, number of particles, full-size particles that one stands for, whether its velocity is hidden."""
+
+    @property
+    def pixels(self) -> bool:
+        """Whether to use the pixel raster."""
 
 
-def drawing(camera: View, dtype: torch.dtype) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
+def drawing(camera: Camera, dtype: torch.dtype) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
     """A function that draws what a camera sees, for tensors of one type on the CPU.
 
     Args:
@@ -65,13 +74,12 @@ def drawing(camera: View, dtype: torch.dtype) -> Callable[[Tensor, Tensor, Tenso
         ValueError: There is no compiler, or it failed.
     """
     function = getattr(build(_SOURCE, *_OPTIONS), _FUNCTIONS[dtype])
-    table = [*zip(camera.counts, camera.particle_weight, camera.hidden_velocity, strict=True)]
-    body = torch.tensor(table, dtype=torch.float64, device="cpu")
+    body = torch.tensor(camera.bodies, dtype=torch.float64, device="cpu")
     boxes = [(b.left, b.right, b.bottom, b.top, b.closed) for b in camera.boxes]
     box = torch.tensor(boxes, dtype=torch.float64, device="cpu")
     constants = {
         "pixels": camera.pixels,
-        "bodies": len(table),
+        "bodies": len(camera.bodies),
         "boxes": len(boxes),
         "view": tuple(math.nan if c is None else c for c in camera.view),
         "margin": GRID.margin,
