@@ -9,11 +9,11 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from baselines.common.rollout import Judge, judge_true
+from baselines.common.rollout import StepFunction
 from baselines.planning.base import BestPlans, Planner, PlannerConfig
 from cfp.config import positive
 from cfp.errors import ConfigError
-from dittogym import TorchEnv
+from dittogym import TorchEnv, core
 from dittogym.action import bicubic
 from dittogym.model import EnvState
 from torchmpm import tree
@@ -66,10 +66,10 @@ class CEMPlanner(Planner[CEMPlannerConfig]):
         env: TorchEnv,
         config: CEMPlannerConfig | None = None,
         *,
-        judge: Judge = judge_true,
+        step: StepFunction = core.step,
         seed: int = 0,
     ) -> None:
-        super().__init__(env, config, judge=judge, seed=seed)
+        super().__init__(env, config, step=step, seed=seed)
 
     @torch.no_grad()
     def _search(self, state: EnvState, plan: Tensor) -> Tensor:
