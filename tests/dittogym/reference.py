@@ -11,9 +11,9 @@ import pytest
 import torch
 
 import dittogym
-from dittogym import core as dynamics
+from dittogym import core
 from dittogym.action import patch_field, place
-from dittogym.observation.window import in_window
+from dittogym.window import centre_in_window
 from torchmpm import muscle
 from torchmpm.grid import PAD
 from torchmpm.solver import grid_velocity
@@ -82,7 +82,7 @@ def make(data: dict[str, np.ndarray], **options: Any) -> dittogym.TorchEnv:
     )
     env.reset(seed=0)
     # Not through the option "positions": one file parks particles that it does not need outside the window.
-    env.env_state, _ = dynamics.initial(env.model, torch.as_tensor(data["x0"])[None].to(env.dtype))
+    env.env_state, _ = core.reset(env.model, torch.as_tensor(data["x0"])[None].to(env.dtype))
     return env
 
 
@@ -112,7 +112,7 @@ def _first_grid(data: dict[str, np.ndarray], env: dittogym.TorchEnv, recorded: t
     """Actuation, mass and velocity on the nodes in the first substep."""
     spec, solver, start = env.spec, env.model.solver, env.env_state
     patch = patch_field(action(data, env, 0), spec.patch, spec.max_actuation)
-    ours = place(patch, in_window(spec.reach, start.centre, start.origin), solver.grid.resolution)
+    ours = place(patch, centre_in_window(spec.reach, start.centre, start.origin), solver.grid.resolution)
     scene = solver.scene(start.particles, recorded, start.origin)
     grid = solver.to_grid(scene, start.particles.planes())
     along = torch.stack(muscle.sample(grid.nodes, scene.actuation), -1)[0]
@@ -147,7 +147,7 @@ def episode_errors(data: dict[str, np.ndarray]) -> dict[str, float]:
         rows["v_mean"].append(v[:robot].mean(0))
         rows["reward"].append(reward[0])
         rows["terminated"].append(terminated[0])
-        rows["action_norm"].append(env._field.flatten(2).norm(dim=2).sum())
+        rows["action_norm"].append(env._actuation.flatten(2).norm(dim=2).sum())
         rows["kinetic"].append(0.5 * (torch.as_tensor(data["mass"]) * v.square().sum(-1)).sum())
         rows["det_F_mean"].append(torch.linalg.det(F).mean())
         rows["obs"].append(observation[0])
