@@ -15,12 +15,13 @@ from baselines.modular import train as modular
 from baselines.planning.mpc import CEM, MPC
 from baselines.shac.train import Shac
 from baselines.trajectory.optimise import Gradient
-from cfp.config import RunConfig, merge
+from cfp.config import RunConfig
 from cfp.errors import ConfigError
 from cfp.evaluation.rollout import Policy
 from cfp.experiment.cfp_run import Runner
 from cfp.experiment.process import StopSignals
 from cfp.experiment.run import Run
+from cfp.from_dict import update_from_dict
 from cfp.weights import read_policy
 
 ALGORITHMS: dict[str, Entry] = {
@@ -65,7 +66,9 @@ def configure(values: dict[str, Any]) -> RunConfig:
     entry = find(values.get("algo", "cfp"))
     if values.get("algo") in ALIASES:
         values = {**values, "algo": ALIASES[values["algo"]]}
-    config: RunConfig = merge(entry.preset(values.get("task", "shapematch"), values.get("preset", "quick")), values)
+    config: RunConfig = update_from_dict(
+        entry.preset(values.get("task", "shapematch"), values.get("preset", "quick")), values
+    )
     return config
 
 

@@ -15,8 +15,8 @@ from torch import Tensor
 import cfp
 from baselines.common.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.common.open_loop import OpenLoop
-from cfp.config import ReportConfig
 from cfp.evaluation.rollout import Policy
+from cfp.sections import ReportConfig
 from cfp.weights import fitting, read_policy, write_policy
 from dittogym import make_spec
 from dittogym.action import ActionIndexing, from_grid_indexing
@@ -30,9 +30,9 @@ class FloorConfig(GridConfig):
         """Environment steps after which the only stage ends."""
         return (1,)
 
-    def idle(self) -> dict[str, str]:
+    def ineffective(self) -> dict[str, str]:
         """Nothing is learned side by side."""
-        return super().idle() | {"environment.num_envs": "algorithms that learn"}
+        return super().ineffective() | {"environment.num_envs": "algorithms that learn"}
 
 
 class Floor(Algorithm):
@@ -110,7 +110,7 @@ class Scripted(Floor):
     def make(self, description: dict[str, Any]) -> OpenLoop:
         """The wave, for as long as an episode lasts."""
         steps, size = make_spec(self.config.task).horizon, self.config.resolution(0)
-        return OpenLoop(wave(steps, size, self.config.environment.layout), description)
+        return OpenLoop(wave(steps, size, self.config.environment.action_indexing), description)
 
 
 class Random(Floor):

@@ -11,12 +11,13 @@ from typing import Any, Literal
 
 from baselines.compare.plan import judged, read_notes
 from baselines.registry import load
-from cfp.config import RunConfig, Tier
+from cfp.config import RunConfig
 from cfp.envs.disturbances import Case, make_cases
 from cfp.envs.make import choose_device, make_env
 from cfp.evaluation.rollout import Policy, Result, evaluate, judging_seed
 from cfp.files import write_json
 from cfp.robustness import report
+from cfp.sections import Particles
 from cfp.weights import policy_file
 
 CHUNK = 10
@@ -33,11 +34,11 @@ class Judging:
         episodes: For each policy, on the same layouts for all.
         tier: Particles, see `cfp.config.EnvironmentConfig`.
         robustness: Which disturbed cases: none, those of the paper, or all of `cfp.envs.disturbances.make_cases`.
-        parity: Of the run, which holds at full size only, see `cfp.config.EnvironmentConfig.judged_at`.
+        parity: Of the run, which holds at full size only, see `cfp.config.EnvironmentConfig.for_evaluation`.
     """
 
     episodes: int
-    tier: Tier = "lite"
+    tier: Particles = "lite"
     robustness: Literal["none", "paper", "all"] = "paper"
     parity: Literal["clean", "reference"] = "clean"
 

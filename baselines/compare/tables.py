@@ -12,7 +12,7 @@ from baselines.compare import paper
 from baselines.compare.results import Found, Group
 from baselines.compare.stats import common_curve, first_reach, interquartile_mean, interval, wilson
 from baselines.compare.table import Column, Table
-from cfp.config import Tier
+from cfp.sections import Particles
 from dittogym import make_spec
 
 SHARES = (0.5, 0.75, 0.9)
@@ -152,7 +152,7 @@ def aggregate_table(groups: Sequence[Group]) -> Table:
     return Table("aggregate", "All tasks together", about, columns, rows)
 
 
-def efficiency_table(groups: Sequence[Group], tier: Tier) -> Table:
+def efficiency_table(groups: Sequence[Group], tier: Particles) -> Table:
     """Steps until the evaluations of a run reach shares of the way from rest to the best that see the same.
 
     Args:

@@ -16,7 +16,7 @@ from cfp.experiment.estimate import Cost
 from cfp.experiment.process import StopSignals
 from cfp.experiment.run import Run, copy_policy
 from cfp.experiment.state_file import Position
-from cfp.groups import TASK_OPTIONS
+from cfp.sections import TASK_OPTIONS
 from cfp.weights import read_policy, shipped, write_policy
 
 TRAINED = ("shac", "gradient")

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from baselines.common.open_loop import OpenLoop
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
-from cfp.config import EnvironmentConfig
 from cfp.evaluation.rollout import Policy, SeesState
+from cfp.sections import EnvironmentConfig
 from cfp.weights import check_trained_for, read_policy
 from dittogym import TorchEnv, make_spec
 from dittogym.action import ActionIndexing, bicubic_matrix, from_grid_indexing, to_grid_indexing

@@ -23,9 +23,11 @@ from baselines.planning.gradient import GradientPlannerConfig
 from baselines.shac.networks import quieten
 from cfp.agent.actor import build_actor
 from cfp.agent.policies import ActorPolicy
-from cfp.config import EnvironmentConfig, LadderConfig, RunConfig, Tier, at_least_one, positive, share, training_layouts
+from cfp.config import LadderConfig, RunConfig, check_training_layouts
 from cfp.envs.make import make_torch_env
 from cfp.errors import NonFiniteError
+from cfp.sections import EnvironmentConfig, Particles
+from cfp.validation import check_at_least, check_fraction, check_positive
 from cfp.weights import KIND, load, save_policy
 from dittogym import make_spec
 
@@ -57,7 +59,7 @@ class DistillConfig(LadderConfig):
     """Which algorithm."""
     teacher: str = "shac"
     """mpc (plans from every state), shac or gradient (trained first), or a policy: a run folder, policy.safetensors."""
-    train_particles: Tier = "lite"
+    train_particles: Particles = "lite"
     """Particles of the simulations that are taught in."""
     rollout_steps: int = 64
     """Control steps between two lessons."""
@@ -88,16 +90,16 @@ class DistillConfig(LadderConfig):
     planner_grid: int | Literal["coarse", "fine"] = "coarse"
     """Action grid of the teacher mpc."""
 
-    def idle(self) -> dict[str, str]:
+    def ineffective(self) -> dict[str, str]:
         """What concerns plans; layouts are counted from the seed."""
         plans = {} if self.teacher == "mpc" else dict.fromkeys(("planner.", "planner_grid"), "teacher mpc")
-        return super().idle() | plans | SEEDED
+        return super().ineffective() | plans | SEEDED
 
     def check(self) -> None:
         """Check what the types cannot, see `LadderConfig.check`."""
         super().check()
-        self.planner.check()
-        at_least_one(
+        check_at_least(
+            1,
             rollout_steps=self.rollout_steps,
             updates=self.updates,
             batch_size=self.batch_size,
@@ -106,9 +108,9 @@ class DistillConfig(LadderConfig):
             max_episode_steps=self.max_episode_steps,
             num_layouts=self.num_layouts,
         )
-        training_layouts("num_layouts", self.num_layouts * len(self.resolutions), self.environment.num_envs)
-        positive(student_learning_rate=self.student_learning_rate, max_grad_norm=self.max_grad_norm)
-        share(beta_decay=self.beta_decay, dropout=self.dropout)
+        check_training_layouts("num_layouts", self.num_layouts * len(self.resolutions), self.environment.num_envs)
+        check_positive(student_learning_rate=self.student_learning_rate, max_grad_norm=self.max_grad_norm)
+        check_fraction(beta_decay=self.beta_decay, dropout=self.dropout)
 
 
 class Distill(Algorithm):
@@ -131,7 +133,7 @@ class Distill(Algorithm):
         self, config: DistillConfig, level: int = 0, start: ActorPolicy | None = None, teacher: Path | None = None
     ) -> None:
         self.config, self.level = config, level
-        own = replace(config, environment=config.environment.learned_at(config.train_particles))
+        own = replace(config, environment=config.environment.for_training(config.train_particles))
         self.env = make_torch_env(own, make_spec(config.task).patch)
         self.spec = config.actor_spec(level)
         with self._luck():
@@ -201,7 +203,7 @@ class Distill(Algorithm):
             return PlannerTeacher(make_torch_env(own, size), config.planner, config.seed)
         policy = read_teacher(path or config.teacher, config.task, config.environment)
         theirs = EnvironmentConfig(**policy.description["environment"])
-        return PolicyTeacher(policy, theirs.layout, config.environment.layout)
+        return PolicyTeacher(policy, theirs.action_indexing, config.environment.action_indexing)
 
     @property
     def policy(self) -> ActorPolicy:

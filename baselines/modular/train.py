@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, cast, get_args
@@ -19,19 +19,21 @@ from baselines.modular.networks import Kind, ModularActor, ModularCritics
 from baselines.modular.nodes import Nodes
 from baselines.modular.policy import SegmentPolicy
 from cfp.agent.composition import Composition
+from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
 from cfp.agent.policies import NetworkPolicy
 from cfp.agent.sac import CFP
-from cfp.config import RunConfig, SACConfig, StageConfig, at_least_one, not_negative
+from cfp.config import RunConfig
 from cfp.envs.make import choose_device, make_torch_env
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
 from cfp.experiment.cfp_run import SACRun
+from cfp.validation import check_at_least
 from cfp.weights import origin
 from dittogym import make_spec
 
 
 @dataclass(frozen=True)
-class ModularConfig(SACConfig):
+class ModularConfig(RunConfig):
     """A run of a modular policy; ``algo`` says its network and how many segments the robot is cut into."""
 
     algo: str = "gnn-16"
@@ -42,6 +44,7 @@ class ModularConfig(SACConfig):
     """Uniformly random environment steps at the start."""
     alpha: float = 0.01
     """Entropy temperature."""
+    learning: LearningConfig = field(default_factory=LearningConfig)
 
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
 
@@ -68,14 +71,14 @@ class ModularConfig(SACConfig):
         """Action grid R: the task's whole patch, so that segments write to its nodes."""
         return make_spec(self.task).patch
 
-    def idle(self) -> dict[str, str]:
+    def ineffective(self) -> dict[str, str]:
         """What concerns ladders, and grids of actions: segments act on nodes."""
         needs = dict.fromkeys(("learning.anchor", "learning.warm_critic", "environment.action_layout"), "algo cfp")
-        return super().idle() | needs
+        return super().ineffective() | needs
 
-    def stage(self, level: int) -> StageConfig:
-        """What the training needs."""
-        return StageConfig(self.resolution(level), self.steps, self.random_steps, self.alpha, 0.0)
+    def hyperparameters(self, stage: int) -> Hyperparameters:
+        """Hyperparameters of the only stage."""
+        return Hyperparameters(**vars(self.learning), alpha=self.alpha, random_steps=self.random_steps)
 
     def check(self) -> None:
         """Check what the types cannot, see `RunConfig.check`."""
@@ -83,8 +86,8 @@ class ModularConfig(SACConfig):
         if kind not in get_args(Kind) or not count.isdecimal() or int(count) < 2:
             raise ConfigError(f"algo: got {self.algo!r}, allowed {' or '.join(get_args(Kind))} with a count, as gnn-16")
         super().check()
-        at_least_one(steps=self.steps)
-        not_negative(random_steps=self.random_steps, alpha=self.alpha)
+        check_at_least(1, steps=self.steps)
+        check_at_least(0, random_steps=self.random_steps, alpha=self.alpha)
         particles = self.environment.particles
         robot = particles[0] if isinstance(particles, tuple) else particles
         if isinstance(robot, int) and robot < self.segments:
@@ -176,7 +179,9 @@ class ModularRun(SACRun):
         """Networks, replay memory and environment."""
         env = SegmentedEnv(make_torch_env(self.config, self.config.resolution(level)), self.config.nodes)
         networks = {"kind": self.config.kind, "features": self.config.nodes.features(env.env.spec)}
-        return self.build(level, VecMonitor(TorchVecEnv(env, env.spaces)), ModularPolicy, networks)
+        return self.build(
+            VecMonitor(TorchVecEnv(env, env.spaces)), ModularPolicy, networks, self.hyperparameters(level)
+        )
 
     def keep(self, model: CFP, level: int, step: int) -> None:
         """Write the actor as ``policy.safetensors``."""

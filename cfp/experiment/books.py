@@ -10,9 +10,9 @@ from typing import Any
 from stable_baselines3.common.logger import Logger
 from tqdm import tqdm
 
-from cfp.config import ReportConfig
 from cfp.evaluation.rollout import Result
 from cfp.experiment.process import Plateau, Stopped, StopSignals
+from cfp.sections import ReportConfig
 
 BOOK_METRICS: dict[str, str] = {
     "stage": "stage in training, 1 is the first",

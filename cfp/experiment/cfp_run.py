@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,11 @@ import numpy as np
 import torch
 from stable_baselines3.common.vec_env import VecMonitor
 
+from cfp.agent.hyperparameters import Hyperparameters
 from cfp.agent.policies import ActorPolicy, CFPPolicy, NetworkPolicy
 from cfp.agent.replay import FIELDS
 from cfp.agent.sac import CFP
-from cfp.config import Config, SACConfig
+from cfp.config import Config
 from cfp.envs.make import choose_device, make_env
 from cfp.errors import ConfigError
 from cfp.evaluation.pictures import policy_pictures
@@ -29,58 +31,49 @@ class SACRun(Run):
     """Trains `CFP` with whatever networks in its folder; a subclass makes the models and knows their policies."""
 
     checkpoint_type = Checkpoint
-    config: SACConfig
+    config: Any
     checkpoint: Checkpoint
     model_type: type[CFP] = CFP
 
     def build(
-        self, level: int, env: VecMonitor, policy: type[NetworkPolicy], networks: dict[str, Any], **others: Any
+        self,
+        env: VecMonitor,
+        policy: type[NetworkPolicy],
+        networks: dict[str, Any],
+        hyperparameters: Hyperparameters,
     ) -> CFP:
-        """The model of a stage as its options say.
+        """Create the model of a stage.
 
         Args:
-            level: Index of the stage.
-            env: Where it acts.
-            policy: Its networks.
-            networks: Their options.
-            others: Options of the model in place of the run's.
+            env: Environment to train in.
+            policy: Class of the networks.
+            networks: Options of the networks.
+            hyperparameters: Of the stage.
         """
-        stage, learning = self.config.stage(level), self.config.learning
-        if learning.compile:
+        if hyperparameters.compile:
             print("compiling the updates; the first time on a machine this takes minutes ...", flush=True)
-        options: dict[str, Any] = {
-            "update_start": learning.update_start,
-            "random_steps": self.random_steps(level),
-            "batch_size": learning.batch_size,
-            "tau": learning.tau,
-            "gamma": learning.gamma,
-            "gradient_steps": learning.gradient_steps,
-            "alpha": stage.alpha,
-            "gate_penalty": stage.gate_penalty,
-            "reward_momentum": learning.reward_momentum,
-            "max_grad_norm": learning.max_grad_norm,
-            "actor_rate": learning.actor_rate,
-            "actor_start": learning.actor_start,
-            "precision": learning.precision,
-            "compile": learning.compile,
-            "policy_kwargs": networks,
-            "seed": self.config.seed,
-            "device": choose_device(self.config.device),
-            "stats_window_size": max(10, env.num_envs),
-        }
-        model = self.model_type(policy, env, learning.learning_rate, learning.buffer_size, **{**options, **others})
+        model = self.model_type(
+            policy,
+            env,
+            hyperparameters,
+            policy_kwargs=networks,
+            seed=self.config.seed,
+            device=choose_device(self.config.device),
+            stats_window_size=max(10, env.num_envs),
+        )
         model.set_logger(self.logger)
         return model
 
-    def random_steps(self, level: int) -> int:
-        """Uniformly random environment steps at the start of a stage."""
-        return self.config.stage(level).random_steps
+    def hyperparameters(self, stage: int) -> Hyperparameters:
+        """Hyperparameters of a stage."""
+        hyperparameters: Hyperparameters = self.config.hyperparameters(stage)
+        return hyperparameters
 
     def remarks(self) -> list[str]:
         """Stages that are over before they act by their policy, or before they learn."""
         lines, (starts, waits) = [], (self.config.learning.update_start, self.config.learning.actor_start)
         for level in range(self.position.level, len(self.config.ends())):
-            steps, random = self.config.stage(level).steps, self.random_steps(level)
+            steps, random = self.config.stage_steps(level), self.hyperparameters(level).random_steps
             if steps <= random:
                 lines.append(f"stage {level + 1}: all its {steps:,} steps are random (--random-steps {random})")
             elif steps <= starts:
@@ -113,7 +106,7 @@ class SACRun(Run):
         for _ in range(-(-model.batch_size // count)):
             buffer.add(observation, observation, stored, np.zeros(count), np.zeros(count), [{}] * count)
         acting = seconds(lambda: env.step(model.predict(observation)[0]))
-        model.num_timesteps = model.actor_start  # from here on an update is a whole one
+        model.num_timesteps = model.hyperparameters.actor_start  # from here on an update is a whole one
         updating = seconds(lambda: model.train(1, model.batch_size)) * self.config.learning.gradient_steps
         arrays = (getattr(buffer, name) for name in FIELDS)
         return Cost((acting + updating) / count, sum(array.nbytes for array in arrays))
@@ -156,9 +149,10 @@ class Runner(SACRun):
         """Whether the actor of a level begins as the one in `start`."""
         return self.config.refine and self.start.exists() and read_policy(self.start)[1]["stage"] == level + 1
 
-    def random_steps(self, level: int) -> int:
-        """None where a policy is refined."""
-        return 0 if self.refines(level) else super().random_steps(level)
+    def hyperparameters(self, stage: int) -> Hyperparameters:
+        """Hyperparameters of a stage; a policy that is refined does not act at random."""
+        own = super().hyperparameters(stage)
+        return replace(own, random_steps=0) if self.refines(stage) else own
 
     def begins_trained(self, level: int) -> bool:
         """Also where a policy is refined."""
@@ -182,8 +176,7 @@ class Runner(SACRun):
     def make_model(self, level: int) -> CFP:
         """Networks, replay memory and environment of a level, over the frozen policy of the coarser one."""
         env, refines = make_env(self.config, self.config.action_size(level)), self.refines(level)
-        others = {"anchor": self.config.learning.anchor} if refines else {}
-        model = self.build(level, env, CFPPolicy, {"spec": self.config.actor_spec(level)}, **others)
+        model = self.build(env, CFPPolicy, {"spec": self.config.actor_spec(level)}, self.hyperparameters(level))
         if refines:
             model.origin = load(self.start, str(model.device)).actor
             model.networks()[0].load_state_dict(model.origin.state_dict())
