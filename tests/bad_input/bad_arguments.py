@@ -214,7 +214,7 @@ ENVIRONMENT = table(
             lambda: spec(reward_fn="fair"),
             "reward_fn must be a function",
         ),
-        ("no robot", lambda: spec(robot=None), "robot must be a Body, got None"),
+        ("no robot", lambda: spec(robot=None), "robot must be a BodySpec, got None"),
         ("task of nothing", lambda: dittogym.register("x", None), "make must be a function that returns a TaskSpec"),
     ],
     TypeError,

@@ -8,7 +8,7 @@ import torch
 from tiny import FIXED, SMALL, TASKS, actions, assert_same_bits, everything, leaves, stir, tiny
 
 from dittogym import BatchEnv, TorchEnv
-from dittogym.spec import FAILURE_REWARD
+from dittogym.core import FAILURE_REWARD
 
 
 def assert_element_is(batch: TorchEnv, result: tuple, i: int, single: TorchEnv, one: tuple) -> None:

@@ -429,13 +429,11 @@ def test_a_robot_outside_its_window_is_refused() -> None:
 
 
 def test_a_robot_of_another_material_and_size() -> None:
-    """An elastic robot springs back where the task's own matter yields."""
-    robot = dataclasses.replace(hop().robot, material=Elastic(500.0, 50.0), lite=100)
-    env = tiny(dataclasses.replace(hop(), robot=robot), particles="lite", substeps=100)
-    env.reset(seed=0)
-    assert env.num_particles == 100 and env.model.solver.bodies[0].material is robot.material
-    plastic = tiny(hop(), particles=100, substeps=100)
-    plastic.reset(seed=0)
-    action = torch.ones(1, *env.action_shape, dtype=env.dtype)
-    env.step(action), plastic.step(action)
-    assert not torch.equal(env.state.F, plastic.state.F)
+    robot = dataclasses.replace(hop().robot, material=Elastic(1500.0, 50.0), lite=100)
+    elastic = tiny(dataclasses.replace(hop(), robot=robot), particles="lite", substeps=20)
+    own = tiny(hop(), particles=100, substeps=20)
+    for env in (elastic, own):
+        env.reset(seed=0)
+        env.step(torch.ones(1, *env.action_shape, dtype=env.dtype))
+    assert elastic.num_particles == 100
+    assert (elastic.state.x - own.state.x).abs().max() > 1e-6
