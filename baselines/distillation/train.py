@@ -20,7 +20,7 @@ from baselines.common.episodes import Episodes
 from baselines.distillation.dagger import Collector, Dataset, Labels, lose
 from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
 from baselines.planning.gradient import GradientPlannerConfig
-from baselines.shac.networks import quieten
+from baselines.shac.networks import fix_std
 from cfp.agent.actor import build_actor
 from cfp.agent.policies import ActorPolicy
 from cfp.config import LadderConfig, RunConfig, check_training_layouts
@@ -138,7 +138,7 @@ class Distill(Algorithm):
         self.spec = config.actor_spec(level)
         with self._luck():
             self.actor = build_actor(self.spec)
-        quieten(self.actor)
+        fix_std(self.actor)
         if start is not None:
             self.actor.get_submodule("coarse").load_state_dict(start.actor.state_dict())
         self.actor.to(self.env.device)

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 import cfp
 from baselines.common.algorithm import Entry
+from baselines.common.policies import StateBasedPolicy
 from baselines.modular.env import SegmentedEnv
 from baselines.modular.networks import Kind, ModularActor, ModularCritics
 from baselines.modular.nodes import Nodes
@@ -161,7 +162,7 @@ class ModularSAC(CFP):
     ) -> tuple[np.ndarray, np.ndarray]:
         return actions, stored
 
-    def attached(self, env: Any) -> SegmentPolicy:
+    def attached(self, env: Any) -> StateBasedPolicy:
         """The present policy, looking at an environment."""
         assert isinstance(self.policy, ModularPolicy)
         actor = cast(ModularActor, self.networks()[0])
@@ -178,7 +179,7 @@ class ModularRun(SACRun):
     def make_model(self, level: int) -> CFP:
         """Networks, replay memory and environment."""
         env = SegmentedEnv(make_torch_env(self.config, self.config.resolution(level)), self.config.nodes)
-        networks = {"kind": self.config.kind, "features": self.config.nodes.features(env.env.spec)}
+        networks = {"kind": self.config.kind, "features": self.config.nodes.num_features(env.env.spec)}
         return self.build(
             VecMonitor(TorchVecEnv(env, env.spaces)), ModularPolicy, networks, self.hyperparameters(level)
         )
