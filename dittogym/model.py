@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -15,7 +15,7 @@ from dittogym.observation.camera import Camera
 from dittogym.physics import Physics, part_of
 from dittogym.spec import TaskSpec
 from dittogym.window import GRID
-from torchmpm import Body, Elastic, ParticleState, Solver, VonMises, native, tree
+from torchmpm import Body, Elastic, ParticleState, Solver, VonMises, tree
 from torchmpm.rollout import Segment
 
 
@@ -102,7 +102,7 @@ class Model:
         if not physics:
             return self.solver
         bodies = _bodies(self.spec, self.camera.counts, self.particle_weight, physics)
-        return replace(self.solver, bodies=bodies, gravity=physics.get("gravity", self.spec.gravity))
+        return self.solver.with_constants(bodies, physics.get("gravity", self.spec.gravity))
 
 
 def make_model(
@@ -149,7 +149,7 @@ def make_model(
         particle_weight=weight,
         hidden_velocity=tuple(body.hidden_velocity for body in spec.bodies),
         pixels=parity.pixel_raster or counts == full,
-        native=backend in ("auto", "native") and native.unsupported(solver, torch.device("cpu")) is None,
+        native=backend in ("auto", "native") and solver.kernels.unsupported(torch.device("cpu")) is None,
     )
     model = Model(spec, solver, substeps, weight, camera, segment)
     check_stability(model, {})

@@ -23,7 +23,7 @@ from dittogym.observation.raster import (
 )
 from dittogym.observation.smooth import box_fraction, smooth_crop_corner
 from dittogym.window import GRID, Centre, Window, centre_in_window
-from torchmpm.rollout import transforming
+from torchmpm.backends import transforming, warn_eager
 
 #: Draws images (B, 3, 64, 64) uint8 of x, v, origin and centre.
 Drawing = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
@@ -73,8 +73,17 @@ class Camera:
             return self.draw(*arrays)
         kind = x.dtype, x.device
         if kind not in self._drawings:
-            self._drawings[kind] = native.drawing(self, x.dtype) if self.native and x.is_cpu else self.draw
+            self._drawings[kind] = self._choose(*kind)
         return self._drawings[kind](*arrays)
+
+    def _choose(self, dtype: torch.dtype, device: torch.device) -> Drawing:
+        if not self.native or device.type != "cpu":
+            return self.draw
+        try:
+            return native.drawing(self, dtype)
+        except ValueError as error:  # no compiler, or it failed
+            warn_eager(str(error))
+            return self.draw
 
     def draw(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
         """:meth:`observe` in torch operations."""

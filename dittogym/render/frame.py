@@ -11,6 +11,7 @@ from dittogym.geometry import Box
 from dittogym.model import EnvState, Model
 from dittogym.window import centre_in_window
 from torchmpm import Soil, checks
+from torchmpm.materials.body import slices
 
 GROUND = (248, 246, 240)
 SOLID = (112, 119, 130)
@@ -67,7 +68,7 @@ def frame(model: Model, state: EnvState, index: int, actuation: Tensor | None, s
     colours = np.repeat(np.array(kinds), counts, axis=0)
     if actuation is not None:
         colours[: model.num_robot_particles] = _muscle_colours(model, state, index, actuation)
-    parts = [part for _, part in model.solver.parts()]
+    parts = [part for _, part in slices(model.solver.bodies)]
     for part, weight in reversed(list(zip(parts, model.particle_weight, strict=True))):  # the robot last, on top
         canvas.dots(x[part], colours[part], radius=_radius(weight, size * OVERSAMPLING))
     return cv2.resize(canvas.image, (size, size), interpolation=cv2.INTER_AREA)

@@ -407,7 +407,7 @@ def test_matter_too_stiff_for_the_substeps_is_refused() -> None:
             assert float(str(raised.value).split()[-2]) == pytest.approx(limit, rel=1e-6)
     assert env.state is before
     env.reset(options={"physics": {"mu": 3000.0}})
-    with pytest.raises(ValueError, match="are stable, got matter so stiff and light"):
+    with pytest.raises(ValueError, match="got matter so stiff and light"):
         tiny(replace(dittogym.make_spec("run"), mu=9000.0))
 
 

@@ -19,7 +19,7 @@ from dittogym.geometry import Box
 from dittogym.observation.image import BLOCK, CLIP, RASTER, SATURATION, SHAPE, SIZE
 from dittogym.observation.raster import FRAME
 from dittogym.window import GRID, Centre
-from torchmpm.native.library import Call, build, thread_pool
+from torchmpm.native.cpu.library import POOL, build, thread_pool
 
 _SOURCE = Path(__file__).parent / "picture.cpp"
 _OPTIONS = (
@@ -34,7 +34,7 @@ class Picture(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_int64) for name in ("batch", "particles", "threads", "pixels")),
-        *((name, ctypes.c_void_p) for name in Call._POOL),
+        *((name, ctypes.c_void_p) for name in POOL),
         *((name, ctypes.c_int64) for name in ("bodies", "boxes")),
         *((name, ctypes.c_void_p) for name in ("body", "box")),
         ("view", ctypes.c_double * 2),
