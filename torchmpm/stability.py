@@ -31,7 +31,8 @@ def stable_dt(bodies: Sequence[Body], h: float, actuation: Value = 0.0) -> float
         try:
             stiffness: Value = body.material.stiffness()
             if body.muscle:
-                stiffness = stiffness + 2.0 * torch.as_tensor(detached_column(actuation)).abs()
+                pull: Value = detached_column(actuation)
+                stiffness = stiffness + 2.0 * (pull.abs() if isinstance(pull, Tensor) else abs(pull))
             rate = stiffness * detached_column(body.volume) / detached_column(body.mass)
         except RuntimeError as error:
             raise ValueError(f"values of bodies[{k}] must have shapes that go together: {error}") from error

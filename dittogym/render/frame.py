@@ -10,7 +10,7 @@ from dittogym.action import place
 from dittogym.geometry import Box
 from dittogym.model import EnvState, Model
 from dittogym.window import centre_in_window
-from torchmpm import Soil, checks
+from torchmpm import Snow, checks
 from torchmpm.materials.body import slices
 
 GROUND = (248, 246, 240)
@@ -64,7 +64,7 @@ def frame(model: Model, state: EnvState, index: int, actuation: Tensor | None, s
             canvas.box(box, filled=bool(obstacle.drawn) or box.ground)
     x = particles.x[0].cpu().double().numpy()
     counts = [body.count for body in model.solver.bodies]
-    kinds = [ROBOT, *(GROUND_BODY if isinstance(body.material, Soil) else OBJECT for body in spec.objects)]
+    kinds = [ROBOT, *(GROUND_BODY if isinstance(body.material, Snow) else OBJECT for body in spec.objects)]
     colours = np.repeat(np.array(kinds), counts, axis=0)
     if actuation is not None:
         colours[: model.num_robot_particles] = _muscle_colours(model, state, index, actuation)

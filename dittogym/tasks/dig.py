@@ -8,12 +8,12 @@ from dittogym.geometry import ceiling, floor, side_walls
 from dittogym.rewards import signed_quadratic
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.window import Window
-from torchmpm import Soil, lame
+from torchmpm import Snow, lame
 
 GOAL = (0.2, 0.17)
 #: Mean distance of the robot's particles (|x| + |y|) from the goal that counts as success (our definition), m.
 REACHED = 0.1
-SOIL = Soil(*lame(5000.0, 0.2))
+SOIL = Snow(*lame(5000.0, 0.2))
 
 
 def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
