@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from cfp.agent.actor import Actor
-from cfp.agent.policies import ActorPolicy
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.spec import RESOLUTIONS, ActorSpec
 from cfp.config import LARGEST_SEED, Config, RunConfig
 from cfp.errors import CheckpointError, ConfigError
@@ -226,7 +226,7 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
         policy.actor.load_state_dict(tensors)
     policy.description = description
     policy.to(device)
-    policy.set_training_mode(False)
+    policy.eval()
     return policy
 
 

@@ -22,7 +22,7 @@ from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teach
 from baselines.planning.gradient import GradientPlannerConfig
 from baselines.shac.networks import fix_std
 from cfp.agent.actor import build_actor
-from cfp.agent.policies import ActorPolicy
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.config import LadderConfig, RunConfig, check_training_layouts
 from cfp.envs.make import make_torch_env
 from cfp.errors import NonFiniteError
