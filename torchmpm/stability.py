@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from torchmpm.materials.base import Value, detached_column
 from torchmpm.materials.body import Body
