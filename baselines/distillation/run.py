@@ -9,7 +9,7 @@ from pathlib import Path
 from baselines.common.algorithm import AlgorithmRun
 from baselines.distillation.teachers import is_record_of_another_start, read_teacher
 from baselines.distillation.train import Distill, DistillConfig
-from cfp.agent.policies import ActorPolicy
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.config import RunConfig
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.estimate import Cost

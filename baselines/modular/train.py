@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, cast, get_args
 
-import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecMonitor
@@ -19,7 +18,6 @@ from baselines.modular.env import SegmentedEnv
 from baselines.modular.networks import Kind, ModularActor, ModularCritics
 from baselines.modular.nodes import Nodes
 from baselines.modular.policy import SegmentPolicy
-from cfp.agent.composition import Composition
 from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
 from cfp.agent.policies import NetworkPolicy
 from cfp.agent.sac import CFP
@@ -156,11 +154,6 @@ class ModularPolicy(NetworkPolicy):
 
 class ModularSAC(CFP):
     """`cfp.agent.sac.CFP` on segments."""
-
-    def _random(
-        self, actions: np.ndarray, stored: np.ndarray, composition: Composition | None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        return actions, stored
 
     def attached(self, env: Any) -> StateBasedPolicy:
         """The present policy, looking at an environment."""

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from stable_baselines3.common.vec_env import VecMonitor
 
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.hyperparameters import Hyperparameters
-from cfp.agent.policies import ActorPolicy, CFPPolicy, NetworkPolicy
-from cfp.agent.replay import FIELDS
+from cfp.agent.policies import CFPPolicy, NetworkPolicy
 from cfp.agent.sac import CFP
 from cfp.config import Config
 from cfp.envs.make import choose_device, make_env
@@ -22,6 +22,7 @@ from cfp.experiment.books import Books
 from cfp.experiment.callbacks import StageCallback
 from cfp.experiment.checkpoint import Checkpoint
 from cfp.experiment.estimate import Cost, seconds
+from cfp.experiment.replay_archive import FIELDS
 from cfp.experiment.run import Run
 from cfp.experiment.state_file import Position
 from cfp.weights import describe, fitting, load, policy_for, read_policy, save_policy, write_policy

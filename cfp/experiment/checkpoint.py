@@ -11,10 +11,11 @@ import numpy as np
 import torch
 from stable_baselines3.common.vec_env import VecMonitor
 
-from cfp.agent.replay import ReplayArchive, ReplayRing
+from cfp.agent.replay import ReplayRing
 from cfp.agent.sac import CFP
 from cfp.config import RunConfig
 from cfp.envs.vec_env import TorchVecEnv
+from cfp.experiment.replay_archive import ReplayArchive
 from cfp.experiment.state_file import Position, StateFile
 
 
