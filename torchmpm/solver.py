@@ -210,7 +210,7 @@ class Solver:
 
         Args:
             state: The current state.
-            fields: Other tensors that the step depends on, of any shape.
+            fields: Other tensors (B, ...) that the step depends on.
 
         Raises:
             ValueError: The backend is ``"native"``, or ``"compile"``, and cannot run this.

@@ -122,6 +122,13 @@ def scatter_actuation(field_bar, i, j, fx, fy, act_x_bar, act_y_bar, on, resolut
 
 
 @triton.jit
+def subtract_sums(to, x, y):
+    """Subtract the sums over particles from two numbers."""
+    tl.atomic_add(to, -tl.sum(x, axis=0), sem="relaxed")
+    tl.atomic_add(to + 1, -tl.sum(y, axis=0), sem="relaxed")
+
+
+@triton.jit
 def add_values(to, stride, mass, factor, mu2, lam, s0, s1, s2, s3, mask):
     """Add derivatives in the eight values of particles."""
     add(to, mass, mask)
@@ -153,10 +160,7 @@ def finish_adjoint(
     KIND: tl.constexpr, VARYING: tl.constexpr, MUSCLE: tl.constexpr, WANT_FIELD: tl.constexpr,
     WANT_VALUES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Bring the derivatives in the state after a substep to those in the one before, in place; add up all others.
-
-    ``answers`` are those of :func:`torchmpm.native.cuda.grid.node_adjoint`.
-    """
+    """From the derivatives in the state after a substep to those in the state before, in place; sums up all others."""
     element, k, at, valid = own_particles(first, count, particles, blocks, BLOCK)
     stride = stride.to(tl.int64)
     place = values_at(values, element, k, column, columns, values_batch, VARYING)
@@ -171,7 +175,6 @@ def finish_adjoint(
     answers += ADJOINT * element * width * width
     field += 2 * resolution * resolution * element
     field_bar += 2 * resolution * resolution * element
-    origin_bar += 2 * element
     act_x, act_y = tl.zeros_like(x), tl.zeros_like(x)
     if MUSCLE:
         act_x, act_y = actuation_at(field, i, j, fx, fy, on, resolution)
@@ -191,7 +194,6 @@ def finish_adjoint(
     e0_bar, e1_bar, e2_bar, e3_bar = matmul(g0, g2, g1, g3, e0_bar, e1_bar, e2_bar, e3_bar)
     d0, d1 = mass * pxx_bar + dt * d0, mass * pxy_bar + dt * d1
     d2, d3 = mass * pyx_bar + dt * d2, mass * pyy_bar + dt * d3
-
     scale = 4.0 * inverse_h
     fx_bar, fy_bar, masses = position_adjoint(
         answers, node, width, fx, fy, on, vx_bar + dt * x_bar, vy_bar + dt * y_bar, mass * vx, mass * vy, mass,
@@ -200,8 +202,7 @@ def finish_adjoint(
         field, i, j, act_x_bar, act_y_bar, resolution, MUSCLE,
     )  # fmt: skip
     fx_bar, fy_bar = tl.where(on, fx_bar * inverse_h, 0.0), tl.where(on, fy_bar * inverse_h, 0.0)
-    tl.atomic_add(origin_bar, -tl.sum(fx_bar, axis=0), sem="relaxed")
-    tl.atomic_add(origin_bar + 1, -tl.sum(fy_bar, axis=0), sem="relaxed")
+    subtract_sums(origin_bar + 2 * element, fx_bar, fy_bar)
     store_bars(
         bars + at, stride, x_bar + fx_bar, y_bar + fy_bar, mass * px_bar, mass * py_bar,
         d0, d1, d2, d3, e0_bar, e1_bar, e2_bar, e3_bar, new_Jp_bar, on,
