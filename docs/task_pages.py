@@ -14,7 +14,7 @@ from PIL import Image
 import dittogym
 from dittogym.bodies.positions import particle_counts
 from dittogym.geometry import Obstacle
-from dittogym.spec import Body, TaskSpec
+from dittogym.spec import BodySpec, TaskSpec
 from torchmpm import Snow, VelocityRule
 
 DOCS = Path(__file__).resolve().parent
@@ -155,7 +155,7 @@ def numbers(spec: TaskSpec) -> list[tuple[str, str]]:
     return rows
 
 
-def matter(body: Body) -> str:
+def matter(body: BodySpec) -> str:
     """Material of an object."""
     return "soil" if isinstance(body.material, Snow) else "elastic"
 

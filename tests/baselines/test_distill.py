@@ -11,7 +11,9 @@ import cfp
 import cfp.train
 from baselines import Distill, GradientPlannerConfig, OpenLoop, Shac, distill
 from baselines.common.episodes import Episodes
-from baselines.compare.worker import _train
+from baselines.compare.evaluations import Protocol
+from baselines.compare.jobs import Job
+from baselines.compare.worker import train
 from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entries
 from baselines.distillation.teachers import PolicyTeacher, Teacher, project, read_teacher
 from baselines.distillation.train import METRICS
@@ -27,7 +29,7 @@ from cfp.sections import EnvironmentConfig, ReportConfig
 from cfp.tables import read_table
 from cfp.weights import origin, read_policy, write_policy
 from dittogym import TASKS, TorchEnv
-from dittogym.action import patch_field, to_grid_layout
+from dittogym.action import patch_field, to_grid_indexing
 
 
 def make(**changes):
@@ -300,9 +302,9 @@ def test_action_of_the_other_layout_acts_at_the_same_place():
     seen = torch.zeros(1, 3, 64, 64, dtype=torch.uint8)
     action = PolicyTeacher(record, "image", "image").act(env, seen)
     as_grid = PolicyTeacher(record, "image", "grid").act(env, seen)
-    assert torch.equal(as_grid, to_grid_layout(action, "image"))
+    assert torch.equal(as_grid, to_grid_indexing(action, "image"))
     back = PolicyTeacher(record, "grid", "image").act(env, seen)
-    assert torch.equal(to_grid_layout(back, "image"), action)
+    assert torch.equal(to_grid_indexing(back, "image"), action)
 
 
 def test_sequence_teaches_by_the_step_of_the_episode():
@@ -367,10 +369,10 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch, caps
     assert last in capsys.readouterr().out.splitlines()[-1]
     config = configure(json.loads((folder / "config.json").read_text()))
     with StopSignals() as signals:
-        _train(config, tmp_path / "noted", signals, False)
+        train(Job("distill", config, tmp_path / "noted", Protocol(1)), signals, False)
     (session,) = json.loads((tmp_path / "noted" / "sessions.json").read_text())["sessions"]
     assert (session["from"], session["to"], session["teacher"]["steps"]) == (0, 32, 32)
-    assert 0 < session["teacher"]["seconds"] < session["seconds"] - session["judging"]
+    assert 0 < session["teacher"]["seconds"] < session["seconds"] - session["evaluation_seconds"]
 
 
 @pytest.mark.parametrize(
