@@ -18,7 +18,7 @@ from baselines.shac.train import Shac
 from baselines.trajectory.optimise import Gradient
 from cfp.config import RunConfig, merge
 from cfp.errors import ConfigError
-from cfp.evaluation.rollout import Policy
+from cfp.evaluation.evaluate import Policy
 from cfp.experiment.cfp_run import Runner
 from cfp.experiment.process import StopSignals
 from cfp.experiment.run import Run

@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
-from cfp.evaluation.rollout import Policy
+from cfp.evaluation.evaluate import Policy
 from cfp.experiment.books import Books
 from cfp.experiment.estimate import Cost
 from cfp.experiment.process import StopSignals

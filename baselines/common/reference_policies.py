@@ -16,7 +16,7 @@ import cfp
 from baselines.common.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.common.open_loop import OpenLoop
 from cfp.config import ReportConfig
-from cfp.evaluation.rollout import Policy
+from cfp.evaluation.evaluate import Policy
 from cfp.weights import fitting, read_policy, write_policy
 from dittogym import make_spec
 from dittogym.action import Layout, from_grid_layout

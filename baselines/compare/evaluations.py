@@ -14,7 +14,8 @@ from baselines.registry import load
 from cfp.config import RunConfig, Tier
 from cfp.envs.disturbances import Case, make_cases
 from cfp.envs.make import choose_device, make_env
-from cfp.evaluation.rollout import Policy, Result, evaluate, judging_seed
+from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
+from cfp.policy import Policy
 from cfp.files import write_json
 from cfp.robustness import report
 from cfp.weights import policy_file
@@ -125,7 +126,7 @@ def judge(config: RunConfig, folder: Path, judging: Judging, stop: Callable[[], 
     policy = load(folder / "policy.safetensors", choose_device(config.device))
 
     def part(first: int, count: int) -> dict[str, Any]:
-        return _entry(_evaluate(own, policy, judging_seed(own) + first, count))
+        return _entry(_evaluate(own, policy, evaluation_seed(own) + first, count))
 
     def disturbed(first: int, count: int, case: Case) -> list[dict[str, Any]]:
         return [_entry(result) for result in report(replace(own, seed=own.seed + first), policy, [case], count)]

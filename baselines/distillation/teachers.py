@@ -14,7 +14,7 @@ from torch import Tensor
 from baselines.common.open_loop import OpenLoop
 from baselines.planning.gradient import Planner, PlannerConfig
 from cfp.config import EnvironmentConfig
-from cfp.evaluation.rollout import Policy, SeesState
+from cfp.policy import Policy, SeesState
 from cfp.weights import check_trained_for, read_policy
 from dittogym import TorchEnv, make_spec
 from dittogym.action import Layout, bicubic_matrix, from_grid_layout, to_grid_layout

@@ -20,7 +20,7 @@ from cfp.agent.policies import ActorPolicy
 from cfp.config import ReportConfig, RunConfig, Tier, at_least_one, not_negative, positive, share, training_layouts
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
-from cfp.evaluation.rollout import Policy
+from cfp.policy import Policy
 from cfp.weights import KIND, load, policy_for, read_policy, save_policy
 
 BETAS = (0.7, 0.95)

@@ -13,7 +13,7 @@ import dittogym
 from baselines import evaluate, robustness, train
 from cfp.agent.actor import build_actor
 from cfp.errors import ConfigError
-from cfp.evaluation.rollout import SeesState
+from cfp.policy import SeesState
 from cfp.experiment.books import Books
 from cfp.experiment.cli import parse
 from cfp.tables import read_table

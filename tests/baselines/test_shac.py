@@ -18,7 +18,7 @@ from cfp.agent.actor import ActorSpec, build_actor
 from cfp.config import EnvironmentConfig, to_json
 from cfp.envs.make import make_env
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
-from cfp.evaluation.rollout import attached, evaluate
+from cfp.evaluation.evaluate import attached, evaluate
 from cfp.evaluation.video import film
 from cfp.weights import describe, origin, save_policy
 from dittogym import TorchEnv

@@ -24,7 +24,7 @@ from cfp.config import EnvironmentConfig
 from cfp.envs.vec_env import monitored
 from cfp.evaluation import plots as plot
 from cfp.evaluation import video
-from cfp.evaluation.rollout import compare
+from cfp.evaluation.evaluate import compare
 from cfp.experiment.callbacks import StageCallback
 from cfp.experiment.cfp_run import Runner
 from cfp.experiment.cli import program_name
