@@ -5,9 +5,9 @@ from baselines.common.open_loop import OpenLoop
 from baselines.distillation.train import Distill, DistillConfig
 from baselines.modular.policy import SegmentPolicy
 from baselines.modular.train import ModularConfig
-from baselines.planning.cem import CEM, CEMConfig, CEMPlanner, CEMPlannerConfig
-from baselines.planning.gradient import Planner, PlannerConfig
-from baselines.planning.mpc import MPC, MPCConfig
+from baselines.planning.cem import CEMPlanner, CEMPlannerConfig
+from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
+from baselines.planning.mpc import CEM, MPC, CEMConfig, MPCConfig
 from baselines.registry import ALGORITHMS, load
 from baselines.shac.networks import StatePolicy
 from baselines.shac.train import Shac, ShacConfig
@@ -26,11 +26,11 @@ __all__ = [
     "Entry",
     "Gradient",
     "GradientConfig",
+    "GradientPlanner",
+    "GradientPlannerConfig",
     "MPCConfig",
     "ModularConfig",
     "OpenLoop",
-    "Planner",
-    "PlannerConfig",
     "SegmentPolicy",
     "Shac",
     "ShacConfig",

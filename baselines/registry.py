@@ -12,8 +12,7 @@ from baselines.common.reference_policies import Random, Scripted, Zero
 from baselines.distillation.run import DistillRun
 from baselines.distillation.train import Distill
 from baselines.modular import train as modular
-from baselines.planning.cem import CEM
-from baselines.planning.mpc import MPC
+from baselines.planning.mpc import CEM, MPC
 from baselines.shac.train import Shac
 from baselines.trajectory.optimise import Gradient
 from cfp.config import RunConfig, merge

@@ -16,7 +16,7 @@ import torchmpm
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(Path(__file__).parent))
 
-import house  # noqa: E402
+import architecture  # noqa: E402
 from task_pages import write_pages  # noqa: E402
 
 project = "torchmpm"
@@ -47,7 +47,7 @@ sphinx_gallery_conf = {
 }
 suppress_warnings = ["config.cache"]
 nitpicky = True
-#: Annotations name types of other libraries, and aliases, that have no page here.
+#: Types of other libraries, and aliases, that are not documented here.
 nitpick_ignore_regex = [
     (r"py:class", r"(?!(torchmpm|dittogym|cfp|baselines)\.).*"),
     (r"py:class", r"torchmpm\.rollout\.(State|Input|Output)|cfp\.(run\.Run|process\.StopSignals|evaluation\.Policy)"),
@@ -72,14 +72,14 @@ napoleon_use_ivar = True
 
 
 class CommandHelp(SphinxDirective):
-    """Show what ``python -m MODULE OPTIONS --help`` prints, so that the page cannot fall behind the program."""
+    """Show the output of ``python -m MODULE OPTIONS --help``, so that the page is always up to date."""
 
     required_arguments = 1
     final_argument_whitespace = True
 
     def run(self) -> list[nodes.Node]:
-        """Run the command and keep its output as a literal block."""
-        self.env.note_reread()  # the program may have changed though the page has not
+        """Run the command and show its output as a literal block."""
+        self.env.note_reread()  # the program may have changed even if the page has not
         environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
         command = [sys.executable, "-m", *self.arguments[0].split(), "--help"]
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
@@ -89,7 +89,7 @@ class CommandHelp(SphinxDirective):
 
 
 class NamesTable(SphinxDirective):
-    """A table of names and their meanings from dictionaries ``package.module.NAME``, so that none is forgotten."""
+    """A table of names and their meanings, read from dictionaries ``package.module.NAME``."""
 
     required_arguments = 1
     final_argument_whitespace = True
@@ -103,7 +103,7 @@ class NamesTable(SphinxDirective):
         return names
 
     def run(self) -> list[nodes.Node]:
-        """Write a line for each name."""
+        """Write a row for each name."""
         self.env.note_reread()
         lines = [".. list-table::", "   :header-rows: 1", "", "   * - Name", "     - Meaning"]
         for key, meaning in self.names().items():
@@ -111,43 +111,43 @@ class NamesTable(SphinxDirective):
         return self.parse_text_to_nodes("\n".join(["```{eval-rst}", *lines, "```"]))
 
 
-class HouseRooms(NamesTable):
-    """A table of the files of a package."""
+class ModuleTable(NamesTable):
+    """A table of the folders and modules of a package."""
 
     def names(self) -> dict[str, str]:
-        """First lines of their docstrings."""
-        return house.rooms(self.arguments[0])
+        """Read the first lines of their docstrings."""
+        return architecture.module_table(self.arguments[0])
 
 
-class HousePicture(SphinxDirective):
-    """The packages and what they import, see `house.picture`."""
+class PackageDiagram(SphinxDirective):
+    """The packages and what they import, see `architecture.diagram`."""
 
     def run(self) -> list[nodes.Node]:
-        """Draw it."""
+        """Draw them."""
         self.env.note_reread()
-        return [nodes.raw(text=house.picture(), format="html")]
+        return [nodes.raw(text=architecture.diagram(), format="html")]
 
 
 class KeepColons:
-    """Napoleon takes words before a colon in the docstring of an attribute for its type; this puts the text back."""
+    """Restores docstrings of attributes, in which Napoleon takes the words before a colon for a type."""
 
     def __init__(self, app: Sphinx) -> None:
-        self.said: dict[str, list[str]] = {}
+        self.docstrings: dict[str, list[str]] = {}
         app.connect("autodoc-process-docstring", self.before, priority=400)
         app.connect("autodoc-process-docstring", self.after, priority=600)
 
     def before(self, app: Sphinx, what: str, name: str, item: object, options: object, lines: list[str]) -> None:
-        """Keep what Napoleon is going to read."""
+        """Store the docstring before Napoleon processes it."""
         if what == "attribute":
-            self.said[name] = lines.copy()
+            self.docstrings[name] = lines.copy()
 
     def after(self, app: Sphinx, what: str, name: str, item: object, options: object, lines: list[str]) -> None:
-        """Undo what it did."""
-        lines[:] = self.said.pop(name, lines)
+        """Restore it."""
+        lines[:] = self.docstrings.pop(name, lines)
 
 
 def drop_links_back(app: Sphinx, page: str, template: str, context: dict[str, object], doctree: object) -> None:
-    """Links from a source to its documentation miss where a class is shown under the shorter, public name."""
+    """Drop links from sources to their documentation, broken for classes that are documented under a public name."""
     if page.startswith("_modules/"):
         context["body"] = re.sub(r'<a class="viewcode-back".*?</a>', "", str(context["body"]))
 
@@ -159,5 +159,5 @@ def setup(app: Sphinx) -> None:
     KeepColons(app)
     app.add_directive("command-help", CommandHelp)
     app.add_directive("names-table", NamesTable)
-    app.add_directive("house-picture", HousePicture)
-    app.add_directive("house-rooms", HouseRooms)
+    app.add_directive("package-diagram", PackageDiagram)
+    app.add_directive("module-table", ModuleTable)

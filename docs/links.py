@@ -1,4 +1,4 @@
-"""Follows every link inside the built site, and from the pages of the repository that are read on their own."""
+"""Checks the internal links of the built site, and of the Markdown files that are read in the repository."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 ROOT = Path(__file__).resolve().parents[1]
-ALONE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "benchmarks/README.md")
+STANDALONE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "benchmarks/README.md")
 
 
 @dataclass
 class Page(HTMLParser):
-    """Where a page of HTML leads, and its anchors."""
+    """Link targets and anchors of an HTML page."""
 
     targets: list[str] = field(default_factory=list)
     anchors: set[str] = field(default_factory=set)
@@ -24,7 +24,7 @@ class Page(HTMLParser):
         super().__init__()
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Note links, pictures, scripts and anchors."""
+        """Collect links, images, scripts and anchors."""
         for name, value in attrs:
             if name in ("href", "src") and value:
                 self.targets.append(value)
@@ -39,41 +39,41 @@ def read(file: Path) -> Page:
     return page
 
 
-def inside(target: str) -> bool:
-    """Whether a link stays here."""
+def is_relative(target: str) -> bool:
+    """Whether a link is relative."""
     parts = urlsplit(target)
     return not (parts.scheme or parts.netloc)
 
 
-def dead_in_site(site: Path) -> list[str]:
-    """Links of a built site that lead nowhere."""
+def broken_in_site(site: Path) -> list[str]:
+    """Broken links of a built site."""
     pages = {file.resolve(): read(file) for file in site.rglob("*.html")}
-    dead = []
+    broken = []
     for file, page in pages.items():
-        for target in filter(inside, page.targets):
+        for target in filter(is_relative, page.targets):
             parts = urlsplit(target)
             place = (file.parent / unquote(parts.path)).resolve() if parts.path else file
             place = place / "index.html" if place.is_dir() else place
             missing = parts.fragment and place in pages and unquote(parts.fragment) not in pages[place].anchors
             if not place.exists() or missing:
-                dead.append(f"{file.relative_to(site.resolve())}: {target}")
-    return dead
+                broken.append(f"{file.relative_to(site.resolve())}: {target}")
+    return broken
 
 
-def dead_in_repository() -> list[str]:
-    """Relative links of the pages that are read on their own, to files that are not there."""
-    dead = []
-    for name in ALONE:
+def broken_in_repository() -> list[str]:
+    """Relative links from standalone Markdown files to files that do not exist."""
+    broken = []
+    for name in STANDALONE:
         file = ROOT / name
-        for target in filter(inside, re.findall(r"\]\(([^)\s]+)\)", file.read_text())):
+        for target in filter(is_relative, re.findall(r"\]\(([^)\s]+)\)", file.read_text())):
             if urlsplit(target).path and not (file.parent / urlsplit(target).path).exists():
-                dead.append(f"{name}: {target}")
-    return dead
+                broken.append(f"{name}: {target}")
+    return broken
 
 
 if __name__ == "__main__":
     site = Path(sys.argv[1])
-    dead = dead_in_site(site) + dead_in_repository()
+    broken = broken_in_site(site) + broken_in_repository()
     count = sum(len(read(file).targets) for file in site.rglob("*.html"))
-    print("\n".join(dead) or f"{count} links on {len(list(site.rglob('*.html')))} pages, none dead inside")
-    sys.exit(bool(dead))
+    print("\n".join(broken) or f"{count} links on {len(list(site.rglob('*.html')))} pages, none broken")
+    sys.exit(bool(broken))

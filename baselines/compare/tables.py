@@ -215,7 +215,7 @@ def cost_table(groups: Sequence[Group]) -> Table:
         costs, speed, config = group.costs, group.speed, group.runs[0].job.config
         if speed is None:
             continue
-        tier = getattr(config, "tier", None)
+        tier = getattr(config, "train_particles", None)
         memories = [cost.memory / 2**20 for cost in costs if cost.memory]
         theirs = paper.COST.get(group.label, (None, None)) if group.task == "run" else (None, None)
         rows.append(

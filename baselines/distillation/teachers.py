@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from baselines.common.open_loop import OpenLoop
-from baselines.planning.gradient import Planner, PlannerConfig
+from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from cfp.config import EnvironmentConfig
 from cfp.policy import Policy, SeesState
 from cfp.weights import check_trained_for, read_policy
@@ -91,17 +91,17 @@ class PlannerTeacher(Teacher):
         seed: Of the plans' noise.
     """
 
-    def __init__(self, env: TorchEnv, config: PlannerConfig, seed: int) -> None:
+    def __init__(self, env: TorchEnv, config: GradientPlannerConfig, seed: int) -> None:
         env.reset(seed=seed)
         self.env, self.resolution = env, env.action_resolution
-        self.planner = Planner(env, config, seed=seed)
+        self.planner = GradientPlanner(env, config, seed=seed)
 
     def act(self, env: TorchEnv, seen: Tensor) -> Tensor:
         """The next actions of its plans."""
         self.env.env_state = env.env_state
         with torch.enable_grad():
             action = self.planner.act()
-        self.fresh = self.planner.fresh
+        self.fresh = self.planner.has_replanned
         return action.float()
 
     def state_dict(self) -> dict[str, Any]:

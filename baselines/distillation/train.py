@@ -19,7 +19,7 @@ from baselines.common.algorithm import SEEDED, Algorithm, Callback, Sees, grid_s
 from baselines.common.episodes import Episodes
 from baselines.distillation.dagger import Collector, Dataset, Labels, lose
 from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
-from baselines.planning.gradient import PlannerConfig
+from baselines.planning.gradient import GradientPlannerConfig
 from baselines.shac.networks import quieten
 from cfp.agent.actor import build_actor
 from cfp.agent.policies import ActorPolicy
@@ -50,16 +50,16 @@ METRICS: dict[str, str] = {
 class DistillConfig(LadderConfig):
     """A distillation; num_envs robots move side by side. Levels are listed coarsest first.
 
-    The environment options say how the result is judged; tier says where it is taught.
+    The environment options say how the result is judged; train_particles, where it is taught.
     """
 
     algo: str = "distill"
     """Which algorithm."""
     teacher: str = "shac"
     """mpc (plans from every state), shac or gradient (trained first), or a policy: a run folder, policy.safetensors."""
-    tier: Tier = "lite"
+    train_particles: Tier = "lite"
     """Particles of the simulations that are taught in."""
-    round: int = 64
+    rollout_steps: int = 64
     """Control steps between two lessons."""
     updates: int = 48
     """Gradient steps in a lesson."""
@@ -67,24 +67,24 @@ class DistillConfig(LadderConfig):
     """Labels in a gradient step."""
     student_noise: bool = True
     """The student moves with the noise of its policy."""
-    student_rate: float = 1e-3
+    student_learning_rate: float = 1e-3
     """Adam's step size at the beginning of each level; it falls to a tenth."""
     max_grad_norm: float = 1.0
     """Largest norm of the gradient."""
-    share: float = 0.7
+    beta_decay: float = 0.7
     """Factor by which the share of legs that the teacher leads falls from round to round; it begins at 1."""
-    leg: int = 8
+    switch_every: int = 8
     """Control steps after which it is drawn anew who leads a robot."""
-    faults: float = 0.0
+    dropout: float = 0.0
     """Share of entries that become 0 in half of the images that the student sees and of the actions that it takes, so
     that it learns to do without them."""
     capacity: int = 100_000
     """Labels that are kept; an image takes 12 KiB, an action on the smaller grid of teacher and student 8 R R bytes."""
-    age: int = 400
+    max_episode_steps: int = 400
     """Control steps after which an episode is cut; the first ones are cut at staggered ages."""
-    layouts: int = 64
+    num_layouts: int = 64
     """Particle layouts that are gone through."""
-    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    planner: GradientPlannerConfig = field(default_factory=GradientPlannerConfig)
     planner_grid: int | Literal["coarse", "fine"] = "coarse"
     """Action grid of the teacher mpc."""
 
@@ -98,17 +98,17 @@ class DistillConfig(LadderConfig):
         super().check()
         self.planner.check()
         at_least_one(
-            round=self.round,
+            rollout_steps=self.rollout_steps,
             updates=self.updates,
             batch_size=self.batch_size,
-            leg=self.leg,
+            switch_every=self.switch_every,
             capacity=self.capacity,
-            age=self.age,
-            layouts=self.layouts,
+            max_episode_steps=self.max_episode_steps,
+            num_layouts=self.num_layouts,
         )
-        training_layouts("layouts", self.layouts * len(self.resolutions), self.environment.num_envs)
-        positive(student_rate=self.student_rate, max_grad_norm=self.max_grad_norm)
-        share(share=self.share, faults=self.faults)
+        training_layouts("num_layouts", self.num_layouts * len(self.resolutions), self.environment.num_envs)
+        positive(student_learning_rate=self.student_learning_rate, max_grad_norm=self.max_grad_norm)
+        share(beta_decay=self.beta_decay, dropout=self.dropout)
 
 
 class Distill(Algorithm):
@@ -131,7 +131,7 @@ class Distill(Algorithm):
         self, config: DistillConfig, level: int = 0, start: ActorPolicy | None = None, teacher: Path | None = None
     ) -> None:
         self.config, self.level = config, level
-        own = replace(config, environment=config.environment.learned_at(config.tier))
+        own = replace(config, environment=config.environment.learned_at(config.train_particles))
         self.env = make_torch_env(own, make_spec(config.task).patch)
         self.spec = config.actor_spec(level)
         with self._luck():
@@ -141,12 +141,16 @@ class Distill(Algorithm):
             self.actor.get_submodule("coarse").load_state_dict(start.actor.state_dict())
         self.actor.to(self.env.device)
         learning = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
-        self.adam = torch.optim.Adam(learning, config.student_rate)
-        episodes = Episodes(self.env, config.seed + level * config.layouts, config.age, config.layouts)
+        self.adam = torch.optim.Adam(learning, config.student_learning_rate)
+        episodes = Episodes(
+            self.env, config.seed + level * config.num_layouts, config.max_episode_steps, config.num_layouts
+        )
         grid = self.spec.resolutions[-1]
-        self.collector = Collector(self.env, self._teacher(own, teacher), episodes, config.leg, config.faults, grid)
+        self.collector = Collector(
+            self.env, self._teacher(own, teacher), episodes, config.switch_every, config.dropout, grid
+        )
         self.dataset, self.rounds = Dataset(config.capacity), 0
-        self.period = config.round * self.env.num_envs
+        self.period = config.rollout_steps * self.env.num_envs
 
     @staticmethod
     def preset(task: str, name: str) -> DistillConfig:
@@ -171,14 +175,14 @@ class Distill(Algorithm):
             gate_bias=base.gate_bias,
             network=base.network,
             teacher="gradient" if silhouette else "shac",
-            round=30 if silhouette else 64,
+            rollout_steps=30 if silhouette else 64,
             updates=160 if silhouette else 48,
             batch_size=64 if silhouette else 256,
             student_noise=not base.report.eval_deterministic,
-            student_rate=2e-3 if silhouette else 1e-3,
-            share=0.8 if silhouette else 0.7,
-            faults=0.2,
-            planner=PlannerConfig(iterations=30, learning_rate=0.1) if silhouette else PlannerConfig(),
+            student_learning_rate=2e-3 if silhouette else 1e-3,
+            beta_decay=0.8 if silhouette else 0.7,
+            dropout=0.2,
+            planner=GradientPlannerConfig(iterations=30, learning_rate=0.1) if silhouette else GradientPlannerConfig(),
             planner_grid=16 if silhouette else "coarse",
         )
 
@@ -225,9 +229,9 @@ class Distill(Algorithm):
         return self
 
     def _round(self) -> dict[str, float | None]:
-        config, share = self.config, self.config.share**self.rounds
+        config, share = self.config, self.config.beta_decay**self.rounds
         student = partial(self.actor, deterministic=not config.student_noise)
-        labels = self._kept(self.collector.collect(config.round, share, student))
+        labels = self._kept(self.collector.collect(config.rollout_steps, share, student))
         self.dataset.add(labels)
         self.rounds += 1
         with torch.no_grad():
@@ -256,7 +260,7 @@ class Distill(Algorithm):
     def _rate(self) -> float:
         bounds = (0, *self.config.ends())
         done = self.num_timesteps / (bounds[self.level + 1] - bounds[self.level])
-        return self.config.student_rate * (1.0 - (1.0 - FINAL_RATE) * min(done, 1.0))
+        return self.config.student_learning_rate * (1.0 - (1.0 - FINAL_RATE) * min(done, 1.0))
 
     def _loss(self, observations: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """Mean square difference of the mean action from the teacher's, both on the grid that is carried out."""
@@ -266,7 +270,7 @@ class Distill(Algorithm):
 
     def _improve(self) -> float:
         labels = self.dataset.sample(self.config.batch_size)
-        loss = self._loss(lose(labels.observations, self.config.faults), labels.actions)
+        loss = self._loss(lose(labels.observations, self.config.dropout), labels.actions)
         if not math.isfinite(value := float(loss.detach())):
             raise NonFiniteError(
                 f"the loss became {value} after {self.num_timesteps} environment steps of the stage; "

@@ -1,4 +1,4 @@
-"""``python -m baselines.gradlab``: up to which horizon does a gradient help on a task?"""
+"""``python -m baselines.gradlab``: up to which horizon does a gradient through the simulation help on a task?"""
 
 from __future__ import annotations
 
@@ -13,24 +13,26 @@ from typing import Literal
 import torch
 import tyro
 from torch import Tensor
-from tqdm import tqdm
 
-from baselines.common.rollout import judge
-from baselines.gradlab.measure import Probe, Smoothing, measure
+from baselines.gradlab.measure import ReturnFunction, measure
 from baselines.gradlab.report import format_table, write
-from cfp.config import positive
 from cfp.envs.make import choose_device
 from cfp.errors import ConfigError
 from cfp.experiment.cli import run_command
 from dittogym import TorchEnv
 from dittogym.tasks import task_name
 
+ACTION_RANGE = 0.3
+"""Actions are drawn uniformly from [-ACTION_RANGE, ACTION_RANGE]."""
+DIRECTIONS = 4
+"""Random directions of the finite differences."""
+
 
 @dataclass(frozen=True)
-class Lab:
-    """Measure the gradient of a task's smooth return in the actions, by horizon, and write a table and a picture.
+class GradLabConfig:
+    """Measure the gradient of a task's smooth return in the actions, by horizon, and write a table and a figure.
 
-    Finite differences against step width, norm, float32 against float64, first against zeroth order.
+    Compares it with finite differences, float32 with float64, and first- with zeroth-order estimates.
     """
 
     task: str = "run"
@@ -38,9 +40,9 @@ class Lab:
     out: Path | None = None
     """Folder of the results; runs/gradlab-TASK if not given."""
     quick: bool = False
-    """Other defaults: a tiny robot, short horizons, seconds."""
+    """Start from other defaults: a tiny robot and short horizons, which take seconds."""
     seed: int = 0
-    """Controls particles, actions and noise."""
+    """Seed of particles, actions and noise."""
     device: str = "auto"
     """cpu, cuda, or auto."""
     particles: Literal["full", "lite"] | int = "lite"
@@ -54,120 +56,89 @@ class Lab:
     horizons: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64)
     """Control steps over which rewards are summed; those beyond the end of the episode are left out."""
     warmup: int = 8
-    """Control steps, driven at random, before the measured ones."""
-    amplitude: float = 0.3
-    """Actions are uniform in plus or minus this."""
-    widths: tuple[float, ...] = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
-    """Step widths of finite differences, root mean square per action value."""
-    directions: int = 4
-    """Random directions of finite differences."""
-    sigma: float = 0.1
-    """Width of the noise on actions of which first and zeroth order estimate the mean gradient."""
+    """Control steps with random actions before the measured ones."""
     samples: int = 16
-    """Simulations for either estimate, an even number."""
-    chunk: int = 16
-    """Simulations at once: bounds the memory."""
+    """Simulations for each of the first- and zeroth-order estimates, an even number."""
 
     def check(self) -> None:
         """Check what the types cannot.
 
         Raises:
-            ConfigError: Naming the option, what was given and what is allowed.
+            ConfigError: An option is out of range.
         """
-        for name, least in {"warmup": 0, "directions": 1, "chunk": 1}.items():
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed {least} or more")
+        if self.warmup < 0:
+            raise ConfigError(f"warmup must not be negative, got {self.warmup}")
         if self.samples < 4 or self.samples % 2:
-            raise ConfigError(f"samples: got {self.samples}, allowed an even number, 4 or more")
-        positive(sigma=self.sigma, amplitude=self.amplitude)
-        growing = all(early < late for early, late in pairwise((0, *self.horizons)))
-        if not self.horizons or not growing:
-            raise ConfigError(f"horizons: got {self.horizons}, allowed are growing numbers from 1")
-        if not self.widths or min(self.widths) <= 0:
-            raise ConfigError(f"widths: got {self.widths}, allowed are numbers above 0")
+            raise ConfigError(f"samples must be an even number and at least 4, got {self.samples}")
+        if not self.horizons or any(early >= late for early, late in pairwise((0, *self.horizons))):
+            raise ConfigError(f"horizons must be increasing and at least 1, got {self.horizons}")
 
 
-QUICK = Lab(quick=True, particles=200, substeps=5, horizons=(1, 2, 4), warmup=1, samples=4, directions=2)
+QUICK = GradLabConfig(quick=True, particles=200, substeps=5, horizons=(1, 2, 4), warmup=1, samples=4)
 
 
-def parse(arguments: Sequence[str]) -> Lab:
+def parse(arguments: Sequence[str]) -> GradLabConfig:
     """Read a command line; ``--quick`` chooses other defaults.
 
     Raises:
-        ConfigError: An option is wrong.
+        ConfigError: An option is out of range.
         SystemExit: ``--help``, or an option that does not exist or cannot be read (exit code 2).
     """
-    default = QUICK if "--quick" in arguments else Lab()
-    lab: Lab = tyro.cli(Lab, prog="python -m baselines.gradlab", args=list(arguments), default=default)
-    lab.check()
-    return replace(lab, out=lab.out or Path("runs") / f"gradlab-{task_name(lab.task)}")
+    default = QUICK if "--quick" in arguments else GradLabConfig()
+    config = tyro.cli(GradLabConfig, prog="python -m baselines.gradlab", args=list(arguments), default=default)
+    config.check()
+    return replace(config, out=config.out or Path("runs") / f"gradlab-{task_name(config.task)}")
 
 
-def make_env(lab: Lab) -> TorchEnv:
-    """The task in float64.
+def make_env(config: GradLabConfig) -> TorchEnv:
+    """Build and reset the task in float64.
 
     Raises:
-        ConfigError: It refuses an option, or the episode is over before the first horizon.
+        ConfigError: The environment refuses an option, or the episode is shorter than the first horizon.
     """
-    device = choose_device(lab.device)
+    names = ("resolution", "particles", "substeps", "backend")
+    options = {name: getattr(config, name) for name in names}
     try:
-        env = TorchEnv(
-            lab.task,
-            resolution=lab.resolution,
-            particles=lab.particles,
-            substeps=lab.substeps,
-            backend=lab.backend,
-            dtype="float64",
-            device=device,
-        )
-        env.reset(seed=lab.seed)
+        env = TorchEnv(config.task, dtype="float64", device=choose_device(config.device), **options)
+        env.reset(seed=config.seed)
     except (ValueError, TypeError) as error:
         raise ConfigError(" ".join(str(error).split())) from error
-    if lab.warmup + lab.horizons[0] > env.spec.horizon:
+    if (most := env.spec.horizon - config.horizons[0]) < config.warmup:
         raise ConfigError(
-            f"warmup: got {lab.warmup}, allowed at most {env.spec.horizon - lab.horizons[0]} before a horizon of "
-            f"{lab.horizons[0]} in an episode of {env.spec.horizon} steps"
+            f"warmup must be at most {most} (an episode has {env.spec.horizon} steps and the first horizon is "
+            f"{config.horizons[0]}), got {config.warmup}"
         )
     return env
 
 
-def total_steps(lab: Lab, horizons: Sequence[int]) -> int:
-    """Control steps to be simulated; a gradient counts as three."""
-    longest = horizons[-1]
-    once = longest * (1 + 2 * lab.directions * len(lab.widths) + lab.samples)
-    return once + sum(horizons) * (3 * (2 + lab.samples) + 3)
-
-
-def run(lab: Lab) -> str:
-    """Measure, write the folder, and return what to print.
+def run(config: GradLabConfig) -> str:
+    """Measure, write the folder, and return the text to print.
 
     Raises:
-        ConfigError: See `make_env`.
-        NoGradientError: The task's reward has no gradient.
+        ConfigError: See `make_env`, or the task's reward has no gradient.
         OSError: The folder cannot be made.
     """
-    assert lab.out is not None
-    env = make_env(lab)
-    lab.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
-    horizons = [horizon for horizon in lab.horizons if horizon <= env.spec.horizon - lab.warmup]
-    generator = torch.Generator().manual_seed(lab.seed)
+    assert config.out is not None
+    env = make_env(config)
+    config.out.mkdir(parents=True, exist_ok=True)  # before the long measurement, not after it
+    horizons = [horizon for horizon in config.horizons if horizon <= env.spec.horizon - config.warmup]
+    generator = torch.Generator().manual_seed(config.seed)
     shape = (horizons[-1], *env.action_shape)
 
     def normal(count: int) -> Tensor:
         return torch.randn(count, *shape, generator=generator, dtype=env.dtype).to(env.device)
 
-    drive = 2.0 * torch.rand(lab.warmup + shape[0], *env.action_shape, generator=generator, dtype=env.dtype) - 1.0
-    drive = (lab.amplitude * drive).to(env.device)
+    actions = torch.rand(config.warmup + shape[0], *env.action_shape, generator=generator, dtype=env.dtype)
+    actions = (ACTION_RANGE * (2.0 * actions - 1.0)).to(env.device)
     with torch.no_grad():
-        for action in drive[: lab.warmup]:
+        for action in actions[: config.warmup]:
             env.step(action[None])
-    with tqdm(total=total_steps(lab, horizons), unit=" steps", disable=None) as bar:
-        probe = Probe(env.model, env.env_state, judge, lab.chunk, bar.update)
-        directions, smoothing = normal(lab.directions), Smoothing(normal(lab.samples), lab.sigma)
-        rows, errors = measure(probe, drive[lab.warmup :], horizons, lab.widths, directions, smoothing)
-    config = dataclasses.asdict(lab) | {"out": str(lab.out)}
-    sentence = write(lab.out, config, rows, lab.widths, errors.tolist())
-    return f"{format_table(rows)}\n\n{sentence}\nwritten to {lab.out}"
+    function = ReturnFunction(env.model, env.env_state)
+    directions, noise = normal(DIRECTIONS), normal(config.samples)
+    results, errors = measure(function, actions[config.warmup :], horizons, directions, noise)
+    options = dataclasses.asdict(config) | {"out": str(config.out)}
+    sentence = write(config.out, options, results, errors.tolist())
+    return f"{format_table(results)}\n\n{sentence}\nwritten to {config.out}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,107 +1,99 @@
-"""Measurements on the gradient of a return in the actions, by horizon."""
+"""Measurements of the gradient of a return with respect to the actions, at several horizons."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import cosine_similarity
+from tqdm import tqdm
 
-from baselines.common.rollout import Judge, repeat, rollout, to_dtype
-from cfp.errors import CFPError
+from baselines.common.rollout import repeat, rollout, to_dtype
+from cfp.errors import ConfigError
 from dittogym.core import EnvState, Model
 
-
-class NoGradientError(CFPError):
-    """The reward does not depend on the actions in a differentiable way."""
+STEP_SIZES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
+"""Step sizes of the finite differences, root mean square per action value."""
+NOISE_STD = 0.1
+"""Standard deviation of the noise on the actions under which first- and zeroth-order estimates are compared."""
 
 
 @dataclass(frozen=True)
-class Probe:
-    """Returns and gradients of many plans from one state.
+class ReturnFunction:
+    """Return of action sequences (T, 2, R, R) from one initial state, and its gradient.
 
-    A plan is a sequence of actions (T, 2, R, R); its return at horizon h is the sum of its first h smooth rewards.
+    The return at horizon h is the sum of the first h smooth rewards.
 
     Attributes:
         model: The task.
-        start: A state of one simulation; its dtype is that of the computation.
-        judge: What a step is worth.
-        chunk: Simulations at once; this and the horizon bound the memory.
-        advance: Called with the number of control steps simulated; a gradient counts as three.
+        state: Initial state of one simulation; its dtype is that of the computation.
+        batch_size: Largest number of simulations at a time; it bounds the memory.
     """
 
     model: Model
-    start: EnvState
-    judge: Judge
-    chunk: int
-    advance: Callable[[int], object]
+    state: EnvState
+    batch_size: int = 16
 
-    def to(self, dtype: torch.dtype) -> Probe:
-        """The same in another precision."""
-        return replace(self, start=to_dtype(self.start, dtype))
+    def to(self, dtype: torch.dtype) -> ReturnFunction:
+        """Return the same function computed in another precision."""
+        return replace(self, state=to_dtype(self.state, dtype))
 
     @torch.no_grad()
-    def returns(self, plans: Tensor) -> Tensor:
-        """Returns of plans (S, T, 2, R, R) at every horizon, (S, T)."""
-        parts = []
-        for part in self._parts(plans):
-            rewards = rollout(self.model, repeat(self.start, part.shape[1]), part, self.judge).rewards
-            parts.append(rewards.T.cumsum(1))
-            self.advance(part.shape[0] * part.shape[1])
-        return torch.cat(parts)
+    def returns(self, actions: Tensor) -> Tensor:
+        """Returns (S, T) of action sequences (S, T, 2, R, R) at every horizon."""
+        return torch.cat([self._rewards(batch).T.cumsum(1) for batch in self._batches(actions)])
 
-    def gradients(self, plans: Tensor) -> Tensor:
-        """Gradients of the return at horizon T in the plans (S, T, 2, R, R), same shape.
+    def gradients(self, actions: Tensor) -> Tensor:
+        """Gradients (S, T, 2, R, R) of the returns at horizon T of action sequences of the same shape.
 
         Raises:
-            NoGradientError: The reward has none.
+            ConfigError: The task's reward has no gradient.
         """
-        parts = []
-        for part in self._parts(plans):
-            part = part.requires_grad_()
-            rewards = rollout(self.model, repeat(self.start, part.shape[1]), part, self.judge).rewards
+        gradients = []
+        for batch in self._batches(actions):
+            rewards = self._rewards(batch.requires_grad_())
             if not rewards.requires_grad:
-                raise NoGradientError(
-                    f"the reward of task {self.model.spec.name!r} has no gradient in the actions: it only counts"
-                )
-            parts.append(torch.autograd.grad(rewards.sum(), part)[0].transpose(0, 1))
-            self.advance(3 * part.shape[0] * part.shape[1])
-        return torch.cat(parts)
+                raise ConfigError(f"task: the reward of {self.model.spec.name!r} has no gradient in the actions")
+            gradients.append(torch.autograd.grad(rewards.sum(), batch)[0].transpose(0, 1))
+        return torch.cat(gradients)
 
-    def _parts(self, plans: Tensor) -> list[Tensor]:
-        like = self.start.particles.x
-        return [part.to(like).detach().transpose(0, 1).contiguous() for part in plans.split(self.chunk)]
+    def _rewards(self, batch: Tensor) -> Tensor:
+        return rollout(self.model, repeat(self.state, batch.shape[1]), batch).rewards
+
+    def _batches(self, actions: Tensor) -> list[Tensor]:
+        """Time-major batches (T, B, 2, R, R)."""
+        like = self.state.particles.x
+        return [part.to(like).detach().transpose(0, 1).contiguous() for part in actions.split(self.batch_size)]
 
 
 @dataclass(frozen=True)
-class Row:
-    """What was found at one horizon.
+class HorizonResult:
+    """Measurements at one horizon.
 
     Attributes:
         horizon: Control steps.
-        value: Return of the plan.
-        norm: Norm of its gradient in all actions.
-        first_norm: Norm of its gradient in the first action.
-        difference_error: Smallest error of finite differences over all widths, see `finite_differences`.
-        difference_width: The width where it was reached.
-        cosine: Of the angle between the float32 and the float64 gradient.
+        norm: Norm of its gradient with respect to all actions.
+        first_norm: Norm of its gradient with respect to the first action.
+        difference_error: Smallest error of finite differences over all step sizes, see `finite_difference_errors`.
+        difference_step: The step size at which it was reached.
+        cosine: Cosine similarity of the float32 and the float64 gradient.
         relative_error: Norm of their difference over the norm of the float64 gradient.
-        first_variance: Of the mean of first-order samples; total over all actions.
-        zeroth_variance: Of the mean of zeroth-order samples from as many simulations.
-        promised: What a step along the first-order mean gains if the return were linear.
-        first_gain: What it gains.
-        zeroth_gain: What a step of the same length along the zeroth-order mean gains.
-        failed: Samples whose return or gradient was not finite; they are left out.
+        first_variance: Total variance of the mean of the first-order samples.
+        zeroth_variance: Total variance of the mean of the zeroth-order samples, from as many simulations.
+        promised: Gain of a step along the first-order mean if the return were linear.
+        first_gain: Actual gain of that step.
+        zeroth_gain: Actual gain of a step of the same length along the zeroth-order mean.
+        failed: Number of samples that were not finite; they are left out of the means.
     """
 
     horizon: int
-    value: float
     norm: float
     first_norm: float
     difference_error: float
-    difference_width: float
+    difference_step: float
     cosine: float
     relative_error: float
     first_variance: float
@@ -112,137 +104,101 @@ class Row:
     failed: int
 
 
-def finite_differences(
-    probe: Probe, plan: Tensor, gradients: Sequence[Tensor], widths: Sequence[float], directions: Tensor
+def finite_difference_errors(
+    function: ReturnFunction, actions: Tensor, gradients: Sequence[Tensor], directions: Tensor
 ) -> Tensor:
-    """Error of central differences against gradients.
+    """Compare gradients with central differences at every step size of `STEP_SIZES`.
 
     Args:
-        probe: In float64.
-        plan: (T, 2, R, R).
-        gradients: Of the return at some horizons, (h, 2, R, R) each.
-        widths: Step widths, root mean square per action value.
+        function: In float64.
+        actions: (T, 2, R, R), where the gradients were taken.
+        gradients: Of the returns at some horizons h, (h, 2, R, R) each.
         directions: (D, T, 2, R, R), standard normal.
 
     Returns:
-        (horizons, widths): root mean square over the directions of the difference between the two slopes, over the
-        gradient's norm, which is the expected size of a slope.
+        Errors (horizons, step sizes): root mean square over the directions of the difference between the two
+        directional derivatives, relative to the gradient's norm, which is the expected size of such a derivative.
     """
     count = len(directions)
-    result = torch.empty(len(gradients), len(widths), dtype=plan.dtype)
-    for column, width in enumerate(widths):
-        sides = probe.returns(torch.cat((plan + width * directions, plan - width * directions)))
-        slopes = (sides[:count] - sides[count:]) / (2 * width)
+    errors = torch.empty(len(gradients), len(STEP_SIZES), dtype=actions.dtype)
+    for column, step in enumerate(STEP_SIZES):
+        returns = function.returns(torch.cat((actions + step * directions, actions - step * directions)))
+        slopes = (returns[:count] - returns[count:]) / (2 * step)
         for row, gradient in enumerate(gradients):
             horizon = len(gradient)
             expected = (directions[:, :horizon] * gradient).flatten(1).sum(1)
-            result[row, column] = (slopes[:, horizon - 1] - expected).square().mean().sqrt() / gradient.norm()
-    return result
+            errors[row, column] = (slopes[:, horizon - 1] - expected).square().mean().sqrt() / gradient.norm()
+    return errors
+
+
+def measure(
+    function: ReturnFunction, actions: Tensor, horizons: Sequence[int], directions: Tensor, noise: Tensor
+) -> tuple[list[HorizonResult], Tensor]:
+    """Take all measurements at several horizons.
+
+    Args:
+        function: In float64; first and zeroth order are compared in float32.
+        actions: (T, 2, R, R) float64, where everything is measured.
+        horizons: Increasing; the last is T.
+        directions: (D, T, 2, R, R), standard normal, of the finite differences.
+        noise: (S, T, 2, R, R), standard normal, S even. The first half serves the zeroth-order estimate in
+            antithetic pairs, so both estimates cost S simulations.
+
+    Returns:
+        One result per horizon, and the errors of finite differences (horizons, step sizes).
+    """
+    gradients = [
+        function.gradients(actions[None, :horizon])[0] for horizon in tqdm(horizons, "gradients", disable=None)
+    ]
+    errors = finite_difference_errors(function, actions, gradients, directions)
+    single = function.to(torch.float32)
+    offsets = NOISE_STD * noise[: len(noise) // 2]
+    paired_returns = single.returns(torch.cat((actions + offsets, actions - offsets)))
+    results = []
+    for gradient, error in zip(tqdm(gradients, "estimates", disable=None), errors, strict=True):
+        horizon = len(gradient)
+        best = int(torch.where(error.isfinite(), error, torch.inf).argmin())
+        rounded = single.gradients(actions[None, :horizon])[0].to(gradient)
+        results.append(
+            HorizonResult(
+                horizon=horizon,
+                norm=float(gradient.norm()),
+                first_norm=float(gradient[0].norm()),
+                difference_error=float(error[best]),
+                difference_step=STEP_SIZES[best],
+                cosine=float(cosine_similarity(gradient.flatten(), rounded.flatten(), dim=0)),
+                relative_error=float((rounded - gradient).norm() / gradient.norm()),
+                **_compare_orders(single, actions[:horizon], paired_returns[:, horizon - 1], noise[:, :horizon]),
+            )
+        )
+    return results, errors
+
+
+def _compare_orders(function: ReturnFunction, actions: Tensor, paired_returns: Tensor, noise: Tensor) -> dict[str, Any]:
+    """Fields of a `HorizonResult` about first- and zeroth-order estimates of the gradient under noise."""
+    first, first_variance, first_failed = _mean_and_variance(function.gradients(actions + NOISE_STD * noise))
+    ahead, behind = paired_returns.chunk(2)
+    slopes = (ahead - behind) / (2 * NOISE_STD)
+    samples = slopes[:, None, None, None, None] * noise[: len(slopes)].to(slopes)
+    zeroth, zeroth_variance, zeroth_failed = _mean_and_variance(samples)
+    length = NOISE_STD * actions.numel() ** 0.5
+    steps = [length * mean / mean.norm() for mean in (first, zeroth)]
+    start, after_first, after_zeroth = function.returns(torch.stack([actions, *(actions + s for s in steps)]))[:, -1]
+    return {
+        "first_variance": first_variance,
+        "zeroth_variance": zeroth_variance,
+        "promised": float(length * first.norm()),
+        "first_gain": float(after_first - start),
+        "zeroth_gain": float(after_zeroth - start),
+        "failed": first_failed + zeroth_failed,
+    }
 
 
 def _mean_and_variance(samples: Tensor) -> tuple[Tensor, float, int]:
     """Mean of the finite samples (S, ...), the total variance of that mean, and how many were not finite."""
     finite = samples.isfinite().flatten(1).all(1)
+    failed = int((~finite).sum())
     kept = samples[finite]
     if len(kept) < 2:
-        return torch.full_like(samples[0], torch.nan), torch.nan, int((~finite).sum())
-    return kept.mean(0), float(kept.var(0).sum() / len(kept)), int((~finite).sum())
-
-
-def _zeroth_order(returns: Tensor, noise: Tensor, sigma: float) -> Tensor:
-    """Samples of the smoothed gradient from antithetic pairs of returns, (2 P,) and noise (P, ...): (P, ...)."""
-    ahead, behind = returns.chunk(2)
-    return ((ahead - behind) / (2 * sigma)).view(-1, *[1] * (noise.ndim - 1)) * noise
-
-
-def _gains(probe: Probe, plan: Tensor, means: Sequence[Tensor], length: float) -> list[float]:
-    """What a step of ``length`` along each mean adds to the return of ``plan``."""
-    steps = [length * mean / mean.norm() for mean in means]
-    returns = probe.returns(torch.stack([plan, *(plan + step for step in steps)]))[:, -1]
-    return [float(gained) for gained in returns[1:] - returns[0]]
-
-
-@dataclass(frozen=True)
-class Smoothing:
-    """Noise on a plan, from which both estimators of a smoothed gradient draw.
-
-    Attributes:
-        noise: (S, T, 2, R, R) standard normal, S even. The first half serves the zeroth order in antithetic pairs, so
-            both estimators spend S simulations.
-        sigma: Its width.
-    """
-
-    noise: Tensor
-    sigma: float
-
-    @property
-    def paired(self) -> Tensor:
-        """The half that the zeroth order uses."""
-        return self.noise[: len(self.noise) // 2]
-
-
-def measure(
-    probe: Probe,
-    plan: Tensor,
-    horizons: Sequence[int],
-    widths: Sequence[float],
-    directions: Tensor,
-    smoothing: Smoothing,
-) -> tuple[list[Row], Tensor]:
-    """Measure everything at several horizons.
-
-    Args:
-        probe: In float64; first and zeroth order are compared in float32.
-        plan: (T, 2, R, R) float64, around which everything is measured.
-        horizons: Growing, the last is T.
-        widths: Of finite differences.
-        directions: (D, T, 2, R, R) of finite differences.
-        smoothing: For the comparison of the orders.
-
-    Returns:
-        One row per horizon, and the errors of finite differences (horizons, widths).
-    """
-    values = probe.returns(plan[None])[0]
-    gradients = [probe.gradients(plan[None, :horizon])[0] for horizon in horizons]
-    errors = finite_differences(probe, plan, gradients, widths, directions)
-    single = probe.to(torch.float32)
-    paired, sigma = smoothing.paired, smoothing.sigma
-    pairs = single.returns(torch.cat((plan + sigma * paired, plan - sigma * paired)))
-    rows = []
-    for gradient, error in zip(gradients, errors, strict=True):
-        horizon = len(gradient)
-        best = int(torch.where(error.isfinite(), error, torch.inf).argmin())
-        rounded = single.gradients(plan[None, :horizon])[0].to(gradient)
-        rows.append(
-            Row(
-                horizon=horizon,
-                value=float(values[horizon - 1]),
-                norm=float(gradient.norm()),
-                first_norm=float(gradient[0].norm()),
-                difference_error=float(error[best]),
-                difference_width=widths[best],
-                cosine=float((gradient * rounded).sum() / (gradient.norm() * rounded.norm())),
-                relative_error=float((rounded - gradient).norm() / gradient.norm()),
-                **_compare_orders(single, plan[:horizon], pairs[:, horizon - 1], smoothing),
-            )
-        )
-    return rows, errors
-
-
-def _compare_orders(probe: Probe, plan: Tensor, pairs: Tensor, smoothing: Smoothing) -> dict[str, Any]:
-    """The entries of a `Row` on both orders at horizon T, from a plan (T, 2, R, R) and returns (S,) of the pairs."""
-    horizon, sigma = len(plan), smoothing.sigma
-    samples = probe.gradients(plan + sigma * smoothing.noise[:, :horizon])
-    first, first_variance, failed = _mean_and_variance(samples)
-    samples = _zeroth_order(pairs, smoothing.paired[:, :horizon].to(pairs), sigma)
-    zeroth, zeroth_variance, also_failed = _mean_and_variance(samples)
-    length = sigma * plan.numel() ** 0.5
-    first_gain, zeroth_gain = _gains(probe, plan, (first, zeroth), length)
-    return {
-        "first_variance": first_variance,
-        "zeroth_variance": zeroth_variance,
-        "promised": float(length * first.norm()),
-        "first_gain": first_gain,
-        "zeroth_gain": zeroth_gain,
-        "failed": failed + also_failed,
-    }
+        return torch.full_like(samples[0], torch.nan), torch.nan, failed
+    return kept.mean(0), float(kept.var(0).sum() / len(kept)), failed

@@ -1,4 +1,4 @@
-"""Planners as algorithms: each plans its way through one episode and keeps what it did."""
+"""Model predictive control: planners as algorithms that plan their way through one episode and record it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from torch import Tensor
 import cfp
 from baselines.common.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.common.open_loop import OpenLoop
-from baselines.planning.gradient import PlanConfig, Planner, PlannerBase, PlannerConfig
-from baselines.planning.surrogate import Reduced
+from baselines.planning.base import Planner, PlannerConfig
+from baselines.planning.cem import CEMPlanner, CEMPlannerConfig
+from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
+from baselines.planning.surrogate import Surrogate
 from cfp.config import EnvironmentConfig, ReportConfig, Tier
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
@@ -23,7 +25,7 @@ METRICS: dict[str, str] = {
     "train/return": "sum of the rewards of the episode so far",
     "train/reward": "reward of the last step",
     "train/plans": "plans evaluated so far; each is a simulation of the planner's horizon",
-    "train/failed": "plans that were not finite so far; they are never carried out",
+    "train/failed": "plans so far that were not finite; they are never carried out",
 }
 """Every scalar that `MPC.learn` logs, and what it means."""
 
@@ -32,12 +34,12 @@ METRICS: dict[str, str] = {
 class PlannedConfig(GridConfig):
     """A planned episode: one robot on the layout of the seed, from the start to the end of the task.
 
-    The environment options say where plans are carried out and judged; tier says where they are tried.
+    The environment options say where plans are carried out and evaluated.
     """
 
-    tier: Tier | None = None
-    """Particles of the simulations that plans are tried in, at most the environment's; None: as many."""
-    planner: PlanConfig = field(default_factory=PlanConfig)
+    train_particles: Tier | None = None
+    """Particles of the simulations in which plans are tried, at most the environment's; None: as many."""
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
 
     def ends(self) -> tuple[int, ...]:
         """Environment steps after which the only stage ends, at the latest."""
@@ -52,9 +54,9 @@ class PlannedConfig(GridConfig):
         super().check()
         self.planner.check()
         if self.environment.num_envs != 1:
-            raise ConfigError(f"num_envs: got {self.environment.num_envs}, allowed 1: an episode is planned for itself")
+            raise ConfigError(f"num_envs must be 1 (an episode is planned by itself), got {self.environment.num_envs}")
         if self.environment.resample:
-            raise ConfigError("resample: got True, allowed False: an episode is planned on one layout")
+            raise ConfigError("resample must be False (an episode is planned on one layout), got True")
 
 
 @dataclass(frozen=True)
@@ -63,11 +65,20 @@ class MPCConfig(PlannedConfig):
 
     algo: str = "mpc"
     """Which algorithm."""
-    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    planner: GradientPlannerConfig = field(default_factory=GradientPlannerConfig)
 
 
-def planned(task: str, name: str) -> dict[str, Any]:
-    """Defaults of a task that do not depend on how plans are found: options by name.
+@dataclass(frozen=True)
+class CEMConfig(PlannedConfig):
+    """An episode planned by the cross-entropy method: one robot on the layout of the seed, start to end of the task."""
+
+    algo: str = "cem"
+    """Which algorithm."""
+    planner: CEMPlannerConfig = field(default_factory=CEMPlannerConfig)
+
+
+def episode_preset(task: str, name: str) -> dict[str, Any]:
+    """Defaults of a task, as options of `PlannedConfig` by name.
 
     ``quick`` carries plans out at the lite tier, ``paper`` in the paper's environment; both try them at the lite tier.
     The episode of SHAPE MATCH is short and its reward all detail: it gets an action grid of 16.
@@ -75,22 +86,21 @@ def planned(task: str, name: str) -> dict[str, Any]:
     Raises:
         ConfigError: No such task or preset.
     """
+    quick = name == "quick"
     environment = cfp.preset(task, name).environment
-    if name == "quick":
-        environment = EnvironmentConfig()
     horizon = make_spec(task).horizon
     return {
         "task": task,
-        "preset": "quick" if name == "quick" else "paper",
-        "environment": replace(environment, num_envs=1),
+        "preset": "quick" if quick else "paper",
+        "environment": replace(EnvironmentConfig() if quick else environment, num_envs=1),
         "report": ReportConfig(horizon // 4 + 1, 1, True, checkpoint_every=horizon // 20 + 1, log_every=10),
         "grid": 16 if task == "shapematch" else "coarse",
-        "tier": None if name == "quick" else "lite",
+        "train_particles": None if quick else "lite",
     }
 
 
 class MPC(Algorithm):
-    """Model predictive control by gradients, see `baselines.Planner`.
+    """Model predictive control by gradients, see `GradientPlanner`.
 
     There is nothing to learn: `learn` carries out planned steps of a single episode, and the policy is the record of
     its actions. On the layout of its seed the record repeats the episode; other layouts have to be planned for
@@ -99,37 +109,37 @@ class MPC(Algorithm):
 
     name: ClassVar[str] = "mpc"
     sees: ClassVar[Sees] = "simulator"
-    planner_type: ClassVar[type[PlannerBase[Any]]] = Planner
+    planner_type: ClassVar[type[Planner[Any]]] = GradientPlanner
 
     def __init__(self, config: PlannedConfig, level: int = 0, start: Any = None) -> None:
         self.config = config
         self.env = make_torch_env(config, config.resolution(0), 1)
         self.env.reset(seed=config.seed)
-        self.reduced = None if config.tier is None else self._reduced(config, config.tier)
-        tried = self.reduced.small if self.reduced else self.env
-        self.planner = self.planner_type(tried, config.planner, seed=config.seed)
-        self.period = config.planner.commit  # all its planning is in the first of these steps
+        self.surrogate = None if config.train_particles is None else self._make_surrogate(config.train_particles)
+        planning_env = self.surrogate.env if self.surrogate else self.env
+        self.planner = self.planner_type(planning_env, config.planner, seed=config.seed)
+        self.period = config.planner.commit  # all planning happens in the first of these steps
         self.actions = torch.zeros(0, *self.env.action_shape)
-        self.total, self.reward, self.over = 0.0, 0.0, False
+        self.total_reward, self.reward, self.is_done = 0.0, 0.0, False
 
-    def _reduced(self, config: PlannedConfig, tier: Tier) -> Reduced:
-        own = replace(config, environment=config.environment.learned_at(tier))
-        small = make_torch_env(own, config.resolution(0), 1)
+    def _make_surrogate(self, particles: Tier) -> Surrogate:
+        config = replace(self.config, environment=self.config.environment.learned_at(particles))
+        small = make_torch_env(config, config.resolution(0), 1)
         small.reset(seed=config.seed)
         try:
-            return Reduced(self.env, small)
+            return Surrogate(self.env, small)
         except ValueError as error:
-            raise ConfigError(f"tier: {error}") from error
+            raise ConfigError(f"train_particles: {error}") from error
 
     @staticmethod
     def preset(task: str, name: str) -> PlannedConfig:
-        """Defaults of a task, see `planned`; SHAPE MATCH gets more and smaller gradient steps.
+        """Defaults of a task, see `episode_preset`; SHAPE MATCH gets more and smaller gradient steps.
 
         Raises:
             ConfigError: No such task or preset.
         """
-        planner = PlannerConfig(iterations=30, learning_rate=0.1) if task == "shapematch" else PlannerConfig()
-        return MPCConfig(**planned(task, name), planner=planner)
+        planner = GradientPlannerConfig(iterations=30, learning_rate=0.1) if task == "shapematch" else None
+        return MPCConfig(**episode_preset(task, name), planner=planner or GradientPlannerConfig())
 
     @property
     def policy(self) -> OpenLoop:
@@ -139,19 +149,19 @@ class MPC(Algorithm):
     def learn(self, total_timesteps: int, callback: Callback) -> MPC:
         """Carry out some more steps, fewer if the episode ends."""
         end = self.num_timesteps + total_timesteps
-        while self.num_timesteps < end and not self.over:
-            if self.reduced and self.planner.due:
-                self.reduced.follow(self.env.env_state)
+        while self.num_timesteps < end and not self.is_done:
+            if self.surrogate and self.planner.needs_plan:
+                self.surrogate.sync(self.env.env_state)
             action = self.planner.act().float()  # as the record keeps it, so that it repeats the episode exactly
             self._carry_out(action)
             self.actions = torch.cat((self.actions, action.cpu()))
             self.num_timesteps += 1
             callback(
                 {
-                    "train/return": self.total,
+                    "train/return": self.total_reward,
                     "train/reward": self.reward,
-                    "train/plans": float(self.planner.plans),
-                    "train/failed": float(self.planner.failed),
+                    "train/plans": float(self.planner.num_plans),
+                    "train/failed": float(self.planner.num_failed),
                 }
             )
         return self
@@ -160,8 +170,8 @@ class MPC(Algorithm):
     def _carry_out(self, action: Tensor) -> None:
         _, reward, terminated, _, _ = self.env.step(action)
         self.reward = float(reward)
-        self.total += self.reward
-        self.over = bool(terminated)
+        self.total_reward += self.reward
+        self.is_done = bool(terminated)
 
     def save(self, path: Path, description: dict[str, Any]) -> None:
         """Write the record, with its layout."""
@@ -173,12 +183,28 @@ class MPC(Algorithm):
         return OpenLoop.load(path)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the next step depends on; the state of the robot is found by repeating its actions."""
+        """Actions and planner; the state of the robot is restored by repeating its actions."""
         return {"actions": self.actions, "planner": self.planner.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Undo `state_dict`."""
+        """Restore a state of `state_dict`."""
         self.actions = state["actions"]
         for action in self.actions.to(self.env.device):
             self._carry_out(action[None])
         self.planner.load_state_dict(state["planner"])
+
+
+class CEM(MPC):
+    """Model predictive control by the cross-entropy method, see `CEMPlanner`; otherwise the same as `MPC`."""
+
+    name: ClassVar[str] = "cem"
+    planner_type: ClassVar[type[Planner[Any]]] = CEMPlanner
+
+    @staticmethod
+    def preset(task: str, name: str) -> CEMConfig:
+        """Defaults of a task, see `episode_preset`.
+
+        Raises:
+            ConfigError: No such task or preset.
+        """
+        return CEMConfig(**episode_preset(task, name))

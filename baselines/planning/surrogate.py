@@ -1,4 +1,4 @@
-"""A simulation with fewer particles that starts from where another has got to: a cheap model to plan in."""
+"""A cheaper model to plan in: the state of one simulation copied into another with fewer particles."""
 
 from __future__ import annotations
 
@@ -12,68 +12,70 @@ from dittogym.core import EnvState
 from dittogym.physics import PER_PARTICLE
 from torchmpm import tree
 
-CANDIDATES = 16
-"""Nearest particles among which each looks for one that no other has taken."""
+NEIGHBOURS = 16
+"""Nearest particles among which each particle looks for one that is not taken yet."""
 
 
-class Reduced:
-    """Copies the state of one environment into another of the same task with fewer particles.
+class Surrogate:
+    """Copies the states of one environment into another of the same task with fewer particles.
 
-    Each particle of the small environment stands for one of the large: the nearest in the layouts that both were reset
-    to, so that an evenly spread layout stays one. It takes over position, velocity and deformation; the mass and volume
-    that go with its share of the body are the small environment's own.
+    Each particle of the small environment stands for one of the large: the nearest in the initial positions of both, so
+    that evenly spread particles stay evenly spread. It takes over position, velocity and deformation; masses and
+    volumes are the small environment's own.
 
     Args:
-        large: The environment that is followed, after a reset.
-        small: Takes over its states, after a reset; as many simulations, same type and device.
+        large: The environment whose states are copied, after a reset.
+        small: The environment that takes them over, after a reset; of the same batch size, dtype and device.
+
+    Attributes:
+        indices: (B, n) the large environment's particles that the small one's stand for.
 
     Raises:
-        ValueError: A body of the small environment has more particles than the same of the large.
+        ValueError: A body of the small environment has more particles than that of the large.
     """
 
     def __init__(self, large: TorchEnv, small: TorchEnv) -> None:
-        self.small = small
-        self._own = {name: value for name, value in small.env_state.memory.items() if not value.is_floating_point()}
-        self.chosen = _nearest(large, small)
+        self.env = small
+        self.indices = _nearest_particles(large, small)
+        memory = small.env_state.memory
+        self._particle_memory = {name: value for name, value in memory.items() if not value.is_floating_point()}
 
-    def follow(self, state: EnvState) -> None:
-        """Bring the small environment to where the large one is.
+    def sync(self, state: EnvState) -> None:
+        """Bring the small environment to a state of the large one.
 
-        Args:
-            state: Of the large environment. Whole numbers in a task's memory name particles (the tip in GROW); of those
-                the small environment keeps its own.
+        Integers in a task's memory are numbers of particles (the tip in GROW): the small environment keeps its own.
         """
 
-        def pick(value: Tensor) -> Tensor:
-            return value[torch.arange(len(value), device=value.device)[:, None], self.chosen]
+        def select(value: Tensor) -> Tensor:
+            return value[torch.arange(len(value), device=value.device)[:, None], self.indices]
 
         physics = {
-            name: pick(value) if name in PER_PARTICLE and value.ndim == 2 else value
+            name: select(value) if name in PER_PARTICLE and value.ndim == 2 else value
             for name, value in state.physics.items()
         }
-        memory = {**state.memory, **self._own}
-        self.small.env_state = replace(state, particles=tree.map(pick, state.particles), physics=physics, memory=memory)
+        memory = {**state.memory, **self._particle_memory}
+        self.env.env_state = replace(state, particles=tree.map(select, state.particles), physics=physics, memory=memory)
 
 
-def _nearest(large: TorchEnv, small: TorchEnv) -> Tensor:
-    """Indices (B, n) of the large environment's particles, by body, each at most once."""
-    chosen, theirs, ours = [], 0, 0
+def _nearest_particles(large: TorchEnv, small: TorchEnv) -> Tensor:
+    """Indices (B, n) of the large environment's nearest particles, body by body, each at most once."""
+    indices, start, small_start = [], 0, 0
     for many, few in zip(large.model.solver.bodies, small.model.solver.bodies, strict=True):
         if few.count > many.count:
             raise ValueError(f"a reduced model must have at most {many.count} particles of a body, got {few.count}")
-        x = large.state.x[:, theirs : theirs + many.count].detach()
-        own = small.state.x[:, ours : ours + few.count].detach()
-        order = torch.cdist(own, x).topk(min(CANDIDATES, many.count), largest=False).indices
-        chosen.append(torch.stack([_distinct(ranked, many.count) for ranked in order.cpu()]) + theirs)
-        theirs, ours = theirs + many.count, ours + few.count
-    return torch.cat(chosen, 1).to(large.device)
+        x = large.state.x[:, start : start + many.count].detach()
+        small_x = small.state.x[:, small_start : small_start + few.count].detach()
+        nearest = torch.cdist(small_x, x).topk(min(NEIGHBOURS, many.count), largest=False).indices
+        indices.append(torch.stack([_assign(rows, many.count) for rows in nearest.cpu()]) + start)
+        start, small_start = start + many.count, small_start + few.count
+    return torch.cat(indices, 1).to(large.device)
 
 
-def _distinct(ranked: Tensor, count: int) -> Tensor:
-    """The best of each row of candidates that no earlier row has; any that is left where all are taken."""
-    free, picks = set(range(count)), []
-    for row in ranked.tolist():
-        pick = next((index for index in row if index in free), None)
-        picks.append(min(free) if pick is None else pick)
-        free.remove(picks[-1])
-    return torch.tensor(picks)
+def _assign(nearest: Tensor, count: int) -> Tensor:
+    """The first index of each row (n, k) that no earlier row has, or any free one where all are taken."""
+    free, assigned = set(range(count)), []
+    for row in nearest.tolist():
+        index = next((index for index in row if index in free), None)
+        assigned.append(min(free) if index is None else index)
+        free.remove(assigned[-1])
+    return torch.tensor(assigned)

@@ -31,17 +31,17 @@ class StateFeatures:
     Attributes:
         deformation: With the four channels of ``F - I``.
         clock: With cosine and sine of the episode's step, for each of `PERIODS`.
-        place: With the robot's displacement since the reset, m.
+        displacement: With the robot's displacement since the reset, m.
     """
 
     deformation: bool = True
     clock: bool = True
-    place: bool = False
+    displacement: bool = False
 
     def size(self, objects: int) -> int:
         """Length D of the vector in a task with 0 or 1 objects."""
         channels = (7 if self.deformation else 3) + 3 * objects
-        return channels * RASTER**2 + 2 * len(PERIODS) * self.clock + 2 * self.place
+        return channels * RASTER**2 + 2 * len(PERIODS) * self.clock + 2 * self.displacement
 
     def __call__(self, env: TorchEnv) -> Tensor:
         """Features (B, D) of the environment's present state, with its autograd graph."""
@@ -58,7 +58,7 @@ class StateFeatures:
             parts.append(_raster(cell[:, robot:], torch.stack(columns, 1)).flatten(1))
         if self.clock:
             parts.append(_clock(state.steps).to(particles.x))
-        if self.place:
+        if self.displacement:
             parts.append(state.centre - state.start.com)
         return torch.cat(parts, 1)
 

@@ -32,7 +32,7 @@ class RewardConfig:
     """Cost of the square by which the robot's spread, as a share of the task's limit, exceeds split_margin."""
     split_margin: float = 0.85
     """Share of the limit on the spread from which it costs; no matter in tasks without a limit."""
-    integrity: float = 300.0
+    integrity_weight: float = 300.0
     """Cost of particles that were close when the window, or the episode within it, began and drift apart; see
     `Pairs`."""
     scale: float = 0.05
@@ -44,7 +44,9 @@ class RewardConfig:
         Raises:
             ConfigError: Naming the option, what was given and what is allowed.
         """
-        not_negative(split_weight=self.split_weight, split_margin=self.split_margin, integrity=self.integrity)
+        not_negative(
+            split_weight=self.split_weight, split_margin=self.split_margin, integrity_weight=self.integrity_weight
+        )
         positive(scale=self.scale)
 
 
@@ -116,6 +118,6 @@ def training_reward(
     if limit is not None and config.split_weight:
         excess = (info["split"] / limit - config.split_margin).clamp_min(0.0)
         reward = reward - config.split_weight * excess.square()
-    if config.integrity:
-        reward = reward - config.integrity * pairs.drift(env.state.x[:, : env.model.robot])
+    if config.integrity_weight:
+        reward = reward - config.integrity_weight * pairs.drift(env.state.x[:, : env.model.robot])
     return config.scale * torch.where(info["finite"], reward, terms["failure"])

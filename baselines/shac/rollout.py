@@ -53,7 +53,7 @@ class Rollout:
 
     def __init__(self, config: ShacConfig, env: TorchEnv, look: Callable[[], Tensor]) -> None:
         self.config, self.env, self.look = config, env, look
-        self.episodes = Episodes(env, config.seed, config.age, config.layouts)
+        self.episodes = Episodes(env, config.seed, config.max_episode_steps, config.num_layouts)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.episodes.counts["dropped"] = 0
 

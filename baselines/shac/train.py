@@ -50,7 +50,7 @@ METRICS: dict[str, str] = {
 class ShacConfig(GridConfig):
     """A run of short-horizon actor-critic; num_envs robots learn side by side.
 
-    The environment options say how the result is judged; tier says how it is trained.
+    The environment options say how the result is judged; train_particles, where it is trained.
     """
 
     algo: str = "shac"
@@ -61,7 +61,7 @@ class ShacConfig(GridConfig):
     """What the policy is given: the privileged state (matter, deformation, clock), or the image like CFP's."""
     start_from: str | None = None
     """Policy of one level on the image, whatever trained it, whose weights the actor begins with, all but its width."""
-    tier: Tier = "lite"
+    train_particles: Tier = "lite"
     """Particles of the simulations that are learned from."""
     window: int = 16
     """Control steps that a gradient reaches back."""
@@ -79,15 +79,15 @@ class ShacConfig(GridConfig):
     """Largest norm of a gradient, of actor and critic each."""
     noise: float = 0.1
     """Standard deviation of actions before tanh (an image policy keeps its network's own, about 0.1)."""
-    age: int = 400
+    max_episode_steps: int = 400
     """Control steps after which an episode of training is cut; the first ones are cut at staggered ages."""
-    layouts: int = 16
+    num_layouts: int = 16
     """Particle layouts that training goes through."""
     deformation: bool = True
     """A policy that sees the state sees deformation."""
     clock: bool = True
     """A policy that sees the state sees a clock."""
-    place: bool = False
+    displacement: bool = False
     """A policy that sees the state sees how far it has come."""
     reward: RewardConfig = field(default_factory=RewardConfig)
 
@@ -99,18 +99,22 @@ class ShacConfig(GridConfig):
 
     def idle(self) -> dict[str, str]:
         """Which parts of the state are seen, where it is not."""
-        parts = {} if self.sees == "state" else dict.fromkeys(("deformation", "clock", "place"), "sees state")
+        parts = {} if self.sees == "state" else dict.fromkeys(("deformation", "clock", "displacement"), "sees state")
         return super().idle() | parts
 
     def check(self) -> None:
         """Check what the types cannot, see `RunConfig.check`."""
         super().check()
         at_least_one(
-            steps=self.steps, window=self.window, critic_updates=self.critic_updates, age=self.age, layouts=self.layouts
+            steps=self.steps,
+            window=self.window,
+            critic_updates=self.critic_updates,
+            max_episode_steps=self.max_episode_steps,
+            num_layouts=self.num_layouts,
         )
         if self.start_from is not None and self.sees != "image":
             raise ConfigError(f"start_from: got a policy, allowed with sees 'image', got {self.sees!r}")
-        training_layouts("layouts", self.layouts, self.environment.num_envs)
+        training_layouts("num_layouts", self.num_layouts, self.environment.num_envs)
         share(gamma=self.gamma, td_lambda=self.td_lambda, tau=self.tau)
         positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
         not_negative(noise=self.noise)
@@ -129,9 +133,9 @@ class Shac(Algorithm):
 
     def __init__(self, config: ShacConfig, level: int = 0, start: Policy | None = None) -> None:
         self.config = config
-        own = replace(config, environment=config.environment.learned_at(config.tier))
+        own = replace(config, environment=config.environment.learned_at(config.train_particles))
         self.env = make_torch_env(own, config.resolution(level))
-        self.features = StateFeatures(config.deformation, config.clock, config.place)
+        self.features = StateFeatures(config.deformation, config.clock, config.displacement)
         with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             torch.manual_seed(config.seed)
             self._make_networks()
@@ -179,7 +183,7 @@ class Shac(Algorithm):
             learning_rate=1e-3 if quick else 5e-4,
             environment=environment,
             report=ReportConfig(0 if name == "paper" else 3200, 3, task == "shapematch", log_every=320),
-            place=not running,
+            displacement=not running,
             reward=RewardConfig("speed") if running else RewardConfig(),
         )
 

@@ -46,7 +46,7 @@ METRICS: dict[str, str] = {
 class GradientConfig(GridConfig):
     """A run of open-loop gradient descent. An iteration simulates num_envs episodes on fixed particle layouts.
 
-    The environment options say how the result is judged; tier says how it is found.
+    The environment options say how the result is judged; train_particles, where it is found.
     """
 
     algo: str = "gradient"
@@ -59,7 +59,7 @@ class GradientConfig(GridConfig):
     """Adam's step size at the beginning; a cosine takes it to a tenth."""
     window: int = 0
     """Control steps that a gradient reaches back; 0: the whole episode."""
-    tier: Tier = "lite"
+    train_particles: Tier = "lite"
     """Particles of the simulation in the first stage."""
     blur: tuple[float, ...] = (4.0, 2.0, 1.0, 0.0)
     """SHAPE MATCH: standard deviations, in pixels, by which both pictures are blurred, one after the other."""
@@ -67,10 +67,10 @@ class GradientConfig(GridConfig):
     """Updates in a second stage, on the particles and the one layout of this seed that judge it."""
     polish_grid: Grid = "fine"
     """Its action grid."""
-    polish_rate: float = 0.05
+    polish_learning_rate: float = 0.05
     """Its learning rate."""
 
-    changeable: ClassVar[tuple[str, ...]] = ("polish", "polish_grid", "polish_rate", *RunConfig.changeable)
+    changeable: ClassVar[tuple[str, ...]] = ("polish", "polish_grid", "polish_learning_rate", *RunConfig.changeable)
 
     def ends(self) -> tuple[int, ...]:
         """Environment steps after which each stage ends."""
@@ -88,7 +88,9 @@ class GradientConfig(GridConfig):
 
     def idle(self) -> dict[str, str]:
         """What concerns the second stage, or a picture to become."""
-        idle = super().idle() | ({} if self.polish else dict.fromkeys(("polish_grid", "polish_rate"), "polish"))
+        idle = super().idle() | (
+            {} if self.polish else dict.fromkeys(("polish_grid", "polish_learning_rate"), "polish")
+        )
         return idle | ({"blur": "a task that has a target"} if make_spec(self.task).target is None else {})
 
     def check(self) -> None:
@@ -96,7 +98,7 @@ class GradientConfig(GridConfig):
         super().check()
         at_least_one(iterations=self.iterations)
         not_negative(window=self.window, polish=self.polish)
-        positive(learning_rate=self.learning_rate, polish_rate=self.polish_rate)
+        positive(learning_rate=self.learning_rate, polish_learning_rate=self.polish_learning_rate)
         if not self.blur or min(self.blur) < 0:
             raise ConfigError(f"blur: got {self.blur}, allowed are one or more numbers of 0 or more")
 
@@ -131,7 +133,7 @@ class Gradient(Algorithm):
 
     def __init__(self, config: GradientConfig, level: int = 0, start: OpenLoop | None = None) -> None:
         self.config, self.level = config, level
-        environment = config.environment if level else config.environment.learned_at(config.tier)
+        environment = config.environment if level else config.environment.learned_at(config.train_particles)
         own = replace(config, environment=environment)
         self.env = make_torch_env(own, config.resolution(level), 1 if level else None)
         self.env.reset(seed=config.seed)
@@ -141,7 +143,7 @@ class Gradient(Algorithm):
         if start is not None:
             self.theta += _theta(start.actions, self.env.action_resolution).to(self.theta)
         self.theta.requires_grad_()
-        self.rate = config.polish_rate if level else config.learning_rate
+        self.rate = config.polish_learning_rate if level else config.learning_rate
         self.adam = torch.optim.Adam([self.theta], self.rate, BETAS)
         self.objective = make_objective(self.env, config.blur[-1:] if level else config.blur)
         self.usual = torch.zeros(self.horizon, device=self.env.device)
@@ -167,7 +169,7 @@ class Gradient(Algorithm):
             preset="quick" if name == "quick" else "paper",
             environment=environment,
             report=ReportConfig(50 * horizon, 3, True, checkpoint_every=10 * horizon, log_every=horizon),
-            tier="lite" if name == "quick" else "full",
+            train_particles="lite" if name == "quick" else "full",
         )
         return config if task == "shapematch" else replace(config, iterations=30, grid="coarse", window=16)
 

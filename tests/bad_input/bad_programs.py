@@ -25,7 +25,7 @@ def learning(algo, name, options, *words):
 
 
 def distilling(name, options, *words):
-    common = "--particles 100 --substeps 1 --tier 100 --eval-episodes 1 --no-video --device cpu"
+    common = "--particles 100 --substeps 1 --train-particles 100 --eval-episodes 1 --no-video --device cpu"
     return Case(f"distill with {name}", command(baselines.distill.main, common + NEW + options), words, Refused)
 
 
@@ -117,9 +117,9 @@ OTHERS = [
     learning("gradient", "no iterations", "--iterations 0", "iterations: got 0, allowed 1 or more"),
     learning("gradient", "a negative window", "--window -1", "window: got -1, allowed 0 or more"),
     learning("gradient", "a grid of 99", "--grid 99", "resolution must be 'coarse', 'fine' or 1 to 64, got 99"),
-    learning("mpc", "two robots", "--num-envs 2", "num_envs: got 2, allowed 1"),
-    learning("mpc", "a horizon before its end", "--horizon 2 --commit 3", "commit: got 3, allowed 1 to the horizon, 2"),
-    learning("cem", "one elite", "--elites 1", "elites: got 1, allowed 2 to the candidates"),
+    learning("mpc", "two robots", "--num-envs 2", "num_envs", "got 2"),
+    learning("mpc", "a horizon before its end", "--horizon 2 --commit 3", "commit", "got 3"),
+    learning("cem", "one elite", "--elites 1", "elites", "got 1"),
     learning("shac", "an endless discount", "--gamma nan", "gamma: got nan, allowed are finite numbers"),
     learning(
         "shac", "a policy of the state", "--start-from run", "start_from: got a policy, allowed with sees 'image'"
@@ -129,18 +129,29 @@ OTHERS = [
     learning(
         "shac", "an image without a clock", "--sees image --no-clock", "clock: got False", "allowed with sees state"
     ),
-    learning("gradient", "polish for nothing", "--polish-rate 1", "polish_rate: got 1.0", "allowed with polish"),
+    learning(
+        "gradient",
+        "polish for nothing",
+        "--polish-learning-rate 1",
+        "polish_learning_rate: got 1.0",
+        "allowed with polish",
+    ),
     learning("gradient", "a blur of rewards", "--task run --blur 1", "blur: got (1.0,)", "a task that has a target"),
     learning("zero", "two robots", "--num-envs 2", "num_envs: got 2", "allowed with algorithms that learn"),
     distilling("plans of no planner", "--iterations 9", "iterations: got 9", "allowed with teacher mpc"),
     learning("zero", "a grid of none", "--grid 0", "resolution must be 'coarse', 'fine' or 1 to 64, got 0"),
     distilling("an unknown teacher", "--teacher socrates", "teacher: got 'socrates'", "mpc, shac, gradient"),
     distilling("a teacher of another task", "--teacher run", "teacher: got a policy for run, allowed shapematch"),
-    distilling("a share of 2", "--share 2", "share: got 2.0, allowed 0 to 1"),
+    distilling("a decay of 2", "--beta-decay 2", "beta_decay: got 2.0, allowed 0 to 1"),
     learning(
-        "shac", "judging layouts", "--layouts 50000", "layouts: got 50000 layouts, allowed 9996: further ones judge"
+        "shac",
+        "judging layouts",
+        "--num-layouts 50000",
+        "num_layouts: got 50000 layouts, allowed 9996: further ones judge",
     ),
-    distilling("judging layouts", "--layouts 5000", "layouts: got 10000 layouts, allowed 9984: further ones judge"),
+    distilling(
+        "judging layouts", "--num-layouts 5000", "num_layouts: got 10000 layouts, allowed 9984: further ones judge"
+    ),
     distilling("no labels", "--capacity 0", "capacity: got 0, allowed 1 or more"),
     evaluating("nothing", "", "policy: got None and the folder None, allowed is one of the two"),
     evaluating("a folder that is not there", "{folder}/none", "none: there is no run (no config.json)"),

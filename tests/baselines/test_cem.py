@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from test_planner import drive, small
+from test_planning import drive, small
 
 from baselines import CEMPlanner, CEMPlannerConfig
 from baselines.common.rollout import judge_true
@@ -15,9 +15,9 @@ def quick(**options) -> CEMPlannerConfig:
 
 def test_planned_episode_beats_rest() -> None:
     env = small("obstacle", substeps=100)
-    planner = CEMPlanner(env, CEMPlannerConfig(horizon=16, commit=16, iterations=4, candidates=24, cells=2))
+    planner = CEMPlanner(env, CEMPlannerConfig(horizon=16, commit=16, iterations=4, candidates=24, noise_grid=2))
     assert float(drive(env, planner, 16)) > float(drive(small("obstacle", substeps=100), None, 16)) + 5.0
-    assert planner.plans == 4 * 24 and planner.failed == 0
+    assert planner.num_plans == 4 * 24 and planner.num_failed == 0
 
 
 def wanted(target: torch.Tensor):
@@ -34,7 +34,7 @@ def wanted(target: torch.Tensor):
 def test_search_finds_what_every_simulation_wants() -> None:
     env = small("run", 2, substeps=1)
     target = torch.tensor([0.6, -0.4]).view(2, 1, 1, 1)
-    config = CEMPlannerConfig(horizon=2, commit=1, iterations=12, candidates=40, cells=1, noise=0.0)
+    config = CEMPlannerConfig(horizon=2, commit=1, iterations=12, candidates=40, noise_grid=1, noise=0.0)
     plan = CEMPlanner(env, config, judge=wanted(target)).plan()
     assert plan.shape == (2, 2, 2, 4, 4) and plan.abs().max() <= 1.0
     assert (plan.mean((0, 2, 3, 4)) - target.flatten()).abs().max() < 0.1
@@ -42,12 +42,12 @@ def test_search_finds_what_every_simulation_wants() -> None:
 
 def test_candidates_persist_and_are_as_coarse_as_asked() -> None:
     env = small("run", 1, substeps=1)
-    planner = CEMPlanner(env, quick(candidates=400, cells=2, persistence=0.8))
+    planner = CEMPlanner(env, quick(candidates=400, noise_grid=2, noise_correlation=0.8))
     noise = planner._noise(torch.zeros(3, 1, 2, 4, 4))
     assert noise.shape == (3, 1, 400, 2, 4, 4) and (noise[:, :, 0] == 0).all()
     pairs = torch.corrcoef(torch.stack((noise[0].flatten(), noise[1].flatten())))
     assert float(pairs[0, 1]) == pytest.approx(0.8, abs=0.05)
-    cells = CEMPlanner(env, quick(candidates=400, cells=4))._noise(torch.zeros(3, 1, 2, 4, 4))
+    cells = CEMPlanner(env, quick(candidates=400, noise_grid=4))._noise(torch.zeros(3, 1, 2, 4, 4))
     assert [float(step.std()) for step in cells] == pytest.approx([1.0] * 3, abs=0.05)
 
 
@@ -71,15 +71,15 @@ def test_simulations_of_a_batch_are_planned_apart() -> None:
 def test_plan_is_never_worse_than_what_is_kept() -> None:
     env = small("run", substeps=1)
     judge = wanted(torch.full((1, 1, 1, 1), 0.25))
-    planner = CEMPlanner(env, quick(noise=0.3, deviation=5.0, iterations=1), judge=judge)
-    planner._ahead = torch.full_like(planner._ahead, 0.25)
-    planner._position = 0  # all of it is kept, and it is the best there can be
+    planner = CEMPlanner(env, quick(noise=0.3, initial_std=5.0, iterations=1), judge=judge)
+    planner._plan = torch.full_like(planner._plan, 0.25)
+    planner._step = 0  # all of it is kept, and it is the best there can be
     assert (planner.plan() == 0.25).all()
 
 
 def test_rest_is_tried() -> None:
     env = small("run", substeps=1)
-    planner = CEMPlanner(env, quick(deviation=5.0, noise=0.5), judge=wanted(torch.zeros(1, 1, 1, 1)))
+    planner = CEMPlanner(env, quick(initial_std=5.0, noise=0.5), judge=wanted(torch.zeros(1, 1, 1, 1)))
     assert (planner.plan() == 0).all()
 
 
@@ -98,29 +98,23 @@ def test_state_goes_on_the_same_and_repeats_by_seed() -> None:
 def test_plans_that_are_not_finite_are_counted_and_no_elites(monkeypatch) -> None:
     env = small("run", 2)
     planner = CEMPlanner(env, quick(candidates=4, elites=3))
-    judge = planner._judge
+    judge = planner._returns
 
     def breaks(start, plan):
         climbed, value = judge(start, plan)
         spoilt = torch.tensor([0.0, torch.nan, torch.nan, 0.0, *[torch.inf] * 4])  # all of the second simulation
         return climbed, value + spoilt
 
-    monkeypatch.setattr(planner, "_judge", breaks)
+    monkeypatch.setattr(planner, "_returns", breaks)
     plan = planner.plan()
-    assert planner.failed == 2 * 6 and planner.plans == 2 * 8
+    assert planner.num_failed == 2 * 6 and planner.num_plans == 2 * 8
     assert plan.isfinite().all() and plan[:, 0].abs().max() > 0 and (plan[:, 1] == 0).all()
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"elites": 9}, "elites: got 9, allowed 2 to the candidates, 8"),
-        ({"elites": 1}, "elites: got 1, allowed 2"),
-        ({"persistence": 1.0}, "persistence: got 1.0, allowed 0 or more, less than 1"),
-        ({"deviation": 0.0}, "deviation: got 0.0, allowed more than 0"),
-        ({"commit": 4}, "commit: got 4, allowed 1 to the horizon, 3"),
-    ],
+    ("option", "value"),
+    [("elites", 9), ("elites", 1), ("noise_correlation", 1.0), ("momentum", -0.1), ("initial_std", 0.0), ("commit", 4)],
 )
-def test_bad_options(options: dict, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        CEMPlanner(small(), quick(**options))
+def test_bad_options_are_named(option: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=f"{option}.*{value}"):
+        CEMPlanner(small(), quick(**{option: value}))

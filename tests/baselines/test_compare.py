@@ -23,7 +23,7 @@ from cfp.tables import read_table
 
 ENVIRONMENT = {"particles": 100, "substeps": 1, "num_envs": 1}
 MPC = {"grid": 8, "planner": {"horizon": 3, "commit": 2, "iterations": 1}}
-SHAC = {"tier": 100, "steps": 48, "window": 6, "grid": 8, "age": 20, "critic_updates": 2}
+SHAC = {"train_particles": 100, "steps": 48, "window": 6, "grid": 8, "max_episode_steps": 20, "critic_updates": 2}
 PLAN = {
     "common": {"environment": ENVIRONMENT, "report": {"eval_episodes": 1}},
     "algos": {

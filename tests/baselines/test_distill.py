@@ -9,7 +9,7 @@ import torch
 import baselines
 import cfp
 import cfp.train
-from baselines import Distill, OpenLoop, PlannerConfig, Shac, distill
+from baselines import Distill, GradientPlannerConfig, OpenLoop, Shac, distill
 from baselines.common.episodes import Episodes
 from baselines.compare.worker import _train
 from baselines.distillation.dagger import Collector, Dataset, Labels, lose
@@ -31,8 +31,14 @@ from dittogym.action import patch_field, to_grid_layout
 
 def make(**changes):
     environment = EnvironmentConfig(changes.pop("num_envs", 2), 300, changes.pop("substeps", 4))
-    defaults = {"environment": environment, "tier": 300, "device": "cpu", "teacher": "mpc", "batch_size": 8}
-    defaults |= {"round": 4, "updates": 2, "leg": 2, "resolutions": (8, 16), "planner": PlannerConfig(2, 2, 1)}
+    defaults = {"environment": environment, "train_particles": 300, "device": "cpu", "teacher": "mpc", "batch_size": 8}
+    defaults |= {
+        "rollout_steps": 4,
+        "updates": 2,
+        "switch_every": 2,
+        "resolutions": (8, 16),
+        "planner": GradientPlannerConfig(2, 2, 1),
+    }
     return replace(Distill.preset("run", "quick"), **defaults | changes)
 
 
@@ -41,7 +47,7 @@ def privileged(tmp_path_factory):
     """Untrained policies of the state, on file, by task."""
     paths = {task: tmp_path_factory.mktemp(task) / "policy.safetensors" for task in ("run", "shapematch")}
     for task, path in paths.items():
-        config = replace(Shac.preset(task, "quick"), environment=EnvironmentConfig(2, 300, 4), tier=300)
+        config = replace(Shac.preset(task, "quick"), environment=EnvironmentConfig(2, 300, 4), train_particles=300)
         Shac(config).save(path, origin(config, "shac", 0, 0))
     return paths
 
@@ -57,7 +63,7 @@ def segments(tmp_path_factory):
 
 def test_how_a_policy_is_judged_does_not_change_what_it_learns():
     def learned(quiet, **changes):
-        config = make(share=0.0, **changes)
+        config = make(beta_decay=0.0, **changes)
         student = Distill(replace(config, report=replace(config.report, eval_deterministic=quiet)))
         student.learn(16, lambda scalars: None)  # the student leads in the second round
         return torch.nn.utils.parameters_to_vector(student.actor.parameters()).detach()
@@ -92,10 +98,10 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"share": 1.5}, "share: got 1.5, allowed 0 to 1"),
-        ({"faults": -0.1}, "faults: got -0.1, allowed 0 to 1"),
+        ({"beta_decay": 1.5}, "beta_decay: got 1.5, allowed 0 to 1"),
+        ({"dropout": -0.1}, "dropout: got -0.1, allowed 0 to 1"),
         ({"updates": 0}, "updates: got 0"),
-        ({"student_rate": 0.0}, "student_rate: got 0.0"),
+        ({"student_learning_rate": 0.0}, "student_learning_rate: got 0.0"),
         ({"gate_bias": ()}, "gate_bias: got 0 values"),
     ],
 )
@@ -129,10 +135,10 @@ def test_every_level_loses_actions_on_its_own_grid() -> None:
 
 
 def test_student_meets_faults_and_labels_do_not() -> None:
-    config = make(num_envs=2, substeps=5, round=8, steps=64, handover=(32,))
+    config = make(num_envs=2, substeps=5, rollout_steps=8, steps=64, handover=(32,))
     rounds = {}
     for share in (0.0, 0.9):
-        student = Distill(replace(config, faults=share, share=0.0))
+        student = Distill(replace(config, dropout=share, beta_decay=0.0))
         student.collector.teacher = Mirror()
         looks = []
         with torch.random.fork_rng():
@@ -149,7 +155,7 @@ def test_student_meets_faults_and_labels_do_not() -> None:
 
 
 def test_student_does_as_the_teacher_in_a_closed_loop():
-    config = make(num_envs=4, substeps=20, round=16, updates=40, batch_size=32, steps=640, handover=(512,))
+    config = make(num_envs=4, substeps=20, rollout_steps=16, updates=40, batch_size=32, steps=640, handover=(512,))
     student, rows = Distill(config), []
     student.collector.teacher = Mirror()
     student.learn(512, rows.append)
@@ -175,7 +181,7 @@ def test_student_does_as_the_teacher_in_a_closed_loop():
 @pytest.mark.parametrize("kind", ["mpc", "privileged", "segments"])
 def test_resumed_distillation_is_the_same_to_the_last_bit(kind, level, privileged, segments):
     teacher = {"mpc": "mpc", "privileged": str(privileged["run"]), "segments": str(segments)}[kind]
-    config = make(teacher=teacher, age=6, planner=PlannerConfig(3, 3, 1))
+    config = make(teacher=teacher, max_episode_steps=6, planner=GradientPlannerConfig(3, 3, 1))
     start = Distill(config).policy if level else None
     whole, first, second = (Distill(config, level, start) for _ in range(3))
     whole.learn(32, lambda _: None)
@@ -193,7 +199,7 @@ def test_resumed_distillation_is_the_same_to_the_last_bit(kind, level, privilege
 def test_teacher_remembers_its_segments_as_long_as_an_episode_lasts(segments, monkeypatch):
     anew, begin = [], modular_env.begin
     monkeypatch.setattr(modular_env, "begin", lambda x, count: anew.append(len(x)) or begin(x, count))
-    Distill(make(teacher=str(segments), age=6)).learn(32, lambda _: None)
+    Distill(make(teacher=str(segments), max_episode_steps=6)).learn(32, lambda _: None)
     assert sum(anew) == 7, "of 16 steps: the first robot begins anew after 3, 9 and 15, the second after 6 and 12"
 
 
@@ -320,7 +326,9 @@ TINY = (
     "--task shapematch --particles 100 --substeps 4 --num-envs 2 --resolutions 4 8 --eval-episodes 2 "
     "--no-video --device cpu --backend eager --checkpoint-every 20"
 ).split()
-LESSONS = "--tier 100 --steps 32 --handover 16 --round 4 --updates 2 --batch-size 4 --eval-every 0".split()
+LESSONS = (
+    "--train-particles 100 --steps 32 --handover 16 --rollout-steps 4 --updates 2 --batch-size 4 --eval-every 0".split()
+)
 
 
 def test_privileged_policy_becomes_one_of_images_that_cfp_refines(privileged, tmp_path, capsys):
@@ -343,7 +351,7 @@ def test_privileged_policy_becomes_one_of_images_that_cfp_refines(privileged, tm
 
 def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch, capsys):
     base = Shac.preset("shapematch", "quick")
-    tiny = replace(base, steps=32, window=4, tier=100, environment=EnvironmentConfig(2, 100, 1))
+    tiny = replace(base, steps=32, window=4, train_particles=100, environment=EnvironmentConfig(2, 100, 1))
     tiny = replace(tiny, report=ReportConfig(0, 1, video=False))
     monkeypatch.setattr(Shac, "preset", staticmethod(lambda task, name: tiny))
     monkeypatch.setitem(baselines.ALGORITHMS, "shac", Shac.entry())

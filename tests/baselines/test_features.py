@@ -49,7 +49,7 @@ def test_first_index_of_the_raster_is_along_x():
 
 def test_object_clock_and_place_are_added():
     env = reset("kick")
-    features = StateFeatures(place=True)
+    features = StateFeatures(displacement=True)
     seen = features(env)
     assert seen.shape == (1, features.size(1)) == (1, 10 * RASTER**2 + 6 + 2)
     assert seen[0, -8:].tolist() == pytest.approx([1, 1, 1, 0, 0, 0, 0, 0])
@@ -84,7 +84,7 @@ def test_speed_is_what_is_paid_for():
     pairs, before = Pairs.of(env.state.x), env.env_state.centre
     env.state.v[..., 0] = 0.5
     _, smooth, _, _, info = env.step(torch.zeros(1, 2, 8, 8), soft=True)
-    config = RewardConfig("speed", split_weight=0.0, integrity=0.0, scale=1.0)
+    config = RewardConfig("speed", split_weight=0.0, integrity_weight=0.0, scale=1.0)
     paid = training_reward(config, env, before, smooth, info, pairs)
     assert paid.item() == pytest.approx(60 * (info["com"] - before)[0, 0].item() / 0.001)
     assert paid.item() == pytest.approx(30, rel=0.05)

@@ -18,7 +18,7 @@ TASKS = ("shapematch", "run", "grow", "kick", "dig", "obstacle", "catch", "slot"
 
 def make(task="shapematch", **changes):
     environment = EnvironmentConfig(1, changes.pop("particles", 300), changes.pop("substeps", 4))
-    defaults = {"environment": environment, "tier": 300, "grid": 4, "device": "cpu", "iterations": 12}
+    defaults = {"environment": environment, "train_particles": 300, "grid": 4, "device": "cpu", "iterations": 12}
     return replace(Gradient.preset(task, "quick"), **defaults | changes)
 
 
@@ -44,7 +44,7 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
     [
         ({"iterations": 0}, "iterations: got 0"),
         ({"window": -1}, "window: got -1"),
-        ({"polish_rate": 0.0}, "polish_rate"),
+        ({"polish_learning_rate": 0.0}, "polish_learning_rate"),
         ({"blur": ()}, "blur"),
     ],
 )
@@ -54,7 +54,10 @@ def test_impossible_options_are_named(changes, message):
 
 
 def test_descent_improves_the_true_return():
-    algorithm, returns = Gradient(make(substeps=30, tier=500, learning_rate=0.2, blur=(1.0,), iterations=6)), []
+    algorithm, returns = (
+        Gradient(make(substeps=30, train_particles=500, learning_rate=0.2, blur=(1.0,), iterations=6)),
+        [],
+    )
     algorithm.learn(6 * 30, lambda scalars: returns.append(scalars["train/return"]))
     assert len(returns) == 6 and algorithm.num_timesteps == 180
     assert returns[-1] > returns[0] + 40
@@ -205,7 +208,9 @@ def test_polish_starts_from_the_actions_of_the_first_stage():
 
 def test_only_polish_takes_place_where_the_result_is_judged():
     environment = EnvironmentConfig(1, 300, 4, parity="reference")
-    first, polish = (Gradient(make("run", environment=environment, tier=200, polish=1), level) for level in (0, 1))
+    first, polish = (
+        Gradient(make("run", environment=environment, train_particles=200, polish=1), level) for level in (0, 1)
+    )
     assert first.env.num_particles == 200 and max(first.env.model.shares) > 1 and not first.env.model.pixels
     assert polish.env.num_particles == 300 and max(polish.env.model.shares) == 1 and polish.env.model.pixels
     assert first.env.action_layout == polish.env.action_layout == "grid"
@@ -213,6 +218,6 @@ def test_only_polish_takes_place_where_the_result_is_judged():
 
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_has_a_gradient(task):
-    algorithm = shorten(Gradient(make(task, substeps=20, particles=100, tier=100)), 3)
+    algorithm = shorten(Gradient(make(task, substeps=20, particles=100, train_particles=100)), 3)
     loss, _, _, gradient = algorithm._episode(0.0)
     assert gradient.isfinite().all() and gradient.abs().sum() > 0 and loss == loss

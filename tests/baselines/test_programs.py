@@ -39,14 +39,14 @@ TINY = {
     "coarse": (LEVEL, 44, ["stage 1"]),
     "fine": (LEVEL, 44, ["stage 1"]),
     "distill": (
-        "--teacher mpc --planner-grid 4 --horizon 2 --commit 2 --iterations 1 --num-envs 2 --tier 100 "
-        "--resolutions 4 8 --steps 60 --handover 30 --round 5 --updates 2 --batch-size 4 --eval-every 20 "
+        "--teacher mpc --planner-grid 4 --horizon 2 --commit 2 --iterations 1 --num-envs 2 --train-particles 100 "
+        "--resolutions 4 8 --steps 60 --handover 30 --rollout-steps 5 --updates 2 --batch-size 4 --eval-every 20 "
         "--checkpoint-every 10 --log-every 10 --backend eager",
         50,
         ["stage 1", "stage 2"],
     ),
     "gradient": (
-        "--iterations 5 --grid 4 --tier 100 --polish 3 --polish-grid 8 "
+        "--iterations 5 --grid 4 --train-particles 100 --polish 3 --polish-grid 8 "
         "--eval-every 90 --checkpoint-every 30 --log-every 30",
         180,
         ["stage 1", "stage 2", "  own layout"],
@@ -63,7 +63,7 @@ TINY = {
         ["stage 1", "  own layout"],
     ),
     "shac": (
-        "--tier 100 --num-envs 2 --steps 96 --window 6 --grid 8 --age 20 --critic-updates 2 "
+        "--train-particles 100 --num-envs 2 --steps 96 --window 6 --grid 8 --max-episode-steps 20 --critic-updates 2 "
         "--eval-every 48 --checkpoint-every 12 --log-every 24",
         60,
         ["stage 1"],

@@ -28,7 +28,7 @@ TASKS = ("shapematch", "run", "grow", "kick", "dig", "obstacle", "catch", "slot"
 
 def make(task="run", **changes):
     environment = EnvironmentConfig(changes.pop("num_envs", 2), 300, changes.pop("substeps", 4))
-    defaults = {"environment": environment, "tier": 300, "device": "cpu", "window": 4, "critic_updates": 2}
+    defaults = {"environment": environment, "train_particles": 300, "device": "cpu", "window": 4, "critic_updates": 2}
     return replace(Shac.preset(task, "quick"), **defaults | changes)
 
 
@@ -42,7 +42,7 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
     config = Shac.preset(task, preset)
     config.check()
     assert configure(json.loads(json.dumps(to_json(config)))) == config
-    learned = config.environment.learned_at(config.tier)
+    learned = config.environment.learned_at(config.train_particles)
     assert (learned.particles, learned.parity) == ("lite", "clean")
     assert learned.layout == config.environment.layout == ("grid" if preset == "paper" else "image")
 
@@ -57,7 +57,7 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
         ({"reward": RewardConfig(scale=0.0)}, "scale: got 0.0, allowed more than 0"),
         ({"reward": RewardConfig(split_weight=-1.0)}, "split_weight: got -1.0, allowed 0 or more"),
         ({"reward": RewardConfig(split_margin=-0.5)}, "split_margin: got -0.5, allowed 0 or more"),
-        ({"reward": RewardConfig(integrity=-2.0)}, "integrity: got -2.0, allowed 0 or more"),
+        ({"reward": RewardConfig(integrity_weight=-2.0)}, "integrity_weight: got -2.0, allowed 0 or more"),
     ],
 )
 def test_impossible_options_are_named(changes, message):
@@ -66,7 +66,9 @@ def test_impossible_options_are_named(changes, message):
 
 
 def test_training_makes_the_robot_run():
-    config = make(substeps=100, window=16, steps=480, age=32, learning_rate=1e-2, noise=0.0, tier=500)
+    config = make(
+        substeps=100, window=16, steps=480, max_episode_steps=32, learning_rate=1e-2, noise=0.0, train_particles=500
+    )
     algorithm, rows = Shac(config), []
     before = speed(algorithm)
     algorithm.learn(config.steps, rows.append)
@@ -118,7 +120,7 @@ def look_in_double(algorithm):
 
 @pytest.mark.parametrize("sees", ["state", "image"])
 def test_resumed_training_is_the_same_to_the_last_bit(sees):
-    config = make(sees=sees, age=6)
+    config = make(sees=sees, max_episode_steps=6)
     whole, first, second = Shac(config), Shac(config), Shac(config)
     ignore = lambda _: None  # noqa: E731
     whole.learn(48, ignore)
@@ -193,7 +195,7 @@ def test_actor_that_has_diverged_does_not_act():
 
 
 def test_episodes_are_cut_at_staggered_ages_and_change_layouts():
-    algorithm = Shac(make(age=8, layouts=3))
+    algorithm = Shac(make(max_episode_steps=8, num_layouts=3))
     first = algorithm.env.state.x[0].clone()
     assert algorithm.rollout.episodes.limit.tolist() == [4, 8]
     algorithm.rollout.play(algorithm.actor, lambda seen: algorithm.value(algorithm.target, seen))
@@ -203,13 +205,13 @@ def test_episodes_are_cut_at_staggered_ages_and_change_layouts():
 
 
 def test_no_more_layouts_are_trained_on_than_there_shall_be():
-    algorithm = Shac(make(num_envs=3, layouts=2))
+    algorithm = Shac(make(num_envs=3, num_layouts=2))
     x = algorithm.env.state.x
     assert torch.equal(x[0], x[2]) and not torch.equal(x[0], x[1])
 
 
 def test_restart_of_a_neighbour_leaves_the_particles_that_were_close(monkeypatch):
-    algorithm, seen, reward = Shac(make(age=8, window=6, substeps=20)), [], shac_rollout.training_reward
+    algorithm, seen, reward = Shac(make(max_episode_steps=8, window=6, substeps=20)), [], shac_rollout.training_reward
 
     def watch(*given):
         seen.append(given[-1])
@@ -223,7 +225,7 @@ def test_restart_of_a_neighbour_leaves_the_particles_that_were_close(monkeypatch
 
 
 def test_return_is_that_of_all_episodes_since_the_last_row():
-    algorithm, rows = Shac(make(age=4)), []  # a window is as long as an episode
+    algorithm, rows = Shac(make(max_episode_steps=4)), []  # a window is as long as an episode
     algorithm.learn(8, rows.append)
     first = list(algorithm.rollout.episodes.ended)
     again = Shac(algorithm.config)

@@ -110,7 +110,10 @@ def test_dry_run_counts_only_levels_that_will_be_trained(tmp_path, capsys, monke
 
 def test_dry_run_of_another_algorithm(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert baselines_train.main([*TINY[:-2], "--algo", "gradient", "--tier", "100", "--grid", "4", "--dry-run"]) == 0
+    assert (
+        baselines_train.main([*TINY[:-2], "--algo", "gradient", "--train-particles", "100", "--grid", "4", "--dry-run"])
+        == 0
+    )
     assert "4x4" in capsys.readouterr().out and not list(tmp_path.iterdir())
 
 

@@ -5,16 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from baselines import CEM, MPC, PlannerConfig
-from baselines.planning.cem import CEMConfig
-from baselines.planning.mpc import MPCConfig
-from baselines.planning.surrogate import Reduced
+from baselines import CEM, MPC, GradientPlannerConfig
+from baselines.planning.mpc import CEMConfig, MPCConfig
+from baselines.planning.surrogate import Surrogate
 from cfp.config import EnvironmentConfig
 from cfp.errors import ConfigError
 from dittogym import TASKS, TorchEnv
 
 ENVIRONMENT = EnvironmentConfig(num_envs=1, particles=600, substeps=2)
-PLANNER = PlannerConfig(horizon=3, commit=2, iterations=1)
+PLANNER = GradientPlannerConfig(horizon=3, commit=2, iterations=1)
 
 
 def make(task: str, particles: int, seed: int = 0) -> TorchEnv:
@@ -26,10 +25,10 @@ def make(task: str, particles: int, seed: int = 0) -> TorchEnv:
 @pytest.mark.parametrize("task", TASKS)
 def test_stands_for_the_same_robot(task: str) -> None:
     large, small = make(task, 900), make(task, 150)
-    reduced = Reduced(large, small)
+    surrogate = Surrogate(large, small)
     for _ in range(3):
         large.step(0.5 * torch.ones(2, *large.action_shape))
-    reduced.follow(large.env_state)
+    surrogate.sync(large.env_state)
     robot, body = small.state.x[:, : small.model.robot], large.state.x[:, : large.model.robot]
     torch.testing.assert_close(robot.mean(1), body.mean(1), atol=4e-3, rtol=0)
     torch.testing.assert_close(robot.std(1), body.std(1), atol=4e-3, rtol=0)
@@ -46,7 +45,7 @@ def test_stands_for_the_same_robot(task: str) -> None:
 
 def test_each_stands_for_another() -> None:
     large, small = make("kick", 400), make("kick", 300, seed=5)
-    chosen = Reduced(large, small).chosen
+    chosen = Surrogate(large, small).indices
     count = large.model.robot
     assert all(len(set(row.tolist())) == len(row) for row in chosen)
     assert bool((chosen[:, : small.model.robot] < count).all() and (chosen[:, small.model.robot :] >= count).all())
@@ -56,15 +55,15 @@ def test_takes_over_constants_of_particles() -> None:
     large, small = make("run", 400), make("run", 100)
     own = torch.linspace(300.0, 600.0, 400).expand(2, 400)
     large.reset(seed=0, options={"physics": {"mu": own, "gravity": torch.tensor([0.0, -5.0])}})
-    reduced = Reduced(large, small)
-    reduced.follow(large.env_state)
+    surrogate = Surrogate(large, small)
+    surrogate.sync(large.env_state)
     physics = small.env_state.physics
-    assert torch.equal(physics["mu"][1], own[1][reduced.chosen[1]]) and physics["gravity"].shape == (2, 2)
+    assert torch.equal(physics["mu"][1], own[1][surrogate.indices[1]]) and physics["gravity"].shape == (2, 2)
     small.step(torch.zeros(2, *small.action_shape))
 
 
 def test_plans_in_it_are_carried_out_in_the_other() -> None:
-    config = MPCConfig(task="grow", device="cpu", grid=4, environment=ENVIRONMENT, planner=PLANNER, tier=80)
+    config = MPCConfig(task="grow", device="cpu", grid=4, environment=ENVIRONMENT, planner=PLANNER, train_particles=80)
     first, second = MPC(config), MPC(config)
     first.learn(5, lambda scalars: None)
     assert first.env.num_particles == 600 and first.planner.env.num_particles == 80
@@ -78,12 +77,14 @@ def test_plans_in_it_are_carried_out_in_the_other() -> None:
 @pytest.mark.parametrize("algorithm", [CEM, MPC])
 def test_presets(algorithm: type[MPC]) -> None:
     quick, paper = (algorithm.preset("run", name) for name in ("quick", "paper"))
-    assert (quick.tier, quick.environment.particles) == (None, "lite")
-    assert (paper.tier, paper.environment.particles) == ("lite", "full")
+    assert (quick.train_particles, quick.environment.particles) == (None, "lite")
+    assert (paper.train_particles, paper.environment.particles) == ("lite", "full")
 
 
 @pytest.mark.parametrize("kind", [MPCConfig, CEMConfig])
 def test_more_particles_than_there_are(kind) -> None:
-    config = kind(task="run", device="cpu", grid=4, environment=replace(ENVIRONMENT, particles=100), tier=200)
-    with pytest.raises(ConfigError, match=r"tier: .* at most 100 particles of a body, got 200"):
+    config = kind(
+        task="run", device="cpu", grid=4, environment=replace(ENVIRONMENT, particles=100), train_particles=200
+    )
+    with pytest.raises(ConfigError, match=r"train_particles: .* at most 100 particles of a body, got 200"):
         (CEM if kind is CEMConfig else MPC)(config)

@@ -1,0 +1,191 @@
+"""Receding-horizon planning in the simulator: what planners share, however they search."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+from baselines.common.rollout import Judge, Judgement, judge, rollout
+from cfp.config import not_negative
+from cfp.errors import ConfigError
+from dittogym import TorchEnv
+from dittogym.core import EnvState, Model
+from dittogym.rewards import measure
+
+SPLIT_MARGIN = 0.8
+"""Fraction of the task's limit on the robot's spread from which a spread costs."""
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """Options that all planners have."""
+
+    horizon: int = 16
+    """Control steps that a plan looks ahead."""
+    commit: int = 8
+    """Control steps of a plan that are carried out before the next plan is made."""
+    noise: float = 0.1
+    """Standard deviation of the random actions that extend a plan."""
+    termination_steps: float = 32.0
+    """A plan that ends the episode early is charged this many control steps at its own mean reward."""
+    split_weight: float = 1000.0
+    """Cost of a robot's spread beyond 80 % of the limit at which it counts as torn, per squared fraction of it."""
+
+    def check(self) -> None:
+        """Check what the types cannot.
+
+        Raises:
+            ConfigError: An option is out of range.
+        """
+        if not 1 <= self.commit <= self.horizon:
+            raise ConfigError(f"commit must be between 1 and the horizon, {self.horizon}, got {self.commit}")
+        not_negative(noise=self.noise, termination_steps=self.termination_steps, split_weight=self.split_weight)
+
+
+Config = TypeVar("Config", bound=PlannerConfig)
+
+
+class Planner(ABC, Generic[Config]):
+    """Plans the next actions of every simulation of an environment, each simulation by itself.
+
+    Plans are tried in the simulator that the environment itself runs on, from its present state, so a planner sees
+    everything. The part of a plan that was not carried out is kept and extended by noise. Of all plans met in a search,
+    the one with the highest true return is carried out.
+
+    Args:
+        env: The environment, after its reset. It is only read.
+        config: Options; the defaults if None.
+        judge: Reward of a step. The search may climb its smooth reward; its true reward chooses the plan.
+        seed: Seed of the noise.
+
+    Attributes:
+        num_plans: Plans evaluated so far.
+        num_failed: Plans so far whose return or gradient was not finite. They are never carried out.
+
+    Raises:
+        ConfigError: An option is out of range.
+    """
+
+    config_type: type[Config]
+
+    def __init__(self, env: TorchEnv, config: Config | None = None, *, judge: Judge = judge, seed: int = 0) -> None:
+        self.config = config = config or self.config_type()
+        config.check()
+        self.env, self.judge = env, judge
+        self.generator = torch.Generator().manual_seed(seed)
+        self.num_plans = self.num_failed = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Drop the present plan, for a new episode."""
+        self._plan, self._step = self._random_actions(self.config.horizon), self.config.commit
+
+    @property
+    def needs_plan(self) -> bool:
+        """Whether the next call of `act` makes a new plan."""
+        return self._step >= min(self.config.commit, len(self._plan))
+
+    @property
+    def has_replanned(self) -> bool:
+        """Whether the last action was the first of its plan."""
+        return self._step == 1
+
+    def act(self) -> Tensor:
+        """Next action (B, 2, R, R) of every simulation; makes new plans where the last are used up."""
+        if self.needs_plan:
+            self.plan()
+        self._step += 1
+        return self._plan[self._step - 1]
+
+    def plan(self) -> Tensor:
+        """Make new plans (T, B, 2, R, R) from the environment's present state."""
+        state = self.env.env_state.detach()
+        remaining = self._remaining_steps(state)
+        length = min(self.config.horizon, remaining) if remaining else self.config.horizon
+        kept = self._plan[self._step :][:length]
+        plan = torch.cat((kept, self._random_actions(length - len(kept))))
+        self._plan, self._step = self._search(state, plan).detach(), 0
+        return self._plan
+
+    @abstractmethod
+    def _search(self, state: EnvState, plan: Tensor) -> Tensor:
+        """Find the best plan (T, B, 2, R, R) from a state, starting from ``plan`` of the same shape."""
+
+    def _evaluate(self, state: EnvState, plan: Tensor) -> tuple[Tensor, Tensor]:
+        """Smooth returns, and true returns less the charge for early ends, of plans (T, B, 2, R, R): (B,) each."""
+        smooth, value = self._returns(state, plan)
+        self.num_plans += len(value)
+        self.num_failed += int((~value.isfinite()).sum())
+        return smooth, value
+
+    def _returns(self, state: EnvState, plan: Tensor) -> tuple[Tensor, Tensor]:
+        layout = self.env.action_layout
+        steps = rollout(self.env.model, state, plan, self._penalised, layout=layout, checkpointed=False)
+        total = steps.true_rewards.sum(0)
+        charged = min(self.config.termination_steps, max(self._remaining_steps(state) - len(plan), 0))
+        charge = torch.where(steps.ended, charged / len(plan) * total.clamp_min(0.0), 0.0)
+        return steps.rewards.sum(0), total - charge
+
+    def _penalised(self, model: Model, state: EnvState, field: Tensor) -> Judgement:
+        """Rewards of a step less a cost of being nearly torn: the task's own penalty comes when it is too late."""
+        judgement, limit = self.judge(model, state, field), model.spec.split_limit
+        if limit is None:
+            return judgement
+        excess = measure(judgement.state.particles, model.robot).split / limit - SPLIT_MARGIN
+        cost = self.config.split_weight * excess.clamp_min(0.0).square()
+        reward, true_reward = judgement.reward - cost, judgement.true_reward - cost.detach()
+        return judgement._replace(reward=reward, true_reward=true_reward)
+
+    def _remaining_steps(self, state: EnvState) -> int:
+        """Control steps to the end of the youngest episode."""
+        return max(self.env.spec.horizon - int(state.steps.min()), 0)
+
+    def _random_actions(self, steps: int) -> Tensor:
+        shape = (steps, self.env.num_envs, *self.env.action_shape)
+        noise = torch.randn(shape, generator=self.generator, dtype=self.env.dtype).to(self.env.device)
+        return (self.config.noise * noise).clamp(-1.0, 1.0)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything besides the environment that the next action depends on."""
+        return {
+            "plan": self._plan.cpu(),
+            "counts": [self._step, self.num_failed, self.num_plans],
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state of `state_dict` in a planner with the same options."""
+        self._plan = state["plan"].to(self._plan)
+        self._step, self.num_failed, self.num_plans = state["counts"]
+        self.generator.set_state(state["generator"])
+
+
+class BestPlans:
+    """The plan with the highest finite value so far, of every simulation.
+
+    Args:
+        like: Plans (T, B, 2, R, R) of the same shape, dtype and device.
+
+    Attributes:
+        plan: (T, B, 2, R, R); zero where no value was finite.
+        value: (B,); minus infinity where no value was finite.
+    """
+
+    def __init__(self, like: Tensor) -> None:
+        self.plan = torch.zeros_like(like)
+        self.value = like.new_full((like.shape[1],), -torch.inf)
+
+    def update(self, plan: Tensor, value: Tensor) -> None:
+        """Take over plans (T, B, 2, R, R) whose values (B,) are finite and better."""
+        better = value.isfinite() & (value > self.value)
+        self.value = torch.where(better, value, self.value)
+        self.plan = where_simulation(better, plan.detach(), self.plan)
+
+
+def where_simulation(mask: Tensor, yes: Tensor | float, no: Tensor) -> Tensor:
+    """Choose plans (T, B, 2, R, R) by a mask (B,) over the simulations."""
+    return torch.where(mask[:, None, None, None], yes, no)
