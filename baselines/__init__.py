@@ -1,6 +1,5 @@
 """Algorithms to compare the coarse-to-fine policy with, behind the same command lines, folders and policies."""
 
-from baselines.common.algorithm import Algorithm, Entry
 from baselines.common.open_loop import OpenLoop
 from baselines.distillation.train import Distill, DistillConfig
 from baselines.modular.policy import SegmentPolicy
@@ -23,7 +22,6 @@ __all__ = [
     "CEMPlannerConfig",
     "Distill",
     "DistillConfig",
-    "Entry",
     "Gradient",
     "GradientConfig",
     "GradientPlanner",
