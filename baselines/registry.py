@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from baselines.common.reference_policies import REFERENCE_POLICIES, ReferenceConfig, reference_preset
-from cfp.config import RunConfig, merge
+from cfp.config import RunConfig
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm, Sees
+from cfp.from_dict import update_from_dict
 from cfp.policy import Policy
 from cfp.weights import read_policy
 
@@ -71,7 +72,7 @@ def configure(values: dict[str, Any]) -> RunConfig:
         values = {**values, "algo": algo}
     reference = isinstance(algo, str) and algo in REFERENCE_POLICIES
     base = reference_preset(algo, task, preset) if reference else find(algo).preset(task, preset)
-    config: RunConfig = merge(base, values)
+    config: RunConfig = update_from_dict(base, values)
     return config
 
 

@@ -42,7 +42,7 @@ def main() -> None:
             particles=arguments.particles,
             substeps=own.substeps,
             dtype=own.dtype,
-            action_layout=own.layout,
+            action_layout=own.action_indexing,
         )
         seed = evaluation_seed(config) + done
         result = evaluate(

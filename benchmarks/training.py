@@ -25,18 +25,13 @@ from cfp.experiment.process import keep_memory
 
 def make_model(config: Config, level: int, num_envs: int) -> CFP:
     """The model of one level of a configuration, with updates from the first steps on."""
-    stage, learning = config.stage(level), config.learning
+    hyperparameters = replace(
+        config.hyperparameters(level), buffer_size=2_000, update_start=config.learning.batch_size, random_steps=0
+    )
     model = CFP(
         CFPPolicy,
         make_env(config, config.action_size(level), num_envs),
-        buffer_size=2_000,
-        update_start=learning.batch_size,
-        random_steps=0,
-        batch_size=learning.batch_size,
-        gradient_steps=learning.gradient_steps,
-        gate_penalty=stage.gate_penalty,
-        precision=learning.precision,
-        compile=learning.compile,
+        hyperparameters,
         policy_kwargs={"spec": config.actor_spec(level)},
         seed=0,
         device="cpu",

@@ -1,4 +1,4 @@
-"""All options of a run as frozen dataclasses, and their JSON form."""
+"""The options of a training run as frozen dataclasses, and their JSON form."""
 
 from __future__ import annotations
 
@@ -9,323 +9,284 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
 
-from cfp.agent.actor import ActorSpec
-from cfp.agent.networks import RESOLUTIONS
+from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
+from cfp.agent.spec import RESOLUTIONS, ActorSpec
 from cfp.errors import ConfigError
-from cfp.experiment.from_dict import flatten
-from cfp.experiment.from_dict import merge as merge
-from cfp.groups import EnvironmentConfig as EnvironmentConfig
-from cfp.groups import LearningConfig as LearningConfig
-from cfp.groups import NetworkConfig as NetworkConfig
-from cfp.groups import ReportConfig as ReportConfig
-from cfp.groups import Tier as Tier
-from cfp.groups import at_least_one as at_least_one
-from cfp.groups import not_negative as not_negative
-from cfp.groups import positive as positive
-from cfp.groups import share as share
+from cfp.from_dict import flatten
+from cfp.sections import EnvironmentConfig, NetworkConfig, ReportConfig
+from cfp.validation import check_at_least
 from dittogym import make_spec
 from dittogym.tasks import allowed_instead, task_name
 
 Preset = Literal["quick", "paper"]
 
 LARGEST_SEED = 2**31 - 1
-SEVERAL = "resolutions of several levels"
 EVALUATION_SEED = 10_000
-"""Added to a run's seed for evaluations, so that they start from particle layouts not trained on."""
+"""Added to a run's seed for evaluations, so that they start from initial positions that are not trained on."""
 
 
 @dataclass(frozen=True)
 class RunConfig:
     """Options of a training run that every algorithm has.
 
-    Training goes through one or more stages; what an algorithm says about them here is what its runs are made of.
+    A run consists of one or more stages. Methods take the index of a stage, which counts from 0; users see stages
+    counted from 1.
     """
 
+    task: str
+    """Task; MODULE:NAME for a custom task that the module registers."""
     algo: str = "cfp"
-    """Which algorithm."""
-    task: str = "shapematch"
-    """Which task; MODULE:NAME for one of your own, which the module registers."""
+    """Algorithm."""
     preset: Preset = "quick"
-    """Where defaults come from: quick (minutes on two cores) or paper (the published numbers)."""
+    """Source of the defaults: quick (minutes on two cores) or paper (the published numbers)."""
     seed: int = 0
-    """Controls everything that is random."""
+    """Seed of everything that is random."""
     device: str = "auto"
     """cpu, cuda, or auto."""
     environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
     report: ReportConfig = field(default_factory=ReportConfig)
 
     changeable: ClassVar[tuple[str, ...]] = ("device", "report.", "environment.backend")
-    """Options that a resumed run may change (a dot at the end: the whole group)."""
+    """Options that a resumed run may change (a trailing dot: the whole section)."""
 
     @property
     def name(self) -> str:
-        """Of the run, for a folder."""
+        """Name of the run, used for its folder."""
         return f"{self.algo}-{task_name(self.task)}-{self.preset}-{self.seed}"
 
     def ends(self) -> tuple[int, ...]:
         """Environment steps since the beginning of the run after which each stage ends."""
         raise NotImplementedError
 
-    def resolution(self, level: int) -> int:
-        """Action grid R of a stage; ``level`` is its index, 0 the first."""
+    def stage_steps(self, stage: int) -> int:
+        """Environment steps of a stage."""
+        bounds = (0, *self.ends())
+        return bounds[stage + 1] - bounds[stage]
+
+    def resolution(self, stage: int) -> int:
+        """Action grid R of a stage."""
         raise NotImplementedError
 
-    def action_size(self, level: int) -> int:
+    def action_size(self, stage: int) -> int:
         """Rows and columns of the actions that the environment of a stage takes."""
-        return self.resolution(level)
+        return self.resolution(stage)
 
-    def evaluation(self, level: int) -> tuple[int, int]:
-        """Seed of the first layout, and episodes, by which stage ``level`` is evaluated while it trains."""
+    def evaluation(self, stage: int) -> tuple[int, int]:
+        """Seed of the first episode, and number of episodes, of the evaluations during a stage."""
         return self.seed + EVALUATION_SEED, self.report.eval_episodes
 
-    def adapted(self, base: RunConfig, given: Collection[str]) -> RunConfig:
-        """These options with what follows from others, unless it was given too.
+    def with_derived(self, base: RunConfig, given: Collection[str]) -> RunConfig:
+        """These options, with those that follow from others computed anew unless they were given.
 
         Args:
             base: The preset.
-            given: Names of the options that do not come from there, even if their values are the same.
+            given: Names of the options that were given, even if with the values of the preset.
         """
         return self
 
-    def idle(self) -> dict[str, str]:
-        """Options that change nothing as the others are, with what they need (a dot at the end: the whole group)."""
+    def ineffective(self) -> dict[str, str]:
+        """Options without effect under the other options, and what they require (a trailing dot: the section)."""
         return {"report.wandb_project": "wandb"} if self.report.wandb == "off" else {}
 
     def check_effect(self, base: RunConfig, given: Collection[str] | None = None) -> None:
-        """Refuse options that differ from those of ``base``, the preset, and change nothing, see `idle`.
+        """Refuse options that differ from those of the preset but have no effect, see `ineffective`.
 
         Args:
             base: The preset.
-            given: Names, with dots, of the options that are looked at; all if None.
+            given: Dotted names of the options to check; None checks all.
 
         Raises:
-            ConfigError: Naming the option, what was given and what it needs.
+            ConfigError: An option has no effect.
         """
         mine, theirs = flatten(to_json(self)), flatten(to_json(base))
-        for option, needs in self.idle().items():
+        for option, required in self.ineffective().items():
             for name, value in mine.items():
                 if name.startswith(option) and value != theirs[name] and (given is None or name in given):
-                    leaf = name.split(".")[-1]
-                    raise ConfigError(f"{leaf}: got {value!r}, which changes nothing; allowed with {needs}")
+                    raise ConfigError(f"{name.split('.')[-1]} requires {required}, got {value!r} without it")
 
     def check(self) -> None:
-        """Check what the types cannot.
+        """Check what the types do not express.
 
         Raises:
-            ConfigError: Naming the option, what was given and what is allowed.
+            ConfigError: An option is wrong.
         """
+        check_task(self.task)
         _check_finite(self)
         if not 0 <= self.seed <= LARGEST_SEED:
-            raise ConfigError(f"seed: got {self.seed}, allowed 0 to {LARGEST_SEED}")
-        at_least_one(
-            num_envs=self.environment.num_envs,
-            substeps=self.environment.substeps,
-            eval_episodes=self.report.eval_episodes,
-            checkpoint_every=self.report.checkpoint_every,
-            log_every=self.report.log_every,
-        )
-        training_layouts("num_envs", self.environment.num_envs)
-        for name in ("eval_every", "video_every"):
-            if (every := getattr(self.report, name)) < 0:
-                raise ConfigError(f"{name}: got {every}, allowed 0 (never) or more")
-        if self.report.patience < 0 or (self.report.patience and not self.report.eval_every):
-            raise ConfigError(f"patience: got {self.report.patience}, allowed 0, or more with evaluations (eval_every)")
+            raise ConfigError(f"seed must be between 0 and {LARGEST_SEED}, got {self.seed}")
+        for option in dataclasses.fields(self):
+            section = getattr(self, option.name)
+            if hasattr(section, "check"):
+                section.check()
+        check_training_layouts("num_envs", self.environment.num_envs)
 
 
-@dataclass(frozen=True)
-class StageConfig:
-    """One level of the ladder, as `Config.stage` cuts it out."""
-
-    resolution: int
-    steps: int
-    random_steps: int
-    alpha: float
-    gate_penalty: float
-
-
-@dataclass(frozen=True)
-class SACConfig(RunConfig):
-    """A run of `cfp.agent.sac.CFP`, whatever its networks."""
-
-    learning: LearningConfig = field(default_factory=LearningConfig)
-
-    def stage(self, level: int) -> StageConfig:
-        """What the training of stage ``level`` needs."""
-        raise NotImplementedError
-
-    def check(self) -> None:
-        """Check what the types cannot, see `RunConfig.check`."""
-        super().check()
-        self.learning.check()
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LadderConfig(RunConfig):
-    """A run that trains the levels of the coarse-to-fine policy. Levels are listed coarsest first."""
+    """A run that trains several stages with action grids of increasing resolution, listed coarsest first."""
 
-    steps: int = 20_000
-    """Environment steps of all levels together."""
-    handover: tuple[int, ...] = (10_000,)
-    """Environment steps after which each level hands over to the next (one less than levels)."""
-    resolutions: tuple[int, ...] = (8, 16)
-    """Action grids R of the levels."""
-    gate_bias: tuple[float, ...] = (-1.0,)
-    """Bias of the gate's logit (one less than levels)."""
+    steps: int
+    """Environment steps of all stages together."""
+    handover: tuple[int, ...]
+    """Environment steps after which each stage hands over to the next (one less than stages)."""
+    resolutions: tuple[int, ...]
+    """Action grid R of each stage."""
+    gate_bias: tuple[float, ...]
+    """Bias of the gate logit (one less than stages)."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
 
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
-    per_level: ClassVar[tuple[str, ...]] = ()
-    """Options with one value for each level."""
-    per_residual: ClassVar[tuple[str, ...]] = ("handover", "gate_bias")
-    """Options with one value for each level but the first."""
+    per_stage: ClassVar[tuple[str, ...]] = ()
+    """Options with one value for each stage."""
+    per_residual_stage: ClassVar[tuple[str, ...]] = ("handover", "gate_bias")
+    """Options with one value for each stage but the first."""
 
     def ends(self) -> tuple[int, ...]:
-        """Environment steps since the beginning of the run after which each level ends."""
+        """Environment steps since the beginning of the run after which each stage ends."""
         return (*self.handover, self.steps)
 
-    def resolution(self, level: int) -> int:
-        """Action grid R of a level."""
-        return self.resolutions[level]
+    def resolution(self, stage: int) -> int:
+        """Action grid R of a stage."""
+        return self.resolutions[stage]
 
-    def action_size(self, level: int) -> int:
-        """Rows and columns of the actions that the environment of a level takes, see `ActorSpec.patch`."""
-        return self.actor_spec(level).action_size
+    def action_size(self, stage: int) -> int:
+        """Rows and columns of the actions that the environment of a stage takes, see `ActorSpec.patch`."""
+        return self.actor_spec(stage).action_size
 
-    def adapted(self, base: RunConfig, given: Collection[str]) -> RunConfig:
-        """Other steps move the handovers in proportion; another number of levels stretches what each has one of.
-
-        Then levels are equally long, and further ones have the values of the last one that has any.
-        """
-        assert isinstance(base, LadderConfig)
-        levels, share, changes = len(self.resolutions), self.steps / base.steps, dict[str, Any]()
-        for name, count in self.counts().items():
-            values: tuple[float, ...] = getattr(base, name)
-            changes[name] = (*values, *values[-1:] * count)[:count]
-        if levels == len(base.resolutions):
-            changes["handover"] = tuple(round(step * share) for step in base.handover)
-        else:
-            changes["handover"] = tuple(round(self.steps * level / levels) for level in range(1, levels))
-        return replace(self, **{name: value for name, value in changes.items() if name not in given})
-
-    def idle(self) -> dict[str, str]:
-        """One level has no gate."""
-        return super().idle() | ({"network.gate_scale": SEVERAL} if len(self.resolutions) == 1 else {})
-
-    def counts(self) -> dict[str, int]:
-        """How many values each option has that has one for a level."""
-        levels = len(self.resolutions)
-        return dict.fromkeys(self.per_level, levels) | dict.fromkeys(self.per_residual, levels - 1)
-
-    def actor_spec(self, level: int) -> ActorSpec:
-        """The networks of the actor at a level (0 is the coarsest), with all coarser ones."""
+    def actor_spec(self, stage: int) -> ActorSpec:
+        """Structure of the actor of a stage, including all coarser ones."""
         return ActorSpec(
-            self.resolutions[: level + 1],
-            self.gate_bias[:level],
+            self.resolutions[: stage + 1],
+            self.gate_bias[:stage],
             self.network.split,
             self.network.gate_scale,
             self.network.interpolation,
             None if self.network.interpolation == "aligned" else make_spec(self.task).patch,
         )
 
+    def with_derived(self, base: RunConfig, given: Collection[str]) -> RunConfig:
+        """Scale the handovers with the steps; for another number of stages, adjust the options with one value each.
+
+        Stages are then equally long, and additional ones take the last value of the preset.
+        """
+        assert isinstance(base, LadderConfig)
+        stages, scale, changes = len(self.resolutions), self.steps / base.steps, dict[str, Any]()
+        for name, count in self._counts().items():
+            values: tuple[float, ...] = getattr(base, name)
+            changes[name] = (*values, *values[-1:] * count)[:count]
+        if stages == len(base.resolutions):
+            changes["handover"] = tuple(round(step * scale) for step in base.handover)
+        else:
+            changes["handover"] = tuple(round(self.steps * stage / stages) for stage in range(1, stages))
+        return replace(self, **{name: value for name, value in changes.items() if name not in given})
+
+    def ineffective(self) -> dict[str, str]:
+        """A single stage has no gate."""
+        single = {"network.gate_scale": "several resolutions"} if len(self.resolutions) == 1 else {}
+        return super().ineffective() | single
+
     def check(self) -> None:
-        """Check what the types cannot.
+        """Check what the types do not express.
 
         Raises:
-            ConfigError: Naming the option, what was given and what is allowed.
+            ConfigError: An option is wrong.
         """
-        levels = len(self.resolutions)
-        growing = list(self.resolutions) == sorted(set(self.resolutions))
-        if not levels or not growing or not set(self.resolutions) <= set(RESOLUTIONS):
-            raise ConfigError(f"resolutions: got {self.resolutions}, allowed is a growing choice of {RESOLUTIONS}")
-        at_least_one(steps=self.steps)
-        positive(gate_scale=self.network.gate_scale)
-        for name, count in self.counts().items():
-            given = len(getattr(self, name))
-            if given != count:
-                raise ConfigError(f"{name}: got {given} values, allowed {count} for resolutions {self.resolutions}")
-        check_task(self.task)
-        if self.resolutions[-1] > (patch := make_spec(self.task).patch):
-            raise ConfigError(f"resolutions: got {self.resolutions}, allowed in {self.task} is at most {patch}")
-        if any(late <= early for early, late in pairwise((0, *self.ends()))):
-            raise ConfigError(
-                f"handover: got {self.handover}, allowed are growing numbers between 0 and the steps, {self.steps}"
-            )
         super().check()
+        increasing = list(self.resolutions) == sorted(set(self.resolutions))
+        if not self.resolutions or not increasing or not set(self.resolutions) <= set(RESOLUTIONS):
+            raise ConfigError(f"resolutions must be increasing values of {RESOLUTIONS}, got {self.resolutions}")
+        if self.resolutions[-1] > (patch := make_spec(self.task).patch):
+            raise ConfigError(f"resolutions must be at most {patch} in {self.task}, got {self.resolutions}")
+        check_at_least(1, steps=self.steps)
+        for name, count in self._counts().items():
+            if (found := len(getattr(self, name))) != count:
+                raise ConfigError(f"{name} must have {count} values for resolutions {self.resolutions}, got {found}")
+        if any(end <= start for start, end in pairwise((0, *self.ends()))):
+            raise ConfigError(
+                f"handover must increase between 0 and the number of steps, {self.steps}, got {self.handover}"
+            )
+
+    def _counts(self) -> dict[str, int]:
+        """Number of values of each option that has one for each stage or residual stage."""
+        stages = len(self.resolutions)
+        return dict.fromkeys(self.per_stage, stages) | dict.fromkeys(self.per_residual_stage, stages - 1)
 
 
-@dataclass(frozen=True)
-class Config(LadderConfig, SACConfig):
-    """A run of CFP. Levels are listed coarsest first; one value per level unless said otherwise."""
+@dataclass(frozen=True, kw_only=True)
+class Config(LadderConfig):
+    """A run of the coarse-to-fine policy; `cfp.preset` supplies the values for a task."""
 
-    random_steps: tuple[int, ...] = (500, 100)
-    """Uniformly random environment steps at the start of each level (none where a policy is refined)."""
-    alpha: tuple[float, ...] = (0.01, 0.01)
-    """Entropy temperature of each level."""
-    gate_penalty: tuple[float, ...] = (0.01,)
-    """Weight of the gate penalty (one less than levels)."""
+    random_steps: tuple[int, ...]
+    """Uniformly random environment steps at the start of each stage (none where a policy is refined)."""
+    alpha: tuple[float, ...]
+    """Entropy temperature of each stage."""
+    gate_penalty: tuple[float, ...]
+    """Weight of the gate penalty (one less than stages)."""
     start_from: str | None = None
-    """Policy of the first levels (a run folder, policy.safetensors, or the name of one that comes with the package):
-    training begins with the level after it."""
+    """Policy of the first stages (a run folder, policy.safetensors, or the name of one that comes with the package):
+    training begins with the stage after it."""
     refine: bool = False
-    """Training begins with the last level of start_from itself, which goes on learning."""
+    """Continue to train the last stage of start_from instead."""
     learning: LearningConfig = field(default_factory=LearningConfig)
 
-    per_level: ClassVar[tuple[str, ...]] = ("random_steps", "alpha")
-    per_residual: ClassVar[tuple[str, ...]] = (*LadderConfig.per_residual, "gate_penalty")
+    per_stage: ClassVar[tuple[str, ...]] = ("random_steps", "alpha")
+    per_residual_stage: ClassVar[tuple[str, ...]] = (*LadderConfig.per_residual_stage, "gate_penalty")
 
-    def stage(self, level: int) -> StageConfig:
-        """What the training of one level needs."""
-        bounds = (0, *self.ends())
-        return StageConfig(
-            self.resolutions[level],
-            bounds[level + 1] - bounds[level],
-            self.random_steps[level],
-            self.alpha[level],
-            self.gate_penalty[level - 1] if level else 0.0,
+    def hyperparameters(self, stage: int) -> Hyperparameters:
+        """Hyperparameters of a stage."""
+        return Hyperparameters(
+            **vars(self.learning),
+            alpha=self.alpha[stage],
+            gate_penalty=self.gate_penalty[stage - 1] if stage else 0.0,
+            random_steps=self.random_steps[stage],
         )
 
-    def idle(self) -> dict[str, str]:
-        """What concerns a policy that is refined, or the level before."""
-        idle = super().idle() | ({} if self.refine else {"learning.anchor": "refine"})
-        return idle | ({"learning.warm_critic": SEVERAL} if len(self.resolutions) == 1 else {})
+    def ineffective(self) -> dict[str, str]:
+        """Options that require a policy to refine, or a previous stage."""
+        anchor = {} if self.refine else {"learning.anchor": "refine"}
+        warm = {"learning.warm_critic": "several resolutions"} if len(self.resolutions) == 1 else {}
+        return super().ineffective() | anchor | warm
 
     def check(self) -> None:
-        """Check what the types cannot, see `LadderConfig.check`."""
+        """Check what the types do not express.
+
+        Raises:
+            ConfigError: An option is wrong.
+        """
         super().check()
         for name in ("random_steps", "alpha", "gate_penalty"):
             for value in getattr(self, name):
-                not_negative(**{name: value})
+                check_at_least(0, **{name: value})
         if self.learning.warm_critic and self.start_from is not None:
-            raise ConfigError("warm_critic: got True, allowed without start_from (a policy brings no critics)")
+            raise ConfigError("warm_critic must be False with start_from, got True (a policy file has no critics)")
         if self.refine and self.start_from is None:
-            raise ConfigError("refine: got True, allowed with start_from, which names the policy")
+            raise ConfigError("refine requires start_from, which names the policy")
 
 
-def training_layouts(name: str, count: int, before: int = 0) -> None:
-    """Check how many layouts are trained on, which are counted on from the seed.
+def check_training_layouts(name: str, count: int, before: int = 0) -> None:
+    """Check that training uses no initial positions that evaluations use; both are numbered from the run's seed.
 
     Args:
-        name: The option that says so.
-        count: How many.
-        before: Those that come first for another reason, such as one for each robot.
+        name: Option that determines their number.
+        count: Number of initial positions.
+        before: Number of those used before them.
 
     Raises:
-        ConfigError: The last of them would be one of those that judge.
+        ConfigError: Training would reach the initial positions of evaluations.
     """
     if before + count > EVALUATION_SEED:
-        raise ConfigError(
-            f"{name}: got {count} layouts, allowed {EVALUATION_SEED - before}: further ones judge policies"
-        )
+        largest = EVALUATION_SEED - before
+        raise ConfigError(f"{name} must be at most {largest}, got {count}: later seeds belong to evaluations")
 
 
 def check_task(task: object) -> None:
-    """Check that something names a task; a module that it names is imported.
+    """Check that a value names a task; a module that it names is imported.
 
     Raises:
         ConfigError: It does not.
     """
     if (allowed := allowed_instead(task)) is not None:
-        raise ConfigError(f"task: got {task!r}, allowed {allowed}")
+        raise ConfigError(f"task must be {allowed}, got {task!r}")
 
 
 def to_json(config: RunConfig) -> dict[str, Any]:
@@ -334,11 +295,11 @@ def to_json(config: RunConfig) -> dict[str, Any]:
 
 
 def _check_finite(options: Any) -> None:
-    """Refuse NaN and infinity wherever they are, which JSON and command lines let through."""
+    """Refuse NaN and infinity, which JSON files and command lines can contain, in all sections."""
     for option in dataclasses.fields(options):
         value = getattr(options, option.name)
         if dataclasses.is_dataclass(value):
             _check_finite(value)
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, float) and not math.isfinite(number):
-                raise ConfigError(f"{option.name}: got {value}, allowed are finite numbers")
+                raise ConfigError(f"{option.name} must be finite, got {value}")

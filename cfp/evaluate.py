@@ -13,18 +13,20 @@ from typing import Any, TypeVar
 import tyro
 
 from cfp import train
-from cfp.config import RunConfig, Tier, at_least_one
+from cfp.config import RunConfig
 from cfp.envs.make import choose_device
 from cfp.errors import CheckpointError, ConfigError
 from cfp.evaluation.evaluate import Noise, compare
 from cfp.evaluation.tables import format_table, to_rows
 from cfp.experiment.cli import program_name, run_command
 from cfp.experiment.folder import policy_files, read_config
-from cfp.experiment.from_dict import merge
 from cfp.experiment.run import make_video
 from cfp.experiment.training import Program
+from cfp.from_dict import update_from_dict
 from cfp.policy import Policy
 from cfp.presets import from_json
+from cfp.sections import Particles
+from cfp.validation import check_at_least
 from cfp.weights import policy_file
 
 PROGRAM = replace(train.PROGRAM, configure=partial(from_json, program="evaluate"))
@@ -42,7 +44,7 @@ class Selection:
     """Episodes of each row."""
     seed: int | None = None
     """Seed of layouts and noise; the run's own if not given."""
-    particles: Tier | None = None
+    particles: Particles | None = None
     """Particles: full (the paper's), lite, or counts; the run's own if not given."""
     device: str = "auto"
     """cpu, cuda, or auto."""
@@ -56,7 +58,7 @@ class Selection:
         Raises:
             CFPError: An option is wrong, there is no run, it has no policy yet, or a file is damaged.
         """
-        at_least_one(episodes=self.episodes)
+        check_at_least(1, episodes=self.episodes)
         if (self.folder is None) == (self.policy is None):
             raise ConfigError(f"policy: got {self.policy!r} and the folder {self.folder}, allowed is one of the two")
         if self.folder is not None:
@@ -65,7 +67,7 @@ class Selection:
             assert self.policy is not None
             config, policies = open_policy(program, self.policy, self.device, self.seed)
         if self.particles is not None and self.particles != config.environment.particles:
-            config = replace(config, environment=config.environment.judged_at(self.particles))
+            config = replace(config, environment=config.environment.for_evaluation(self.particles))
             config.check()
         return config, policies
 
@@ -124,7 +126,9 @@ def open_policy(program: Program, path: str, device: str, seed: int | None) -> t
     policy = program.load(Path(path), choose_device(device))
     about = policy.description
     base = program.configure({"algo": about["kind"], "task": about["task"]})
-    config = merge(base, {"environment": about["environment"], **_ladder(about)}).adapted(base, _ladder(about))
+    config = update_from_dict(base, {"environment": about["environment"], **_ladder(about)}).with_derived(
+        base, _ladder(about)
+    )
     config = replace(config, device=device, seed=about["seed"] if seed is None else seed)
     config.check()
     return config, {policy_file(path).stem: policy}

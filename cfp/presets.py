@@ -11,25 +11,29 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import dittogym
-from cfp.config import Config, EnvironmentConfig, LearningConfig, NetworkConfig, Preset, ReportConfig, check_task, merge
+from cfp.agent.hyperparameters import LearningConfig
+from cfp.config import Config, Preset, check_task
 from cfp.errors import ConfigError
+from cfp.from_dict import update_from_dict
+from cfp.sections import EnvironmentConfig, NetworkConfig, ReportConfig
 
 
 @dataclass(frozen=True)
 class TaskNumbers:
-    """Published hyper-parameters of one task.
+    """Published hyperparameters of one task.
 
     Attributes:
-        alpha: Temperature of stage 1 and 2.
-        gate_bias: Bias of the gate's logit.
+        alpha: Temperature of stages 1 and 2.
+        gate_bias: Bias of the gate logit.
         gate_penalty: Weight rho of the gate penalty.
         steps: Environment steps plotted in the paper.
         handover: Step at which the paper's curves change from stage 1 to stage 2.
         seed: Seed of the published weights.
-        resolutions: Action grid of stage 1 and 2.
-        random_steps: Uniformly random steps of stage 1 and 2.
-        split: Split encoders with a gate of at most 0.25.
-        variant: Of the task's matter, where the published run changed it.
+        resolutions: Action grids of stages 1 and 2.
+        random_steps: Uniformly random steps of stages 1 and 2.
+        split: Separate encoders for observation and action, with a gate of at most 0.25.
+        variant: Material, where the published run changed it.
+        deterministic: Evaluation without action noise.
     """
 
     alpha: tuple[float, float]
@@ -42,11 +46,14 @@ class TaskNumbers:
     random_steps: tuple[int, int] = (6000, 100)
     split: bool = False
     variant: Literal["published"] | None = None
+    deterministic: bool = False
 
 
-# For GROW and CATCH no stage-2 configuration was published: stage 1's values are taken.
+# For GROW and CATCH no stage-2 configuration was published; stage 1's values are used.
 TASKS: dict[str, TaskNumbers] = {
-    "shapematch": TaskNumbers((0.01, 0.0), -2.0, 0.8, 400_000, 142_000, resolutions=(32, 64), random_steps=(500, 100)),
+    "shapematch": TaskNumbers(
+        (0.01, 0.0), -2.0, 0.8, 400_000, 142_000, resolutions=(32, 64), random_steps=(500, 100), deterministic=True
+    ),
     "run": TaskNumbers((0.01, 0.01), -1.0, 0.01, 550_000, 301_000),
     "grow": TaskNumbers((0.01, 0.01), -1.0, 0.01, 600_000, 407_000),
     "kick": TaskNumbers((0.05, 0.05), -1.0, 0.0, 550_000, 132_000),
@@ -55,26 +62,39 @@ TASKS: dict[str, TaskNumbers] = {
     "catch": TaskNumbers((0.1, 0.1), -1.0, 0.01, 380_000, 243_000, seed=2),
     "slot": TaskNumbers((0.05, 0.05), -2.0, 0.1, 600_000, 293_000, seed=1, variant="published"),
 }
+DEFAULT_TASK = "shapematch"
+"""Task of a command line that names none."""
+CUSTOM_TASK = TASKS["run"]
+"""Numbers of a custom task, for which nothing was published; its action grids are its own."""
 
 
 def preset(task: str, name: str = "quick") -> Config:
     """The defaults of a task.
 
     Args:
-        task: One of `dittogym.TASKS`, or ``"MODULE:NAME"``. A task of one's own, for which nothing was
-            published, gets the numbers of RUN on its own grids, and has no preset ``"paper"``.
+        task: One of `dittogym.TASKS`, or ``"MODULE:NAME"``. A custom task, for which nothing was published, gets the
+            numbers of RUN with its own action grids, and has no preset ``"paper"``.
         name: ``"paper"``: one robot at full size, the published numbers, the reference's interpolation and faults.
-            ``"quick"``: sixteen robots at the lite tier, larger steps, minutes instead of days.
+            ``"quick"``: sixteen robots with fewer particles, larger steps, minutes instead of days.
 
     Raises:
-        ConfigError: No such task or preset.
+        ConfigError: There is no such task or preset.
     """
     check_task(task)
     allowed = typing.get_args(Preset) if task in TASKS else ("quick",)
     if name not in allowed:
-        raise ConfigError(f"preset: got {name!r}, allowed {', '.join(allowed)} for {task}")
-    numbers = TASKS[task] if task in TASKS else _own_numbers(task)
-    paper = Config(
+        raise ConfigError(f"preset must be {' or '.join(allowed)} for {task}, got {name!r}")
+    numbers = TASKS[task] if task in TASKS else _custom_numbers(task)
+    return _paper(task, numbers) if name == "paper" else _quick(task, numbers)
+
+
+def _custom_numbers(task: str) -> TaskNumbers:
+    spec = dittogym.make_spec(task)
+    return replace(CUSTOM_TASK, resolutions=(spec.coarse, spec.fine))
+
+
+def _paper(task: str, numbers: TaskNumbers) -> Config:
+    return Config(
         task=task,
         preset="paper",
         seed=numbers.seed,
@@ -87,49 +107,40 @@ def preset(task: str, name: str = "quick") -> Config:
         gate_penalty=(numbers.gate_penalty,),
         environment=EnvironmentConfig(num_envs=1, particles="full", parity="reference", variant=numbers.variant),
         network=NetworkConfig("aligned", numbers.split, 0.25 if numbers.split else 1.0),
-        report=ReportConfig(eval_deterministic=task == "shapematch"),
+        report=ReportConfig(eval_deterministic=numbers.deterministic),
     )
-    return paper if name == "paper" else _quick(paper)
 
 
-def _own_numbers(task: str) -> TaskNumbers:
-    """RUN's numbers on the grids of another task."""
-    spec = dittogym.make_spec(task)
-    return replace(TASKS["run"], resolutions=(spec.coarse, spec.fine))
-
-
-def _quick(paper: Config) -> Config:
-    """Shrink a published configuration to minutes: many small robots, small batches, a shorter horizon of credit."""
-    quick = replace(
-        paper,
+def _quick(task: str, numbers: TaskNumbers) -> Config:
+    """Minutes instead of days: many small robots, small batches, a shorter horizon of credit."""
+    return replace(
+        _paper(task, numbers),
         preset="quick",
         seed=0,
         steps=4_800,
         handover=(3_200,),
         random_steps=(480, 100),
-        alpha=(0.5 * paper.alpha[0], paper.alpha[1]),
+        alpha=(0.5 * numbers.alpha[0], numbers.alpha[1]),
         environment=EnvironmentConfig(),
-        network=replace(paper.network, interpolation="half_pixel"),
+        network=NetworkConfig("half_pixel", numbers.split, 0.25 if numbers.split else 1.0),
         learning=LearningConfig(
             batch_size=64, learning_rate=1e-3, gamma=0.9, tau=0.01, buffer_size=20_000, gradient_steps=4
         ),
-        report=replace(paper.report, eval_every=480, eval_deterministic=False, checkpoint_every=480, log_every=160),
+        report=ReportConfig(eval_every=480, checkpoint_every=480, log_every=160),
     )
-    return quick
 
 
 def from_json(values: dict[str, Any], program: str = "train") -> Config:
-    """A configuration from JSON values; what they leave out comes from the preset they name.
+    """A configuration from JSON values; those that are left out come from the preset that the values name.
 
     Args:
         values: Options by name.
-        program: Which one of `baselines` takes other algorithms, for the message.
+        program: Program of `baselines` that takes other algorithms, for the error message.
 
     Raises:
-        ConfigError: An unknown name or a value of the wrong type.
+        ConfigError: A name is unknown or a value has the wrong type.
     """
     if (algo := values.get("algo", "cfp")) != "cfp":
-        raise ConfigError(f"algo: got {algo!r}, allowed 'cfp'; python -m baselines.{program} takes others")
-    base = preset(values.get("task", "shapematch"), values.get("preset", "quick"))
-    merged: Config = merge(base, values)
-    return merged
+        raise ConfigError(f"algo must be 'cfp', got {algo!r}; python -m baselines.{program} runs other algorithms")
+    base = preset(values.get("task", DEFAULT_TASK), values.get("preset", "quick"))
+    return update_from_dict(base, values)

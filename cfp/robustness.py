@@ -13,7 +13,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from cfp import train
-from cfp.config import RunConfig, at_least_one
+from cfp.config import RunConfig
 from cfp.envs.disturbances import Case, Decides, disturbed_env, idle, make_cases
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection, judge
@@ -24,6 +24,7 @@ from cfp.files import write_json, write_text
 from cfp.policy import Policy
 from cfp.presets import from_json
 from cfp.tables import csv_text
+from cfp.validation import check_at_least
 from dittogym import make_spec
 from dittogym.spec import TaskSpec
 
@@ -60,7 +61,7 @@ class Command(Selection):
         Raises:
             ConfigError: Naming the option, what was given and what is allowed.
         """
-        at_least_one(latency=self.latency)
+        check_at_least(1, latency=self.latency)
         if self.out is None and self.folder is None:
             raise ConfigError("out: got none, allowed with a single policy is a folder to write into")
         for name in ("dropout", "shift"):

@@ -16,14 +16,14 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from cfp.agent.actor import Actor, ActorSpec
-from cfp.agent.networks import RESOLUTIONS
+from cfp.agent.actor import Actor
 from cfp.agent.policies import ActorPolicy
-from cfp.config import LARGEST_SEED, Config, EnvironmentConfig, RunConfig, merge
+from cfp.agent.spec import RESOLUTIONS, ActorSpec
+from cfp.config import LARGEST_SEED, Config, RunConfig
 from cfp.errors import CheckpointError, ConfigError
-from cfp.experiment.from_dict import words
 from cfp.files import parse_json, write_atomically, write_json
-from cfp.groups import TASK_OPTIONS
+from cfp.from_dict import type_name, update_from_dict
+from cfp.sections import TASK_OPTIONS, EnvironmentConfig
 from dittogym import make_spec
 from dittogym.geometry import NODES
 from dittogym.tasks import fingerprint
@@ -170,9 +170,9 @@ def _checked(description: Any) -> dict[str, Any]:
             continue
         wrong = type(value) is not kind  # a truth value is no number here
         if wrong or (least is not None and not least <= value <= most):
-            allowed = words(kind) if least is None else f"{least} to {most}"
+            allowed = type_name(kind) if least is None else f"{least} to {most}"
             raise ConfigError(f"{name}: got {value!r}, allowed {allowed}")
-    merge(EnvironmentConfig(), description["environment"], "environment")
+    update_from_dict(EnvironmentConfig(), description["environment"], "environment")
     return description
 
 
@@ -222,7 +222,7 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
     if description["kind"] != KIND:
         raise CheckpointError(f"{policy_file(path)}: got a policy of kind {description['kind']!r}, allowed {KIND!r}")
     with fitting(path):
-        spec = merge(ActorSpec(resolutions=RESOLUTIONS[:1]), description["network"], "network")
+        spec = update_from_dict(ActorSpec(resolutions=RESOLUTIONS[:1]), description["network"], "network")
         policy = ActorPolicy(spec, description["deterministic"])
         policy.actor.load_state_dict(tensors)
     policy.description = description
@@ -244,8 +244,8 @@ def policy_for(config: RunConfig, path: str) -> ActorPolicy:
     """
     policy = load(path)
     check_trained_for("start_from", policy.description, config.task, config.environment)
-    environment: EnvironmentConfig = merge(EnvironmentConfig(), policy.description["environment"])
-    if (made := environment.layout) != (asked := config.environment.layout):
+    environment: EnvironmentConfig = update_from_dict(EnvironmentConfig(), policy.description["environment"])
+    if (made := environment.action_indexing) != (asked := config.environment.action_indexing):
         raise ConfigError(f"start_from: got a policy for action layout {made}, allowed {asked}")
     return policy
 
@@ -264,7 +264,7 @@ def check_trained_for(option: str, description: Mapping[str, Any], task: str, en
     """
     if description["task"] != task:
         raise ConfigError(f"{option}: got a policy for {description['task']}, allowed {task}")
-    theirs: EnvironmentConfig = merge(EnvironmentConfig(), description["environment"])
+    theirs: EnvironmentConfig = update_from_dict(EnvironmentConfig(), description["environment"])
     if theirs.substeps != environment.substeps:
         raise ConfigError(f"{option}: got a policy for substeps {theirs.substeps}, allowed {environment.substeps}")
     for name in TASK_OPTIONS:
@@ -282,7 +282,7 @@ def is_same_task(task: str, option: str, one: str | None, other: str | None) -> 
 
     Args:
         task: Its name.
-        option: One of `cfp.groups.TASK_OPTIONS`.
+        option: One of `cfp.sections.TASK_OPTIONS`.
         one: A value.
         other: Another.
 

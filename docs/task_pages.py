@@ -1,4 +1,4 @@
-"""Writes a page for each task from its `TaskSpec`, so that no number is typed a second time."""
+"""Writes a page for each task from its `TaskSpec`, so that no number is written by hand."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from torchmpm import Soil, VelocityRule
 DOCS = Path(__file__).resolve().parent
 NOTES, PAGES = DOCS / "tasks", DOCS / "generated"
 STEPS, EVERY, SIZE = 80, 2, 256
-#: Without gravity and ground to hold it a robot is torn by strong waves.
+#: Without gravity and floor, strong waves tear the robot.
 STRENGTH = {"shapematch": 0.5}
 
 TEMPLATE = """# [[ title ]]
 
 [[ what ]]
 
-| at rest | driven by a wave of muscles |
+| initial state | under a travelling wave of contraction |
 | --- | --- |
-| ![The task at rest]([[ spec.name ]]-rest.png) | ![The robot under a travelling wave]([[ spec.name ]]-wave.webp) |
+| ![The task in its initial state]([[ spec.name ]]-rest.png) | ![The robot under a wave]([[ spec.name ]]-wave.webp) |
 
 ```python
 import dittogym, gymnasium
@@ -40,7 +40,7 @@ batch = dittogym.TorchEnv("[[ spec.name ]]", num_envs=16, particles="lite")
 
 [[ notes ]]
 
-## Numbers
+## Constants
 
 | | |
 | --- | --- |
@@ -48,10 +48,10 @@ batch = dittogym.TorchEnv("[[ spec.name ]]", num_envs=16, particles="lite")
 [% endfor %]
 ## Geometry
 
-Node ranges are inclusive and counted from the world's origin, 128 to the metre; of several rules for one direction
-the first that covers a node counts.
+Ranges of nodes are inclusive, and nodes are counted from the origin of the world, 128 per metre. Where several rules
+for the same direction cover a node, the first one applies.
 
-| Obstacle | Seen by the robot | Rules |
+| Obstacle | In the observation | Velocity rules |
 | --- | --- | --- |
 [% for row in geometry %]| [[ row | join(" | ") ]] |
 [% endfor %]
@@ -87,7 +87,7 @@ def write_pages() -> None:
 
 
 def write(path: Path, text: str) -> None:
-    """Write a file that has changed; Sphinx reads again what is new."""
+    """Write a file if its content has changed; Sphinx reads it again only then."""
     if not path.exists() or path.read_text() != text:
         path.write_text(text)
 
@@ -95,7 +95,7 @@ def write(path: Path, text: str) -> None:
 def summary() -> str:
     """A table of all tasks."""
     lines = [
-        "| Task | What to do | Steps | Coarse, fine | Bodies beside the robot |",
+        "| Task | Goal | Steps | Action resolution: coarse, fine | Objects |",
         "| --- | --- | --- | --- | --- |",
     ]
     for name in dittogym.TASKS:
@@ -108,22 +108,25 @@ def summary() -> str:
 
 
 def headline(name: str) -> tuple[str, str]:
-    """Title of a task and what to do, from its module's docstring."""
+    """Title and goal of a task, from its module's docstring."""
     title, _, what = (importlib.import_module(f"dittogym.tasks.{name}").__doc__ or "").strip().partition(": ")
     return title, what[:1].upper() + what[1:]
 
 
 def numbers(spec: TaskSpec) -> list[tuple[str, str]]:
-    """Names and values of everything a task is made of, in words."""
+    """Names and values of the constants of a task."""
     full, lite = (particle_counts(spec, tier) for tier in ("full", "lite"))
     window = spec.window
     rows = [
-        ("steps of an episode", f"{spec.horizon}"),
-        ("action grid, coarse and fine", f"{spec.coarse} × {spec.coarse} and {spec.fine} × {spec.fine}, two muscles"),
-        ("width of the patch that actions cover", f"{spec.patch} nodes"),
+        ("steps per episode", f"{spec.horizon}"),
+        (
+            "action resolution, coarse and fine",
+            f"{spec.coarse} × {spec.coarse} and {spec.fine} × {spec.fine}, two muscle directions",
+        ),
+        ("width of the action patch", f"{spec.patch} nodes"),
         (
             "particles of the robot, full and lite",
-            f"{full[0]:,} and {lite[0]:,}, {spec.robot.mass:g} kg each at full size",
+            f"{full[0]:,} and {lite[0]:,}, {spec.robot.mass:g} kg each with full particles",
         ),
     ]
     for body, one, other in zip(spec.objects, full[1:], lite[1:], strict=True):
@@ -131,56 +134,59 @@ def numbers(spec: TaskSpec) -> list[tuple[str, str]]:
     rows += [
         ("Lamé parameters μ, λ", f"{spec.mu:g} Pa, {spec.lam:g} Pa"),
         ("yield stress", f"{spec.yield_stress:g} Pa"),
-        ("muscle stress at action 1", f"{spec.max_actuation:g} Pa"),
+        ("muscle stress for an action of 1", f"{spec.max_actuation:g} Pa"),
         ("gravity", f"{spec.gravity[1]:g} m/s²"),
-        ("factor on node velocities in a substep", f"{spec.damping:g}"),
+        ("damping factor of the node velocities per substep", f"{spec.damping:g}"),
         (
-            "window",
+            "simulation window",
             f"from x = {window.left:g} m"
             if window.follow is None
             else f"{window.follow:g} m behind the robot's centre",
         ),
-        ("centre of the observed half-window", centre(spec.view)),
+        ("centre of the observed region", centre(spec.view)),
         ("centre of the action patch", centre(spec.reach)),
-        ("spread at which the robot is torn", "never" if spec.split_limit is None else f"{spec.split_limit:g} m"),
+        (
+            "spread limit of the robot",
+            "none" if spec.split_limit is None else f"{spec.split_limit:g} m",
+        ),
     ]
     if spec.goal is not None:
-        rows.append(("goal, marked in the observation", f"({spec.goal[0]:g}, {spec.goal[1]:g}) m"))
+        rows.append(("goal, drawn in the observation", f"({spec.goal[0]:g}, {spec.goal[1]:g}) m"))
     return rows
 
 
 def matter(body: Body) -> str:
-    """What an object is made of."""
+    """Material of an object."""
     return "soil" if isinstance(body.material, Soil) else "elastic"
 
 
 def centre(place: tuple[float | None, float | None]) -> str:
-    """A centre in window coordinates, in words."""
+    """Describe a centre in window coordinates."""
     x, y = (("the robot's" if value is None else f"{value:g} m") for value in place)
     return f"x: {x}, y: {y}"
 
 
 def row(obstacle: Obstacle) -> tuple[str, str, str]:
-    """Name, visibility and rules of an obstacle."""
+    """Name, visibility and velocity rules of an obstacle."""
     rules = "<br>".join(dict.fromkeys(map(rule, obstacle.rules)))
     return obstacle.name, "yes" if obstacle.drawn else "no", rules
 
 
 def rule(rule: VelocityRule) -> str:
-    """A velocity rule in words."""
+    """Describe a velocity rule."""
     ways = {"+x": "to the right", "-x": "to the left", "+y": "upwards", "-y": "downwards"}
     where = [
         f"{axis} {extent(low, high)}"
         for axis, (low, high) in (("i", rule.i), ("j", rule.j))
         if (low, high) != (None, None)
     ]
-    hold = " and sticks" if math.isinf(rule.friction) else f", friction {rule.friction:g}" if rule.friction else ""
+    hold = ", no slip" if math.isinf(rule.friction) else f", friction {rule.friction:g}" if rule.friction else ""
     frame = " of the window" if rule.frame == "window" else ""
-    return f"nothing moves {ways[rule.direction]}{hold}: {', '.join(where) or 'everywhere'}{frame}"
+    return f"no motion {ways[rule.direction]}{hold}: {', '.join(where) or 'everywhere'}{frame}"
 
 
 def extent(low: int | None, high: int | None) -> str:
-    """An inclusive range of nodes."""
+    """Describe an inclusive range of nodes."""
     if low is None:
         return f"≤ {high}"
     if high is None:
@@ -189,7 +195,7 @@ def extent(low: int | None, high: int | None) -> str:
 
 
 def pictures(task: str) -> None:
-    """Draw a task at rest, and film it under a wave; kept from one build to the next."""
+    """Draw a task in its initial state, and record it under a wave, unless an earlier build has done so."""
     rest, film = PAGES / f"{task}-rest.png", PAGES / f"{task}-wave.webp"
     if rest.exists() and film.exists():
         return

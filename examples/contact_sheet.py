@@ -1,4 +1,4 @@
-"""All tasks in one picture: each at rest, and below it under a wave of muscle contraction.
+"""Draw all tasks in one image: each in its initial state, and below it under a wave of muscle contraction.
 
 Run `python examples/contact_sheet.py tasks.png`.
 """
@@ -15,12 +15,12 @@ import dittogym
 
 STEPS = 100
 SIZE = 320
-#: Without gravity and ground to hold it a robot is torn by strong waves.
+#: Without gravity and floor, strong waves tear the robot.
 STRENGTH = {"shapematch": 0.5}
 
 
 def wave(env: dittogym.TorchEnv, t: int) -> torch.Tensor:
-    """A wave to the left in the horizontal muscles, and one downwards in the vertical ones."""
+    """Actions: a wave to the left in the horizontal muscles, and one downwards in the vertical muscles."""
     row, column = torch.meshgrid(
         *[torch.arange(float(env.action_resolution)) / env.action_resolution] * 2, indexing="ij"
     )
@@ -29,7 +29,7 @@ def wave(env: dittogym.TorchEnv, t: int) -> torch.Tensor:
 
 
 def pictures(task: str, particles: str, backend: str) -> tuple[np.ndarray, np.ndarray]:
-    """A task at rest and after the wave."""
+    """Draw a task in its initial state and after the wave."""
     env = dittogym.TorchEnv(task, particles=particles, backend=backend)
     env.reset(seed=0)
     rest = env.render(size=SIZE)
@@ -44,14 +44,14 @@ def pictures(task: str, particles: str, backend: str) -> tuple[np.ndarray, np.nd
 
 
 def titled(picture: np.ndarray, title: str) -> np.ndarray:
-    """A picture with a line of text above it."""
+    """Add a line of text above an image."""
     head = np.full((28, picture.shape[1], 3), 255, np.uint8)
     cv2.putText(head, title, (6, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (40, 40, 40), 1, cv2.LINE_AA)
     return np.vstack((head, picture))
 
 
 def sheet(particles: str, backend: str) -> np.ndarray:
-    """Two rows of two for every four tasks."""
+    """Arrange the images of all tasks, four tasks side by side."""
     columns = []
     for task in dittogym.TASKS:
         rest, driven = pictures(task, particles, backend)

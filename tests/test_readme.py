@@ -50,7 +50,7 @@ PAGES = {
         "assert gradient.abs().max() > 0",
         "assert env.model.segment == segment < 100",
     ),
-    "docs/concepts/planning.md": ("assert planner.plans > 0 and planner.failed == 0",),
+    "docs/concepts/planning.md": ("assert planner.num_plans > 0 and planner.num_failed == 0",),
     "docs/develop/adding.md": (
         "assert width > 2 * start.x[..., 0].std() and bulk.grad.abs() > 0",
         "assert pull.grad.flatten(1).norm(dim=1).min() > 0",

@@ -9,7 +9,7 @@ from cfp.config import RunConfig
 from dittogym import make_spec
 
 SEEDED = {"environment.resample": "soft actor-critic (cfp, coarse, fine, gnn-*, transformer-*)"}
-"""What `RunConfig.idle` says where every episode begins on a layout that is counted from the seed."""
+"""What `RunConfig.ineffective` says where every episode begins on a layout that is counted from the seed."""
 
 Grid = int | Literal["coarse", "fine"]
 """Action grid R: coarse, fine (the task's), or a number."""
@@ -32,6 +32,6 @@ class GridConfig(RunConfig):
         """Action grid R."""
         return grid_size(self.task, self.grid)
 
-    def idle(self) -> dict[str, str]:
+    def ineffective(self) -> dict[str, str]:
         """Layouts are counted from the seed."""
-        return super().idle() | SEEDED
+        return super().ineffective() | SEEDED

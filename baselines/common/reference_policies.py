@@ -13,8 +13,8 @@ from torch import Tensor
 import cfp
 from baselines.common.grid import GridConfig
 from baselines.common.open_loop import OpenLoop
-from cfp.config import ReportConfig
 from cfp.policy import Policy
+from cfp.sections import ReportConfig
 from dittogym import make_spec
 from dittogym.action import Layout, from_grid_layout
 
@@ -27,9 +27,9 @@ class ReferenceConfig(GridConfig):
         """One stage, without learning."""
         return (1,)
 
-    def idle(self) -> dict[str, str]:
+    def ineffective(self) -> dict[str, str]:
         """Nothing is learned side by side."""
-        return super().idle() | {"environment.num_envs": "algorithms that learn"}
+        return super().ineffective() | {"environment.num_envs": "algorithms that learn"}
 
 
 def reference_preset(algo: str, task: str, name: str) -> ReferenceConfig:
@@ -56,7 +56,7 @@ def zero(config: ReferenceConfig) -> OpenLoop:
 
 def scripted(config: ReferenceConfig) -> OpenLoop:
     """Drives every muscle by a moving wave, see `wave`, for as long as an episode lasts."""
-    return OpenLoop(wave(make_spec(config.task).horizon, config.resolution(0), config.environment.layout))
+    return OpenLoop(wave(make_spec(config.task).horizon, config.resolution(0), config.environment.action_indexing))
 
 
 def random(config: ReferenceConfig) -> RandomActions:

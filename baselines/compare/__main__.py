@@ -18,10 +18,11 @@ from baselines.compare.report import write_report
 from baselines.compare.results import Found, find_runs
 from baselines.compare.worker import describe
 from baselines.registry import ALGORITHMS
-from cfp.config import Preset, Tier
+from cfp.config import Preset
 from cfp.errors import ConfigError
 from cfp.experiment.cli import program_name, run_command
 from cfp.experiment.process import StopSignals
+from cfp.sections import Particles
 
 PATIENCE, CLUSTER_PATIENCE = 30.0, 300.0
 """Seconds to wait for another process that holds a run folder; file servers take a while to give up a lost machine."""
@@ -53,7 +54,7 @@ class Command:
     """cpu, cuda, or auto."""
     episodes: int = 10
     """Episodes of the final evaluation of each policy."""
-    tier: Tier = "lite"
+    tier: Particles = "lite"
     """Particles of the final evaluation, for all."""
     slot_episodes: int = 100
     """Least episodes in SLOT, of all seeds of an algorithm together, for the success rate."""

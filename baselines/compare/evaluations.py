@@ -9,15 +9,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare.plan import judged, read_notes
-from baselines.registry import load
-from cfp.config import RunConfig, Tier
+from baselines.registry import load, reference_policy
+from cfp.config import RunConfig
 from cfp.envs.disturbances import Case, make_cases
 from cfp.envs.make import choose_device, make_env
 from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
-from cfp.policy import Policy
 from cfp.files import write_json
+from cfp.policy import Policy
 from cfp.robustness import report
+from cfp.sections import Particles
 from cfp.weights import policy_file
 
 CHUNK = 10
@@ -34,11 +36,11 @@ class Judging:
         episodes: For each policy, on the same layouts for all.
         tier: Particles, see `cfp.config.EnvironmentConfig`.
         robustness: Which disturbed cases: none, those of the paper, or all of `cfp.envs.disturbances.make_cases`.
-        parity: Of the run, which holds at full size only, see `cfp.config.EnvironmentConfig.judged_at`.
+        parity: Of the run, which holds at full size only, see `cfp.config.EnvironmentConfig.for_evaluation`.
     """
 
     episodes: int
-    tier: Tier = "lite"
+    tier: Particles = "lite"
     robustness: Literal["none", "paper", "all"] = "paper"
     parity: Literal["clean", "reference"] = "clean"
 
@@ -123,7 +125,11 @@ def judge(config: RunConfig, folder: Path, judging: Judging, stop: Callable[[], 
         ConfigError: The environment refuses an option.
     """
     record, own = Record(folder), judged(config, judging.tier)
-    policy = load(folder / "policy.safetensors", choose_device(config.device))
+    policy: Policy
+    if config.algo in REFERENCE_POLICIES:
+        policy = reference_policy(config)
+    else:
+        policy = load(folder / "policy.safetensors", choose_device(config.device))
 
     def part(first: int, count: int) -> dict[str, Any]:
         return _entry(_evaluate(own, policy, evaluation_seed(own) + first, count))

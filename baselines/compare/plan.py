@@ -8,14 +8,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from baselines.common.reference_policies import FloorConfig
-from baselines.registry import ALGORITHMS, ALIASES, configure, find
+from baselines.common.reference_policies import ReferenceConfig
+from baselines.registry import ALGORITHMS, ALIASES, configure, sees
 from cfp.config import EVALUATION_SEED, RunConfig, to_json
 from cfp.errors import CheckpointError, ConfigError
-from cfp.experiment.run import holds_run, read_config
-from cfp.experiment.state_file import flatten
+from cfp.experiment.folder import holds_run, read_config
 from cfp.files import parse_json, read_json
-from cfp.groups import TASK_OPTIONS
+from cfp.from_dict import flatten
+from cfp.sections import TASK_OPTIONS
 from cfp.weights import is_of_another_task, is_same_task, read_policy
 from dittogym.tasks import task_name
 
@@ -49,12 +49,12 @@ class Job:
     @property
     def sees(self) -> str:
         """What its policy looks at."""
-        return str(getattr(self.config, "sees", find(self.config.algo).sees))
+        return str(getattr(self.config, "sees", sees(self.config.algo)))
 
     @property
     def untrained(self) -> bool:
         """Whether nothing is learned, so that the seed changes nothing: layouts and noise of judging are the same."""
-        return isinstance(self.config, FloorConfig)
+        return isinstance(self.config, ReferenceConfig)
 
     @property
     def finished(self) -> bool:
@@ -195,7 +195,9 @@ def resolve(plan: Plan, label: str, task: str, preset: str, seed: int, steps: in
         values.setdefault("steps", steps)
     report = {"video": False, **values.pop("report", {})}
     try:
-        config = configure({**start, "seed": seed, "device": device, **values, "report": report}).adapted(base, values)
+        config = configure({**start, "seed": seed, "device": device, **values, "report": report}).with_derived(
+            base, values
+        )
         config.check()
         config.check_effect(base, flatten(plan.own(label, task)))  # what is for all may be idle in some
     except ConfigError as error:
@@ -311,4 +313,4 @@ def judged(config: RunConfig, tier: Any) -> RunConfig:
         config: Of the run.
         tier: Particles, see `cfp.config.EnvironmentConfig`.
     """
-    return replace(config, seed=0, environment=config.environment.judged_at(tier))
+    return replace(config, seed=0, environment=config.environment.for_evaluation(tier))

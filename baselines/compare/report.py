@@ -12,22 +12,22 @@ from baselines.compare import plots as pictures
 from baselines.compare import tables
 from baselines.compare.results import Found, Group, group
 from baselines.compare.table import Table
-from cfp.config import Tier
 from cfp.evaluation.page import STYLE
 from cfp.evaluation.plots import write_figure
 from cfp.files import write_text
+from cfp.sections import Particles
 
 MORE_STYLE = """
 body { max-width: 76rem; } .wide { overflow-x: auto; } table { font-size: 14px; } th { vertical-align: bottom; }
 th.text, td.text { text-align: left; } td { font-variant-numeric: tabular-nums; white-space: nowrap; }
 """
-PAPER: Tier = "full"
+PAPER: Particles = "full"
 """Particles of the paper's figures."""
 Picture = tuple[str, str, str]
 """File, title, words."""
 
 
-def write_report(folder: Path, runs: Sequence[Found], episodes: int, tier: Tier, about: str) -> Path:
+def write_report(folder: Path, runs: Sequence[Found], episodes: int, tier: Particles, about: str) -> Path:
     """Write all files of the report; those of an earlier one are replaced.
 
     Args:
@@ -53,7 +53,7 @@ def write_report(folder: Path, runs: Sequence[Found], episodes: int, tier: Tier,
     return folder / "index.html"
 
 
-def make_tables(runs: Sequence[Found], groups: Sequence[Group], episodes: int, tier: Tier) -> list[Table]:
+def make_tables(runs: Sequence[Found], groups: Sequence[Group], episodes: int, tier: Particles) -> list[Table]:
     """All tables, in the order of the report; those with the paper's returns have rows at its size only."""
     alike = groups if tier == PAPER else []
     return [
@@ -68,7 +68,7 @@ def make_tables(runs: Sequence[Found], groups: Sequence[Group], episodes: int, t
     ]
 
 
-def _size(tier: Tier) -> str:
+def _size(tier: Particles) -> str:
     """What was judged with how many particles, in words."""
     words = f"Final evaluations with {tier} particles."
     if tier != PAPER:

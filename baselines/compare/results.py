@@ -11,7 +11,7 @@ import numpy as np
 
 from baselines.compare.evaluations import Judged, Judging, read
 from baselines.compare.plan import Job, read_sessions
-from cfp.config import Tier
+from cfp.sections import Particles
 from cfp.tables import read_table
 
 Curve = tuple[np.ndarray, np.ndarray]
@@ -101,7 +101,7 @@ class Group:
         return self.runs[0].job.untrained
 
     @property
-    def particles(self) -> Tier:
+    def particles(self) -> Particles:
         """Of the evaluations while it trains."""
         return self.runs[0].job.config.environment.particles
 

@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from baselines.common.reference_policies import Zero
 from baselines.compare import paper
 from baselines.compare.results import Found, Group
 from baselines.compare.stats import common_curve, first_reach, interquartile_mean, interval, wilson
 from baselines.compare.table import Column, Table
-from cfp.config import Tier
+from cfp.sections import Particles
 from dittogym import make_spec
 
 SHARES = (0.5, 0.75, 0.9)
@@ -152,14 +151,14 @@ def aggregate_table(groups: Sequence[Group]) -> Table:
     return Table("aggregate", "All tasks together", about, columns, rows)
 
 
-def efficiency_table(groups: Sequence[Group], tier: Tier) -> Table:
+def efficiency_table(groups: Sequence[Group], tier: Particles) -> Table:
     """Steps until the evaluations of a run reach shares of the way from rest to the best that see the same.
 
     Args:
         groups: All; that of ``zero`` is the resting robot.
         tier: Particles that it was judged with, and with which other curves can be compared.
     """
-    rest = {group.task: iqm(group.scores) for group in groups if group.algo == Zero.name and group.scores}
+    rest = {group.task: iqm(group.scores) for group in groups if group.algo == "zero" and group.scores}
     shown = [group for group in groups if group.curves and not group.untrained]
     best: dict[tuple[str, str], float] = {}
     for group in shown:

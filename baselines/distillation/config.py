@@ -7,7 +7,9 @@ from typing import Literal
 
 from baselines.common.grid import SEEDED
 from baselines.planning.gradient import GradientPlannerConfig
-from cfp.config import LadderConfig, Tier, at_least_one, positive, share, training_layouts
+from cfp.config import LadderConfig, check_training_layouts
+from cfp.sections import Particles
+from cfp.validation import check_at_least, check_fraction, check_positive
 
 
 @dataclass(frozen=True)
@@ -21,7 +23,7 @@ class DistillConfig(LadderConfig):
     """Which algorithm."""
     teacher: str = "shac"
     """mpc (plans from every state), shac or gradient (trained first), or a policy: a run folder, policy.safetensors."""
-    train_particles: Tier = "lite"
+    train_particles: Particles = "lite"
     """Particles of the simulations that are taught in."""
     rollout_steps: int = 64
     """Control steps between two lessons."""
@@ -52,16 +54,16 @@ class DistillConfig(LadderConfig):
     planner_grid: int | Literal["coarse", "fine"] = "coarse"
     """Action grid of the teacher mpc."""
 
-    def idle(self) -> dict[str, str]:
+    def ineffective(self) -> dict[str, str]:
         """What concerns plans; layouts are counted from the seed."""
         plans = {} if self.teacher == "mpc" else dict.fromkeys(("planner.", "planner_grid"), "teacher mpc")
-        return super().idle() | plans | SEEDED
+        return super().ineffective() | plans | SEEDED
 
     def check(self) -> None:
         """Check what the types cannot, see `LadderConfig.check`."""
         super().check()
-        self.planner.check()
-        at_least_one(
+        check_at_least(
+            1,
             rollout_steps=self.rollout_steps,
             updates=self.updates,
             batch_size=self.batch_size,
@@ -70,6 +72,6 @@ class DistillConfig(LadderConfig):
             max_episode_steps=self.max_episode_steps,
             num_layouts=self.num_layouts,
         )
-        training_layouts("num_layouts", self.num_layouts * len(self.resolutions), self.environment.num_envs)
-        positive(student_learning_rate=self.student_learning_rate, max_grad_norm=self.max_grad_norm)
-        share(beta_decay=self.beta_decay, dropout=self.dropout)
+        check_training_layouts("num_layouts", self.num_layouts * len(self.resolutions), self.environment.num_envs)
+        check_positive(student_learning_rate=self.student_learning_rate, max_grad_norm=self.max_grad_norm)
+        check_fraction(beta_decay=self.beta_decay, dropout=self.dropout)

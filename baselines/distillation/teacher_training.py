@@ -15,7 +15,7 @@ from cfp.experiment.folder import copy_policy, policy_path
 from cfp.experiment.process import StopSignals
 from cfp.experiment.run import Run
 from cfp.files import read_json, write_json
-from cfp.groups import TASK_OPTIONS
+from cfp.sections import TASK_OPTIONS
 from cfp.weights import read_policy, shipped, write_policy
 
 TRAINED = ("shac", "gradient")

@@ -14,8 +14,8 @@ from torch import Tensor
 from baselines.common.open_loop import OpenLoop
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.registry import load
-from cfp.config import EnvironmentConfig
 from cfp.policy import Policy, SeesState
+from cfp.sections import EnvironmentConfig
 from cfp.weights import check_trained_for, read_policy
 from dittogym import TorchEnv, make_spec
 from dittogym.action import Layout, bicubic_matrix, from_grid_layout, to_grid_layout

@@ -5,19 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import nn
 
 import cfp
-from baselines.common.grid import grid_size
 from baselines.common.episodes import Episodes
+from baselines.common.grid import grid_size
 from baselines.distillation.config import DistillConfig
+from baselines.distillation.dagger import Collector, Dataset, Labels, lose
 from baselines.distillation.teacher_training import (
     TRAINED,
     copy_teacher,
@@ -25,18 +26,18 @@ from baselines.distillation.teacher_training import (
     train_teacher,
     warn_of_recorded_teacher,
 )
-from baselines.distillation.dagger import Collector, Dataset, Labels, lose
 from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
 from baselines.planning.gradient import GradientPlannerConfig
 from baselines.shac.networks import quieten
 from cfp.agent.actor import build_actor
 from cfp.agent.policies import ActorPolicy
-from cfp.config import EnvironmentConfig, LadderConfig, RunConfig, Tier, at_least_one, positive, share, training_layouts
+from cfp.config import RunConfig
 from cfp.envs.make import choose_device, make_torch_env
 from cfp.errors import NonFiniteError
 from cfp.experiment.algorithm import Algorithm, Position, Scalars, Sees
 from cfp.experiment.folder import policy_path
 from cfp.experiment.process import StopSignals
+from cfp.sections import EnvironmentConfig
 from cfp.weights import KIND, load, save_policy
 from dittogym import make_spec
 
@@ -76,7 +77,7 @@ class Distill(Algorithm):
         self, config: DistillConfig, stage: int = 1, start: ActorPolicy | None = None, teacher: Path | None = None
     ) -> None:
         self.config, self.stage = config, stage
-        own = replace(config, environment=config.environment.learned_at(config.train_particles))
+        own = replace(config, environment=config.environment.for_training(config.train_particles))
         self.env = make_torch_env(own, make_spec(config.task).patch)
         self.spec = config.actor_spec(stage - 1)
         with self._luck():
@@ -178,7 +179,7 @@ class Distill(Algorithm):
             return PlannerTeacher(make_torch_env(own, size), config.planner, config.seed)
         policy = read_teacher(path or config.teacher, config.task, config.environment)
         theirs = EnvironmentConfig(**policy.description["environment"])
-        return PolicyTeacher(policy, theirs.layout, config.environment.layout)
+        return PolicyTeacher(policy, theirs.action_indexing, config.environment.action_indexing)
 
     @property
     def policy(self) -> ActorPolicy:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, cast, get_args
 
@@ -17,19 +17,21 @@ from baselines.modular.networks import Kind, ModularActor, ModularCritics
 from baselines.modular.nodes import Nodes
 from baselines.modular.policy import SegmentPolicy
 from cfp.agent.composition import Composition
+from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
 from cfp.agent.policies import NetworkPolicy
 from cfp.agent.sac import CFP
-from cfp.config import RunConfig, SACConfig, StageConfig, at_least_one, not_negative
+from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Sees
 from cfp.experiment.coarse_to_fine import SACAlgorithm
+from cfp.validation import check_at_least
 from dittogym import make_spec
 
 
 @dataclass(frozen=True)
-class ModularConfig(SACConfig):
+class ModularConfig(RunConfig):
     """A run of a modular policy; ``algo`` says its network and how many segments the robot is cut into."""
 
     algo: str = "gnn-16"
@@ -40,6 +42,7 @@ class ModularConfig(SACConfig):
     """Uniformly random environment steps at the start."""
     alpha: float = 0.01
     """Entropy temperature."""
+    learning: LearningConfig = field(default_factory=LearningConfig)
 
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
 
@@ -66,14 +69,14 @@ class ModularConfig(SACConfig):
         """Action grid R: the task's whole patch, so that segments write to its nodes."""
         return make_spec(self.task).patch
 
-    def idle(self) -> dict[str, str]:
+    def ineffective(self) -> dict[str, str]:
         """What concerns ladders, and grids of actions: segments act on nodes."""
         needs = dict.fromkeys(("learning.anchor", "learning.warm_critic", "environment.action_layout"), "algo cfp")
-        return super().idle() | needs
+        return super().ineffective() | needs
 
-    def stage(self, level: int) -> StageConfig:
-        """What the training needs."""
-        return StageConfig(self.resolution(level), self.steps, self.random_steps, self.alpha, 0.0)
+    def hyperparameters(self, stage: int) -> Hyperparameters:
+        """Hyperparameters of the only stage."""
+        return Hyperparameters(**vars(self.learning), alpha=self.alpha, random_steps=self.random_steps)
 
     def check(self) -> None:
         """Check what the types cannot, see `RunConfig.check`."""
@@ -81,8 +84,8 @@ class ModularConfig(SACConfig):
         if kind not in get_args(Kind) or not count.isdecimal() or int(count) < 2:
             raise ConfigError(f"algo: got {self.algo!r}, allowed {' or '.join(get_args(Kind))} with a count, as gnn-16")
         super().check()
-        at_least_one(steps=self.steps)
-        not_negative(random_steps=self.random_steps, alpha=self.alpha)
+        check_at_least(1, steps=self.steps)
+        check_at_least(0, random_steps=self.random_steps, alpha=self.alpha)
         particles = self.environment.particles
         robot = particles[0] if isinstance(particles, tuple) else particles
         if isinstance(robot, int) and robot < self.segments:
@@ -171,7 +174,8 @@ class Modular(SACAlgorithm):
         env = SegmentedEnv(make_torch_env(config, config.resolution(stage - 1)), config.nodes)
         networks = {"kind": config.kind, "features": config.nodes.features(env.env.spec)}
         monitor = VecMonitor(TorchVecEnv(env, env.spaces))
-        return cls(config, stage, cls.make_model(config, stage, monitor, ModularPolicy, networks))
+        model = cls.make_model(config, monitor, ModularPolicy, networks, cls.hyperparameters(config, stage, folder))
+        return cls(config, stage, model)
 
     def attached(self, env: Any) -> SegmentPolicy:
         """The present policy, looking at an environment."""

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from baselines.common.rollout import Judge, Judgement, judge, rollout
-from cfp.config import not_negative
 from cfp.errors import ConfigError
+from cfp.validation import check_at_least
 from dittogym import TorchEnv
 from dittogym.core import EnvState, Model
 from dittogym.rewards import measure
@@ -43,7 +43,7 @@ class PlannerConfig:
         """
         if not 1 <= self.commit <= self.horizon:
             raise ConfigError(f"commit must be between 1 and the horizon, {self.horizon}, got {self.commit}")
-        not_negative(noise=self.noise, termination_steps=self.termination_steps, split_weight=self.split_weight)
+        check_at_least(0, noise=self.noise, termination_steps=self.termination_steps, split_weight=self.split_weight)
 
 
 Config = TypeVar("Config", bound=PlannerConfig)

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from baselines.common.rollout import Judge, judge_true
 from baselines.planning.base import BestPlans, Planner, PlannerConfig
-from cfp.config import positive
 from cfp.errors import ConfigError
+from cfp.validation import check_positive
 from dittogym import TorchEnv
 from dittogym.action import bicubic
 from dittogym.core import EnvState
@@ -41,7 +41,7 @@ class CEMPlannerConfig(PlannerConfig):
     def check(self) -> None:
         """Check what the types cannot, see `PlannerConfig.check`."""
         super().check()
-        positive(iterations=self.iterations, initial_std=self.initial_std, noise_grid=self.noise_grid)
+        check_positive(iterations=self.iterations, initial_std=self.initial_std, noise_grid=self.noise_grid)
         if not 2 <= self.elites <= self.candidates:
             raise ConfigError(f"elites must be between 2 and candidates, {self.candidates}, got {self.elites}")
         for name in ("noise_correlation", "momentum"):

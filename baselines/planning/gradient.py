@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from baselines.planning.base import BestPlans, Planner, PlannerConfig, where_simulation
-from cfp.config import positive
+from cfp.validation import check_positive
 from dittogym.core import EnvState
 
 
@@ -26,7 +26,7 @@ class GradientPlannerConfig(PlannerConfig):
     def check(self) -> None:
         """Check what the types cannot, see `PlannerConfig.check`."""
         super().check()
-        positive(iterations=self.iterations, learning_rate=self.learning_rate, clip=self.clip)
+        check_positive(iterations=self.iterations, learning_rate=self.learning_rate, clip=self.clip)
 
 
 class GradientPlanner(Planner[GradientPlannerConfig]):

@@ -16,10 +16,10 @@ from baselines.planning.base import Planner, PlannerConfig
 from baselines.planning.cem import CEMPlanner, CEMPlannerConfig
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.planning.surrogate import Surrogate
-from cfp.config import EnvironmentConfig, ReportConfig, Tier
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm, Scalars, Sees
+from cfp.sections import EnvironmentConfig, Particles, ReportConfig
 from dittogym import make_spec
 
 METRICS: dict[str, str] = {
@@ -38,7 +38,7 @@ class PlannedConfig(GridConfig):
     The environment options say where plans are carried out and evaluated.
     """
 
-    train_particles: Tier | None = None
+    train_particles: Particles | None = None
     """Particles of the simulations in which plans are tried, at most the environment's; None: as many."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
 
@@ -53,7 +53,6 @@ class PlannedConfig(GridConfig):
     def check(self) -> None:
         """Check what the types cannot, see `RunConfig.check`."""
         super().check()
-        self.planner.check()
         if self.environment.num_envs != 1:
             raise ConfigError(f"num_envs must be 1 (an episode is planned by itself), got {self.environment.num_envs}")
         if self.environment.resample:
@@ -122,8 +121,8 @@ class MPC(Algorithm):
         self.actions = torch.zeros(0, *self.env.action_shape)
         self.total_reward, self.reward, self.is_done = 0.0, 0.0, False
 
-    def _make_surrogate(self, particles: Tier) -> Surrogate:
-        config = replace(self.config, environment=self.config.environment.learned_at(particles))
+    def _make_surrogate(self, particles: Particles) -> Surrogate:
+        config = replace(self.config, environment=self.config.environment.for_training(particles))
         small = make_torch_env(config, config.resolution(0), 1)
         small.reset(seed=config.seed)
         try:

@@ -11,8 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from baselines.shac.features import StateFeatures
-from cfp.agent.actor import Actor, ActorSpec
+from cfp.agent.actor import Actor
 from cfp.agent.networks import LATENT, Encoder, initialise
+from cfp.agent.spec import ActorSpec
 from cfp.weights import fitting, read_policy, write_policy
 from dittogym import TorchEnv
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from cfp.config import not_negative, positive
+from cfp.validation import check_at_least, check_positive
 from dittogym import TorchEnv
 from torchmpm import tree
 
@@ -44,10 +44,10 @@ class RewardConfig:
         Raises:
             ConfigError: Naming the option, what was given and what is allowed.
         """
-        not_negative(
-            split_weight=self.split_weight, split_margin=self.split_margin, integrity_weight=self.integrity_weight
+        check_at_least(
+            0, split_weight=self.split_weight, split_margin=self.split_margin, integrity_weight=self.integrity_weight
         )
-        positive(scale=self.scale)
+        check_positive(scale=self.scale)
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,13 @@ from baselines.shac.networks import ImageActor, StateActor, StatePolicy, image_c
 from baselines.shac.reward import RewardConfig
 from baselines.shac.rollout import Rollout, Window
 from cfp.agent.policies import ActorPolicy
-from cfp.config import ReportConfig, RunConfig, Tier, at_least_one, not_negative, positive, share, training_layouts
+from cfp.config import RunConfig, check_training_layouts
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.algorithm import Algorithm, Scalars, Sees
 from cfp.policy import Policy
+from cfp.sections import Particles, ReportConfig
+from cfp.validation import check_at_least, check_fraction, check_positive
 from cfp.weights import KIND, load, policy_for, read_policy, save_policy
 
 BETAS = (0.7, 0.95)
@@ -62,7 +64,7 @@ class ShacConfig(GridConfig):
     """What the policy is given: the privileged state (matter, deformation, clock), or the image like CFP's."""
     start_from: str | None = None
     """Policy of one level on the image, whatever trained it, whose weights the actor begins with, all but its width."""
-    train_particles: Tier = "lite"
+    train_particles: Particles = "lite"
     """Particles of the simulations that are learned from."""
     window: int = 16
     """Control steps that a gradient reaches back."""
@@ -98,15 +100,16 @@ class ShacConfig(GridConfig):
         """Environment steps after which the only stage ends."""
         return (self.steps,)
 
-    def idle(self) -> dict[str, str]:
+    def ineffective(self) -> dict[str, str]:
         """Which parts of the state are seen, where it is not."""
         parts = {} if self.sees == "state" else dict.fromkeys(("deformation", "clock", "displacement"), "sees state")
-        return super().idle() | parts
+        return super().ineffective() | parts
 
     def check(self) -> None:
         """Check what the types cannot, see `RunConfig.check`."""
         super().check()
-        at_least_one(
+        check_at_least(
+            1,
             steps=self.steps,
             window=self.window,
             critic_updates=self.critic_updates,
@@ -115,11 +118,10 @@ class ShacConfig(GridConfig):
         )
         if self.start_from is not None and self.sees != "image":
             raise ConfigError(f"start_from: got a policy, allowed with sees 'image', got {self.sees!r}")
-        training_layouts("num_layouts", self.num_layouts, self.environment.num_envs)
-        share(gamma=self.gamma, td_lambda=self.td_lambda, tau=self.tau)
-        positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
-        not_negative(noise=self.noise)
-        self.reward.check()
+        check_training_layouts("num_layouts", self.num_layouts, self.environment.num_envs)
+        check_fraction(gamma=self.gamma, td_lambda=self.td_lambda, tau=self.tau)
+        check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
+        check_at_least(0, noise=self.noise)
 
 
 class Shac(Algorithm):
@@ -133,7 +135,7 @@ class Shac(Algorithm):
 
     def __init__(self, config: ShacConfig, stage: int = 1, start: Policy | None = None) -> None:
         self.config = config
-        own = replace(config, environment=config.environment.learned_at(config.train_particles))
+        own = replace(config, environment=config.environment.for_training(config.train_particles))
         self.env = make_torch_env(own, config.resolution(stage - 1))
         self.features = StateFeatures(config.deformation, config.clock, config.displacement)
         with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
@@ -294,7 +296,9 @@ class Shac(Algorithm):
             policy.save(path)
         else:
             network = {"resolutions": [policy.resolution]}
-            save_policy(path, policy.actor, description | {"kind": KIND, "network": network, "trained_by": self.config.algo})
+            save_policy(
+                path, policy.actor, description | {"kind": KIND, "network": network, "trained_by": self.config.algo}
+            )
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu") -> StatePolicy | ActorPolicy:

@@ -15,10 +15,12 @@ import cfp
 from baselines.common.grid import Grid, GridConfig, grid_size
 from baselines.common.open_loop import OpenLoop
 from baselines.trajectory.objective import make_objective
-from cfp.config import EnvironmentConfig, ReportConfig, RunConfig, Tier, at_least_one, not_negative, positive
+from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.algorithm import Algorithm, Scalars, Sees
+from cfp.sections import EnvironmentConfig, Particles, ReportConfig
+from cfp.validation import check_at_least, check_positive
 from dittogym import make_spec
 
 BETAS = (0.9, 0.98)
@@ -60,7 +62,7 @@ class GradientConfig(GridConfig):
     """Adam's step size at the beginning; a cosine takes it to a tenth."""
     window: int = 0
     """Control steps that a gradient reaches back; 0: the whole episode."""
-    train_particles: Tier = "lite"
+    train_particles: Particles = "lite"
     """Particles of the simulation in the first stage."""
     blur: tuple[float, ...] = (4.0, 2.0, 1.0, 0.0)
     """SHAPE MATCH: standard deviations, in pixels, by which both pictures are blurred, one after the other."""
@@ -87,9 +89,9 @@ class GradientConfig(GridConfig):
         """A polished policy is judged on its own layout while it is polished."""
         return (self.seed, 1) if level else super().evaluation(level)
 
-    def idle(self) -> dict[str, str]:
+    def ineffective(self) -> dict[str, str]:
         """What concerns the second stage, or a picture to become."""
-        idle = super().idle() | (
+        idle = super().ineffective() | (
             {} if self.polish else dict.fromkeys(("polish_grid", "polish_learning_rate"), "polish")
         )
         return idle | ({"blur": "a task that has a target"} if make_spec(self.task).target is None else {})
@@ -97,9 +99,9 @@ class GradientConfig(GridConfig):
     def check(self) -> None:
         """Check what the types cannot, see `RunConfig.check`."""
         super().check()
-        at_least_one(iterations=self.iterations)
-        not_negative(window=self.window, polish=self.polish)
-        positive(learning_rate=self.learning_rate, polish_learning_rate=self.polish_learning_rate)
+        check_at_least(1, iterations=self.iterations)
+        check_at_least(0, window=self.window, polish=self.polish)
+        check_positive(learning_rate=self.learning_rate, polish_learning_rate=self.polish_learning_rate)
         if not self.blur or min(self.blur) < 0:
             raise ConfigError(f"blur: got {self.blur}, allowed are one or more numbers of 0 or more")
 
@@ -133,7 +135,7 @@ class Gradient(Algorithm):
 
     def __init__(self, config: GradientConfig, stage: int = 1, start: OpenLoop | None = None) -> None:
         self.config, self.stage, polishes = config, stage, stage > 1
-        environment = config.environment if polishes else config.environment.learned_at(config.train_particles)
+        environment = config.environment if polishes else config.environment.for_training(config.train_particles)
         own = replace(config, environment=environment)
         self.env = make_torch_env(own, config.resolution(stage - 1), 1 if polishes else None)
         self.env.reset(seed=config.seed)

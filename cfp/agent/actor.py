@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -14,9 +13,7 @@ from cfp.agent import fused as joint
 from cfp.agent.composition import blend
 from cfp.agent.networks import (
     IMAGE_SIZE,
-    RESOLUTIONS,
     Encoder,
-    Interpolation,
     PairEncoder,
     at_least_float32,
     initialise,
@@ -24,58 +21,10 @@ from cfp.agent.networks import (
     normalise_image,
     upsample,
 )
-from dittogym.geometry import NODES
+from cfp.agent.spec import ActorSpec
 
 STD_BOUNDS = (0.1, 6.0)
 """Bounds of the standard deviation before tanh: sampling never becomes deterministic."""
-
-
-@dataclass(frozen=True)
-class ActorSpec:
-    """What an actor is made of, as plain data: enough to build it again before its weights are loaded.
-
-    Attributes:
-        resolutions: Action grid R of every level, coarsest first; one entry is a plain (stage 1) actor.
-        gate_bias: Bias added to the gate's logit, one per residual level (``len(resolutions) - 1`` of them).
-        split: Separate narrow encoders for observation and action (DIG, where the two images do not overlap).
-        gate_scale: Largest gate value; the reference uses 0.25 with split encoders and 1 otherwise.
-        interpolation: Bicubic upsampling inside the networks: ``"half_pixel"`` is what the environment uses on
-            actions, ``"aligned"`` (aligned corners) is what the reference implementation uses here.
-        patch: Size of the images on which a residual actor blends; None: the grid of its own level, as the reference
-            does. Two cubic enlargements are not one, so only images of the size of the environment's patch (then not
-            enlarged any more) make a closed gate leave the field of the coarser level as it was.
-
-    Raises:
-        ValueError: A resolution has no head, the ladder does not grow, or biases and levels do not match.
-    """
-
-    resolutions: tuple[int, ...]
-    gate_bias: tuple[float, ...] = ()
-    split: bool = False
-    gate_scale: float = 1.0
-    interpolation: Interpolation = "half_pixel"
-    patch: int | None = None
-
-    @property
-    def action_size(self) -> int:
-        """Rows and columns of the executed action: a plain actor's own grid, else what is blended."""
-        return self.patch if self.patch and len(self.resolutions) > 1 else self.resolutions[-1]
-
-    def __post_init__(self) -> None:
-        """Check the lengths and the resolutions."""
-        for resolution in self.resolutions:
-            if resolution not in RESOLUTIONS:
-                raise ValueError(f"action resolution: got {resolution}, allowed {', '.join(map(str, RESOLUTIONS))}")
-        if not self.resolutions or list(self.resolutions) != sorted(set(self.resolutions)):
-            raise ValueError(f"resolutions: got {self.resolutions}, allowed is a growing ladder such as (8, 16)")
-        if len(self.gate_bias) != len(self.resolutions) - 1:
-            raise ValueError(
-                f"gate_bias: got {len(self.gate_bias)} values for resolutions {self.resolutions}, "
-                f"allowed is one per residual level ({len(self.resolutions) - 1})"
-            )
-        finest = self.resolutions[-1]
-        if self.patch is not None and not (isinstance(self.patch, int) and finest <= self.patch <= NODES):
-            raise ValueError(f"patch: got {self.patch}, allowed {finest} (the finest level) to {NODES}")
 
 
 class Sample(NamedTuple):

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from cfp.agent.networks import Interpolation, upsample
-
-if TYPE_CHECKING:
-    from cfp.agent.actor import ActorSpec
+from cfp.agent.networks import upsample
+from cfp.agent.spec import ActorSpec, Interpolation
 
 
 def blend(coarse: Tensor, residual: Tensor, gate: Tensor, enlarge: Callable[[Tensor], Tensor]) -> Tensor:

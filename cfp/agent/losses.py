@@ -5,17 +5,17 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Callable
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from cfp.agent.actor import Actor
+from cfp.agent.hyperparameters import Precision
 from cfp.agent.networks import TwinCritic, normalise_image
 from torchmpm.backends import compiler_found
 
-Precision = Literal["auto", "float32", "bfloat16"]
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _logger = logging.getLogger(__name__)

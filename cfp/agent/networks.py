@@ -7,16 +7,15 @@ and Appendix B; parameter totals are held by a test.
 
 from __future__ import annotations
 
-from typing import Literal, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from cfp.agent import fused as joint
+from cfp.agent.spec import Interpolation
 from dittogym.action import bicubic
-
-Interpolation = Literal["half_pixel", "aligned"]
 
 IMAGE_SIZE = 64
 """Rows and columns of the observation and of every action that enters an encoder."""
@@ -30,8 +29,6 @@ _DECODERS: dict[int, tuple[tuple[tuple[int, int, int], ...], tuple[int, ...]]] =
     32: ((_STRETCH, _STRETCH, _STRETCH), (32, 16, 8, 2)),
     64: ((_STRETCH, _STRETCH, _STRETCH, _STRETCH), (32, 16, 8, 4, 2)),
 }
-RESOLUTIONS = (4, *_DECODERS)
-"""Action grids R for which a head exists."""
 
 
 def upsample(action: Tensor, size: int, interpolation: Interpolation) -> Tensor:

@@ -13,8 +13,9 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac import policies as sac_policies
 from torch import nn
 
-from cfp.agent.actor import Actor, ActorSpec, SquashedActor, build_actor
+from cfp.agent.actor import Actor, SquashedActor, build_actor
 from cfp.agent.networks import IMAGE_SIZE, TwinCritic
+from cfp.agent.spec import ActorSpec
 
 
 def observation_space() -> spaces.Box:

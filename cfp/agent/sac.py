@@ -16,12 +16,13 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples
 from torch import Tensor, nn
 
 from cfp.agent.actor import Actor
 from cfp.agent.composition import Composition
-from cfp.agent.losses import Losses, Precision
+from cfp.agent.hyperparameters import Hyperparameters
+from cfp.agent.losses import Losses
 from cfp.agent.networks import TwinCritic, upsample
 from cfp.agent.policies import CFPPolicy, NetworkPolicy
 from cfp.agent.replay import ReplayRing
@@ -88,24 +89,7 @@ class CFP(SAC):
     Args:
         policy: `CFPPolicy` or its name, or another `cfp.agent.policies.NetworkPolicy`.
         env: A vectorised environment with actions in [-1, 1]; (2, R, R) for `CFPPolicy`.
-        learning_rate: Adam's step size.
-        buffer_size: Transitions in the replay ring.
-        update_start: Updates begin when more transitions than this are stored.
-        random_steps: Actions are uniform in [-1, 1] while fewer environment steps than this have been taken.
-        batch_size: Transitions in an update.
-        tau: Polyak factor of the target critics.
-        gamma: Discount factor.
-        gradient_steps: Updates after each batched environment step.
-        alpha: Temperature, a constant.
-        gate_penalty: Weight rho of ``mean ||g||_2 / R`` in the actor loss (stage 2).
-        reward_momentum: Momentum of the reward statistics.
-        actor_rate: Adam's step size for the actor; None: ``learning_rate``.
-        anchor: Weight, in the actor loss, of the mean square by which actions differ from those of `origin`.
-        actor_start: The actor is not updated while fewer environment steps than this have been taken.
-        max_grad_norm: Largest gradient norm of one parameter tensor.
-        precision: Of convolutions and matrix products in an update, see
-            `cfp.agent.losses.choose_precision`. Acting is always in float32.
-        compile: Run the losses through ``torch.compile``.
+        hyperparameters: See there.
         sac_options: Further options of stable-baselines3's SAC.
 
     Attributes:
@@ -119,34 +103,12 @@ class CFP(SAC):
         self,
         policy: str | type[NetworkPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = 3e-4,
-        buffer_size: int = 200_000,
-        *,
-        update_start: int = 256,
-        random_steps: int = 500,
-        batch_size: int = 256,
-        tau: float = 0.005,
-        gamma: float = 0.99,
-        gradient_steps: int = 1,
-        alpha: float = 0.01,
-        gate_penalty: float = 0.0,
-        reward_momentum: float = 0.99,
-        max_grad_norm: float = 10.0,
-        actor_rate: float | None = None,
-        actor_start: int = 0,
-        anchor: float = 0.0,
-        precision: Precision = "float32",
-        compile: bool = False,
+        hyperparameters: Hyperparameters = Hyperparameters(),  # noqa: B008  (it is immutable)
         **sac_options: Any,
     ) -> None:
         """Create networks, replay buffer and reward statistics."""
-        self.random_steps = random_steps
-        self.gate_penalty = gate_penalty
-        self.reward_momentum = reward_momentum
-        self.max_grad_norm = max_grad_norm
-        self.actor_rate, self.actor_start, self.anchor = actor_rate, actor_start, anchor
+        self.hyperparameters = hyperparameters
         self.origin: Actor | None = None
-        self.precision, self.compile = precision, compile
         sac_options.setdefault("replay_buffer_class", ReplayRing)
         spec = (sac_options.get("policy_kwargs") or {}).get("spec")
         noisy = sac_options.get("action_noise") is not None  # then what is executed has no parts
@@ -155,21 +117,21 @@ class CFP(SAC):
         super().__init__(
             policy,
             env,
-            learning_rate,
-            buffer_size,
-            learning_starts=update_start,
-            batch_size=batch_size,
-            tau=tau,
-            gamma=gamma,
-            gradient_steps=gradient_steps,
-            ent_coef=alpha,
+            hyperparameters.learning_rate,
+            hyperparameters.buffer_size,
+            learning_starts=hyperparameters.update_start,
+            batch_size=hyperparameters.batch_size,
+            tau=hyperparameters.tau,
+            gamma=hyperparameters.gamma,
+            gradient_steps=hyperparameters.gradient_steps,
+            ent_coef=hyperparameters.alpha,
             **sac_options,
         )
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self.reward_statistics = RewardStatistics(self.reward_momentum).to(self.device)
-        self.losses = Losses(self.device, self.precision, self.compile)
+        self.reward_statistics = RewardStatistics(self.hyperparameters.reward_momentum).to(self.device)
+        self.losses = Losses(self.device, self.hyperparameters.precision, self.hyperparameters.compile)
 
     def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
         """Actor, critics and target critics with their own types."""
@@ -190,8 +152,8 @@ class CFP(SAC):
         actor, critic, _ = self.networks()
         self.policy.set_training_mode(True)
         self._update_learning_rate([actor.optimizer, critic.optimizer])
-        if self.actor_rate is not None:
-            actor.optimizer.param_groups[0]["lr"] = self.actor_rate
+        if self.hyperparameters.actor_rate is not None:
+            actor.optimizer.param_groups[0]["lr"] = self.hyperparameters.actor_rate
         for _ in range(gradient_steps):
             scalars = self.update(self.replay_buffer.sample(batch_size))
             self._n_updates += 1
@@ -205,7 +167,7 @@ class CFP(SAC):
         _, critic, target = self.networks()
         now, later = map(self.losses.prepare, (batch.observations, batch.next_observations))
         scalars = self._update_critic(now, later, batch)
-        if self.num_timesteps >= self.actor_start:
+        if self.num_timesteps >= self.hyperparameters.actor_start:
             scalars |= self._update_actor(now)
         with torch.no_grad():
             torch._foreach_lerp_(list(target.parameters()), list(critic.parameters()), self.tau)
@@ -225,8 +187,9 @@ class CFP(SAC):
     def _update_actor(self, now: Tensor) -> dict[str, Tensor]:
         actor, critic, _ = self.networks()
         critic.requires_grad_(False)  # spares the critics' weight gradients, which would be thrown away
+        own = self.hyperparameters
         loss, scalars = self.losses.actor_loss(
-            actor, critic, now, self.ent_coef_tensor, self.gate_penalty, self.origin, self.anchor
+            actor, critic, now, self.ent_coef_tensor, own.gate_penalty, self.origin, own.anchor
         )
         self._descend(loss, actor.optimizer, actor.trainable_parameters(), "actor")
         critic.requires_grad_(True)
@@ -240,7 +203,7 @@ class CFP(SAC):
             )
         optimizer.zero_grad()
         loss.backward()
-        clip_each(weights, self.max_grad_norm)
+        clip_each(weights, self.hyperparameters.max_grad_norm)
         optimizer.step()
 
     def _sample_action(
@@ -248,13 +211,13 @@ class CFP(SAC):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Actions to execute, and what the replay memory stores of them."""
         composition = getattr(self.replay_buffer, "composition", None)
-        if self.num_timesteps >= self.random_steps and composition is not None:
+        if self.num_timesteps >= self.hyperparameters.random_steps and composition is not None:
             actions, stored = self._act_in_parts(composition)
             self._check_finite("action", actions)  # here, as environments refuse it with an error of their own
             return actions, stored
         # stable-baselines3 ties the random phase to the start of the updates; here they are two settings.
-        actions, stored = super()._sample_action(self.random_steps, action_noise, n_envs)
-        if self.num_timesteps < self.random_steps:
+        actions, stored = super()._sample_action(self.hyperparameters.random_steps, action_noise, n_envs)
+        if self.num_timesteps < self.hyperparameters.random_steps:
             return self._random(actions, stored, composition)
         self._check_finite("action", actions)
         return actions, stored

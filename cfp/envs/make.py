@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 from cfp.config import RunConfig
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
-from cfp.groups import TASK_OPTIONS
+from cfp.sections import TASK_OPTIONS
 from dittogym import TorchEnv
 
 

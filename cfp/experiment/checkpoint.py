@@ -11,11 +11,11 @@ from typing import Any
 import torch
 
 from cfp.agent.replay import ReplayArchive
-from cfp.config import RunConfig, merge, to_json
+from cfp.config import RunConfig, to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.algorithm import Algorithm, Position
-from cfp.experiment.from_dict import flatten
 from cfp.files import parse_json, write_atomically
+from cfp.from_dict import flatten
 
 VERSION = 2
 
@@ -114,13 +114,10 @@ class Checkpoint:
 def check_same(stored: dict[str, Any], given: RunConfig) -> None:
     """Compare the options of a checkpoint with those of the command that wants to resume it.
 
-    Options that did not exist when the checkpoint was written count as left at their defaults.
-
     Raises:
         ConfigError: Naming the first option that differs and may not, with both values.
     """
-    past: RunConfig = merge(type(given)(), stored)
-    old, new = (flatten(json.loads(json.dumps(to_json(config)))) for config in (past, given))
+    old, new = flatten(stored), flatten(json.loads(json.dumps(to_json(given))))
     for name in {**old, **new}:
         if name.startswith(given.changeable) or old.get(name) == new.get(name):
             continue

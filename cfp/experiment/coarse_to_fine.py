@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecMonitor
 
+from cfp.agent.hyperparameters import Hyperparameters
 from cfp.agent.policies import ActorPolicy, CFPPolicy, NetworkPolicy
 from cfp.agent.replay import FIELDS
 from cfp.agent.sac import CFP
-from cfp.config import Config, SACConfig
+from cfp.config import Config, RunConfig
 from cfp.envs.make import choose_device, make_env
 from cfp.errors import ConfigError
 from cfp.evaluation.pictures import policy_pictures
@@ -45,7 +46,7 @@ class SACAlgorithm(Algorithm):
 
     model_type: type[CFP] = CFP
 
-    def __init__(self, config: SACConfig, stage: int, model: CFP) -> None:
+    def __init__(self, config: Any, stage: int, model: CFP) -> None:
         self.config, self.stage, self.model = config, stage, model
         assert model.replay_buffer is not None
         self.replay_buffer = model.replay_buffer
@@ -63,62 +64,47 @@ class SACAlgorithm(Algorithm):
     @classmethod
     def make_model(
         cls,
-        config: SACConfig,
-        stage: int,
+        config: RunConfig,
         env: VecMonitor,
         policy: type[NetworkPolicy],
         networks: dict[str, Any],
-        **changes: Any,
+        hyperparameters: Hyperparameters,
     ) -> CFP:
-        """The model of a stage as the options say.
+        """Create the model of a stage.
 
         Args:
             config: Options of the run.
-            stage: Which stage, 1 is the first.
-            env: Where it acts.
-            policy: Its networks.
-            networks: Their options.
-            changes: Options of the model in place of the run's.
+            env: Environment to train in.
+            policy: Class of the networks.
+            networks: Options of the networks.
+            hyperparameters: Of the stage.
         """
-        own, learning = config.stage(stage - 1), config.learning
-        if learning.compile:
+        if hyperparameters.compile:
             print("compiling the updates; the first time on a machine this takes minutes ...", flush=True)
-        options: dict[str, Any] = {
-            "update_start": learning.update_start,
-            "random_steps": own.random_steps,
-            "batch_size": learning.batch_size,
-            "tau": learning.tau,
-            "gamma": learning.gamma,
-            "gradient_steps": learning.gradient_steps,
-            "alpha": own.alpha,
-            "gate_penalty": own.gate_penalty,
-            "reward_momentum": learning.reward_momentum,
-            "max_grad_norm": learning.max_grad_norm,
-            "actor_rate": learning.actor_rate,
-            "actor_start": learning.actor_start,
-            "precision": learning.precision,
-            "compile": learning.compile,
-            "policy_kwargs": networks,
-            "seed": config.seed,
-            "device": choose_device(config.device),
-            "stats_window_size": max(10, env.num_envs),
-        }
-        model = cls.model_type(policy, env, learning.learning_rate, learning.buffer_size, **{**options, **changes})
+        model = cls.model_type(
+            policy,
+            env,
+            hyperparameters,
+            policy_kwargs=networks,
+            seed=config.seed,
+            device=choose_device(config.device),
+            stats_window_size=max(10, env.num_envs),
+        )
         model.set_logger(Logger(None, []))
         return model
 
     @classmethod
-    def random_steps(cls, config: Any, folder: Path, stage: int) -> int:
-        """Uniformly random environment steps at the start of a stage."""
-        steps: int = config.stage(stage - 1).random_steps
-        return steps
+    def hyperparameters(cls, config: Any, stage: int, folder: Path) -> Hyperparameters:
+        """Hyperparameters of a stage."""
+        hyperparameters: Hyperparameters = config.hyperparameters(stage - 1)
+        return hyperparameters
 
     @classmethod
     def warnings(cls, config: Any, folder: Path, first_stage: int) -> list[str]:
         """Stages that end before they act by their policy, or before they learn."""
         lines, (starts, waits) = [], (config.learning.update_start, config.learning.actor_start)
         for stage in range(first_stage, len(config.ends()) + 1):
-            steps, random = config.stage(stage - 1).steps, cls.random_steps(config, folder, stage)
+            steps, random = config.stage_steps(stage - 1), cls.hyperparameters(config, stage, folder).random_steps
             if steps <= random:
                 lines.append(f"stage {stage}: all its {steps:,} steps are random (--random-steps {random})")
             elif steps <= starts:
@@ -174,7 +160,7 @@ class SACAlgorithm(Algorithm):
         for _ in range(-(-model.batch_size // count)):
             buffer.add(observation, observation, stored, np.zeros(count), np.zeros(count), [{}] * count)
         acting = mean_seconds(lambda: env.step(model.predict(observation)[0]))
-        model.num_timesteps = model.actor_start  # from here on an update is a whole one
+        model.num_timesteps = model.hyperparameters.actor_start  # from here on an update is a whole one
         updating = mean_seconds(lambda: model.train(1, model.batch_size)) * self.config.learning.gradient_steps
         arrays = (getattr(buffer, name) for name in FIELDS)
         return Cost((acting + updating) / count, sum(array.nbytes for array in arrays))
@@ -213,17 +199,17 @@ class CoarseToFine(SACAlgorithm):
         return Position(stage, (0, *config.handover)[stage - 1])
 
     @classmethod
-    def random_steps(cls, config: Config, folder: Path, stage: int) -> int:
-        """None where a policy is refined."""
-        return 0 if _refines(config, folder, stage) else super().random_steps(config, folder, stage)
+    def hyperparameters(cls, config: Config, stage: int, folder: Path) -> Hyperparameters:
+        """Hyperparameters of a stage; a policy that is refined does not act at random."""
+        own = super().hyperparameters(config, stage, folder)
+        return replace(own, random_steps=0) if _refines(config, folder, stage) else own
 
     @classmethod
     def create(cls, config: Config, stage: int, folder: Path, resumed: bool = False) -> CoarseToFine:
         """Networks, replay memory and environment of a stage."""
         env, spec = make_env(config, config.action_size(stage - 1)), config.actor_spec(stage - 1)
         refines = _refines(config, folder, stage)
-        changes = {"anchor": config.learning.anchor, "random_steps": 0} if refines else {}
-        model = cls.make_model(config, stage, env, CFPPolicy, {"spec": spec}, **changes)
+        model = cls.make_model(config, env, CFPPolicy, {"spec": spec}, cls.hyperparameters(config, stage, folder))
         actor = model.networks()[0]
         if refines:
             model.origin = load(_start_path(folder), str(model.device)).actor
@@ -259,7 +245,7 @@ class CoarseToFine(SACAlgorithm):
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the actor."""
-        network = dataclasses.asdict(self.config.actor_spec(self.stage - 1))
+        network = asdict(self.config.actor_spec(self.stage - 1))
         save_policy(path, self.model.networks()[0], description | {"kind": KIND, "network": network})
 
 

@@ -6,7 +6,7 @@ import inspect
 import json
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,11 @@ from cfp.experiment.algorithm import Algorithm
 from cfp.experiment.cli import program_name, run_command
 from cfp.experiment.estimate import estimate
 from cfp.experiment.folder import holds_run, read_config
-from cfp.experiment.from_dict import merge
 from cfp.experiment.process import Stopped, StopSignals
 from cfp.experiment.run import Run
 from cfp.experiment.run_lock import claim
 from cfp.files import read_json
+from cfp.from_dict import update_from_dict
 from cfp.policy import Policy
 
 
@@ -52,7 +52,7 @@ class Command:
     Ctrl-C writes a checkpoint and stops; --resume goes on.
     """
 
-    run: RunConfig = field(default_factory=RunConfig)
+    run: RunConfig
     out: Path | None = None
     """Folder of the run; in runs/, named by algorithm, task, preset and seed, if not given."""
     resume: bool = False
@@ -109,11 +109,11 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
         if (folder / "config.json").exists():
             past = read_config(folder, program.configure)
             # What a file says otherwise than the run is refused, not left out.
-            command = read(past if choice.config is None else merge(past, values))
+            command = read(past if choice.config is None else update_from_dict(past, values))
             command.run.check()
             return replace(command, out=folder)
     command = read(base)
-    run = command.run.adapted(preset, values.keys() | _named(arguments))
+    run = command.run.with_derived(preset, values.keys() | _named(arguments))
     run.check()
     run.check_effect(preset)
     return replace(command, run=run, out=command.out or _default_folder(run))

@@ -2,19 +2,21 @@ r"""
 Your first simulation
 =====================
 
-A ball of gel falls on a table and bounces. State goes in, state comes out: a `torchmpm.ParticleState` holds all that
-moves, a `torchmpm.Solver` describes the rest of the world and is never changed by a step.
+This tutorial simulates a ball of gel that falls onto a table and bounces. A `torchmpm.ParticleState` holds the state
+of all particles. A `torchmpm.Solver` describes everything that does not change; its method ``step`` returns a new
+state.
 
-Units are SI in two dimensions: metres, seconds, kilograms; the window is one metre wide, a substep takes 0.1 ms.
+Units are SI units in two dimensions: metres, seconds, kilograms. The simulation window is one metre wide, and a
+substep lasts 0.1 ms.
 """
 
 # %%
-# The world
+# The scene
 # ---------
 #
-# One body of 2,000 particles of an elastic solid, a table whose top is 0.2 m high, and gravity. The Lamé parameters
-# are in pascal; `torchmpm.lame` computes them from Young's modulus and Poisson's ratio. Mass and volume are those of
-# one particle; here they make a gel with a density of 1,000 kg/m².
+# The scene consists of an elastic body of 2,000 particles, a table with its top at 0.2 m, and gravity.
+# `torchmpm.lame` computes the Lamé parameters, in Pa, from Young's modulus and Poisson's ratio. The mass and volume
+# of a body are those of one particle; here they give a density of 1,000 kg/m².
 
 import itertools
 import math
@@ -33,18 +35,18 @@ table = torchmpm.VelocityRule("-y", j=(None, 25))  # 26 nodes, 1/128 m apart; wi
 solver = torchmpm.Solver(torchmpm.Grid(128), bodies=(ball,), gravity=(0.0, -9.8), rules=(table,))
 
 # %%
-# Particles come from points of the unit square that a shape maps into the world. A Sobol sequence leaves fewer clumps
-# and holes than random numbers.
+# The initial positions are points of the unit square, mapped to a disc. Points of a Sobol sequence are more evenly
+# spread than random ones.
 
 points = torchmpm.sampling.disc(torchmpm.sampling.sobol(COUNT, seed=0), centre=(0.5, 0.45), radius=RADIUS)
 state = torchmpm.ParticleState.at_rest(torch.as_tensor(points))  # float64, a batch of one
 print(state.x.shape, state.F.shape)
 
 # %%
-# Motion
-# ------
+# The simulation
+# --------------
 #
-# A step of 50 substeps, 5 ms, again and again. Energies come from `torchmpm.diagnostics`.
+# Each step has 50 substeps and simulates 5 ms. `torchmpm.diagnostics` computes the energies.
 
 times, heights, energies, pictures = [], [], [], []
 for step in range(101):
@@ -67,7 +69,8 @@ for axis, x, step in zip(axes, pictures, range(0, 101, 20), strict=True):
 axes[0].set_ylabel("height, m")
 
 # %%
-# The total energy falls, because particles and grid exchange velocities and lose a little each time, and never rises.
+# The total energy never increases. It decreases slightly whenever velocities are transferred between particles and
+# grid.
 
 figure, axis = plt.subplots(figsize=(8, 3))
 for label, values in zip(("kinetic", "elastic", "potential"), zip(*energies, strict=True), strict=True):
@@ -78,11 +81,11 @@ axis.set(xlabel="time, s", ylabel="energy, J")
 axis.legend()
 
 # %%
-# Can it be trusted? Until it touches the table the ball falls like any other body, mass is kept to the last digit,
-# and energy does not grow.
+# The result can be checked against known physics: until it touches the table the ball is in free fall, the mass is
+# conserved, and the energy does not increase.
 
 fall = 20  # steps, 0.1 s
 assert abs(heights[fall] - (heights[0] - 0.5 * 9.8 * times[fall] ** 2)) < 1e-3
 assert torch.allclose(torchmpm.diagnostics.mass(solver, state), torch.tensor([1000.0 * area], dtype=torch.float64))
 assert max(later - now for now, later in itertools.pairwise(total)) < 1e-3 * total[0]
-assert min(heights) < 0.3 < heights[-1], "it came down and jumped"
+assert min(heights) < 0.3 < heights[-1], "the ball fell and bounced"

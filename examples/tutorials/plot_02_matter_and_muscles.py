@@ -1,15 +1,14 @@
 r"""
-Elastic, plastic, muscle
-========================
+Materials and muscles
+=====================
 
-Three squares are pulled by the same muscles for 25 ms and left alone for 125 ms. The elastic one springs back, the
-plastic one keeps its new shape, and a third, whose yield stress is higher, keeps some of it.
+Muscles act on three squares of different materials for 25 ms and then relax for 125 ms. The elastic square returns to
+its shape, the plastic one keeps its new shape, and a third one with a higher yield stress keeps part of it.
 """
 
 # %%
-# A muscle is a stress along a direction of the matter, given as a field on the nodes of the grid: `[:, 0]` pulls
-# along the material's x, `[:, 1]` along its y. Positive values contract. Which bodies it acts on is said with
-# `muscle=True`.
+# Actuation is a stress along two directions of the material, given as a field on the nodes of the grid: `[:, 0]` acts
+# along the material's x, `[:, 1]` along its y. Positive values contract. It acts on bodies with `muscle=True`.
 
 import matplotlib.pyplot as plt
 import torch
@@ -17,7 +16,7 @@ import torch
 import torchmpm
 
 COUNT, SIDE = 1500, 0.16
-MATTER = {
+MATERIALS = {
     "elastic": torchmpm.Elastic(mu=500.0, lam=50.0),
     "yields at 130 Pa": torchmpm.VonMises(mu=500.0, lam=50.0, yield_stress=130.0),
     "yields at 110 Pa": torchmpm.VonMises(mu=500.0, lam=50.0, yield_stress=110.0),
@@ -35,10 +34,10 @@ def shape(state: torchmpm.ParticleState) -> float:
 
 
 # %%
-# `damping` slows every node a little in each substep, so that the squares come to rest soon.
+# `damping` reduces the velocity of every node in each substep, so that the squares come to rest.
 
 curves, ends = {}, {}
-for name, material in MATTER.items():
+for name, material in MATERIALS.items():
     body = torchmpm.Body(COUNT, material, mass=2.0, volume=1.0, muscle=True)
     solver = torchmpm.Solver(torchmpm.Grid(128), bodies=(body,), damping=0.998)
     state, curves[name] = start, []
@@ -52,7 +51,7 @@ figure, axes = plt.subplots(1, 4, figsize=(11, 3), width_ratios=(2, 1, 1, 1))
 for name, curve in curves.items():
     axes[0].plot([5 * step for step in range(30)], curve, label=name)
 axes[0].axvspan(0, 25, color="0.9")
-axes[0].set(xlabel="time, ms (muscles pull in the grey part)", ylabel="height over width")
+axes[0].set(xlabel="time, ms (muscles active in the grey part)", ylabel="height over width")
 axes[0].legend()
 for axis, (name, state) in zip(axes[1:], ends.items(), strict=True):
     axis.scatter(state.x[0, :, 0], state.x[0, :, 1], s=0.5, color="#26798c")
@@ -60,8 +59,8 @@ for axis, (name, state) in zip(axes[1:], ends.items(), strict=True):
 figure.tight_layout()
 
 # %%
-# The yield stress bounds the elastic strain: the deviatoric strain in a particle never exceeds ``yield_stress / (2
-# mu)``. Flow keeps the volume, so the plastic square has the area it started with.
+# The yield stress bounds the elastic strain: the norm of a particle's deviatoric strain never exceeds ``yield_stress
+# / (2 mu)``. Plastic flow preserves the volume, so the plastic square keeps its initial area.
 
 for name, state in ends.items():
     F = state.F[0]

@@ -2,13 +2,13 @@ r"""
 A batch of robots
 =================
 
-Everything has a leading batch dimension, and every constant of the matter may differ between the elements of a batch.
-Here 64 robots of RUN with different stiffness and gravity are driven by the same wave, in one call.
+All tensors have a leading batch dimension, and every material parameter can differ between the simulations of a
+batch. This tutorial simulates 64 robots of RUN with different stiffness and gravity in parallel.
 """
 
 # %%
-# `dittogym.TorchEnv` is an environment with tensors in and out. `particles="lite"` gives each robot 2,000 particles
-# instead of 22,000; the page on fidelity says what that changes.
+# `dittogym.TorchEnv` is an environment whose inputs and outputs are tensors. With `particles="lite"` each robot has
+# 2,000 particles instead of 22,000; the page on fidelity compares the two.
 
 import math
 import time
@@ -26,7 +26,7 @@ physics = {"mu": stiffness, "gravity": torch.stack((torch.zeros(NUM), gravity), 
 batch.reset(seed=0, options={"physics": physics})
 
 # %%
-# The wave travels to the left through the horizontal muscles. Actions are in units of the strongest pull.
+# The actions are a wave that travels to the left through the horizontal muscles.
 
 column = torch.arange(batch.action_resolution) / batch.action_resolution
 
@@ -45,7 +45,7 @@ seconds = time.perf_counter() - began
 print(f"{NUM * STEPS / seconds:.0f} environment steps a second, {NUM} robots side by side")
 
 # %%
-# How far did each of them come?
+# The displacement depends on stiffness and gravity.
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6))
 picture = left.pcolormesh(
@@ -55,12 +55,12 @@ left.set(xscale="log", xlabel="second Lamé parameter mu, Pa", ylabel="gravity, 
 figure.colorbar(picture, label="displacement, cm")
 best = int(info["displacement"].argmax())
 right.imshow(batch.render(best, muscles=True))
-right.set(title="the one that came furthest", xticks=[], yticks=[])
+right.set(title="the robot that moved furthest", xticks=[], yticks=[])
 figure.tight_layout()
 
 # %%
-# A batch is not an approximation: element 13 moves as it would alone, with the native kernels to the last bit, else to
-# rounding.
+# The simulations of a batch do not affect each other: element 13 moves as it does alone, bit for bit with the native
+# backend and to rounding with the others.
 
 alone = dittogym.TorchEnv("run", particles="lite", substeps=50)
 alone.reset(seed=13, options={"physics": {"mu": stiffness[13], "gravity": (0.0, gravity[13].item())}})

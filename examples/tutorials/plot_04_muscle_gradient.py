@@ -2,13 +2,13 @@ r"""
 Gradients through the muscles
 =============================
 
-Which pull makes the robot jump? Every step is differentiable in the action, the state and the matter, so ask for the
-gradient of a height and follow it.
+Every step is differentiable with respect to the action, the state and the material. This tutorial computes the
+gradient of the robot's height with respect to its actions, and follows it to make the robot jump.
 """
 
 # %%
-# The graph of a control step holds its hundred substeps; `torchmpm.estimate_memory` says how much memory that takes.
-# Here ten steps in a row, small ones: 50 substeps each.
+# The gradient goes through ten control steps, here with 50 substeps each. `torchmpm.estimate_memory` predicts the
+# memory that a gradient needs.
 
 import matplotlib.pyplot as plt
 import torch
@@ -22,7 +22,7 @@ start = env.save()
 
 
 def height(actions: torch.Tensor) -> torch.Tensor:
-    """How high the robot's centre gets within the steps, for actions (STEPS, 2, R, R)."""
+    """Height of the robot's centre after the steps, for actions (STEPS, 2, R, R)."""
     env.load(start)
     for action in actions:
         env.step(action[None])
@@ -33,7 +33,7 @@ def height(actions: torch.Tensor) -> torch.Tensor:
 # The gradient
 # ------------
 #
-# One call of ``backward`` gives the derivative in every action of every step.
+# One backward pass gives the derivatives with respect to all actions of all steps.
 
 actions = torch.zeros(STEPS, *env.action_shape, dtype=torch.float64, requires_grad=True)
 resting = height(actions)
@@ -46,11 +46,11 @@ for column, step in enumerate(shown):
     for muscle, name in enumerate("xy"):
         axes[muscle, column].imshow(gradient[step, muscle], cmap="coolwarm", vmin=-limit, vmax=limit)
         axes[muscle, column].set(xticks=[], yticks=[], title=f"step {step}, {name} muscle")
-figure.suptitle("what a contraction would do for the height: red lifts, blue lowers")
+figure.suptitle("derivative of the height: where contraction lifts (red) and lowers (blue) the robot")
 figure.tight_layout()
 
 # %%
-# Is it right? Compare with a central difference along a random direction, in float64.
+# Compare the gradient with a central difference along a random direction, in float64.
 
 generator = torch.Generator().manual_seed(0)
 direction = torch.randn(actions.shape, generator=generator, dtype=torch.float64)
@@ -61,10 +61,10 @@ exact = (gradient * direction).sum().item()
 print(f"autograd {exact:.8e}, central difference {measured:.8e}")
 
 # %%
-# Climb it
-# --------
+# Optimisation
+# ------------
 #
-# A few steps of Adam on the actions, kept within [-1, 1] by a hyperbolic tangent.
+# Take a few steps of Adam. A hyperbolic tangent keeps the actions within [-1, 1].
 
 theta = torch.zeros_like(actions, requires_grad=True)
 adam = torch.optim.Adam([theta], lr=0.3)
@@ -84,7 +84,7 @@ left.set(xlabel="iteration", ylabel="height after ten steps, m")
 right.imshow(env.render(muscles=True))
 right.set(title="the last step; contraction red", xticks=[], yticks=[])
 figure.tight_layout()
-print(f"height {resting.item():.4f} m at rest, {jumping.item():.4f} m with the pulls found")
+print(f"height {resting.item():.4f} m with zero actions, {jumping.item():.4f} m with the optimised actions")
 
 assert abs(exact - measured) < 1e-5 * abs(exact)
 assert jumping > resting + 0.005

@@ -2,14 +2,14 @@ r"""
 Match a shape by gradient
 =========================
 
-SHAPE MATCH asks a disc to become a star. Thirty actions of 2 x 16 x 16 numbers are 15,360 unknowns: hopeless by
-trial, easy by gradient. This is the method of ``python -m baselines.train --algo gradient``, cut down to its core and
-to half a minute.
+In SHAPE MATCH a disc must take the shape of a star. An episode has 30 actions with 2 x 16 x 16 values each. Random
+search over these 15,360 values is hopeless, but gradient descent works. This tutorial is a short version of the
+method of ``python -m baselines.train --algo gradient``, and takes half a minute.
 """
 
 # %%
-# The silhouette that the reward counts is made of pixels that are on or off, so its derivative is zero.
-# `soft_silhouette` is the smooth one; blurring it and the target lets matter feel where a missing arm should grow.
+# The reward counts pixels that are on or off, so its derivative is zero. `soft_silhouette` is a smooth version of the
+# silhouette. Blurring it and the target gives gradients also where an arm of the star is still missing.
 
 import matplotlib.pyplot as plt
 import torch
@@ -23,7 +23,7 @@ target = torch.as_tensor(env.spec.target, dtype=torch.float32)
 
 
 def blurred(image: torch.Tensor, width: float) -> torch.Tensor:
-    """A picture (64, 64) after a Gaussian blur of some pixels."""
+    """Blur an image (64, 64) with a Gaussian of a given width in pixels."""
     if width == 0:
         return image
     offset = torch.arange(-12.0, 13.0)
@@ -34,12 +34,13 @@ def blurred(image: torch.Tensor, width: float) -> torch.Tensor:
 
 
 # %%
-# One episode under given actions. The loss is the difference of the blurred pictures, over all steps: a robot that
-# gets there early is better. ``detach`` is never called, so the gradient reaches through all 3,000 substeps.
+# This function simulates an episode. Its loss is the mean difference of the blurred images over all steps, so
+# reaching the shape early is better. The gradient goes through all 3,000 substeps, because ``detach`` is never
+# called.
 
 
 def episode(theta: torch.Tensor, width: float) -> tuple[torch.Tensor, float]:
-    """Loss, and the task's own return."""
+    """Simulate an episode; return its loss, and its return."""
     env.reset(seed=0)
     loss, total = torch.zeros(()), 0.0
     for action in theta.tanh():
@@ -51,8 +52,8 @@ def episode(theta: torch.Tensor, width: float) -> tuple[torch.Tensor, float]:
 
 
 # %%
-# Each step's gradient is clipped to three times its usual norm: where matter tears, derivatives are many times larger
-# and say little.
+# The gradient of each step is clipped to three times its usual norm, because derivatives are many times larger where
+# the robot tears.
 
 theta = torch.zeros(env.spec.horizon, *env.action_shape, requires_grad=True)
 adam = torch.optim.Adam([theta], lr=0.1, betas=(0.9, 0.98))
@@ -69,19 +70,19 @@ for width in (4, 2, 1, 0):
         curve.append(total)
 
 # %%
-# The return counts pixels, with the true, jumping reward.
+# The return of the true reward, which counts pixels:
 
 with torch.no_grad():
     _, resting = episode(torch.zeros_like(theta), 0)
     _, found = episode(theta, 0)
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6))
 left.plot(curve)
-left.axhline(resting, color="0.6", linestyle="--", label="no action")
-left.set(xlabel="iteration", ylabel="return at the lite tier")
+left.axhline(resting, color="0.6", linestyle="--", label="zero actions")
+left.set(xlabel="iteration", ylabel="return, lite particles")
 left.legend()
 right.imshow(env.render())
 right.set(title="after 40 iterations", xticks=[], yticks=[])
 figure.tight_layout()
-print(f"return {resting:.0f} without action, {found:.0f} with the actions found")
+print(f"return {resting:.0f} with zero actions, {found:.0f} with the optimised actions")
 
 assert found > resting + 200

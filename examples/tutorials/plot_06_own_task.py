@@ -1,9 +1,10 @@
 r"""
-Write your own task
-===================
+Define a custom task
+====================
 
-A task is data and one function. This one, HOP, wants a robot to be high up; it has its own obstacle and its own
-success, and then works like the eight others: with Gymnasium, in batches, with gradients, and for every algorithm.
+A task is a dataclass with a reward function. This tutorial defines HOP, which rewards the robot's height and has its
+own obstacle and success criterion. The task then works like the built-in ones: with Gymnasium, in batches, with
+gradients, and with every algorithm.
 """
 
 # %%
@@ -29,7 +30,7 @@ def judge(moment: dittogym.spec.Moment, weights: dittogym.Weights) -> dittogym.O
 
 
 def hop(wall: int = 60) -> dittogym.TaskSpec:
-    """HOP, with a wall at a column of nodes of one's choice."""
+    """HOP, with a wall that begins at the given column of nodes."""
     return dataclasses.replace(
         dittogym.make_spec("run"),
         name="hop",
@@ -41,7 +42,7 @@ def hop(wall: int = 60) -> dittogym.TaskSpec:
 
 
 # %%
-# ``register`` gives it Gymnasium ids. Options of the function become options of ``make``.
+# ``register`` creates Gymnasium ids. The arguments of the function become options of ``gymnasium.make``.
 
 dittogym.register("hop", hop)
 env = gymnasium.make("dittogym/hop-coarse-v0", particles="lite", wall=64)
@@ -50,7 +51,7 @@ total = 0.0
 for _ in range(20):
     observation, reward, terminated, truncated, info = env.step(np.zeros(env.action_space.shape, np.float32))
     total += reward
-print(f"resting robot: return {total:.2f}, terms {sorted(info['reward_terms'])}, ended {terminated or truncated}")
+print(f"zero actions: return {total:.2f}, terms {sorted(info['reward_terms'])}, ended {terminated or truncated}")
 
 # %%
 # The same task as a differentiable function: because ``judge`` is made of torch operations, its reward can be
@@ -71,7 +72,7 @@ for _ in range(8):
 print("return by iteration:", ", ".join(f"{value:.1f}" for value in curve))
 
 # %%
-# Look at it.
+# The resulting motion:
 
 batch.reset(seed=0)
 heights, successes, pictures = [], 0, []

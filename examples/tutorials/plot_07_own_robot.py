@@ -1,14 +1,14 @@
 r"""
-Your own robot from a drawing
-=============================
+Use a custom robot
+==================
 
-A robot's body is a picture: a file, an array, or the corners of an outline. Here a stool, a ring and a boot are
-driven by the same wave in the same task.
+A robot's body can be an image file, an array, or the corners of an outline. This tutorial applies the same actions to
+a stool, a ring and a boot in the same task.
 """
 
 # %%
-# Bright pixels are the robot. The body gets the area of the task's own and stands where that stood, so that rewards
-# and limits keep their meaning.
+# Bright pixels belong to the robot. The body is scaled to the area of the task's own robot and placed where that one
+# stands, so that rewards and limits keep their meaning.
 
 import math
 import tempfile
@@ -36,7 +36,7 @@ BODIES = {
 }
 
 # %%
-# They all are given the same wave.
+# All of them get the same actions.
 
 
 def wave(env: dittogym.TorchEnv, step: int) -> torch.Tensor:
@@ -64,8 +64,8 @@ figure.tight_layout()
 print({name: f"{100 * far:.1f} cm" for name, far in reached.items()})
 
 # %%
-# The same options work in `gymnasium.make`. A target for SHAPE MATCH is given in the same forms; its centre of mass
-# should be in the middle of the picture, because that is where the robot stays.
+# The same options work in `gymnasium.make`. A target for SHAPE MATCH can be given in the same forms; its centroid
+# should be in the middle of the image, because the observed region is centred on the robot.
 
 row, column = np.mgrid[-32:32, -32:32]
 plus = ((abs(row) < 5) & (abs(column) < 16)) | ((abs(column) < 5) & (abs(row) < 16))
@@ -79,4 +79,4 @@ print(f"intersection over union of disc and plus: {info['iou'].item():.2f}")
 folder.cleanup()
 
 assert 0.3 < info["iou"].item() < 0.8
-assert len(set(reached.values())) == len(BODIES), "three bodies, three gaits"
+assert len(set(reached.values())) == len(BODIES), "the bodies move differently"

@@ -2,13 +2,13 @@ r"""
 Train the coarse-to-fine policy
 ===============================
 
-One command trains; this page gives it few robots, few particles and few steps, so that it ends in half a minute. For
-a policy that is worth something leave these options out and wait some minutes: ``make demo`` does.
+This tutorial trains a policy with the command line. It uses few robots, particles and steps, so that it takes half a
+minute. For a useful policy leave these options out, as ``make demo`` does; training then takes a few minutes.
 """
 
 # %%
-# ``--dry-run`` first: it prints every option as it comes out of the preset and the command line, and what the run
-# will cost.
+# ``--dry-run`` prints the options that result from the preset and the command line, and estimates the cost of the
+# run.
 
 import subprocess
 import sys
@@ -30,21 +30,21 @@ command = [sys.executable, "-m", "cfp.train", "--task", "shapematch", "--seed", 
 
 
 def run(*more: str) -> str:
-    """What the command prints."""
+    """Run the command and return its output."""
     return subprocess.run([*command, *more], check=True, capture_output=True, text=True).stdout
 
 
 print("\n".join(run("--dry-run").splitlines()[-8:]))
 
 # %%
-# Now for real. The first stage learns on a 32 x 32 grid; the second freezes it and learns, on 64 x 64, where to be
-# finer.
+# Train the policy. The first stage learns actions of 32 x 32 cells. The second stage freezes the first one and learns
+# corrections of 64 x 64 cells.
 
 print(run())
 
 # %%
-# A run is a folder. If it is interrupted, the same command with ``--resume`` goes on where it stopped, to the last
-# bit.
+# A run is a folder. If it is interrupted, the same command with ``--resume`` continues it, and the result is the same
+# bit for bit.
 
 for path in sorted(out.iterdir()):
     print(path.name)
@@ -53,7 +53,7 @@ axis.imshow(plt.imread(out / "curve.png"))
 axis.axis("off")
 
 # %%
-# The policy has the interface of stable-baselines3, and loading it never runs code from the file.
+# The policy has the ``predict`` method of stable-baselines3. Loading it never runs code from the file.
 
 policy = cfp.load(out)
 env = dittogym.TorchEnv("shapematch", num_envs=2, resolution=policy.resolution, particles=1000)

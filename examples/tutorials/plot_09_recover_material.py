@@ -1,14 +1,15 @@
 r"""
-Recover a material
-==================
+Identify a material
+===================
 
-Which matter is this robot made of, judging by its silhouettes alone? A robot of unknown stiffness and yield stress is
-driven by known muscles and filmed. Gradient descent through the simulation finds the constants with which a simulated
-robot, filled with other particles, makes the same film.
+This tutorial identifies the stiffness and yield stress of a robot from its silhouettes alone. A robot with unknown
+parameters is recorded under known actions. Gradient descent through the simulation then finds the parameters with
+which a simulated robot, with different particles, produces the same recording.
 """
 
 # %%
-# A wave that stretches and shears, and slack muscles in the last third to see what springs back.
+# The actions are a wave that stretches and shears the robot. They are zero in the last third, to observe how it
+# relaxes.
 
 import math
 
@@ -35,12 +36,12 @@ def muscles() -> Tensor:
 
 
 # %%
-# Constants of the matter are options of ``reset``. A tensor that requires gradients is differentiated through: the
-# film's graph reaches back to it.
+# Material parameters are options of ``reset``. If a parameter is a tensor that requires gradients, the recording is
+# differentiable with respect to it.
 
 
-def film(env: dittogym.TorchEnv, seed: int, physics: dict[str, Tensor]) -> Tensor:
-    """Soft silhouettes (STEPS, 64, 64) of a robot of the given matter."""
+def record(env: dittogym.TorchEnv, seed: int, physics: dict[str, Tensor]) -> Tensor:
+    """Soft silhouettes (STEPS, 64, 64) of a robot with the given material parameters."""
     env.reset(seed=seed, options={"physics": physics})
     pictures = []
     for action in muscles():
@@ -51,10 +52,10 @@ def film(env: dittogym.TorchEnv, seed: int, physics: dict[str, Tensor]) -> Tenso
 
 env = dittogym.TorchEnv("shapematch", resolution=RESOLUTION, particles="lite")
 with torch.no_grad():
-    recording = film(env, 1, {name: torch.tensor(value) for name, value in TRUTH.items()})
+    recording = record(env, 1, {name: torch.tensor(value) for name, value in TRUTH.items()})
 
 # %%
-# Adam works on logarithms: constants are positive, and a per cent is a per cent.
+# Adam optimises the logarithms of the parameters, which keeps them positive and makes steps relative.
 
 logarithm = torch.tensor([math.log(value) for value in GUESS.values()], requires_grad=True)
 adam = torch.optim.Adam([logarithm], lr=0.06, betas=(0.8, 0.95))
@@ -62,7 +63,7 @@ schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, ITERATIONS, 0.003)
 history = []
 for _ in range(ITERATIONS):
     physics = dict(zip(GUESS, logarithm.exp(), strict=True))
-    loss = (film(env, 0, physics) - recording).square().mean()
+    loss = (record(env, 0, physics) - recording).square().mean()
     adam.zero_grad()
     loss.backward()
     adam.step()
@@ -70,12 +71,12 @@ for _ in range(ITERATIONS):
     history.append(logarithm.detach().exp())
 
 # %%
-# The two robots are filled with different particles, which bounds how well it can be done.
+# The two robots consist of different particles, which limits the accuracy.
 
 found = dict(zip(GUESS, history[-1].tolist(), strict=True))
 figure, axes = plt.subplots(1, 3, figsize=(11, 3))
 axes[0].imshow(recording[-1], cmap="gray")
-axes[0].set(title="the last picture of the film", xticks=[], yticks=[])
+axes[0].set(title="last frame of the recording", xticks=[], yticks=[])
 for axis, (name, true), values in zip(axes[1:], TRUTH.items(), torch.stack(history).T, strict=True):
     axis.plot(values)
     axis.axhline(true, color="0.5", linestyle="--")

@@ -2,14 +2,14 @@ r"""
 Compare algorithms
 ==================
 
-One command trains every algorithm with every seed, judges all policies on the same layouts, and writes a report. Here
-it gets three that take seconds: slack muscles, random actions, and a sequence of actions by gradient, all on SHAPE
-MATCH.
+One command trains every algorithm with every seed, evaluates all policies on the same episodes, and writes a report.
+This tutorial compares three that take seconds on SHAPE MATCH: zero actions, random actions, and an action sequence
+optimised by gradient descent.
 """
 
 # %%
-# Options of single algorithms come from a small file. This one cuts the gradient's work down to thirty iterations
-# with few particles.
+# Options for single algorithms are given in a JSON file. This one limits the optimisation to 30 iterations with few
+# particles.
 
 import json
 import subprocess
@@ -21,33 +21,32 @@ import matplotlib.pyplot as plt
 
 folder = tempfile.TemporaryDirectory()
 out, plan = Path(folder.name) / "compare", Path(folder.name) / "plan.json"
-quick = {"iterations": 30, "tier": 500, "grid": 8, "learning_rate": 0.1}
+quick = {"iterations": 30, "train_particles": 500, "grid": 8, "learning_rate": 0.1}
 plan.write_text(json.dumps({"algos": {"gradient": quick}}))
 command = [sys.executable, "-m", "baselines.compare", "--tasks", "shapematch", "--algos", "zero", "random", "gradient"]
 command += ["--seeds", "0", "1", "--plan", str(plan), "--out", str(out), "--episodes", "3", "--robustness", "none"]
 
 # %%
-# ``--dry-run`` lists what there is to do.
+# ``--dry-run`` lists the runs.
 
 
 def run(*more: str) -> str:
-    """What the command prints."""
+    """Run the command and return its output."""
     return subprocess.run([*command, *more], check=True, capture_output=True, text=True).stdout
 
 
 print(run("--dry-run"))
 
 # %%
-# Then for real. What is finished is kept: the same command again would train nothing, and after an interruption it
-# goes on where it was.
+# Run the comparison. Finished runs are kept, so the same command continues after an interruption.
 
 run()
 report = (out / "report.md").read_text()
 print(report[: report.index("##", report.index("## ") + 3)])
 
 # %%
-# The report is a page that opens from disk, with tables as CSV and pictures beside it. A policy that knows nothing
-# but the time, such as the gradient's, is never ranked with those that look at the image.
+# The report is an HTML page, with tables as CSV files and plots in the same folder. Policies that observe nothing,
+# such as a fixed action sequence, are never ranked together with policies that observe the image.
 
 for path in sorted(out.iterdir()):
     print(path.name)
@@ -56,7 +55,7 @@ axis.imshow(plt.imread(out / "curves.png"))
 axis.axis("off")
 
 # %%
-# The numbers, as any program would read them:
+# The tables can be read by any program:
 
 lines = (out / "returns.csv").read_text().splitlines()
 columns = lines[0].split(",")

@@ -2,13 +2,14 @@ r"""
 On a GPU, and on a cluster
 ==========================
 
-The same program runs on a laptop's CPU and on a GPU: say ``device="cuda"``. What changes is how many robots it takes
-to fill the machine. This page measures that where it was built. (On a GPU nothing of this has been timed yet; there
-``backend="native"`` has to be asked for, otherwise the physics runs operator by operator.)
+The same program runs on a CPU and, with ``device="cuda"``, on a GPU. They differ in the number of robots that is
+needed to use the whole device. This tutorial measures it on the machine on which the documentation was built. Nothing
+has been timed on a GPU yet; there, ``backend="native"`` selects the fused kernels, and the default is plain PyTorch
+operations.
 """
 
 # %%
-# Tensors live on the environment's device, actions too.
+# All tensors are on the device of the environment, including actions.
 
 import time
 
@@ -22,7 +23,7 @@ print(f"torch {torch.__version__}, {device}, {torch.get_num_threads()} threads")
 
 
 def throughput(num_envs: int, gradient: bool = False) -> float:
-    """Environment steps a second, of all robots together; the best of three tries."""
+    """Environment steps per second of all robots together, best of three measurements."""
     env = dittogym.TorchEnv("run", num_envs=num_envs, particles="lite", device=device)
     env.reset(seed=0)
     action = torch.zeros(num_envs, *env.action_shape, device=device, requires_grad=gradient)
@@ -41,8 +42,9 @@ def throughput(num_envs: int, gradient: bool = False) -> float:
 
 
 # %%
-# A step of one robot cannot be spread well over many cores, a batch can: each robot is independent. On a GPU go on
-# doubling until the curve is flat, or memory ends: `torchmpm.estimate_memory` says beforehand what gradients take.
+# A batch of independent robots can be divided among many cores, a single robot cannot. On a GPU, double the batch
+# size until the curve is flat or the memory is full. `torchmpm.estimate_memory` predicts the memory that gradients
+# need.
 
 sizes = (1, 2, 4, 8, 16, 32)
 forward = [throughput(size) for size in sizes]
@@ -50,7 +52,7 @@ backward = [throughput(size, gradient=True) for size in sizes]
 figure, axis = plt.subplots(figsize=(7, 3.5))
 axis.plot(sizes, forward, "o-", label="forward")
 axis.plot(sizes, backward, "s-", label="with the gradient")
-axis.set(xscale="log", xlabel="robots side by side", ylabel="environment steps a second")
+axis.set(xscale="log", xlabel="robots in parallel", ylabel="environment steps per second")
 axis.legend()
 figure.tight_layout()
 
@@ -58,12 +60,12 @@ figure.tight_layout()
 # On the command line
 # -------------------
 #
-# ``python -m cfp.train --task run --device cuda --num-envs 256`` simulates and learns on the GPU. One run does not
-# spread over several GPUs or machines; many runs do: ``python -m baselines.compare --executor ray`` hands them to a
-# Ray cluster, and a Slurm array starts one command for each.
+# ``python -m cfp.train --task run --device cuda --num-envs 256`` simulates and trains on the GPU. A single run uses
+# one device. Several runs can use several GPUs and machines: ``python -m baselines.compare --executor ray``
+# distributes them over a Ray cluster, and a Slurm array starts one command for each run.
 
 for size, alone, both in zip(sizes, forward, backward, strict=True):
     print(f"{size:3d} robots: {alone:7.0f} steps/s, with the gradient {both:6.0f}")
 
 assert max(forward) >= forward[0]
-assert all(a > b for a, b in zip(forward, backward, strict=True)), "a gradient is not for nothing"
+assert all(a > b for a, b in zip(forward, backward, strict=True)), "gradients take time"

@@ -2,12 +2,12 @@ r"""
 Reading the training metrics
 ============================
 
-A run writes what it measures into ``progress.csv`` and TensorBoard. This page trains a tiny one and says what to look
-at. Every column is explained on the page of scalars.
+A run writes its metrics to ``progress.csv`` and TensorBoard. This tutorial trains a small policy and explains the
+most important ones. The page on logged scalars lists all of them.
 """
 
 # %%
-# One level, few particles, few steps: just enough for curves to have a shape.
+# Few particles and few steps are enough to see the shape of the curves.
 
 import csv
 import subprocess
@@ -39,21 +39,24 @@ print(f"{len(rows)} rows, columns: {', '.join(rows[0])}")
 
 
 def series(name: str) -> tuple[list[int], list[float]]:
-    """Steps and values of a column, where it has one."""
+    """Steps and values of a column, without empty cells."""
     points = [(int(row["step"]), float(row[name])) for row in rows if row[name]]
     return [step for step, _ in points], [value for _, value in points]
 
 
 # %%
-# What to look at first
-# ---------------------
+# The main metrics
+# ----------------
 #
-# - ``rollout/return`` is what exploring robots earn; ``evaluations.csv`` holds what the policy earns on other layouts.
-# - ``train/critic_loss`` should fall from its first peak and stay flat. If it grows without end, values run away.
-# - ``train/q`` and the reward statistics tell the scale. Rewards are centred: values near zero mean "as usual".
-# - ``train/entropy`` falls as the policy becomes sure. At its least value at once, the policy has stopped exploring;
-#   if it never falls, the critic cannot tell actions apart.
-# - ``train/gate`` exists from the second level on: 0 keeps the coarse action, 1 replaces it.
+# - ``rollout/return`` is the return of training episodes, with exploration. ``evaluations.csv`` contains the returns of
+#   the policy in separate evaluation episodes.
+# - ``train/critic_loss`` should decrease after its first peak and then stay constant. If it keeps growing, the values
+#   diverge.
+# - ``train/q`` and the reward statistics show the scale of the values. Rewards are normalised, so 0 is an average
+#   reward.
+# - ``train/entropy`` decreases as the policy becomes more certain. If it is minimal from the start, the policy does not
+#   explore; if it never decreases, the critics do not distinguish actions.
+# - ``train/gate`` exists from the second stage on: 0 keeps the coarse action, and 1 replaces it.
 
 shown = ("rollout/return", "train/critic_loss", "train/q", "train/entropy", "train/reward_std", "train/gate")
 figure, axes = plt.subplots(2, 3, figsize=(11, 5.4))
@@ -61,23 +64,23 @@ for axis, name in zip(axes.flat, shown, strict=True):
     axis.plot(*series(name))
     axis.axvline(800, color="0.7", linestyle="--")
     axis.set(title=name, xlabel="environment steps")
-figure.suptitle("the dashed line is the handover from the coarse level to the fine one")
+figure.suptitle("dashed line: start of the second stage")
 figure.tight_layout()
 
 # %%
 # Signs of trouble
 # ----------------
 #
-# - A non-finite loss stops the run with an error that names it; nothing is hidden, and the last checkpoint is good.
-# - Episodes that end early show in ``rollout/length``. In tasks that can tear a robot it is the first thing to fall.
-# - ``time/steps_per_second`` (TensorBoard only) falling over hours means that something else wants the machine.
+# - A loss that is not finite stops the run with an error that names it. The last checkpoint remains valid.
+# - ``rollout/length`` decreases when episodes end early, for example because robots tear.
+# - If ``time/steps_per_second`` (TensorBoard only) decreases over hours, other programs use the machine.
 #
-# ``tensorboard --logdir runs`` shows all of it live, with pictures of action and gate at every evaluation.
+# ``tensorboard --logdir runs`` shows all metrics live, with images of action and gate at every evaluation.
 
 gate_steps, gates = series("train/gate")
 losses = series("train/critic_loss")[1]
 folder.cleanup()
 
-assert min(gate_steps) > 800, "the coarse level has no gate"
+assert min(gate_steps) > 800, "the first stage has no gate"
 assert all(0 < gate < 1 for gate in gates)
 assert all(loss > 0 for loss in losses)

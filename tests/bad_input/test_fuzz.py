@@ -1,6 +1,7 @@
 """Whatever is in a file of options, a picture or a policy: the documented errors come out, or what it says."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,9 +12,10 @@ from hypothesis import strategies as st
 import baselines
 from baselines.registry import ALGORITHMS, configure
 from cfp.agent.actor import build_actor
-from cfp.config import Config, to_json
+from cfp.config import to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.process import peak_memory
+from cfp.presets import preset
 from cfp.weights import describe, save_policy
 from dittogym.targets import load_target
 
@@ -116,7 +118,7 @@ def test_pictures_of_any_bytes(kind, tmp_path_factory, cuts, changes):
         assert target.shape == (64, 64) and target.dtype == bool
 
 
-CONFIG = Config(resolutions=(4, 8))
+CONFIG = replace(preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,))
 OF_OTHERS = {"inputs": 10, "noise": 0.1, "features": {}, "nodes": {"count": 16, "graph": True}}
 DESCRIPTION = json.loads(json.dumps(describe(CONFIG, 0, 7))) | OF_OTHERS
 

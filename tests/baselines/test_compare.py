@@ -159,7 +159,7 @@ def test_runs_of_the_paper_are_judged_in_the_same_sound_world_at_every_tier():
         configs = [configure({"algo": algo, "preset": "paper"}) for algo in ("zero", "cfp")]
         configs.append(replace(configs[0], environment=replace(configs[0].environment, particles=tier)))
         places = [judged(config, tier).environment for config in configs]
-        assert {(place.particles, place.parity, place.layout) for place in places} == {(tier, parity, "grid")}
+        assert {(place.particles, place.parity, place.action_indexing) for place in places} == {(tier, parity, "grid")}
 
 
 def test_what_was_judged_in_another_world_is_judged_again():
@@ -194,7 +194,7 @@ def test_array_job_does_one_run_and_no_report(tmp_path):
     ("options", "message"),
     [
         ("--algos alchemy", "algo: got 'alchemy', allowed cfp"),
-        ("--tasks swim --algos mpc", "task: got 'swim'"),
+        ("--tasks swim --algos mpc", "task must be catch"),
         ("--algos mpc mpc", "algos: got mpc mpc, allowed one or more, each once"),
         ("--seeds 9500 --algos mpc", "seeds: got 9500, allowed 0 to 8999"),
         ("--episodes 0", "episodes: got 0, allowed 1 or more"),
@@ -234,7 +234,7 @@ def test_options_without_effect_are_refused_where_they_are_for_one_algorithm(tmp
         (label,) = algos
         assert compare(tmp_path / "out", "--algos", label, "--tasks", "run", plan={"algos": algos}) == 2
         error = capsys.readouterr().err
-        assert f"{label} on run: warm_critic: got True, which changes nothing; allowed with" in error
+        assert f"{label} on run: warm_critic requires " in error
     plan = {"common": idle, "algos": {"gnn-16": {"learning": {"warm_critic": False}}}}
     assert compare(tmp_path / "out", "--dry-run", "--algos", "cfp", "coarse", "gnn-16", plan=plan) == 0
 

@@ -20,9 +20,10 @@ from baselines.modular.networks import ModularActor
 from baselines.modular.nodes import Nodes
 from baselines.modular.policy import SegmentPolicy
 from baselines.registry import configure
-from cfp.config import EnvironmentConfig, ReportConfig, to_json
+from cfp.config import to_json
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.process import StopSignals
+from cfp.sections import EnvironmentConfig, ReportConfig
 from cfp.tables import read_table
 from cfp.weights import origin, read_policy, write_policy
 from dittogym import TASKS, TorchEnv
@@ -98,11 +99,11 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"beta_decay": 1.5}, "beta_decay: got 1.5, allowed 0 to 1"),
-        ({"dropout": -0.1}, "dropout: got -0.1, allowed 0 to 1"),
-        ({"updates": 0}, "updates: got 0"),
-        ({"student_learning_rate": 0.0}, "student_learning_rate: got 0.0"),
-        ({"gate_bias": ()}, "gate_bias: got 0 values"),
+        ({"beta_decay": 1.5}, "beta_decay must be between 0 and 1, got 1.5"),
+        ({"dropout": -0.1}, "dropout must be between 0 and 1, got -0.1"),
+        ({"updates": 0}, "updates must be at least 1, got 0"),
+        ({"student_learning_rate": 0.0}, "student_learning_rate must be positive, got 0.0"),
+        ({"gate_bias": ()}, "gate_bias must have 1 values"),
     ],
 )
 def test_impossible_options_are_named(changes, message):

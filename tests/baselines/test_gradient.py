@@ -9,8 +9,9 @@ import torch
 from baselines import Gradient, OpenLoop
 from baselines.registry import configure
 from baselines.trajectory.optimise import Episode
-from cfp.config import EnvironmentConfig, to_json
+from cfp.config import to_json
 from cfp.errors import ConfigError, NonFiniteError
+from cfp.sections import EnvironmentConfig
 from dittogym import make_spec
 
 TASKS = ("shapematch", "run", "grow", "kick", "dig", "obstacle", "catch", "slot")
@@ -42,8 +43,8 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"iterations": 0}, "iterations: got 0"),
-        ({"window": -1}, "window: got -1"),
+        ({"iterations": 0}, "iterations must be at least 1, got 0"),
+        ({"window": -1}, "window must be at least 0, got -1"),
         ({"polish_learning_rate": 0.0}, "polish_learning_rate"),
         ({"blur": ()}, "blur"),
     ],

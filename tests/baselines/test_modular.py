@@ -17,12 +17,12 @@ from baselines.modular.nodes import Nodes, pack, places, unpack
 from baselines.modular.policy import SegmentPolicy
 from baselines.modular.train import ModularConfig, ModularRun, preset
 from cfp.agent.losses import Losses
-from cfp.config import EnvironmentConfig, ReportConfig
 from cfp.envs.disturbances import Case
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.process import StopSignals
 from cfp.robustness import report
+from cfp.sections import EnvironmentConfig, ReportConfig
 from cfp.weights import origin
 from dittogym import TorchEnv
 

@@ -8,11 +8,11 @@ import torch
 
 from baselines import MPC, GradientPlannerConfig, OpenLoop, train
 from baselines.planning.mpc import MPCConfig
-from cfp.config import EnvironmentConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
 from cfp.experiment.process import StopSignals
 from cfp.experiment.run import holds_run
+from cfp.sections import EnvironmentConfig
 from cfp.tables import read_table
 
 ENVIRONMENT = EnvironmentConfig(num_envs=1, particles=100, substeps=2)

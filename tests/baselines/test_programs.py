@@ -13,9 +13,9 @@ import dittogym
 from baselines import evaluate, robustness, train
 from cfp.agent.actor import build_actor
 from cfp.errors import ConfigError
-from cfp.policy import SeesState
 from cfp.experiment.books import Books
 from cfp.experiment.cli import parse
+from cfp.policy import SeesState
 from cfp.tables import read_table
 from cfp.weights import describe, save_policy
 
@@ -205,7 +205,7 @@ def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, mon
 
 @pytest.mark.parametrize("algo", ["shac", "distill", "gradient", "zero", "random", "scripted"])
 def test_new_particles_are_refused_where_the_seed_says_them(algo):
-    with pytest.raises(ConfigError, match="resample: got True, which changes nothing; allowed with soft actor-critic"):
+    with pytest.raises(ConfigError, match="resample requires soft actor-critic"):
         parse(train.PROGRAM, ["--algo", algo, "--resample"])
     assert parse(train.PROGRAM, ["--algo", "gnn-16", "--resample"]).run.environment.resample
 
@@ -236,7 +236,7 @@ def test_wrong_algorithm_is_named(tmp_path, capsys):
     assert train.main(["--algo", "alchemy", "--out", str(tmp_path / "a")]) == 2
     assert f"algo: got 'alchemy', allowed {', '.join(baselines.ALGORITHMS)}" in capsys.readouterr().err
     assert cfp.train.main(["--algo", "gradient", "--out", str(tmp_path / "a")]) == 2
-    assert "algo: got 'gradient', allowed 'cfp'; python -m baselines.train takes others" in capsys.readouterr().err
+    assert "algo must be 'cfp', got 'gradient'; python -m baselines.train" in capsys.readouterr().err
 
 
 def test_robustness_is_reported_whatever_trained_it(finished):

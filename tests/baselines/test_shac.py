@@ -14,12 +14,14 @@ from baselines.registry import configure
 from baselines.shac import rollout as shac_rollout
 from baselines.shac.reward import RewardConfig
 from baselines.shac.train import METRICS
-from cfp.agent.actor import ActorSpec, build_actor
-from cfp.config import EnvironmentConfig, to_json
+from cfp.agent.actor import build_actor
+from cfp.agent.spec import ActorSpec
+from cfp.config import to_json
 from cfp.envs.make import make_env
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
 from cfp.evaluation.evaluate import attached, evaluate
 from cfp.evaluation.video import film
+from cfp.sections import EnvironmentConfig
 from cfp.weights import describe, origin, save_policy
 from dittogym import TorchEnv
 
@@ -42,22 +44,22 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
     config = Shac.preset(task, preset)
     config.check()
     assert configure(json.loads(json.dumps(to_json(config)))) == config
-    learned = config.environment.learned_at(config.train_particles)
+    learned = config.environment.for_training(config.train_particles)
     assert (learned.particles, learned.parity) == ("lite", "clean")
-    assert learned.layout == config.environment.layout == ("grid" if preset == "paper" else "image")
+    assert learned.action_indexing == config.environment.action_indexing == ("grid" if preset == "paper" else "image")
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"window": 0}, "window: got 0"),
-        ({"gamma": 1.5}, "gamma: got 1.5"),
+        ({"window": 0}, "window must be at least 1, got 0"),
+        ({"gamma": 1.5}, "gamma must be between 0 and 1, got 1.5"),
         ({"learning_rate": 0.0}, "learning_rate"),
-        ({"noise": -0.1}, "noise: got -0.1"),
-        ({"reward": RewardConfig(scale=0.0)}, "scale: got 0.0, allowed more than 0"),
-        ({"reward": RewardConfig(split_weight=-1.0)}, "split_weight: got -1.0, allowed 0 or more"),
-        ({"reward": RewardConfig(split_margin=-0.5)}, "split_margin: got -0.5, allowed 0 or more"),
-        ({"reward": RewardConfig(integrity_weight=-2.0)}, "integrity_weight: got -2.0, allowed 0 or more"),
+        ({"noise": -0.1}, "noise must be at least 0, got -0.1"),
+        ({"reward": RewardConfig(scale=0.0)}, "scale must be positive, got 0.0"),
+        ({"reward": RewardConfig(split_weight=-1.0)}, "split_weight must be at least 0, got -1.0"),
+        ({"reward": RewardConfig(split_margin=-0.5)}, "split_margin must be at least 0, got -0.5"),
+        ({"reward": RewardConfig(integrity_weight=-2.0)}, "integrity_weight must be at least 0, got -2.0"),
     ],
 )
 def test_impossible_options_are_named(changes, message):

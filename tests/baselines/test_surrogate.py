@@ -8,8 +8,8 @@ import torch
 from baselines import CEM, MPC, GradientPlannerConfig
 from baselines.planning.mpc import CEMConfig, MPCConfig
 from baselines.planning.surrogate import Surrogate
-from cfp.config import EnvironmentConfig
 from cfp.errors import ConfigError
+from cfp.sections import EnvironmentConfig
 from dittogym import TASKS, TorchEnv
 
 ENVIRONMENT = EnvironmentConfig(num_envs=1, particles=600, substeps=2)

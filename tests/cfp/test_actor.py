@@ -5,8 +5,9 @@ import torch
 from torch import distributions
 from torch.nn import functional as F
 
-from cfp.agent.actor import ActorSpec, Sample, build_actor
+from cfp.agent.actor import Sample, build_actor
 from cfp.agent.networks import normalise_image, upsample
+from cfp.agent.spec import ActorSpec
 from cfp.envs.make import make_torch_env
 from cfp.presets import preset
 from dittogym import TASKS, make_spec
@@ -168,10 +169,10 @@ def test_coarser_levels_are_frozen_and_drawn_anew():
 @pytest.mark.parametrize(
     ("resolutions", "bias", "message"),
     [
-        ((7,), (), "resolution: got 7, allowed 4, 8, 16, 32, 64"),
-        ((16, 8), (0.0,), "growing ladder"),
-        ((), (), "growing ladder"),
-        ((8, 16), (), "got 0 values"),
+        ((7,), (), "resolutions must be increasing"),
+        ((16, 8), (0.0,), "resolutions must be increasing"),
+        ((), (), "resolutions must be increasing"),
+        ((8, 16), (), "gate_bias must have 1 values"),
     ],
 )
 def test_impossible_ladders_are_refused(resolutions, bias, message):

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,19 +13,22 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch.nn import functional as F
 
-from cfp.agent.actor import ActorSpec
+from cfp.agent.hyperparameters import Hyperparameters
 from cfp.agent.policies import CFPPolicy
 from cfp.agent.sac import CFP, METRICS, RewardStatistics, clip_each
+from cfp.agent.spec import ActorSpec
 from cfp.envs.vec_env import monitored
 from cfp.errors import NonFiniteError
 
 ALPHA, RHO, GAMMA, LIMIT = 0.03, 0.7, 0.9, 0.05
 
 
-def make_model(spec, env=None, **options):
+def make_model(spec, env=None, sac_options=None, **hyperparameters):
     env = env or FakeEnv(num_envs=2, resolution=spec.resolutions[-1])
-    settings = {"buffer_size": 400, "batch_size": 8, "seed": 0, "device": "cpu", "policy_kwargs": {"spec": spec}}
-    model = CFP(CFPPolicy, monitored(env), **(settings | options))
+    own = Hyperparameters(**{"buffer_size": 400, "batch_size": 8, **hyperparameters})
+    model = CFP(
+        CFPPolicy, monitored(env), own, seed=0, device="cpu", policy_kwargs={"spec": spec}, **(sac_options or {})
+    )
     model.set_logger(Logger(None, []))
     return model
 
@@ -232,7 +236,7 @@ def test_actor_waits_for_the_critics_and_has_a_rate_of_its_own():
     assert same() == [True, False] and not actor.optimizer.state
     model.learn(12, reset_num_timesteps=False)
     assert same() == [True, False] and actor.optimizer.state
-    model.actor_rate = None
+    model.hyperparameters = replace(model.hyperparameters, actor_rate=None)
     model.learn(4, reset_num_timesteps=False)
     assert same() == [False, False]
 
@@ -377,4 +381,4 @@ def test_wrong_action_grid_is_refused():
     with pytest.raises(ValueError, match="ladder \\(16,\\)"):
         make_model(ActorSpec((16,)), FakeEnv(num_envs=1, resolution=8))
     with pytest.raises(ValueError, match="use_sde"):
-        make_model(ActorSpec((8,)), use_sde=True)
+        make_model(ActorSpec((8,)), sac_options={"use_sde": True})

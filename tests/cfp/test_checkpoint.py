@@ -6,25 +6,26 @@ from fakes import FakeEnv
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
+from cfp.agent.hyperparameters import Hyperparameters
 from cfp.agent.policies import CFPPolicy
 from cfp.agent.sac import CFP
-from cfp.config import Config, to_json
 from cfp.envs.vec_env import monitored
-from cfp.errors import CheckpointError, ConfigError
+from cfp.errors import CheckpointError
 from cfp.experiment.checkpoint import Checkpoint, model_state
-from cfp.experiment.state_file import Position, check_same
+from cfp.experiment.state_file import Position
 from cfp.presets import preset
 
-CONFIG = Config(resolutions=(4, 8), gate_bias=(-1.0,))
+CONFIG = replace(preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,))
 
 
 def make_model(level=1):
     # The ring (20 rows) wraps around, and 7 does not divide anything: episodes are in progress at every checkpoint.
     env = monitored(FakeEnv(num_envs=2, resolution=CONFIG.action_size(level), horizon=7))
     spec = CONFIG.actor_spec(level)
-    options = {"buffer_size": 40, "batch_size": 4, "update_start": 6, "random_steps": 10, "seed": 3, "device": "cpu"}
-    options |= {"precision": "bfloat16"}
-    model = CFP(CFPPolicy, env, gate_penalty=0.1, policy_kwargs={"spec": spec}, **options)
+    hyperparameters = Hyperparameters(
+        buffer_size=40, batch_size=4, update_start=6, random_steps=10, precision="bfloat16", gate_penalty=0.1
+    )
+    model = CFP(CFPPolicy, env, hyperparameters, policy_kwargs={"spec": spec}, seed=3, device="cpu")
     model.set_logger(Logger(None, []))
     return model
 
@@ -136,15 +137,6 @@ def test_damaged_state_is_refused_with_its_name(tmp_path, damage):
         torch.save({"version": 99}, path)
     with pytest.raises(CheckpointError, match=r"state\.pt"):
         Checkpoint(tmp_path).load()
-
-
-def test_checkpoint_from_before_an_option_existed_is_resumed():
-    stored, given = to_json(preset("shapematch")), preset("shapematch")
-    del stored["learning"]["precision"], stored["learning"]["compile"]
-    check_same(stored, given)
-    other = replace(given, learning=replace(given.learning, precision="bfloat16"))
-    with pytest.raises(ConfigError, match="precision: the run was started with 'float32', got 'bfloat16'"):
-        check_same(stored, other)
 
 
 def test_state_of_another_network_is_refused(tmp_path):

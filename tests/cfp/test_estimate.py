@@ -9,8 +9,9 @@ from baselines import train as baselines_train
 from cfp import train
 from cfp.agent.policies import ActorPolicy
 from cfp.agent.sac import CFP
-from cfp.config import Config, merge
+from cfp.config import Config
 from cfp.experiment.estimate import REPEATS, _duration, seconds
+from cfp.from_dict import update_from_dict
 from cfp.presets import preset
 from dittogym import make_spec
 
@@ -24,7 +25,7 @@ def test_dry_run_tells_options_and_costs_and_writes_nothing(tmp_path, capsys, mo
     assert train.main(arguments) == 0
     assert not list(tmp_path.iterdir())
     options, end = json.JSONDecoder().raw_decode(printed := capsys.readouterr().out)
-    config: Config = merge(preset("shapematch"), options)
+    config: Config = update_from_dict(preset("shapematch"), options)
     assert (config.steps, config.handover, config.environment.particles) == (150, (70,), 100)
     header, first, second, time, memory = printed[end:].strip().splitlines()
     assert header.split()[:3] == ["stage", "action", "steps"]

@@ -6,8 +6,9 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from test_algorithm import make_batch, make_model
 from torch.nn import functional as F
 
-from cfp.agent.actor import ActorSpec, squashed_log_prob
+from cfp.agent.actor import squashed_log_prob
 from cfp.agent.losses import Losses, choose_precision
+from cfp.agent.spec import ActorSpec
 
 PLAIN = ActorSpec((32,))
 LADDERS = {

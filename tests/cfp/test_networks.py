@@ -3,8 +3,9 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from cfp.agent.actor import Actor, ActorSpec, build_actor
+from cfp.agent.actor import Actor, build_actor
 from cfp.agent.networks import Encoder, TwinCritic, make_head, normalise_image, upsample
+from cfp.agent.spec import ActorSpec
 
 
 def trainable(module):

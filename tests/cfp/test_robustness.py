@@ -247,7 +247,7 @@ def test_ratios_need_a_positive_return():
     ("arguments", "message"),
     [
         (["--dropout", "1.5"], "dropout: got 1.5, allowed between 0 and 1"),
-        (["--latency", "0"], "latency: got 0, allowed 1 or more"),
+        (["--latency", "0"], "latency must be at least 1, got 0"),
         (["--noise", "nan"], "noise: got nan"),
         (["--friction", "-1"], "friction: got (-1.0,), allowed 0 or more"),
         (["--device", "abacus"], "device: got 'abacus'"),

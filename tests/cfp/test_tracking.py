@@ -13,8 +13,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from test_train import run
 
 from cfp import train
-from cfp.agent.actor import ActorSpec, build_actor
+from cfp.agent.actor import build_actor
 from cfp.agent.sac import METRICS
+from cfp.agent.spec import ActorSpec
 from cfp.evaluation.pictures import PICTURES, muscles, policy_pictures
 from cfp.experiment.books import BOOK_METRICS
 from cfp.experiment.callbacks import ROLLOUT_METRICS

@@ -18,9 +18,9 @@ from fakes import FakeEnv
 import cfp
 import dittogym
 from cfp import evaluate, train
-from cfp.agent.actor import ActorSpec, build_actor
+from cfp.agent.actor import build_actor
 from cfp.agent.policies import ActorPolicy
-from cfp.config import EnvironmentConfig
+from cfp.agent.spec import ActorSpec
 from cfp.envs.vec_env import monitored
 from cfp.evaluation import plots as plot
 from cfp.evaluation import video
@@ -29,6 +29,7 @@ from cfp.experiment.callbacks import StageCallback
 from cfp.experiment.cfp_run import Runner
 from cfp.experiment.cli import program_name
 from cfp.presets import preset
+from cfp.sections import EnvironmentConfig
 from cfp.tables import read_table
 from cfp.weights import describe, policy_file, save_policy, shipped
 
@@ -242,8 +243,8 @@ def test_damaged_checkpoint_is_an_error_that_names_it(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--task", "jump"], "task: got 'jump', allowed catch, dig"),
-        (["--preset", "slow"], "preset: got 'slow', allowed quick, paper"),
+        (["--task", "jump"], "task must be catch, dig"),
+        (["--preset", "slow"], "preset must be quick or paper for shapematch, got 'slow'"),
         (["--particles", "0"], "particles"),
         (["--target", "no/such.png"], "target"),
         (["--num-envs", "0"], "num_envs: got 0"),
@@ -319,7 +320,7 @@ def test_single_policy_need_not_have_the_grids_of_its_task(tmp_path, monkeypatch
     tens = replace(dittogym.make_spec("run"), name="tens", coarse=10, fine=20, horizon=2)
     dittogym.register("tens", lambda: tens)
     environment = EnvironmentConfig(particles=60, substeps=1)
-    config = cfp.Config(task="tens", resolutions=(4, 8, 16), gate_bias=(-1.0, -2.0), environment=environment)
+    config = replace(cfp.preset("tens"), resolutions=(4, 8, 16), gate_bias=(-1.0, -2.0), environment=environment)
     save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(2)), describe(config, 2, 0))
     command = evaluate.Command(policy=str(tmp_path), episodes=1, device="cpu")
     opened, _ = command.open(train.PROGRAM)
@@ -334,7 +335,7 @@ def test_other_particles_are_not_those_of_the_reference_s_faults(tmp_path):
         chosen = evaluate.Selection(policy=str(tmp_path), particles=particles)
         environment = chosen.open(train.PROGRAM)[0].environment
         assert (environment.particles, environment.parity) == (particles or "full", parity)
-        assert environment.layout == "grid"  # as the policy acts
+        assert environment.action_indexing == "grid"  # as the policy acts
 
 
 @pytest.mark.parametrize(

@@ -1,22 +1,25 @@
 import json
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 import cfp
-from cfp.agent.actor import ActorSpec, build_actor
+from cfp.agent.actor import build_actor
 from cfp.agent.networks import normalise_image
 from cfp.agent.policies import CFPPolicy, action_space, observation_space
-from cfp.config import Config, EnvironmentConfig
+from cfp.agent.spec import ActorSpec
 from cfp.errors import CheckpointError, ConfigError
+from cfp.presets import preset
+from cfp.sections import EnvironmentConfig
 from cfp.weights import check_trained_for, describe, save_policy
 
 
 @pytest.fixture
 def saved(tmp_path):
-    config = Config(resolutions=(8, 16), gate_bias=(-1.0,))
+    config = replace(preset("shapematch"), resolutions=(8, 16), gate_bias=(-1.0,))
     actor = build_actor(config.actor_spec(1))
     save_policy(tmp_path / "policy.safetensors", actor, describe(config, 1, 123))
     return tmp_path, actor
@@ -98,6 +101,6 @@ def test_file_that_is_no_policy_is_refused(saved, damage):
     elif damage == "foreign":
         save_policy(path, actor, {"format": "other"})
     else:
-        save_policy(path, actor, describe(Config(resolutions=(8, 32), gate_bias=(-1.0,)), 1, 0))
+        save_policy(path, actor, describe(replace(preset("shapematch"), resolutions=(8, 32)), 1, 0))
     with pytest.raises(CheckpointError, match=r"policy\.safetensors: "):
         cfp.load(path)

@@ -1,0 +1,75 @@
+"""The hyperparameters of `cfp.agent.sac.CFP`, declared once for constructor, presets and command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from cfp.validation import check_at_least, check_fraction, check_positive
+
+Precision = Literal["auto", "float32", "bfloat16"]
+
+
+@dataclass(frozen=True)
+class LearningConfig:
+    """Hyperparameters of soft actor-critic that are the same in every stage."""
+
+    learning_rate: float = 3e-4
+    """Adam's step size for actor and critics."""
+    actor_rate: float | None = None
+    """Adam's step size for the actor alone; None: the same as for the critics."""
+    actor_start: int = 0
+    """Environment steps of each stage before the first actor update; until then only the critics learn."""
+    gamma: float = 0.99
+    """Discount factor."""
+    tau: float = 0.005
+    """Polyak factor of the target critics."""
+    batch_size: int = 256
+    """Transitions in an update."""
+    buffer_size: int = 200_000
+    """Transitions in the replay buffer."""
+    gradient_steps: int = 1
+    """Updates after each batched step of num_envs robots."""
+    update_start: int = 256
+    """Updates begin when more transitions than this are stored."""
+    anchor: float = 100.0
+    """With refine: weight of the mean squared difference to the mean actions of the policy that is refined."""
+    reward_momentum: float = 0.99
+    """Momentum of the running mean and variance of the rewards."""
+    max_grad_norm: float = 10.0
+    """Largest gradient norm of each parameter tensor."""
+    precision: Precision = "float32"
+    """Precision of convolutions and matrix products in updates: float32, bfloat16, or auto (bfloat16 on CPUs that
+    support it)."""
+    compile: bool = False
+    """Run the updates through torch.compile."""
+    warm_critic: bool = False
+    """Initialise critics and reward statistics of each stage from the previous one, instead of anew."""
+
+    def check(self) -> None:
+        """Check the ranges that the types do not express.
+
+        Raises:
+            ConfigError: A value is out of range.
+        """
+        check_at_least(2, batch_size=self.batch_size)  # rewards are divided by their deviation in the batch
+        check_at_least(
+            1, buffer_size=self.buffer_size, gradient_steps=self.gradient_steps, update_start=self.update_start
+        )
+        check_fraction(gamma=self.gamma, tau=self.tau, reward_momentum=self.reward_momentum)
+        check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
+        if self.actor_rate is not None:
+            check_positive(actor_rate=self.actor_rate)
+        check_at_least(0, actor_start=self.actor_start, anchor=self.anchor)
+
+
+@dataclass(frozen=True)
+class Hyperparameters(LearningConfig):
+    """All hyperparameters of one stage: those of `LearningConfig` and those that differ between stages."""
+
+    alpha: float = 0.01
+    """Entropy temperature, a constant."""
+    gate_penalty: float = 0.0
+    """Weight rho of the gate penalty ``mean ||g||_2 / R`` in the actor loss of a residual actor."""
+    random_steps: int = 500
+    """Environment steps with uniformly random actions at the start."""

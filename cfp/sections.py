@@ -1,0 +1,130 @@
+"""Sections of a run's options that do not belong to the algorithm: environment, networks, reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
+
+from cfp.agent.spec import Interpolation
+from cfp.errors import ConfigError
+from cfp.validation import check_at_least, check_positive
+
+Particles: TypeAlias = Literal["full", "lite"] | int | tuple[int, int]
+"""Particle count: the paper's, about 2,000, a number, or one number for the robot and one for the object."""
+
+TASK_OPTIONS = ("target", "variant")
+"""Fields of `EnvironmentConfig` that are options of some tasks only."""
+
+
+@dataclass(frozen=True)
+class EnvironmentConfig:
+    """Options of `dittogym.TorchEnv`."""
+
+    num_envs: int = 16
+    """Number of robots simulated side by side."""
+    particles: Particles = "lite"
+    """Particles: full (the paper's), lite (about 2,000), a count, or one count for robot and one for object."""
+    substeps: int = 100
+    """Physics steps in one environment step."""
+    dtype: Literal["float32", "float64"] = "float32"
+    """Precision of the physics."""
+    backend: str = "auto"
+    """Backend of the physics: auto, eager, compile, ..."""
+    action_layout: Literal["image", "grid"] | None = None
+    """Orientation of the action array: image (as the observation) or grid (the reference's); None: by parity."""
+    parity: Literal["clean", "reference"] = "clean"
+    """clean: without the reference's faults in observations and resets; reference: with them."""
+    resample: bool = False
+    """Draw the particles anew at every reset."""
+    target: str | None = None
+    """Target shape, for tasks that have one: a letter, star, or the path of an image; None: the task's default."""
+    variant: Literal["registered", "published"] | None = None
+    """Material, for tasks that have variants: that of the registered environment (also None) or that of the published
+    training run."""
+
+    def task_options(self) -> dict[str, Any]:
+        """The options that belong to the task, for `dittogym.make_spec`."""
+        return {name: value for name in TASK_OPTIONS if (value := getattr(self, name)) is not None}
+
+    @property
+    def action_indexing(self) -> Literal["image", "grid"]:
+        """Orientation of the action array that these options result in."""
+        return self.action_layout or ("grid" if self.parity == "reference" else "image")
+
+    def for_training(self, particles: Particles) -> EnvironmentConfig:
+        """These options with other particles, without the reference's faults, and with actions oriented as here."""
+        return replace(self, particles=particles, parity="clean", action_layout=self.action_indexing)
+
+    def for_evaluation(self, particles: Particles) -> EnvironmentConfig:
+        """These options with other particles: unchanged otherwise at full size, else as `for_training`.
+
+        With the reference's parity fewer particles would make a lighter, softer and fainter robot.
+        """
+        return replace(self, particles=particles) if particles == "full" else self.for_training(particles)
+
+    def check(self) -> None:
+        """Check the ranges that the types do not express.
+
+        Raises:
+            ConfigError: A value is out of range.
+        """
+        check_at_least(1, num_envs=self.num_envs, substeps=self.substeps)
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Options of the networks, see `cfp.agent.spec.ActorSpec`."""
+
+    interpolation: Interpolation = "half_pixel"
+    """Bicubic upsampling: half_pixel (as the environment, blended on its patch) or aligned (the reference's)."""
+    split: bool = False
+    """Separate narrow encoders for observation and action."""
+    gate_scale: float = 1.0
+    """Largest gate value (the reference: 0.25 with split encoders)."""
+
+    def check(self) -> None:
+        """Check the ranges that the types do not express.
+
+        Raises:
+            ConfigError: A value is out of range.
+        """
+        check_positive(gate_scale=self.gate_scale)
+
+
+@dataclass(frozen=True)
+class ReportConfig:
+    """What is measured and written while training."""
+
+    eval_every: int = 10_000
+    """Environment steps between evaluations; 0: none."""
+    eval_episodes: int = 5
+    """Episodes of an evaluation and of the final table."""
+    eval_deterministic: bool = False
+    """Evaluate without action noise."""
+    patience: int = 0
+    """Consecutive evaluations without a new best after which a stage ends early; 0: only steps count."""
+    checkpoint_every: int = 1_000
+    """Environment steps between checkpoints."""
+    log_every: int = 500
+    """Environment steps between rows of progress.csv and TensorBoard points."""
+    video: bool = True
+    """Record video.mp4 at the end."""
+    video_every: int = 0
+    """Environment steps between videos of one episode in videos/; 0: none."""
+    wandb: Literal["off", "offline", "online"] = "off"
+    """Weights & Biases: off, offline (kept in the folder of the run), or online (uploads)."""
+    wandb_project: str = "torchmpm"
+    """Weights & Biases project."""
+
+    def check(self) -> None:
+        """Check the ranges that the types do not express.
+
+        Raises:
+            ConfigError: A value is out of range.
+        """
+        check_at_least(
+            1, eval_episodes=self.eval_episodes, checkpoint_every=self.checkpoint_every, log_every=self.log_every
+        )
+        check_at_least(0, eval_every=self.eval_every, video_every=self.video_every, patience=self.patience)
+        if self.patience and not self.eval_every:
+            raise ConfigError(f"patience must be 0 without evaluations (eval_every 0), got {self.patience}")
