@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal, cast
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
@@ -73,6 +73,7 @@ class Algorithm(ABC):
         starts_trained: Whether the stage begins with a trained policy, which is then evaluated before the first step.
         replay_buffer: Transitions to keep in checkpoints.
         logger: Receives scalars.
+        scalars: Those of the last update.
     """
 
     sees: ClassVar[Sees] = "image"
@@ -81,6 +82,7 @@ class Algorithm(ABC):
     starts_trained: bool = False
     replay_buffer: ReplayBuffer | None = None
     logger: Logger
+    scalars: Scalars = {}
 
     @abstractmethod
     def __init__(self, config: Any, stage: int = 1, start: Any = None) -> None: ...
@@ -172,13 +174,14 @@ class Algorithm(ABC):
         """Whether the stage is over before its last step."""
         return False
 
-    def learn(self, total_timesteps: int, callback: BaseCallback) -> Algorithm:
+    def learn(self, total_timesteps: int, callback: BaseCallback | None = None) -> Algorithm:
         """Take some more environment steps and learn from them.
 
         Args:
             total_timesteps: How many at least.
             callback: A rollout starts before each update, and a step ends after it; may raise to stop the training.
         """
+        callback = callback or CallbackList([])
         callback.init_callback(cast(BaseAlgorithm, self))
         callback.on_training_start(locals(), globals())
         end = self.num_timesteps + total_timesteps
@@ -188,8 +191,6 @@ class Algorithm(ABC):
             callback.on_step()
         callback.on_training_end()
         return self
-
-    scalars: Scalars = {}
 
     def update(self) -> Scalars:
         """Take some environment steps, add them to `num_timesteps`, and learn from them.

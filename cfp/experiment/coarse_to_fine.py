@@ -118,7 +118,7 @@ class SACAlgorithm(Algorithm):
         self.logger = logger
         self.model.set_logger(logger)
 
-    def learn(self, total_timesteps: int, callback: BaseCallback) -> SACAlgorithm:
+    def learn(self, total_timesteps: int, callback: BaseCallback | None = None) -> SACAlgorithm:
         """Train for some more environment steps in stable-baselines3's loop."""
         self.model.learn(total_timesteps, callback, log_interval=1 << 62, reset_num_timesteps=False)
         return self
