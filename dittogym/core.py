@@ -93,7 +93,7 @@ class Model:
             return self.solver
         counts = tuple(body.count for body in self.solver.bodies)
         bodies = _bodies(self.spec, counts, self.shares, physics)
-        return replace(self.solver, bodies=bodies, gravity=physics.get("gravity", self.spec.gravity))
+        return self.solver.with_constants(bodies, physics.get("gravity", self.spec.gravity))
 
     def per_particle(self, values: tuple[float, ...] | tuple[bool, ...], like: Tensor) -> Tensor:
         """Values of the bodies as (N,) over all particles: truth values, or numbers like ``like``."""

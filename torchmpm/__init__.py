@@ -1,19 +1,23 @@
 """Batched, differentiable two-dimensional material point method in PyTorch.
 
-State goes in, state comes out: :class:`ParticleState` holds everything that moves, :class:`Solver` (a frozen
-description of grid, bodies and boundary) advances it, and no function keeps a tensor behind.
+State goes in, state comes out: :class:`ParticleState` holds everything that moves, and :class:`Solver`, a frozen
+description of grid, bodies and boundary, advances it. ``substep`` is the algorithm, ``materials`` holds the
+constitutive laws, and ``native`` the same substep as fused kernels. This package imports torch and numpy only.
 """
 
 from torchmpm import diagnostics, sampling, tree
 from torchmpm.boundary import VelocityRule, fixed
 from torchmpm.grid import Grid
-from torchmpm.material import Elastic, Material, Soil, VonMises, lame
+from torchmpm.materials import Body, Elastic, Material, Snow, VonMises, lame
 from torchmpm.memory import estimate_memory, segment_for
 from torchmpm.rollout import repeated, trajectory
-from torchmpm.solver import Body, Solver
+from torchmpm.solver import Solver
 from torchmpm.state import ParticleState
 
 __version__ = "0.1.0"
+
+#: The soil of DittoGym's DIG is the snow model with its default values.
+Soil = Snow
 
 __all__ = [
     "Body",
@@ -21,6 +25,7 @@ __all__ = [
     "Grid",
     "Material",
     "ParticleState",
+    "Snow",
     "Soil",
     "Solver",
     "VelocityRule",

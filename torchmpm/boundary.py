@@ -67,26 +67,26 @@ class VelocityRule:
 def fixed(
     i: Range = (None, None), j: Range = (None, None), frame: Literal["world", "window"] = "world"
 ) -> tuple[VelocityRule, ...]:
-    """Rules that hold the nodes of a box at rest, whatever direction they would move in.
+    """Rules that hold the nodes of a box at rest.
 
     Args:
         i: Inclusive range of node indices in x.
         j: Inclusive range of node indices in y.
-        frame: What the ranges count from, see :class:`VelocityRule`.
+        frame: Origin of the ranges, see :class:`VelocityRule`.
     """
     return tuple(VelocityRule(direction, i, j, 0.0, frame) for direction in _DIRECTIONS)
 
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """All rules against one direction, as masks over the padded grid for the present place of the window.
+    """All rules against one direction, as masks over the padded grid for the current position of the window.
 
     Attributes:
         axis: 0 for x, 1 for y.
         sign: +1 or -1, the sign of the removed component.
         active: (1 or B, cells) nodes with a rule.
-        stick: (1 or B, cells) nodes of these that stick, or ``None`` if no rule does.
-        friction: (1 or B, cells) Coulomb coefficients, or ``None`` if no rule rubs.
+        stick: (1 or B, cells) those of them that stick, or ``None`` if no rule does.
+        friction: (1 or B, cells) Coulomb coefficients, or ``None`` if no rule has a finite friction.
     """
 
     axis: int
@@ -111,19 +111,23 @@ def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Fa
     """
     window = torch.arange(-PAD, grid.resolution + PAD, device=origin.device)[None]
     shift = node_shift(grid, origin)
+
+    def covered(rule: VelocityRule) -> Tensor:
+        inside = []
+        for axis, (low, high) in enumerate((rule.i, rule.j)):
+            bounded = low is not None or high is not None
+            node = window + shift[:, axis : axis + 1] if bounded and rule.frame == "world" else window
+            first, last = (-math.inf if low is None else low), (math.inf if high is None else high)
+            inside.append((node >= first) & (node <= last))
+        return inside[0][:, :, None] & inside[1][:, None, :]
+
     result = []
     for direction in dict.fromkeys(rule.direction for rule in rules):
         same = [rule for rule in rules if rule.direction == direction]
         active = torch.zeros(1, grid.width, grid.width, dtype=torch.bool, device=origin.device)
         stick, friction = active, torch.zeros_like(active, dtype=origin.dtype)
         for rule in same:
-            inside = []
-            for axis, (low, high) in enumerate((rule.i, rule.j)):
-                bounded = low is not None or high is not None
-                node = window + shift[:, axis : axis + 1] if bounded and rule.frame == "world" else window
-                first, last = (-math.inf if low is None else low), (math.inf if high is None else high)
-                inside.append((node >= first) & (node <= last))
-            new = inside[0][:, :, None] & inside[1][:, None, :] & ~active
+            new = covered(rule) & ~active
             active = active | new
             if math.isinf(rule.friction):
                 stick = stick | new
@@ -145,7 +149,7 @@ def constrain(faces: Sequence[Face], velocity: Tensor) -> Tensor:
     """Apply the rules to node velocities.
 
     Rules of different directions commute as long as none has a finite friction, so the order of directions only
-    matters in a corner of two rubbing walls.
+    matters in a corner between two walls with friction.
 
     Args:
         faces: Masks from :func:`faces`.

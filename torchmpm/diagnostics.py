@@ -1,4 +1,4 @@
-"""Balances of a simulation: mass, momentum, energy, and whether its numbers are still numbers."""
+"""Balances of a simulation: mass, momentum and energy, and a check for non-finite values."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ import torch
 from torch import Tensor
 
 from torchmpm.boundary import constrain
-from torchmpm.material import column
-from torchmpm.solver import MASS_EPSILON, Solver
+from torchmpm.materials.base import broadcast_plane
+from torchmpm.materials.body import per_particle, slices
+from torchmpm.solver import Solver
 from torchmpm.state import ParticleState
+from torchmpm.substep import free_velocity, grid_velocity, particles_to_grid
 
 
 def masses(solver: Solver, state: ParticleState) -> Tensor:
     """Mass of every particle, (B, N), kg."""
-    return solver.per_particle(state, "mass") * torch.ones_like(state.Jp)
+    return per_particle(solver.bodies, "mass", state.Jp) * torch.ones_like(state.Jp)
 
 
 def mass(solver: Solver, state: ParticleState) -> Tensor:
@@ -41,11 +43,11 @@ def kinetic_energy(solver: Solver, state: ParticleState) -> Tensor:
 def elastic_energy(solver: Solver, state: ParticleState) -> Tensor:
     """Energy stored in deformation, (B,), J; muscles are not counted."""
     total = torch.zeros_like(state.Jp[:, 0])
-    for body, part in solver.parts():
+    for body, part in slices(solver.bodies):
         F = state.F[:, part]
         planes = (F[..., 0, 0], F[..., 0, 1], F[..., 1, 0], F[..., 1, 1])
         Jp = state.Jp[:, part]
-        total = total + (column(body.volume, Jp, "volume") * body.material.energy(planes, Jp)).sum(-1)
+        total = total + (broadcast_plane(body.volume, Jp, "volume") * body.material.energy(planes, Jp)).sum(-1)
     return total
 
 
@@ -56,15 +58,15 @@ def potential_energy(solver: Solver, state: ParticleState) -> Tensor:
 
 
 def finite(state: ParticleState) -> Tensor:
-    """Which simulations consist of finite numbers only, (B,) bool."""
-    # Zero times a number is zero, times anything else not a number, and the sum keeps that.
+    """Which simulations hold finite numbers only, (B,) bool."""
+    # Zero times a finite number is zero and zero times anything else is NaN, which the sum keeps.
     return (state.stack().detach() * 0.0).sum((0, 2)) == 0.0
 
 
 def impulses(
     solver: Solver, state: ParticleState, actuation: Tensor | None = None, origin: Tensor | None = None
 ) -> dict[str, Tensor]:
-    """Momentum that each outer influence adds in the substep that starts at ``state``.
+    """Momentum that each external influence adds in the substep that starts at ``state``.
 
     Args:
         solver: The solver.
@@ -77,10 +79,8 @@ def impulses(
         :func:`momentum` over the substep while all particles are in the window. Internal forces and muscles cancel.
     """
     scene = solver.scene(state, actuation, origin)
-    grid = solver.to_grid(scene, state.planes()).momentum
-    before = grid[1:] * (scene.inside / (grid[0] + MASS_EPSILON))
-    accelerated = before + scene.gravity
-    damped = accelerated * scene.damping
-    after = constrain(scene.faces, damped)
+    momentum = particles_to_grid(scene, state.planes()).momentum
+    before, damped = free_velocity(scene, momentum), grid_velocity(scene, momentum)
+    accelerated, after = before + scene.gravity, constrain(scene.faces, damped)
     stages = {"gravity": (before, accelerated), "damping": (accelerated, damped), "boundary": (damped, after)}
-    return {name: (grid[0] * (new - old)).sum(-1).T for name, (old, new) in stages.items()}
+    return {name: (momentum[0] * (new - old)).sum(-1).T for name, (old, new) in stages.items()}

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from torchmpm import checks
 
-#: Rows of nodes kept around the window so that every 3x3 stencil has an address. They collect what would fall
-#: outside and carry zero velocity: contributions to nodes that do not exist are dropped, never stored elsewhere.
+#: Rows of nodes kept around the window so that every 3x3 stencil has an address. Their velocity is zero: contributions
+#: to nodes outside the window are dropped.
 PAD = 3
 
 
@@ -52,7 +52,7 @@ class Grid:
         return self.resolution + 2 * PAD
 
     def contains(self, x: Tensor, origin_x: Tensor) -> Tensor:
-        """Which particles take part: the window test in x, false for a position that is not a number.
+        """Which particles take part: the window test in x, false for NaN.
 
         Args:
             x: (B, N) horizontal positions, m.

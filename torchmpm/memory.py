@@ -1,25 +1,28 @@
-"""What a gradient costs in memory, before it is computed."""
+"""Memory that gradients need, estimated before they are computed."""
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import weakref
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
+
+# Tensors without memory and interception of operators have no public names; ``torch.utils.flop_counter`` and the
+# notes on extending torch use these. The public meta device cannot stand in: some operators behave otherwise on it.
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.weak import WeakIdKeyDictionary
 
 from torchmpm import checks
-from torchmpm.backends import runs_native, substep_function
-from torchmpm.native import ops, pack
+from torchmpm.native.cpu import call
 from torchmpm.rollout import SEGMENT, Segment, check_repetition, repeated
-from torchmpm.solver import MASS_EPSILON, Solver
+from torchmpm.solver import Solver
 from torchmpm.state import ParticleState
+from torchmpm.substep import substep
 
 #: Component planes of a state.
 PLANES = 13
@@ -72,15 +75,15 @@ def estimate_memory(
 ) -> int:
     """Bytes that :meth:`torchmpm.Solver.step`, and a backward pass through it, will need beyond their inputs.
 
-    Eagerly the operators of two substeps and of their backward passes run on tensors without memory; the rest is
-    proportion. A compiled substep keeps less than an eager one, so there this is an upper bound. The native backend
-    says how large its scratch memory is. Counted are the largest sizes alive at once, with gradients in state and
-    actuation; what an allocator rounds up, or keeps for later, comes on top.
+    For the eager backend, the operators of two substeps and of their backward passes run on tensors without memory, and
+    the result is extrapolated. A compiled substep keeps less than an eager one, so there this is an upper bound. The
+    native backend reports the size of its scratch memory. The estimate is the largest number of bytes alive at once,
+    with gradients in state and actuation; what an allocator rounds up, or keeps for later, is not included.
 
     Args:
         solver: The solver; its backend is the one that the step would use.
-        state: Where the step starts; or (B, N, dtype) on the CPU, for which the native backend assumes matter all over
-            the window.
+        state: Where the step starts; or (B, N, dtype) on the CPU, for which the native backend assumes particles
+            all over the window.
         substeps: Substeps of a step.
         segment: As in :meth:`torchmpm.Solver.step`.
         env_steps: Steps in a row, through :func:`torchmpm.trajectory` with its checkpoints.
@@ -96,7 +99,7 @@ def estimate_memory(
     substeps, segment = check_repetition(substeps, segment, "substeps")
     share = _occupied(solver, state)
     state = _empty(solver, state)
-    if runs_native(solver, state):
+    if solver.runs_native(state):
         if state.device.type != "cpu":
             raise ValueError(f"state must be on the CPU for the memory of backend 'native', got {state.device}")
         return _native(solver, state, substeps, segment, env_steps, backward, share)
@@ -133,7 +136,7 @@ def segment_for(
         return None
     share, state = _occupied(solver, state), _empty(solver, state)
     lengths = range(substeps - 1, 0, -1)
-    if runs_native(solver, state):
+    if solver.runs_native(state):
         needs = {n: _native(solver, state, substeps, n, env_steps, True, share) for n in lengths}
     else:
         kept, grown = _eager_parts(solver, state)
@@ -196,7 +199,7 @@ def _rehearsed(solver: Solver, state: ParticleState, substeps: int, backward: bo
     with FakeTensorMode(allow_non_fake_inputs=True), torch.set_grad_enabled(backward):
         planes = tuple(empty((batch, count), requires_grad=backward) for _ in range(PLANES))
         field = empty(scene.actuation.shape, requires_grad=backward)
-        run = substep_function(replace(solver, backend="eager"), replace(scene, actuation=field))
+        run = partial(substep, replace(scene, actuation=field))
         with PeakMemory() as memory:
             final = ParticleState.from_planes(repeated(run, planes, substeps))
             if backward:
@@ -223,7 +226,7 @@ def _native(
     share: float,
 ) -> int:
     planes = state.x.new_empty(PLANES, state.batch_size, state.num_particles)
-    length = min(substeps, ops.tape_limit(planes, solver.grid.width, segment)) if backward else substeps
+    length = min(substeps, solver.kernels.tape_limit(planes, segment)) if backward else substeps
     scratch = _scratch_bytes(solver, state, length, backward)
     if not backward:
         return scratch + 2 * _state_bytes(state)
@@ -239,23 +242,21 @@ def _native(
 
 def _differentiates_values(solver: Solver) -> bool:
     """Whether a material value, mass or volume has a gradient."""
-    values = [v for body in solver.bodies for v in (body.mass, body.volume, *vars(body.material).values())]
-    return any(isinstance(value, Tensor) and value.requires_grad for value in values)
+    return any(value.requires_grad for name, value in solver.constants.items() if name != "gravity")
 
 
 def _scratch_bytes(solver: Solver, state: ParticleState, substeps: int, backward: bool) -> int:
-    """What the kernels ask for."""
+    """Scratch memory that the kernels ask for."""
     batch, count, nodes = state.batch_size, state.num_particles, solver.grid.resolution
     empty = state.x.new_empty
     with torch.no_grad():
-        values, widths = pack.values(solver, state.Jp)
-    description = pack.description(solver, widths, MASS_EPSILON)
-    field, origin, shift = empty(batch, 2, nodes, nodes), empty(batch, 2), torch.empty(batch, 2, dtype=torch.int64)
-    planes = empty(PLANES, batch, count)
-    call = ops._call(planes, field, origin, origin, values, shift, description, substeps)
-    call.result = call.result_bar = call.planes_bar = call.field_bar = planes.data_ptr()
-    call.origin_bar = call.gravity_bar = origin.data_ptr()
-    call.values_bar = planes.data_ptr() if _differentiates_values(solver) else None
-    measure = ops.library_for(state.dtype)[f"torchmpm_{'backward' if backward else 'forward'}_bytes"]
-    measure.restype = ctypes.c_size_t
-    return int(measure(ctypes.byref(call)))
+        values = solver.kernels.values(state.Jp)
+    field, pair, planes = empty(batch, 2, nodes, nodes), empty(batch, 2), empty(PLANES, batch, count)
+    inputs = call.Inputs(planes, field, pair, pair, values, torch.empty(batch, 2, dtype=torch.int64))
+    outputs = {"result": planes}
+    if backward:
+        outputs = dict.fromkeys(("result_bar", "planes_bar", "field_bar"), planes)
+        outputs |= dict.fromkeys(("origin_bar", "gravity_bar"), pair)
+        if _differentiates_values(solver):
+            outputs["values_bar"] = planes
+    return call.scratch_bytes(inputs, solver.kernels.handle, substeps, **outputs)

@@ -1,103 +1,27 @@
-"""The material point method: one substep, and steps of many."""
+"""The solver: a frozen description of grid, bodies and boundary, and the step that advances a state."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property, partial
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import pad
 
-from torchmpm import checks, muscle, native, transfer
-from torchmpm.backends import BACKENDS, compiler_found, runs_native, substep_function, vmapping
-from torchmpm.boundary import Face, VelocityRule, constrain, faces
-from torchmpm.grid import PAD, Grid
-from torchmpm.linalg import Mat2, matmul
-from torchmpm.material import Material, Sym2, Value, column, spread
-from torchmpm.native.library import NO_COMPILER
-from torchmpm.rollout import Segment, check_repetition, reads, repeated, tensors
-from torchmpm.spline import Stencil, stencil
+from torchmpm import checks, stability
+from torchmpm.backends import BACKENDS, compiled, compiler_found, has_tangents, transforming, warn_eager
+from torchmpm.boundary import VelocityRule, faces
+from torchmpm.grid import Grid
+from torchmpm.materials.base import Value
+from torchmpm.materials.body import Body
+from torchmpm.native.cpu.library import NO_COMPILER
+from torchmpm.native.kernels import Kernels
+from torchmpm.rollout import Segment, check_repetition, repeated
 from torchmpm.state import ParticleState
-
-#: Added to the mass of a node before the division, kg, so that an empty node has velocity zero.
-MASS_EPSILON = 1e-10
-
-
-@dataclass(frozen=True, eq=False)
-class Body:
-    """A run of consecutive particles of one material.
-
-    Attributes:
-        count: Number of particles.
-        material: Constitutive law, such as :class:`torchmpm.VonMises`.
-        mass: Mass of a particle, kg; a number or a tensor of shape (), (B,) or (B, count).
-        volume: Undeformed volume of a particle, m^2 (two-dimensional); a number, (), (B,) or (B, count).
-        muscle: Whether the actuation field acts on it.
-
-    Raises:
-        ValueError: ``count`` is below 1, or ``mass`` or ``volume`` is not positive.
-        TypeError: The material is not a :class:`torchmpm.Material`.
-    """
-
-    count: int
-    material: Material
-    mass: Value = 1.0
-    volume: Value = 1.0
-    muscle: bool = False
-
-    def __post_init__(self) -> None:
-        checks.whole("count", self.count, 1)
-        checks.instance("material", self.material, Material)
-        for name in ("mass", "volume"):
-            checks.value(name, getattr(self, name), above=0.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """What stays the same during one step, in the form the substep wants it.
-
-    Attributes:
-        grid: The window.
-        origin: (B, 2) lower left corner of the window, m.
-        mass: (B or 1, N) particle masses, kg.
-        inside: (1, cells) 1 on nodes that exist, 0 on the padding.
-        gravity: (2, B or 1, cells) velocity gained by gravity in a substep, m/s.
-        damping: Factor on node velocities in a substep.
-        faces: Velocity rules as masks.
-        actuation: (2, B, cells) muscle actuation on the nodes, Pa, or ``None``.
-    """
-
-    grid: Grid
-    origin: Tensor
-    mass: Tensor
-    inside: Tensor
-    gravity: Tensor
-    damping: float
-    faces: tuple[Face, ...]
-    actuation: Tensor | None
-
-
-class Scattered(NamedTuple):
-    """What the first half of a substep yields.
-
-    Attributes:
-        nodes: The stencils.
-        inside: (B, N) which particles take part.
-        F: Planes (B, N) of the returned deformation gradient.
-        Jp: (B, N) plastic volume ratio.
-        momentum: (3, B, cells) mass (kg) and momentum (kg m/s) on the nodes.
-    """
-
-    nodes: Stencil
-    inside: Tensor
-    F: Mat2
-    Jp: Tensor
-    momentum: Tensor
+from torchmpm.substep import Planes, Scene, make_scene, substep
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,15 +38,15 @@ class Solver:
         damping: Factor on every node velocity in every substep (1 = none).
         rules: Velocity rules, see :class:`torchmpm.VelocityRule`.
         dt: Duration of a substep, s.
-        backend: ``"native"`` (fused kernels, ``torchmpm.native``: C++ on the CPU, Triton on CUDA), ``"eager"`` or
-            ``"compile"`` (see ``torchmpm.backends.substep_function``), or ``"auto"``: native on a CPU where it
-            works, else eager.
-        allow_unstable: Accept a ``dt`` beyond :meth:`stable_dt`.
+        backend: ``"native"`` (fused kernels, ``torchmpm.native``: C++ on the CPU, Triton on CUDA), ``"eager"``
+            (operator by operator), ``"compile"`` (the same through ``torch.compile``), or ``"auto"``: native on a CPU
+            where it works, else eager.
+        allow_unstable: Accept a ``dt`` above :meth:`stable_dt`.
 
     Raises:
-        ValueError: No bodies, ``dt`` not positive or beyond :meth:`stable_dt`, ``damping`` negative, gravity not two
+        ValueError: No bodies, ``dt`` not positive or above :meth:`stable_dt`, ``damping`` negative, gravity not two
             numbers, or an unknown or unavailable backend.
-        TypeError: ``grid``, a body or a rule is something else.
+        TypeError: ``grid``, a body or a rule has another type.
     """
 
     grid: Grid
@@ -140,33 +64,63 @@ class Solver:
         if not self.bodies:
             raise ValueError("bodies must hold at least one Body, got none")
         checks.instances("rules", self.rules, VelocityRule)
-        for name in ("bodies", "rules"):  # a list could change behind the tables that backends keep
+        for name in ("bodies", "rules"):  # a list could change after the tables of the kernels were built
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if not isinstance(self.gravity, Tensor):
             if not isinstance(self.gravity, Sequence) or len(self.gravity) != 2:
                 raise ValueError(f"gravity must be two numbers (x, y) or a tensor, got {self.gravity!r}")
-            for component, pull in zip("xy", self.gravity, strict=True):
-                checks.number(f"gravity {component}", pull)
+            for component, value in zip("xy", self.gravity, strict=True):
+                checks.number(f"gravity {component}", value)
         checks.number("damping", self.damping, least=0.0)
         checks.number("dt", self.dt, above=0.0)
         if self.backend not in BACKENDS:
             raise ValueError(f"backend must be one of {BACKENDS}, got {self.backend!r}")
         if self.backend in ("compile", "native") and not compiler_found() and not torch.cuda.is_available():
             raise ValueError(f"backend {self.backend!r} {NO_COMPILER}")
-        if not (self.allow_unstable or self._vmapped()) and self.dt > (limit := self.stable_dt()):
+        if not self.allow_unstable:
+            self._check_stability()
+
+    def _check_stability(self) -> None:
+        try:
+            limit = self.stable_dt()
+        except RuntimeError:
+            if not transforming():
+                raise
+            return  # under torch.func.vmap nothing can depend on the numbers that tensors hold
+        if self.dt > limit:
             raise ValueError(
-                f"dt must be at most {limit} s for matter so stiff and light to be stable, got {self.dt}; "
+                f"dt must be at most {limit} s for particles of this stiffness and mass to be stable, got {self.dt}; "
                 "allow_unstable=True accepts it"
             )
 
-    @cached_property
-    def tensors(self) -> dict[str, Tensor]:
-        """Constants of the matter, and gravity, that are tensors; by names such as ``bodies[0].material.mu``."""
-        return tensors({"bodies": self.bodies, "gravity": self.gravity})
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields alone: cached tables are built anew in a copy."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    def _vmapped(self) -> bool:
-        """Whether constants may be tensors of a ``vmap``, under which nothing can depend on the numbers they hold."""
-        return vmapping() and bool(self.tensors)
+    def with_constants(self, bodies: tuple[Body, ...], gravity: tuple[float, float] | Tensor) -> Solver:
+        """The same solver with other constants; skips all checks, stability included.
+
+        For simulations whose constants change in every step.
+
+        Args:
+            bodies: Bodies of the same counts.
+            gravity: Acceleration, as in the constructor.
+        """
+        solver = object.__new__(type(self))
+        for name, value in (self.__getstate__() | {"bodies": bodies, "gravity": gravity}).items():
+            object.__setattr__(solver, name, value)
+        return solver
+
+    @cached_property
+    def constants(self) -> dict[str, Tensor]:
+        """Constants of the bodies, and gravity, that are tensors, by names such as ``bodies[0].material.mu``."""
+        named = {f"bodies[{k}].{name}": v for k, body in enumerate(self.bodies) for name, v in body.constants().items()}
+        return {name: value for name, value in {**named, "gravity": self.gravity}.items() if isinstance(value, Tensor)}
+
+    @cached_property
+    def kernels(self) -> Kernels:
+        """The tables that the native backend reads."""
+        return Kernels(self.grid, self.bodies, self.rules, self.dt, self.damping)
 
     @property
     def num_particles(self) -> int:
@@ -174,12 +128,10 @@ class Solver:
         return sum(body.count for body in self.bodies)
 
     def stable_dt(self, actuation: Value = 0.0) -> float:
-        """Largest duration of a substep for which small strains of undeformed matter do not grow, s.
+        """Largest duration of a substep for which small strains of undeformed material do not grow, s.
 
-        ``h / sqrt((k + 2 |a|) V / m)``, least over all particles, with the stiffness k = 2 (mu + lam) and the actuation
-        a. It holds however particles lie: the strain rate C of a particle cannot exceed what the kinetic energy of
-        its nodes allows, ``h^2/4 |C|^2 <= sum w |v_i|^2``, and a particle alone reaches that. Large strains, and soil
-        that has hardened, are stiffer and may need less.
+        See :func:`torchmpm.stability.stable_dt`. Large strains, and snow that has hardened, are stiffer and may need
+        less.
 
         Args:
             actuation: Of the muscles, Pa; a number or a tensor of shape (), (B,) or (B, count).
@@ -187,24 +139,7 @@ class Solver:
         Raises:
             ValueError: Shapes of a body's values do not go together, or they are not finite or have a wrong sign.
         """
-        rates = [0.0]
-        for k, body in enumerate(self.bodies):
-            try:
-                pull = (
-                    torch.as_tensor(spread(actuation), dtype=torch.float64, device="cpu").abs() if body.muscle else 0.0
-                )
-                rate = (body.material.stiffness() + 2.0 * pull) * spread(body.volume) / spread(body.mass)
-            except RuntimeError as error:
-                raise ValueError(f"values of bodies[{k}] must have shapes that go together: {error}") from error
-            rate = torch.as_tensor(rate, dtype=torch.float64, device="cpu")
-            if not bool(((rate >= 0) & torch.isfinite(rate)).all()):
-                raise ValueError(
-                    f"values of bodies[{k}] must be finite, its mass and volume positive and its stiffness not "
-                    f"negative, got stiffness x volume / mass from {rate.min().item():g} to {rate.max().item():g}"
-                )
-            rates.append(float(rate.max()))
-        fastest = math.sqrt(max(rates))
-        return self.grid.h / fastest if fastest > 0 else math.inf
+        return stability.stable_dt(self.bodies, self.grid.h, actuation)
 
     def step(
         self,
@@ -217,10 +152,10 @@ class Solver:
     ) -> ParticleState:
         """Advance all simulations by ``substeps * dt`` seconds.
 
-        Particles outside the window in x keep everything they have until the window comes back to them.
+        Particles outside the window in x keep their whole state until the window comes back to them.
 
         Args:
-            state: Where they are.
+            state: The current state.
             actuation: (B, 2, G, G) muscle actuation in Pa on the nodes of the window, ``[:, 0]`` along material x,
                 indices (i, j) rightwards and upwards; constant during the step, and felt only by bodies with
                 ``muscle=True``. ``None`` for none.
@@ -236,34 +171,98 @@ class Solver:
         Raises:
             ValueError: Shapes, dtypes or devices do not fit together, or the native backend was chosen and cannot run
                 this.
-            TypeError: The state, the actuation or the origin is something else.
-            RuntimeError: In the backward pass: one of these tensors was changed in place, and is read again there.
+            TypeError: The state, the actuation or the origin has another type.
+            RuntimeError: In the backward pass: one of these tensors was changed in place before it is read again.
         """
         checks.instance("state", state, ParticleState)
         substeps, segment = check_repetition(substeps, segment, "substeps")
-        origin = self.check(state, actuation, origin)
+        origin = self._check_arguments(state, actuation, origin)
         if substeps == 0 or state.batch_size == 0:
             return state
-        reads({"state": state, "actuation": actuation, "origin": origin} | self.tensors)
-        if runs_native(self, state, actuation, origin):
-            return native.step(self, state, actuation, origin, substeps, segment, mass_epsilon=MASS_EPSILON)
-        substep = substep_function(self, self.scene(state, actuation, origin))
-        return ParticleState.from_planes(repeated(substep, state.planes(), substeps, segment=segment))
+        if self.runs_native(state, actuation, origin):
+            return self.kernels.step(state, actuation, origin, self.gravity, substeps, segment)
+        run = partial(self.substep_function(), self, self.scene(state, actuation, origin))
+        reads = {"origin": origin} | self.constants
+        return ParticleState.from_planes(repeated(run, state.planes(), substeps, segment=segment, reads=reads))
 
-    def check(self, state: ParticleState, actuation: Tensor | None, origin: Tensor | None) -> Tensor:
-        """Check the arguments of a step, see :meth:`step`, and fill in the origin.
+    def substep(self, scene: Scene, planes: Planes) -> Planes:
+        """One substep, see :func:`torchmpm.substep.substep`; a subclass may compute it in another way.
 
         Args:
-            state: Where the particles are.
-            actuation: (B, 2, G, G), Pa, or ``None``.
-            origin: (B, 2), m, or ``None``.
+            scene: What the substeps of a step share.
+            planes: The 13 component planes, (B, N) each, see :meth:`ParticleState.planes`.
 
         Returns:
-            The origin (B, 2), m.
+            The new planes, (B, N) each.
+        """
+        return substep(scene, planes)
+
+    def substep_function(self) -> Any:
+        """The substep of this class, a function of solver, scene and planes, as the backend runs it."""
+        return compiled(type(self).substep) if self.backend == "compile" else type(self).substep
+
+    def runs_native(self, state: ParticleState, *fields: Tensor | None) -> bool:
+        """Whether a step from this state runs in the kernels of ``torchmpm.native``.
+
+        ``"auto"`` chooses them on the CPU wherever they work; where they do not, the reason is logged once. On CUDA
+        they run only if ``"native"`` is asked for.
+
+        Args:
+            state: The current state.
+            fields: What else the step depends on.
 
         Raises:
-            ValueError: Shapes, dtypes or devices do not fit together.
+            ValueError: The backend is ``"native"``, or ``"compile"``, and cannot run this.
         """
+        if self.backend == "eager":
+            return False
+        tensors = (state.x, state.v, state.C, state.F, state.Jp, *fields, *self.constants.values())
+        in_transform = transforming()
+        tangents = not in_transform and has_tangents(tensor for tensor in tensors if tensor is not None)
+        if self.backend == "compile":
+            if tangents:
+                raise ValueError("backend 'compile' loses the tangents of forward_ad; use 'eager', or torch.func.jvp")
+            return False
+        reason = self._not_native(state.device, in_transform, tangents)
+        if self.backend == "native":
+            if reason is not None:
+                raise ValueError(f"backend 'native' cannot run this: {reason}; use 'eager'")
+            return True
+        if reason is None and state.device.type == "cuda":
+            reason = "on CUDA the native backend runs only if backend='native' asks for it"
+        if reason is None:
+            try:
+                self.kernels.load(state.dtype)
+            except ValueError as error:
+                reason = str(error)
+        if reason is not None:
+            warn_eager(reason)
+        return reason is None
+
+    def _not_native(self, device: torch.device, in_transform: bool, tangents: bool) -> str | None:
+        """Why the kernels cannot run a step on a device, or ``None`` if they can."""
+        if type(self).substep is not Solver.substep:
+            return f"it does not call {type(self).__name__}.substep"
+        reason = self.kernels.unsupported(device)
+        if reason is None and in_transform:
+            return "the transforms of torch.func do not go through its kernels"
+        return "it has no forward-mode derivatives" if reason is None and tangents else reason
+
+    def scene(self, state: ParticleState, actuation: Tensor | None = None, origin: Tensor | None = None) -> Scene:
+        """Check the arguments of a step and prepare what its substeps share; see :meth:`step`.
+
+        Args:
+            state: The current state.
+            actuation: (B, 2, G, G), Pa, or ``None``.
+            origin: (B, 2), m, or ``None``.
+        """
+        origin = self._check_arguments(state, actuation, origin)
+        gravity = torch.as_tensor(self.gravity, dtype=state.dtype, device=state.device)
+        masks = faces(self.rules, self.grid, origin)
+        return make_scene(self.grid, self.bodies, self.dt, gravity, self.damping, masks, actuation, origin, state.Jp)
+
+    def _check_arguments(self, state: ParticleState, actuation: Tensor | None, origin: Tensor | None) -> Tensor:
+        """Check the arguments of a step; returns the origin (B, 2), m."""
         batch, nodes = state.batch_size, self.grid.resolution
         if state.num_particles != self.num_particles:
             raise ValueError(f"state has {state.num_particles} particles, the solver's bodies {self.num_particles}")
@@ -281,118 +280,3 @@ class Solver:
         if isinstance(gravity, Tensor) and tuple(gravity.shape) not in ((2,), (1, 2), (batch, 2)):
             raise ValueError(f"gravity must have shape (2,) or ({batch}, 2), got {tuple(gravity.shape)}")
         return state.x.new_zeros(batch, 2) if origin is None else origin
-
-    def scene(self, state: ParticleState, actuation: Tensor | None = None, origin: Tensor | None = None) -> Scene:
-        """Check the arguments of a step and prepare what its substeps share; see :meth:`step`.
-
-        Args:
-            state: Where the particles are.
-            actuation: (B, 2, G, G), Pa, or ``None``.
-            origin: (B, 2), m, or ``None``.
-        """
-        origin, nodes = self.check(state, actuation, origin), self.grid.resolution
-        inside = pad(state.x.new_ones(nodes, nodes), [PAD] * 4).flatten()[None]
-        if actuation is not None:
-            actuation = pad(actuation, [PAD] * 4).flatten(2).transpose(0, 1).contiguous()
-        gravity = torch.as_tensor(self.gravity, dtype=state.dtype, device=state.device)
-        return Scene(
-            grid=self.grid,
-            origin=origin,
-            mass=self.per_particle(state, "mass"),
-            inside=inside,
-            gravity=(self.dt * gravity).reshape(-1, 2).T[..., None] * inside,
-            damping=self.damping,
-            faces=faces(self.rules, self.grid, origin),
-            actuation=actuation,
-        )
-
-    def substep(self, scene: Scene, planes: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        """One substep: transfer to the grid, grid, transfer back.
-
-        Args:
-            scene: What the substeps of a step share.
-            planes: The 13 component planes, (B, N) each, see :meth:`ParticleState.planes`.
-
-        Returns:
-            The new planes, (B, N) each.
-        """
-        x, y = planes[:2]
-        grid = self.to_grid(scene, planes)
-        v, C = transfer.grid_to_particles(self.grid, grid.nodes, grid_velocity(scene, grid.momentum))
-        moved = (x + self.dt * v[0], y + self.dt * v[1], *v, *C, *grid.F, grid.Jp)
-        return tuple(torch.where(grid.inside, new, old) for new, old in zip(moved, planes, strict=True))
-
-    def to_grid(self, scene: Scene, planes: tuple[Tensor, ...]) -> Scattered:
-        """First half of a substep: deform the particles, find their forces, collect mass and momentum on the nodes.
-
-        Args:
-            scene: What the substeps of a step share.
-            planes: The 13 component planes, (B, N) each.
-        """
-        x, y, vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, Jp = planes
-        inside = self.grid.contains(x, scene.origin[:, 0:1])
-        nodes = stencil(self.grid, x, y, scene.origin)
-        growth = (1.0 + self.dt * c0, self.dt * c1, self.dt * c2, 1.0 + self.dt * c3)
-        F, Jp, force = self._internal_force(scene, nodes, matmul(growth, (f0, f1, f2, f3)), Jp)
-        momentum = transfer.particles_to_grid(
-            self.grid, nodes, inside.to(x.dtype), (vx, vy), (c0, c1, c2, c3), scene.mass, force
-        )
-        return Scattered(nodes, inside, F, Jp, momentum)
-
-    def _internal_force(self, scene: Scene, nodes: Stencil, trial: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor, Sym2]:
-        """Return-mapped deformation and ``-dt V 4/h^2 tau`` of all bodies."""
-        parts: list[tuple[Tensor, ...]] = []
-        for body, part in self.parts():
-            a, b, c, d = trial
-            before = Jp[:, part]
-            F, after = body.material.return_map((a[:, part], b[:, part], c[:, part], d[:, part]), before)
-            xx, xy, yy = body.material.stress(F, before)
-            if body.muscle and scene.actuation is not None:
-                pull = muscle.muscle_stress(F, muscle.sample(nodes.part(part), scene.actuation))
-                xx, xy, yy = xx + pull[0], xy + pull[1], yy + pull[2]
-            factor = -self.dt * (4.0 / self.grid.h**2) * column(body.volume, before, "volume")
-            parts.append((*F, after, factor * xx, factor * xy, factor * yy))
-        planes = zip(*parts, strict=True)
-        f0, f1, f2, f3, Jp, xx, xy, yy = (p[0] if len(p) == 1 else torch.cat(p, dim=1) for p in planes)
-        return (f0, f1, f2, f3), Jp, (xx, xy, yy)
-
-    def parts(self) -> Iterator[tuple[Body, slice]]:
-        """The bodies with their places among the particles."""
-        start = 0
-        for body in self.bodies:
-            yield body, slice(start, start + body.count)
-            start += body.count
-
-    def per_particle(self, state: ParticleState, name: str) -> Tensor:
-        """A value of the bodies as a plane over all particles.
-
-        Args:
-            state: Gives batch size, dtype and device.
-            name: ``"mass"`` (kg) or ``"volume"`` (m^2).
-
-        Returns:
-            (1, N) or (B, N).
-        """
-        like = state.Jp.detach()
-        columns = []
-        for body, part in self.parts():
-            value = column(getattr(body, name), like[:, part], name)
-            columns.append(value * torch.ones_like(like[:1, part]))
-        batch = max(len(c) for c in columns)
-        return torch.cat([c.expand(batch, -1) for c in columns], dim=1)
-
-
-def grid_velocity(scene: Scene, momentum: Tensor) -> Tensor:
-    """Velocity of the nodes: normalise, accelerate, damp, constrain.
-
-    Args:
-        scene: The shared data of the step.
-        momentum: (3, B, cells) mass and momentum from :func:`torchmpm.transfer.particles_to_grid`.
-
-    Returns:
-        (2, B, cells) velocities, m/s; zero on padding nodes.
-    """
-    velocity = momentum[1:] * (scene.inside / (momentum[0] + MASS_EPSILON)) + scene.gravity
-    if scene.damping != 1.0:
-        velocity = velocity * scene.damping
-    return constrain(scene.faces, velocity)

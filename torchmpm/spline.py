@@ -1,4 +1,4 @@
-"""Quadratic B-spline weights, node addresses, and the one scatter and gather built on them."""
+"""Quadratic B-spline weights, node addresses, and the scatter and gather built on them."""
 
 from __future__ import annotations
 
@@ -71,10 +71,10 @@ def stencil(grid: Grid, x: Tensor, y: Tensor, origin: Tensor) -> Stencil:
         u = (position - start) * (1.0 / grid.h)
         base = torch.trunc(u.detach() - 0.5)
         f = u - base
-        f = torch.where(torch.isnan(f), 1.0, f)  # a particle at no place is on padding; it spoils no shared derivative
+        f = torch.where(torch.isnan(f), 1.0, f)  # NaN positions address padding; they must not spoil shared derivatives
         fraction.append(f)
         weight.append(quadratic_weights(f))
-        # Clamped before the conversion, which is undefined for large numbers; a NaN ends at the low end: padding.
+        # Clamped before the conversion, which is undefined for large numbers; NaN goes to the low end: padding.
         address = torch.where(base > -PAD, base, -PAD).clamp_max(grid.resolution)
         node.append(address.to(torch.int64) + PAD)
     offset = torch.arange(3, device=x.device)

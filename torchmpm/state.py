@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchmpm import checks, tree
-from torchmpm.rollout import transforming
+from torchmpm.backends import transforming
 
 #: Trailing shape of every field after the leading (B, N).
 _TRAILING = {"x": (2,), "v": (2,), "C": (2, 2), "F": (2, 2), "Jp": ()}
@@ -23,14 +23,14 @@ class ParticleState:
     """Positions, velocities and deformation of B independent simulations with N particles each.
 
     The solver stores the components of a vector or matrix as separate planes behind these shapes (strides, not
-    copies), because whole planes are what its arithmetic runs over.
+    copies), because its arithmetic runs over whole planes.
 
     Attributes:
         x: (B, N, 2) positions in the world, m.
         v: (B, N, 2) velocities, m/s.
         C: (B, N, 2, 2) affine velocity matrix of APIC, row = velocity component, 1/s.
         F: (B, N, 2, 2) elastic part of the deformation gradient, dimensionless.
-        Jp: (B, N) plastic volume ratio, dimensionless; only soil changes it.
+        Jp: (B, N) plastic volume ratio, dimensionless; only snow changes it.
 
     Raises:
         ValueError: A field has the wrong shape, is neither float32 nor float64, or dtype or device differ between
@@ -159,7 +159,7 @@ class ParticleState:
 
     @classmethod
     def from_stack(cls, stacked: Tensor) -> ParticleState:
-        """The same from one tensor (13, B, N), of which the fields become views."""
+        """Inverse of :meth:`stack`; the fields are views of the tensor (13, B, N)."""
         vector, matrix = (lambda p: p.movedim(0, -1)), (lambda p: p.movedim(0, -1).unflatten(-1, (2, 2)))
         x, v, C, F = vector(stacked[0:2]), vector(stacked[2:4]), matrix(stacked[4:8]), matrix(stacked[8:12])
         state = cls(x, v, C, F, stacked[12])
@@ -167,15 +167,15 @@ class ParticleState:
         return state
 
     def stack(self) -> Tensor:
-        """The :meth:`planes` as one tensor (13, B, N); no copy of what :meth:`from_stack` made, unless with a graph."""
+        """The :meth:`planes` as one tensor (13, B, N); no copy of what :meth:`from_stack` made without a graph."""
         stacked: Tensor | None = getattr(self, "_stack", None)
         if stacked is None or stacked.requires_grad or transforming():
             return torch.stack(self.planes())
-        memory = stacked.untyped_storage()._cdata
-        for field in (self.x, self.v, self.C, self.F, self.Jp):
+        memory = stacked.data_ptr()
+        for row, field in zip((0, 2, 4, 8, 12), (self.x, self.v, self.C, self.F, self.Jp), strict=True):
             # With a graph the tensor goes through the fields, so that derivatives in them can be asked for. And
             # ``state.x.data = ...`` gives a field other memory.
-            if field.requires_grad or field.untyped_storage()._cdata != memory:
+            if field.requires_grad or field.data_ptr() != memory + row * stacked.stride(0) * stacked.element_size():
                 return torch.stack(self.planes())
         return stacked
 

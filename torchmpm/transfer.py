@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from torchmpm.grid import Grid
-from torchmpm.linalg import Mat2
-from torchmpm.material import Sym2
+from torchmpm.materials.linalg import Mat2, Sym2
 from torchmpm.spline import Stencil, gather, scatter
 
 
@@ -18,7 +17,7 @@ def particles_to_grid(
     v: tuple[Tensor, Tensor],
     C: Mat2,
     mass: Tensor,
-    force: Sym2,
+    stress_momentum: Sym2,
 ) -> Tensor:
     """Mass and momentum on the nodes after the internal forces of one substep.
 
@@ -32,15 +31,15 @@ def particles_to_grid(
         v: Planes of the velocity.
         C: Planes of the affine velocity matrix.
         mass: (1 or B, N) particle masses, kg.
-        force: Planes of ``-dt V 4/h^2 tau``, kg/s.
+        stress_momentum: Planes of ``-dt V 4/h^2 tau``, kg/s.
 
     Returns:
         (3, B, cells): mass, momentum in x, momentum in y.
     """
     offset = torch.arange(3, device=active.device, dtype=active.dtype)[:, None]
     dx, dy = (offset - stencil.fx[:, None]) * grid.h, (offset - stencil.fy[:, None]) * grid.h
-    xx, xy = force[0] + mass * C[0], force[1] + mass * C[1]
-    yx, yy = force[1] + mass * C[2], force[2] + mass * C[3]
+    xx, xy = stress_momentum[0] + mass * C[0], stress_momentum[1] + mass * C[1]
+    yx, yy = stress_momentum[1] + mass * C[2], stress_momentum[2] + mass * C[3]
     weight = (stencil.wx * active[:, None])[:, :, None] * stencil.wy[:, None]
     momentum_x = ((mass * v[0])[:, None] + xx[:, None] * dx)[:, :, None] + (xy[:, None] * dy)[:, None]
     momentum_y = ((mass * v[1])[:, None] + yx[:, None] * dx)[:, :, None] + (yy[:, None] * dy)[:, None]
@@ -60,8 +59,22 @@ def grid_to_particles(grid: Grid, stencil: Stencil, velocity: Tensor) -> tuple[t
     offset = torch.arange(3, device=velocity.device, dtype=velocity.dtype)[:, None]
     wy_dy = stencil.wy * (offset - stencil.fy[:, None])
     wx_dx = stencil.wx * (offset - stencil.fx[:, None])
-    across = (nodes * stencil.wy[:, None]).sum(3)  # (2, B, 3, N): summed over y
-    v = (across * stencil.wx).sum(2)
-    slope_x = (across * wx_dx).sum(2) * (4.0 / grid.h)
+    row = (nodes * stencil.wy[:, None]).sum(3)  # (2, B, 3, N): summed over y
+    v = (row * stencil.wx).sum(2)
+    slope_x = (row * wx_dx).sum(2) * (4.0 / grid.h)
     slope_y = ((nodes * wy_dy[:, None]).sum(3) * stencil.wx).sum(2) * (4.0 / grid.h)
     return (v[0], v[1]), (slope_x[0], slope_y[0], slope_x[1], slope_y[1])
+
+
+def interpolate(stencil: Stencil, field: Tensor) -> tuple[Tensor, Tensor]:
+    """Values of a field at the particles, for example of the muscle actuation.
+
+    Args:
+        stencil: Stencils of the particles.
+        field: (2, B, cells) two components on the padded grid.
+
+    Returns:
+        Two planes (B, N).
+    """
+    first, second = (stencil.weights * gather(stencil, field)).sum((2, 3))
+    return first, second

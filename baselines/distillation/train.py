@@ -28,7 +28,7 @@ from baselines.distillation.teacher_training import (
 )
 from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
 from baselines.planning.gradient import GradientPlannerConfig
-from baselines.shac.networks import quieten
+from baselines.shac.networks import fix_std
 from cfp.agent.actor import build_actor
 from cfp.agent.policies import ActorPolicy
 from cfp.config import RunConfig
@@ -82,7 +82,7 @@ class Distill(Algorithm):
         self.spec = config.actor_spec(stage - 1)
         with self._luck():
             self.actor = build_actor(self.spec)
-        quieten(self.actor)
+        fix_std(self.actor)
         if start is not None:
             self.actor.get_submodule("coarse").load_state_dict(start.actor.state_dict())
         self.actor.to(self.env.device)

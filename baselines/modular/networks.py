@@ -1,4 +1,4 @@
-"""Networks that treat a robot's segments alike: a graph network and a Transformer, as actor and as critics."""
+"""Actor and critics over a robot's segments, whose weights are shared by all segments: graph network or Transformer."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ from cfp.agent.networks import at_least_float32, initialise
 
 Kind = Literal["gnn", "transformer"]
 WIDTH = 128
-"""Numbers that a node carries through the network."""
-ROUNDS = 3
+"""Width of the hidden layers."""
+LAYERS = 3
 """Rounds of messages, or layers of attention."""
 HEADS = 4
+"""Attention heads."""
 
 
 class GraphTrunk(nn.Module):
-    """Three rounds of messages between neighbours, with the same weights in each.
+    """Three rounds of messages between neighbours, with the same weights in each (after Pathak et al., NeurIPS 2019).
 
     ``h <- h + ELU(W h + V mean of the neighbours' h)``.
 
     Args:
-        inputs: Numbers of a node.
+        inputs: Number of features of a node.
     """
 
     def __init__(self, inputs: int) -> None:
@@ -35,31 +36,31 @@ class GraphTrunk(nn.Module):
         self.own, self.message = nn.Linear(WIDTH, WIDTH), nn.Linear(WIDTH, WIDTH)
 
     def forward(self, nodes: Tensor, edges: Tensor) -> Tensor:
-        """What nodes (B, K, inputs) know (B, K, 128) after the messages along edges (B, K, K), 0 or 1."""
-        share = edges / edges.sum(-1, keepdim=True).clamp_min(1.0)
-        known: Tensor = self.embed(nodes)
-        for _ in range(ROUNDS):
-            known = known + F.elu(self.own(known) + self.message(share @ known))
-        return known
+        """Hidden states (B, K, 128) of nodes (B, K, inputs) with edges (B, K, K), 0 or 1."""
+        weights = edges / edges.sum(-1, keepdim=True).clamp_min(1.0)
+        hidden: Tensor = self.embed(nodes)
+        for _ in range(LAYERS):
+            hidden = hidden + F.elu(self.own(hidden) + self.message(weights @ hidden))
+        return hidden
 
 
 class AttentionTrunk(nn.Module):
-    """Three layers of self-attention over all nodes, pre-norm, without positions.
+    """Three layers of self-attention over all nodes, pre-norm, without positional encoding.
 
     Args:
-        inputs: Numbers of a node.
+        inputs: Number of features of a node.
     """
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
         self.embed = nn.Linear(inputs, WIDTH)
         layer = nn.TransformerEncoderLayer(WIDTH, HEADS, 2 * WIDTH, dropout=0.0, batch_first=True, norm_first=True)
-        self.layers = nn.TransformerEncoder(layer, ROUNDS, nn.LayerNorm(WIDTH), enable_nested_tensor=False)
+        self.layers = nn.TransformerEncoder(layer, LAYERS, nn.LayerNorm(WIDTH), enable_nested_tensor=False)
 
     def forward(self, nodes: Tensor, edges: Tensor | None) -> Tensor:
-        """What nodes (B, K, inputs) know of each other, (B, K, 128)."""
-        known: Tensor = self.layers(self.embed(nodes))
-        return known
+        """Hidden states (B, K, 128) of nodes (B, K, inputs)."""
+        hidden: Tensor = self.layers(self.embed(nodes))
+        return hidden
 
 
 class Trunk(nn.Module):
@@ -67,20 +68,20 @@ class Trunk(nn.Module):
 
     Args:
         kind: Which.
-        features: Numbers of a row without neighbours.
-        more: Numbers that are given beside a row.
+        features: Length of a row without neighbours.
+        extra: Number of further inputs of each node.
     """
 
-    def __init__(self, kind: Kind, features: int, more: int = 0) -> None:
+    def __init__(self, kind: Kind, features: int, extra: int = 0) -> None:
         super().__init__()
         self.kind, self.features = kind, features
-        self.trunk = (GraphTrunk if kind == "gnn" else AttentionTrunk)(features + more)
+        self.trunk = (GraphTrunk if kind == "gnn" else AttentionTrunk)(features + extra)
 
-    def forward(self, rows: Tensor, *more: Tensor) -> Tensor:
-        """What nodes know (B, K, 128), from rows (B, K, columns) and more numbers of each (B, K, ...)."""
+    def forward(self, rows: Tensor, *extra: Tensor) -> Tensor:
+        """Hidden states (B, K, 128) of nodes with rows (B, K, columns) and further inputs (B, K, ...)."""
         edges = unpack(rows[..., self.features :], rows.shape[1]) if self.kind == "gnn" else None
-        known: Tensor = self.trunk(torch.cat((rows[..., : self.features], *more), -1), edges)
-        return known
+        hidden: Tensor = self.trunk(torch.cat((rows[..., : self.features], *extra), -1), edges)
+        return hidden
 
 
 class ModularActor(SquashedActor):
@@ -88,7 +89,7 @@ class ModularActor(SquashedActor):
 
     Args:
         kind: Of the trunk.
-        features: Numbers of a node.
+        features: Number of features of a node.
     """
 
     def __init__(self, kind: Kind, features: int) -> None:
@@ -104,11 +105,11 @@ class ModularActor(SquashedActor):
 
 
 class ModularCritics(nn.Module):
-    """Two critics that share nothing: a trunk that is told the nodes' actions, the mean over nodes, a perceptron.
+    """Twin critics without shared weights: a trunk that also reads actions, the mean over nodes, a perceptron.
 
     Args:
         kind: Of the trunks.
-        features: Numbers of a node.
+        features: Number of features of a node.
     """
 
     optimizer: torch.optim.Optimizer
@@ -129,5 +130,5 @@ class ModularCritics(nn.Module):
         return tuple(at_least_float32(value(trunk(observation, values).mean(1))) for trunk, value in pairs)
 
     def set_training_mode(self, mode: bool) -> None:
-        """Switch between training and evaluation; without effect on these layers, asked for by stable-baselines3."""
+        """Switch between training and evaluation; stable-baselines3 calls it, no layer depends on it."""
         self.train(mode)

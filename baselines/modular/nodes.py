@@ -1,4 +1,4 @@
-"""What a modular policy sees of a robot's segments, and how it acts through them."""
+"""Features and actions of a robot's segments, the nodes of a modular policy."""
 
 from __future__ import annotations
 
@@ -6,95 +6,94 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from baselines.modular.kmeans import adjacency, averages, squared_distances
+from baselines.modular.kmeans import adjacency, segment_means, squared_distances
 from dittogym import TorchEnv
 from dittogym.action import from_grid_layout, patch_corner
 from dittogym.observation.window import in_window
 from dittogym.spec import TaskSpec
 from torchmpm import checks
 
-LENGTH, SPEED = 0.1, 0.5
+LENGTH_SCALE, SPEED_SCALE = 0.1, 0.5
 """Units of the features, m and m/s: most values lie within [-2, 2]."""
 FLOOR = 20 / 128
 """Height of the floor, m."""
-FASTEST = 100.0
-"""Speed along an axis at which the view saturates, m/s."""
-BEYOND = 1.0
-"""Distance from the window beyond which matter is seen no farther away, m: what tears can fly off to 1e20."""
-MOST = 4096
-"""Segments at most."""
+MAX_SPEED = 100.0
+"""Speed along an axis at which the feature saturates, m/s."""
+MAX_DISTANCE = 1.0
+"""Distance from the window at which positions saturate, m: torn-off matter can fly as far as 1e20."""
+MAX_SEGMENTS = 4096
+"""Largest number of segments."""
 BITS = 16
-"""Neighbours that one float32 of a node's row holds; whole numbers up to 2^24 are exact there."""
+"""Neighbours packed into one float32 of a node's row; integers up to 2^24 are exact there."""
 
 
 @dataclass(frozen=True)
 class Nodes:
-    """Segments as rows of numbers.
+    """Reads a robot's segments as rows of numbers, and writes values of segments to the action grid.
 
-    A row holds, for its segment: the centre relative to the robot's (2), mean velocity (2), spread along x and y (2),
-    share of the particles times K (1), height above the floor (1). Then what is there to know of the surroundings:
-    how far the robot has come (2), the goal relative to the centre (2, in tasks with one), the object relative to the
-    centre, in place and velocity (4, in tasks with one that moves visibly: not DIG's soil). With a graph, the
-    segment's neighbours follow, packed by `pack`.
+    A row holds, for its segment: the centre relative to the robot's (2), mean velocity (2), standard deviation of x and
+    y (2), share of the particles times K (1), height above the floor (1). Then the surroundings: the robot's
+    displacement since the reset (2), the goal relative to the centre (2, in tasks with one), position and velocity of
+    the object relative to the segment's (4, in tasks with one that is drawn as a body: not DIG's snow). With a graph,
+    the segment's neighbours follow, packed by `pack`.
 
     Attributes:
-        count: Segments K.
-        graph: With neighbours.
+        count: Number of segments K.
+        graph: Whether rows hold neighbours.
 
     Raises:
-        ValueError: Fewer segments than two or more than `MOST`, or no truth value.
+        ValueError: ``count`` is below 2 or above `MAX_SEGMENTS`, or ``graph`` is not a bool.
     """
 
     count: int
     graph: bool
 
     def __post_init__(self) -> None:
-        checks.whole("count", self.count, 2, MOST)
+        checks.whole("count", self.count, 2, MAX_SEGMENTS)
         checks.flag("graph", self.graph)
 
-    def features(self, spec: TaskSpec) -> int:
-        """Length D of a row without neighbours."""
+    def num_features(self, spec: TaskSpec) -> int:
+        """Length of a row without neighbours in a task."""
         return 10 + 2 * (spec.goal is not None) + 4 * _has_object(spec)
 
-    def columns(self, spec: TaskSpec) -> int:
-        """Length of a row."""
-        return self.features(spec) + (-(-self.count // BITS) if self.graph else 0)
+    def num_columns(self, spec: TaskSpec) -> int:
+        """Length of a row in a task."""
+        return self.num_features(spec) + (-(-self.count // BITS) if self.graph else 0)
 
-    def __call__(self, env: TorchEnv, labels: Tensor) -> Tensor:
+    def observe(self, env: TorchEnv, labels: Tensor) -> Tensor:
         """Rows (B, K, columns), float32, of the environment's present state with labels (B, N)."""
         state, robot = env.env_state, env.model.robot
-        x, v = places(env), state.particles.v[:, :robot].clamp(-FASTEST, FASTEST)
+        x, v = visible_positions(env), state.particles.v[:, :robot].clamp(-MAX_SPEED, MAX_SPEED)
         com = x.mean(1)[:, None]
         offset = x - com
-        means, sizes = averages(torch.cat((offset, offset.square(), v), -1), labels, self.count)
+        means, sizes = segment_means(torch.cat((offset, offset.square(), v), -1), labels, self.count)
         centre, square, velocity = means.split(2, -1)
-        spread = (square - centre.square()).clamp_min(0.0).sqrt()
-        place = com + centre
+        std = (square - centre.square()).clamp_min(0.0).sqrt()
+        position = com + centre
         parts = [
-            centre / LENGTH,
-            velocity / SPEED,
-            spread * self.count**0.5 / LENGTH,
+            centre / LENGTH_SCALE,
+            velocity / SPEED_SCALE,
+            std * self.count**0.5 / LENGTH_SCALE,
             sizes[..., None] * (self.count / robot),
-            (place[..., 1:] - FLOOR) / LENGTH,
-            ((com - state.start.com[:, None]) / LENGTH).expand_as(centre),
+            (position[..., 1:] - FLOOR) / LENGTH_SCALE,
+            ((com - state.start.com[:, None]) / LENGTH_SCALE).expand_as(centre),
         ]
         if env.spec.goal is not None:
-            parts.append((place.new_tensor(env.spec.goal) - place) / LENGTH)
+            parts.append((position.new_tensor(env.spec.goal) - position) / LENGTH_SCALE)
         if _has_object(env.spec):
-            parts.append((state.particles.x[:, robot:].mean(1)[:, None] - place) / LENGTH)
-            parts.append((state.particles.v[:, robot:].mean(1)[:, None] - velocity) / SPEED)
+            parts.append((state.particles.x[:, robot:].mean(1)[:, None] - position) / LENGTH_SCALE)
+            parts.append((state.particles.v[:, robot:].mean(1)[:, None] - velocity) / SPEED_SCALE)
         if self.graph:
             parts.append(pack(adjacency(offset, centre)))
         return torch.cat([part.float() for part in parts], -1)
 
-    def act(self, env: TorchEnv, labels: Tensor, values: Tensor) -> Tensor:
-        """Actions (B, 2, P, P) for an environment whose action grid is its patch.
-
-        Every node of the patch gets the value of the segment whose centre is nearest.
+    def to_grid(self, env: TorchEnv, labels: Tensor, values: Tensor) -> Tensor:
+        """Actions (B, 2, P, P) in which every node of the patch has the value of the segment with the nearest centre.
 
         Args:
-            env: Before its step.
+            env: Before its step, with its patch as action grid.
             labels: (B, N).
             values: (B, K, 2), in [-1, 1].
 
@@ -103,23 +102,23 @@ class Nodes:
         """
         size, state = env.spec.patch, env.env_state
         if env.action_resolution != size:
-            raise ValueError(f"env: got an action grid of {env.action_resolution}, allowed {size}, the task's patch")
+            raise ValueError(f"env must have the task's patch, {size}, as action grid, got {env.action_resolution}")
         grid = env.model.solver.grid.resolution
         corner = patch_corner(in_window(env.spec.reach, state.centre, state.origin), size, grid)
-        along = torch.arange(size, device=env.device)
-        nodes = torch.stack(torch.meshgrid(along, along, indexing="ij"), -1).flatten(0, 1)
-        place = state.origin[:, None] + (corner[:, None] + nodes) / grid
-        centres, _ = averages(places(env), labels, self.count)
-        nearest = squared_distances(place.to(centres), centres).argmin(-1)
+        index = torch.arange(size, device=env.device)
+        indices = torch.stack(torch.meshgrid(index, index, indexing="ij"), -1).flatten(0, 1)
+        position = state.origin[:, None] + (corner[:, None] + indices) / grid
+        centres, _ = segment_means(visible_positions(env), labels, self.count)
+        nearest = squared_distances(position.to(centres), centres).argmin(-1)
         field = values.to(centres).gather(1, nearest[..., None].expand(-1, -1, 2))
         return from_grid_layout(field.transpose(1, 2).unflatten(2, (size, size)), env.action_layout)
 
 
-def places(env: TorchEnv) -> Tensor:
-    """Where the robot's particles are seen, (B, N, 2), m: at most `BEYOND` outside the window, which is 1 m wide."""
+def visible_positions(env: TorchEnv) -> Tensor:
+    """Positions (B, N, 2), m, of the robot's particles, cut at `MAX_DISTANCE` from the window, which is 1 m wide."""
     state = env.env_state
-    low = state.origin[:, None] - BEYOND
-    return state.particles.x[:, : env.model.robot].clamp(low, low + 1.0 + 2.0 * BEYOND)
+    low = state.origin[:, None] - MAX_DISTANCE
+    return state.particles.x[:, : env.model.robot].clamp(low, low + 1.0 + 2.0 * MAX_DISTANCE)
 
 
 def _has_object(spec: TaskSpec) -> bool:
@@ -127,14 +126,14 @@ def _has_object(spec: TaskSpec) -> bool:
 
 
 def pack(edges: Tensor) -> Tensor:
-    """Neighbours (B, K, K) bool as whole numbers in float32, 16 to each, (B, K, K / 16), for a replay memory."""
-    padded = torch.nn.functional.pad(edges, (0, -edges.shape[-1] % BITS))
+    """Pack neighbours (B, K, K) bool as integers in float32, 16 in each, (B, K, K / 16), for a replay buffer."""
+    padded = pad(edges, (0, -edges.shape[-1] % BITS))
     weights = 2.0 ** torch.arange(BITS, device=edges.device)
     return (padded.unflatten(-1, (-1, BITS)) * weights).sum(-1)
 
 
 def unpack(numbers: Tensor, count: int) -> Tensor:
-    """Undo `pack`, to float32 (B, K, K)."""
+    """Unpack what `pack` made of the neighbours of ``count`` nodes, to float32 (B, K, K)."""
     shifts = torch.arange(BITS, device=numbers.device)
     bits = (numbers.to(torch.int32)[..., None] >> shifts) & 1
     return bits.flatten(-2)[..., :count].float()

@@ -12,6 +12,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecMonitor
 
 import cfp
+from baselines.common.policies import StateBasedPolicy
 from baselines.modular.env import SegmentedEnv
 from baselines.modular.networks import Kind, ModularActor, ModularCritics
 from baselines.modular.nodes import Nodes
@@ -172,12 +173,12 @@ class Modular(SACAlgorithm):
     def create(cls, config: ModularConfig, stage: int, folder: Path, resumed: bool = False) -> Modular:
         """Networks, replay memory and environment."""
         env = SegmentedEnv(make_torch_env(config, config.resolution(stage - 1)), config.nodes)
-        networks = {"kind": config.kind, "features": config.nodes.features(env.env.spec)}
+        networks = {"kind": config.kind, "features": config.nodes.num_features(env.env.spec)}
         monitor = VecMonitor(TorchVecEnv(env, env.spaces))
         model = cls.make_model(config, monitor, ModularPolicy, networks, cls.hyperparameters(config, stage, folder))
         return cls(config, stage, model)
 
-    def attached(self, env: Any) -> SegmentPolicy:
+    def attached(self, env: Any) -> StateBasedPolicy:
         """The present policy, looking at an environment."""
         return self._policy({}).attached(env)
 

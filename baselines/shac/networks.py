@@ -1,4 +1,4 @@
-"""Networks of the short-horizon actor-critic, and the policy that sees the state."""
+"""Actors and critics of the short-horizon actor-critic, and the policy that acts on the state."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from baselines.common.policies import StateBasedPolicy, load_network
 from baselines.shac.features import StateFeatures
 from cfp.agent.actor import Actor
 from cfp.agent.networks import LATENT, Encoder, initialise
 from cfp.agent.spec import ActorSpec
 from cfp.weights import fitting, read_policy, write_policy
 from dittogym import TorchEnv
+from dittogym.spec import TaskSpec
 
 WIDTH = 128
-"""Units of the hidden layers."""
-QUIET = -0.4
-"""Output of an image actor's head for the width: a standard deviation of 0.105, near the least it can be."""
+"""Width of the hidden layers."""
+STD_BIAS = -0.4
+"""Bias of an image actor's standard deviation: 0.105 before tanh, near the smallest that the network allows."""
 
 
-def perceptron(inputs: int, outputs: int) -> nn.Sequential:
-    """Two hidden layers of 128 units with layer normalisation and ELU; the last layer begins small."""
+def mlp(inputs: int, outputs: int) -> nn.Sequential:
+    """Two hidden layers of 128 units with layer normalisation and ELU; the last layer starts with small weights."""
     layers: list[nn.Module] = []
-    for before in (inputs, WIDTH):
-        layers += [nn.Linear(before, WIDTH), nn.LayerNorm(WIDTH), nn.ELU()]
+    for size in (inputs, WIDTH):
+        layers += [nn.Linear(size, WIDTH), nn.LayerNorm(WIDTH), nn.ELU()]
     last = nn.Linear(WIDTH, outputs)
     with torch.no_grad():
         last.weight.mul_(0.1)
@@ -36,7 +38,7 @@ def perceptron(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class StateActor(nn.Module):
-    """Features (B, D) to the mean before tanh, (B, 2, R, R).
+    """Mean action before tanh, (B, 2, R, R), from features (B, D).
 
     Args:
         inputs: D.
@@ -46,7 +48,7 @@ class StateActor(nn.Module):
     def __init__(self, inputs: int, resolution: int) -> None:
         super().__init__()
         self.inputs, self.resolution = inputs, resolution
-        self.body = perceptron(inputs, 2 * resolution**2)
+        self.body = mlp(inputs, 2 * resolution**2)
 
     def forward(self, features: Tensor) -> Tensor:
         """Mean before tanh."""
@@ -54,17 +56,17 @@ class StateActor(nn.Module):
         return output.unflatten(1, (2, self.resolution, self.resolution))
 
 
-def quieten(actor: Actor) -> None:
-    """Fix the width of an actor of the coarse-to-fine policy at a standard deviation of about 0.1 before tanh."""
+def fix_std(actor: Actor) -> None:
+    """Fix the standard deviation of an actor of the coarse-to-fine policy at 0.105 before tanh."""
     layers = [layer for layer in actor.std.modules() if isinstance(layer, nn.Linear | nn.ConvTranspose2d)]
     nn.init.zeros_(layers[-1].weight)
     assert layers[-1].bias is not None
-    nn.init.constant_(layers[-1].bias, QUIET)
+    nn.init.constant_(layers[-1].bias, STD_BIAS)
     actor.std.requires_grad_(False)
 
 
 class ImageActor(nn.Module):
-    """The first actor of the coarse-to-fine policy, trained through its mean; its width stays about 0.1.
+    """The coarsest actor of the coarse-to-fine policy; its mean is trained and its standard deviation fixed.
 
     Args:
         resolution: R.
@@ -74,7 +76,7 @@ class ImageActor(nn.Module):
         super().__init__()
         self.spec = ActorSpec((resolution,))
         self.actor = Actor(resolution)
-        quieten(self.actor)
+        fix_std(self.actor)
 
     def forward(self, image: Tensor) -> Tensor:
         """Mean before tanh, (B, 2, R, R), of images (B, 3, 64, 64) in [-1, 1]."""
@@ -84,53 +86,29 @@ class ImageActor(nn.Module):
 
 def state_critic(inputs: int) -> nn.Module:
     """Value (B, 1) of features (B, D)."""
-    return perceptron(inputs, 1)
+    return mlp(inputs, 1)
 
 
 def image_critic() -> nn.Module:
     """Value (B, 1) of images (B, 3, 64, 64) in [-1, 1], with an encoder like the actor's."""
-    return initialise(nn.Sequential(Encoder(3, 32), nn.Flatten(), perceptron(LATENT, 1)))
+    return initialise(nn.Sequential(Encoder(3, 32), nn.Flatten(), mlp(LATENT, 1)))
 
 
-def shown(env: TorchEnv | None, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[TorchEnv, bool]:
-    """The environment that a policy looks at, and whether the observation is a single image.
-
-    Raises:
-        RuntimeError: It was not shown an environment.
-        ValueError: The images are not as many as the environment has simulations.
-    """
-    if env is None:
-        raise RuntimeError("this policy sees the state of the simulation, not the image: call attached(env) first")
-    single = isinstance(observation, np.ndarray) and observation.ndim == 3
-    count = 1 if single else len(observation)
-    if count != env.num_envs:
-        raise ValueError(f"observation: got {count} images, allowed {env.num_envs} as in the environment")
-    return env, single
-
-
-class StatePolicy:
-    """Acts on the state of the environment that it is shown by `attached`, not on the image.
+class StatePolicy(StateBasedPolicy):
+    """A trained `StateActor`, acting on `StateFeatures` of the environment given to `attached`.
 
     Args:
         actor: The network.
-        features: What it is given.
+        features: Its inputs.
         noise: Standard deviation before tanh of actions that are not deterministic.
-        description: What it is and comes from.
-        env: Where it looks.
+        description: What it is and where it comes from, see `cfp.weights.origin`.
     """
 
-    sees_image = False
-
     def __init__(
-        self,
-        actor: StateActor,
-        features: StateFeatures,
-        noise: float,
-        description: dict[str, Any] | None = None,
-        env: TorchEnv | None = None,
+        self, actor: StateActor, features: StateFeatures, noise: float, description: dict[str, Any] | None = None
     ) -> None:
-        self.actor, self.features, self.noise, self.env = actor, features, noise, env
-        self.description = description or {}
+        super().__init__(description)
+        self.actor, self.features, self.noise = actor, features, noise
 
     @property
     def resolution(self) -> int:
@@ -138,51 +116,21 @@ class StatePolicy:
         return self.actor.resolution
 
     @property
-    def deterministic_by_default(self) -> bool:
-        """Whether the run that trained it evaluates it without noise."""
-        return bool(self.description.get("deterministic", False))
+    def num_inputs(self) -> int:
+        """Number of features that the network takes."""
+        return self.actor.inputs
 
-    def attached(self, env: TorchEnv) -> StatePolicy:
-        """The same policy, looking at the environment ``env``.
+    def num_features(self, spec: TaskSpec) -> int:
+        """Number of features of a task."""
+        return self.features.size(len(spec.bodies) - 1)
 
-        Raises:
-            ValueError: Another task's environment, with other things to see.
-        """
-        found = self.features.size(len(env.spec.bodies) - 1)
-        if found != self.actor.inputs:
-            raise ValueError(f"env: got {env.spec.name!r} with {found} features, allowed {self.actor.inputs}")
-        return StatePolicy(self.actor, self.features, self.noise, self.description, env)
-
-    @torch.no_grad()
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Actions for the state of the attached environment; the image is not looked at.
-
-        Args:
-            observation: (B, 3, 64, 64) or (3, 64, 64); only the number of images matters.
-            state: Arrays with a leading B, handed through: the policy has no memory.
-            episode_start: (B,) bool; changes nothing.
-            deterministic: Without noise.
-
-        Returns:
-            Actions (B, 2, R, R), or (2, R, R) for one image, and ``state``.
-
-        Raises:
-            RuntimeError: It was not shown an environment.
-            ValueError: The images are not as many as the environment has simulations.
-        """
-        env, single = shown(self.env, observation)
-        device = next(self.actor.parameters()).device
-        mean = self.actor(self.features(env).float().to(device))
+    def _act(
+        self, env: TorchEnv, state: tuple[np.ndarray, ...] | None, deterministic: bool
+    ) -> tuple[Tensor, tuple[np.ndarray, ...] | None]:
+        mean = self.actor(self.features(env).float().to(next(self.actor.parameters()).device))
         if not deterministic:
             mean = mean + self.noise * torch.randn_like(mean)
-        actions = mean.tanh().cpu().numpy()
-        return actions[0] if single else actions, state
+        return mean.tanh(), state
 
     def save(self, path: Path) -> None:
         """Write ``path`` (``.safetensors``) and the ``.json`` beside it."""
@@ -194,12 +142,10 @@ class StatePolicy:
         """Load what `save` wrote.
 
         Raises:
-            CheckpointError: No such file, a damaged one, or one that is not such a policy.
+            CheckpointError: The file is missing, damaged, or not such a policy.
         """
         tensors, description = read_policy(path, device)
         with fitting(path):
-            with torch.device("meta"):  # so that a size that the file only claims takes no memory
-                actor = StateActor(description["inputs"], description["resolution"])
-            actor.load_state_dict(tensors, assign=True)
-            features, noise = StateFeatures(**description["features"]), float(description["noise"])
-            return cls(actor.to(device, torch.float32).requires_grad_(False), features, noise, description)
+            size = description["inputs"], description["resolution"]
+            actor = load_network(lambda: StateActor(*size), tensors, device)
+            return cls(actor, StateFeatures(**description["features"]), float(description["noise"]), description)

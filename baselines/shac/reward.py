@@ -1,4 +1,4 @@
-"""What a policy is trained on, by gradients, in place of a task's own reward."""
+"""The reward that the short-horizon actor-critic maximises in place of a task's own."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from cfp.validation import check_at_least, check_positive
 from dittogym import TorchEnv
 from torchmpm import tree
 
-SPEED = 60.0
+SPEED_WEIGHT = 60.0
 """Reward for a mean speed of 1 m/s."""
-NEIGHBOURS, SAMPLE = 6, 500
-"""Pairs of each particle that is watched, and how many are watched at most."""
-REACH = 0.03
+NEIGHBOURS, MAX_SAMPLES = 6, 500
+"""Neighbours of each sampled particle whose distance is tracked, and how many particles are sampled at most."""
+RADIUS = 0.03
 """Particles nearer than this, m, belong together."""
-SLACK = 0.25
-"""Share of `REACH` by which they may drift apart for nothing."""
+TOLERANCE = 0.25
+"""Fraction of `RADIUS` by which they may drift apart at no cost."""
 
 
 @dataclass(frozen=True)
 class RewardConfig:
-    """What is maximised while training; judgement is always by the task's own reward."""
+    """The training reward; evaluations always use the task's own."""
 
     form: Literal["task", "speed"] = "task"
     """task: the task's own reward, made smooth; speed: 60 per m/s to the right, less the task's cost of action."""
     split_weight: float = 1000.0
-    """Cost of the square by which the robot's spread, as a share of the task's limit, exceeds split_margin."""
+    """Cost of the square by which the robot's spread, as a fraction of the task's limit, exceeds split_margin."""
     split_margin: float = 0.85
-    """Share of the limit on the spread from which it costs; no matter in tasks without a limit."""
+    """Fraction of the limit on the spread from which it costs; no effect in tasks without a limit."""
     integrity_weight: float = 300.0
     """Cost of particles that were close when the window, or the episode within it, began and drift apart; see
-    `Pairs`."""
+    `Neighbours`."""
     scale: float = 0.05
     """Factor of the whole, so that values are not far from one."""
 
@@ -42,7 +42,7 @@ class RewardConfig:
         """Check what the types cannot.
 
         Raises:
-            ConfigError: Naming the option, what was given and what is allowed.
+            ConfigError: An option is out of range.
         """
         check_at_least(
             0, split_weight=self.split_weight, split_margin=self.split_margin, integrity_weight=self.integrity_weight
@@ -50,68 +50,69 @@ class RewardConfig:
         check_positive(scale=self.scale)
 
 
+@tree.register
 @dataclass(frozen=True)
-class Pairs:
-    """Particles of the robot that were close to each other, and how close.
-
-    Tearing shows in them long before the spread of the whole body does.
+class Neighbours:
+    """Pairs of a robot's particles that were close to each other; tearing shows in them before the body is split.
 
     Attributes:
-        one: (K,) watched particles.
-        other: (B, K, M) the nearest of them to each.
-        distance: (B, K, M), m.
-        counts: (B, K, M) which are nearer than `REACH`.
+        index: (B, K) sampled particles, numbers.
+        neighbours: (B, K, M) their nearest other samples, numbers among the samples.
+        distance: (B, K, M), m, when they were found.
+        is_close: (B, K, M) bool, whether they were nearer than `RADIUS`.
     """
 
-    one: Tensor
-    other: Tensor
+    index: Tensor
+    neighbours: Tensor
     distance: Tensor
-    counts: Tensor
+    is_close: Tensor
 
     @classmethod
     @torch.no_grad()
-    def of(cls, x: Tensor) -> Pairs:
-        """Choose among a robot's particles (B, N, 2)."""
-        number = min(SAMPLE, x.shape[1])
-        one = torch.linspace(0, x.shape[1] - 1, number, device=x.device).long()
-        spots = x[:, one]
-        nearest = torch.cdist(spots, spots).topk(min(NEIGHBOURS + 1, number), largest=False)
-        distance, other = nearest.values[..., 1:], nearest.indices[..., 1:]  # the first is the particle itself
-        return cls(one, other, distance, distance < REACH)
-
-    def renewed(self, anew: Tensor, x: Tensor) -> Pairs:
-        """The same pairs, but chosen again among the particles (B, N, 2) of the simulations of a mask (B,)."""
-        fresh = Pairs.of(x)
-        other, distance = tree.where(anew, fresh.other, self.other), tree.where(anew, fresh.distance, self.distance)
-        return Pairs(self.one, other, distance, tree.where(anew, fresh.counts, self.counts))
+    def find(cls, x: Tensor) -> Neighbours:
+        """Find neighbours among a robot's particles (B, N, 2), m."""
+        count = min(MAX_SAMPLES, x.shape[1])
+        index = torch.linspace(0, x.shape[1] - 1, count, device=x.device).long()
+        nearest = torch.cdist(x[:, index], x[:, index]).topk(min(NEIGHBOURS + 1, count), largest=False)
+        distance, neighbours = nearest.values[..., 1:], nearest.indices[..., 1:]  # the first is the particle itself
+        return cls(index.expand(len(x), -1), neighbours, distance, distance < RADIUS)
 
     def drift(self, x: Tensor) -> Tensor:
-        """Mean square of ``(d - d_0) / REACH - SLACK`` where positive, over pairs, (B,), for particles (B, N, 2)."""
-        spots = x[:, self.one]
-        index = self.other.flatten(1)[..., None].expand(-1, -1, 2)
-        gap = spots.gather(1, index).view(*self.other.shape, 2) - spots[:, :, None]
+        """Mean over close pairs, (B,), of the square of ``(d - d_0) / RADIUS - TOLERANCE`` where it is positive.
+
+        Args:
+            x: (B, N, 2) the robot's particles now, m.
+        """
+        samples = x.gather(1, self.index[..., None].expand(-1, -1, 2))
+        index = self.neighbours.flatten(1)[..., None].expand(-1, -1, 2)
+        gap = samples.gather(1, index).view(*self.neighbours.shape, 2) - samples[:, :, None]
         distance = (gap.square().sum(-1) + 1e-12).sqrt()
-        excess = ((distance - self.distance) / REACH - SLACK).clamp_min(0.0) * self.counts
-        return excess.square().sum((1, 2)) / self.counts.sum((1, 2)).clamp_min(1)
+        excess = ((distance - self.distance) / RADIUS - TOLERANCE).clamp_min(0.0) * self.is_close
+        return excess.square().sum((1, 2)) / self.is_close.sum((1, 2)).clamp_min(1)
 
 
 def training_reward(
-    config: RewardConfig, env: TorchEnv, before: Tensor, reward: Tensor, info: dict[str, Any], pairs: Pairs
+    config: RewardConfig,
+    env: TorchEnv,
+    previous_centre: Tensor,
+    reward: Tensor,
+    info: dict[str, Any],
+    neighbours: Neighbours,
 ) -> Tensor:
-    """Reward (B,) of the step that has just been made.
+    """Training reward (B,) of the environment's last step.
 
     Args:
-        config: Which.
-        env: After the step.
-        before: (B, 2) the robot's centre before it, m.
+        config: Options of the reward.
+        env: The environment after the step.
+        previous_centre: (B, 2) the robot's centre of mass before the step, m.
         reward: (B,) the smooth reward of ``env.step(action, soft=True)``.
-        info: What came with it.
-        pairs: Who was close when the window, or the episode within it, began.
+        info: The info of that step.
+        neighbours: Pairs that were close when the window, or the episode within it, began.
     """
     terms = info["reward_terms"]
     if config.form == "speed":
         seconds = env.model.substeps * env.model.solver.dt
-        reward = SPEED / seconds * (info["com"] - before)[:, 0] + terms["failure"]
+        reward = SPEED_WEIGHT / seconds * (info["com"] - previous_centre)[:, 0] + terms["failure"]
         if "action" in terms:
             reward = reward + terms["action"]
     limit = env.spec.split_limit
@@ -119,5 +120,5 @@ def training_reward(
         excess = (info["split"] / limit - config.split_margin).clamp_min(0.0)
         reward = reward - config.split_weight * excess.square()
     if config.integrity_weight:
-        reward = reward - config.integrity_weight * pairs.drift(env.state.x[:, : env.model.robot])
+        reward = reward - config.integrity_weight * neighbours.drift(env.state.x[:, : env.model.robot])
     return config.scale * torch.where(info["finite"], reward, terms["failure"])

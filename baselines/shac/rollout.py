@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from baselines.common.episodes import Episodes
-from baselines.shac.reward import Pairs, training_reward
+from baselines.shac.reward import Neighbours, training_reward
 from cfp.errors import NonFiniteError
 from dittogym import TorchEnv
 from torchmpm import tree
@@ -71,7 +71,7 @@ class Rollout:
         total = torch.zeros(env.num_envs, device=env.device)
         discount = torch.ones_like(total)
         seen, rewards, values, ends, truth = [], [], [], [], 0.0
-        now, pairs = self.look(), Pairs.of(self._places())
+        now, pairs = self.look(), Neighbours.find(self._places())
         for step in range(self.config.window):
             seen.append(now.detach())
             before = env.env_state.centre
@@ -91,7 +91,7 @@ class Rollout:
             ends.append(out)
             if bool(out.any()):
                 self.episodes.restart(out, terminated, info["finite"])
-                pairs = pairs.renewed(out, self._places())
+                pairs = tree.where(out, Neighbours.find(self._places()), pairs)
                 after = tree.where(out, self.look(), after)
             now = after
         targets = self._targets(rewards, values, ends)

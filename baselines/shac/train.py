@@ -13,7 +13,7 @@ from torch import Tensor, nn
 import cfp
 from baselines.common.grid import GridConfig
 from baselines.shac.features import StateFeatures
-from baselines.shac.networks import ImageActor, StateActor, StatePolicy, image_critic, quieten, state_critic
+from baselines.shac.networks import ImageActor, StateActor, StatePolicy, fix_std, image_critic, state_critic
 from baselines.shac.reward import RewardConfig
 from baselines.shac.rollout import Rollout, Window
 from cfp.agent.policies import ActorPolicy
@@ -144,7 +144,7 @@ class Shac(Algorithm):
         if start is not None:
             assert isinstance(self.actor, ImageActor) and isinstance(start, ActorPolicy)
             self.actor.actor.load_state_dict(start.actor.state_dict())
-            quieten(self.actor.actor)  # the width is not learned: that of the policy would stay
+            fix_std(self.actor.actor)  # the width is not learned: that of the policy would stay
         self.target.load_state_dict(self.critic.state_dict())
         self.target.requires_grad_(False)
         learning = [p for p in self.actor.parameters() if p.requires_grad]

@@ -12,6 +12,7 @@ from dittogym.action import place
 from dittogym.geometry import Box
 from dittogym.observation.window import in_window
 from torchmpm import Soil, checks
+from torchmpm.materials.body import slices
 
 if TYPE_CHECKING:
     from dittogym.core import EnvState, Model
@@ -71,7 +72,7 @@ def frame(model: Model, state: EnvState, index: int, field: Tensor | None, size:
     colours = np.repeat(np.array(kinds), counts, axis=0)
     if field is not None:
         colours[: model.robot] = _muscle_colours(model, state, index, field)
-    parts = [part for _, part in model.solver.parts()]
+    parts = [part for _, part in slices(model.solver.bodies)]
     for part, share in reversed(list(zip(parts, model.shares, strict=True))):  # the robot last, on top
         canvas.dots(x[part], colours[part], radius=_radius(share, size * OVERSAMPLING))
     return cv2.resize(canvas.image, (size, size), interpolation=cv2.INTER_AREA)

@@ -199,8 +199,8 @@ def test_resumed_distillation_is_the_same_to_the_last_bit(kind, level, privilege
 
 
 def test_teacher_remembers_its_segments_as_long_as_an_episode_lasts(segments, monkeypatch):
-    anew, begin = [], modular_env.begin
-    monkeypatch.setattr(modular_env, "begin", lambda x, count: anew.append(len(x)) or begin(x, count))
+    anew, fit = [], modular_env.fit
+    monkeypatch.setattr(modular_env, "fit", lambda x, count: anew.append(len(x)) or fit(x, count))
     Distill(make(teacher=str(segments), max_episode_steps=6)).learn(32)
     assert sum(anew) == 7, "of 16 steps: the first robot begins anew after 3, 9 and 15, the second after 6 and 12"
 

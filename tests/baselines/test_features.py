@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from baselines.shac.features import RASTER, StateFeatures
-from baselines.shac.reward import REACH, SLACK, Pairs, RewardConfig, training_reward
+from baselines.shac.features import CELLS, StateFeatures
+from baselines.shac.reward import RADIUS, TOLERANCE, Neighbours, RewardConfig, training_reward
 from dittogym import TorchEnv
 
 
@@ -17,7 +17,7 @@ def reset(task="run", count=500, envs=1):
 
 
 def rasters(env):
-    return StateFeatures(clock=False)(env).view(env.num_envs, -1, RASTER, RASTER)
+    return StateFeatures(clock=False)(env).view(env.num_envs, -1, CELLS, CELLS)
 
 
 def test_raster_holds_mass_momentum_and_deformation():
@@ -25,7 +25,7 @@ def test_raster_holds_mass_momentum_and_deformation():
     velocity = torch.tensor([0.3, -0.2], dtype=torch.float64)
     env.state.v[:] = velocity
     picture = rasters(env)
-    assert picture.shape == (1, 7, RASTER, RASTER)
+    assert picture.shape == (1, 7, CELLS, CELLS)
     assert picture[0, 0].mean().item() == pytest.approx(1.0)
     assert torch.allclose(picture[0, 1:3], velocity[:, None, None] * picture[0, :1])
     assert picture[0, 3:].abs().max() == 0
@@ -40,18 +40,18 @@ def test_first_index_of_the_raster_is_along_x():
     env = reset()
     env.state.x[..., 0] += 0.1
     moved = rasters(env)[0, 0]
-    along = torch.arange(RASTER, dtype=torch.float64) + 0.5
+    along = torch.arange(CELLS, dtype=torch.float64) + 0.5
     patch = env.spec.patch / env.model.solver.grid.resolution
-    place = (moved.sum(1) * along).sum() / moved.sum() - RASTER / 2
-    assert place.item() == pytest.approx(0.1 / patch * RASTER, abs=1e-6)
-    assert (moved.sum(0) * along).sum() / moved.sum() < RASTER / 2
+    place = (moved.sum(1) * along).sum() / moved.sum() - CELLS / 2
+    assert place.item() == pytest.approx(0.1 / patch * CELLS, abs=1e-6)
+    assert (moved.sum(0) * along).sum() / moved.sum() < CELLS / 2
 
 
 def test_object_clock_and_place_are_added():
     env = reset("kick")
     features = StateFeatures(displacement=True)
     seen = features(env)
-    assert seen.shape == (1, features.size(1)) == (1, 10 * RASTER**2 + 6 + 2)
+    assert seen.shape == (1, features.size(1)) == (1, 10 * CELLS**2 + 6 + 2)
     assert seen[0, -8:].tolist() == pytest.approx([1, 1, 1, 0, 0, 0, 0, 0])
     env.step(torch.zeros(1, 2, 8, 8))
     clock = features(env)[0, -8:-2].tolist()
@@ -70,25 +70,27 @@ def test_features_have_a_gradient():
 def test_integrity_counts_what_drifts_apart():
     line = torch.linspace(0, 0.1, 11, dtype=torch.float64)
     x = torch.stack((line, torch.zeros(11, dtype=torch.float64)), 1)[None]
-    pairs = Pairs.of(x)
-    assert pairs.drift(x + 1.0).item() == 0
+    neighbours = Neighbours.find(x)
+    assert neighbours.drift(x + 1.0).item() == 0
     torn = x.clone()
     torn[:, 6:, 0] += 0.05
-    counted = (pairs.distance < REACH).sum()
-    crossing = ((pairs.other > 5) != (torch.arange(11)[:, None] > 5)) & pairs.counts
-    assert pairs.drift(torn).item() == pytest.approx((crossing.sum() / counted * (0.05 / REACH - SLACK) ** 2).item())
+    counted = (neighbours.distance < RADIUS).sum()
+    crossing = ((neighbours.neighbours > 5) != (torch.arange(11)[:, None] > 5)) & neighbours.is_close
+    assert neighbours.drift(torn).item() == pytest.approx(
+        (crossing.sum() / counted * (0.05 / RADIUS - TOLERANCE) ** 2).item()
+    )
 
 
 def test_speed_is_what_is_paid_for():
     env = reset()
-    pairs, before = Pairs.of(env.state.x), env.env_state.centre
+    neighbours, before = Neighbours.find(env.state.x), env.env_state.centre
     env.state.v[..., 0] = 0.5
     _, smooth, _, _, info = env.step(torch.zeros(1, 2, 8, 8), soft=True)
     config = RewardConfig("speed", split_weight=0.0, integrity_weight=0.0, scale=1.0)
-    paid = training_reward(config, env, before, smooth, info, pairs)
+    paid = training_reward(config, env, before, smooth, info, neighbours)
     assert paid.item() == pytest.approx(60 * (info["com"] - before)[0, 0].item() / 0.001)
     assert paid.item() == pytest.approx(30, rel=0.05)
-    assert training_reward(RewardConfig("task", 0.0, 1.0, 0.0, 1.0), env, before, smooth, info, pairs) == smooth
+    assert training_reward(RewardConfig("task", 0.0, 1.0, 0.0, 1.0), env, before, smooth, info, neighbours) == smooth
     margin = RewardConfig("task", 1000.0, 0.5, 0.0, 1.0)
-    lost = smooth - training_reward(margin, env, before, smooth, info, pairs)
+    lost = smooth - training_reward(margin, env, before, smooth, info, neighbours)
     assert lost.item() == pytest.approx(1000 * (info["split"].item() / env.spec.split_limit - 0.5) ** 2)

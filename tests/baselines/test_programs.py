@@ -136,9 +136,9 @@ def test_folder_is_evaluated_whatever_trained_it(finished, capsys):
     assert json.loads(capsys.readouterr().out) == json.loads((folder / "results.json").read_text())
     assert cfp.evaluate.main([str(folder), "--episodes", "1", "--device", "cpu"]) == (0 if algo == "cfp" else 2)
     if algo != "cfp":
-        assert "python -m baselines.evaluate takes others" in capsys.readouterr().err
+        assert "python -m baselines.evaluate runs other algorithms" in capsys.readouterr().err
         assert cfp.robustness.main([str(folder), "--episodes", "1", "--device", "cpu"]) == 2
-        assert "python -m baselines.robustness takes others" in capsys.readouterr().err
+        assert "python -m baselines.robustness runs other algorithms" in capsys.readouterr().err
 
 
 def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monkeypatch, capsys, stop_at):
@@ -242,7 +242,7 @@ def test_algorithm_with_a_count_has_two_spellings(given, name):
 
 def test_wrong_algorithm_is_named(tmp_path, capsys):
     assert train.main(["--algo", "alchemy", "--out", str(tmp_path / "a")]) == 2
-    assert f"algo: got 'alchemy', allowed {', '.join(baselines.ALGORITHMS)}" in capsys.readouterr().err
+    assert f"algo must be one of {', '.join(baselines.ALGORITHMS)}, got 'alchemy'" in capsys.readouterr().err
     assert cfp.train.main(["--algo", "gradient", "--out", str(tmp_path / "a")]) == 2
     assert "algo must be 'cfp', got 'gradient'; python -m baselines.train" in capsys.readouterr().err
 

@@ -6,8 +6,8 @@ import torch
 import dittogym
 from baselines.common.reference_policies import wave
 from baselines.modular.env import SegmentedEnv
-from baselines.modular.kmeans import adjacency, averages, begin, connected, follow, squared_distances
-from baselines.modular.nodes import LENGTH, SPEED, Nodes, pack, unpack
+from baselines.modular.kmeans import adjacency, connect, fit, segment_means, squared_distances, update
+from baselines.modular.nodes import LENGTH_SCALE, SPEED_SCALE, Nodes, pack, unpack
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
 from dittogym.action import place, to_grid_layout
@@ -22,7 +22,7 @@ def segmented(task="run", num_envs=2, count=16, graph=True, **options):
 
 
 def inertia(x, labels, count):
-    return squared_distances(x, averages(x, labels, count)[0]).gather(2, labels[..., None]).mean()
+    return squared_distances(x, segment_means(x, labels, count)[0]).gather(2, labels[..., None]).mean()
 
 
 @pytest.mark.parametrize("count", [16, 64])
@@ -38,34 +38,34 @@ def test_segments_last_while_the_robot_moves(count):
         shares.append(float((env.labels != before).float().mean()))
     x = env.env.state.x
     assert max(shares) < 0.05 and sum(shares) > 0
-    assert inertia(x, env.labels, count) < 1.03 * inertia(x, begin(x, count), count)
-    assert (averages(x, env.labels, count)[1] > 0).all()
+    assert inertia(x, env.labels, count) < 1.03 * inertia(x, fit(x, count), count)
+    assert (segment_means(x, env.labels, count)[1] > 0).all()
 
 
 def test_first_segments_are_seeded_and_the_same_in_a_batch_and_alone():
     x = torch.rand(2, 300, 2, generator=torch.Generator().manual_seed(0))
-    labels = begin(x, 16)
-    assert torch.equal(labels, begin(x, 16)) and not torch.equal(labels, begin(x, 16, seed=1))
-    assert torch.equal(labels[1:], begin(x[1:], 16)) and labels.unique().tolist() == list(range(16))
+    labels = fit(x, 16)
+    assert torch.equal(labels, fit(x, 16)) and not torch.equal(labels, fit(x, 16, seed=1))
+    assert torch.equal(labels[1:], fit(x[1:], 16)) and labels.unique().tolist() == list(range(16))
 
 
 def test_labels_of_a_rigid_motion_stay():
     x = torch.rand(1, 300, 2, generator=torch.Generator().manual_seed(0))
     labels = x.new_zeros(1, 300, dtype=torch.int64)
     for _ in range(60):
-        labels = follow(x, labels if labels.any() else begin(x, 8), 8)
-    assert torch.equal(follow(x + 3.0, labels, 8), labels)
+        labels = update(x, labels if labels.any() else fit(x, 8), 8)
+    assert torch.equal(update(x + 3.0, labels, 8), labels)
 
 
 def test_empty_segment_gets_the_farthest_particle():
     points = [[0.0, 0.0], [0.1, 0.0], [1.0, 0.0], [1.1, 0.0], [0.05, 0.0], [1.05, 0.0], [0.0, 0.3]]
-    labels = follow(torch.tensor([points]), torch.tensor([[0, 0, 1, 1, 2, 2, 0]]), 3)
+    labels = update(torch.tensor([points]), torch.tensor([[0, 0, 1, 1, 2, 2, 0]]), 3)
     assert labels[0].tolist() == [0, 0, 1, 1, 0, 1, 2]  # the centre of 2 was half-way between the others
 
 
 def test_more_segments_than_particles_are_refused():
-    with pytest.raises(ConfigError, match="particles: got 10 of the robot, allowed 16"):
-        begin(torch.rand(1, 10, 2), 16)
+    with pytest.raises(ConfigError, match=r"at least 16.*got 10"):
+        fit(torch.rand(1, 10, 2), 16)
 
 
 def test_neighbours_touch():
@@ -84,7 +84,7 @@ def test_parts_are_linked_by_the_shortest_edges_only_where_needed():
     edges[0, 0, 1] = edges[0, 1, 0] = edges[0, 2, 3] = edges[0, 3, 2] = True
     edges[1] = ~torch.eye(4, dtype=torch.bool)
     points = torch.tensor([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0], [4.0, 0.0]]).expand(2, -1, -1)
-    joined = connected(edges, torch.cdist(points, points))
+    joined = connect(edges, torch.cdist(points, points))
     new = (joined & ~edges).nonzero().tolist()
     assert new == [[0, 1, 2], [0, 2, 1]]
 
@@ -101,21 +101,21 @@ def test_rows_say_what_the_segments_are():
     env = segmented("catch", 1)
     state, robot = env.env.env_state, env.env.model.robot
     state.particles.v[:] = torch.rand(state.particles.v.shape, generator=torch.Generator().manual_seed(0))
-    rows = env.nodes(env.env, env.labels)
+    rows = env.nodes.observe(env.env, env.labels)
     mine = env.labels[0] == 5
     x, v = state.particles.x[0, :robot], state.particles.v[0, :robot]
     centre = x[mine].mean(0)
     wanted = torch.cat(
         (
-            (centre - x.mean(0)) / LENGTH,
-            v[mine].mean(0) / SPEED,
-            x[mine].std(0, correction=0) * 4 / LENGTH,
+            (centre - x.mean(0)) / LENGTH_SCALE,
+            v[mine].mean(0) / SPEED_SCALE,
+            x[mine].std(0, correction=0) * 4 / LENGTH_SCALE,
             mine.float().mean()[None] * 16,
-            (centre[1:] - 20 / 128) / LENGTH,
+            (centre[1:] - 20 / 128) / LENGTH_SCALE,
             torch.zeros(2),
-            (torch.tensor([0.15, 0.25]) - centre) / LENGTH,
-            (state.particles.x[0, robot:].mean(0) - centre) / LENGTH,
-            (state.particles.v[0, robot:].mean(0) - v[mine].mean(0)) / SPEED,
+            (torch.tensor([0.15, 0.25]) - centre) / LENGTH_SCALE,
+            (state.particles.x[0, robot:].mean(0) - centre) / LENGTH_SCALE,
+            (state.particles.v[0, robot:].mean(0) - v[mine].mean(0)) / SPEED_SCALE,
         )
     )
     assert torch.allclose(rows[0, 5, :16], wanted, atol=1e-4) and rows.shape == (1, 16, 17)
@@ -123,7 +123,7 @@ def test_rows_say_what_the_segments_are():
 
 @pytest.mark.parametrize(("task", "columns"), [("run", 10), ("grow", 12), ("kick", 14), ("dig", 12), ("slot", 14)])
 def test_what_is_seen_depends_on_the_task(task, columns):
-    assert Nodes(16, False).columns(dittogym.make_spec(task)) == columns
+    assert Nodes(16, False).num_columns(dittogym.make_spec(task)) == columns
 
 
 @pytest.mark.parametrize("layout", ["image", "grid"])
@@ -131,12 +131,12 @@ def test_what_is_seen_depends_on_the_task(task, columns):
 def test_nodes_of_the_grid_get_the_value_of_the_nearest_segment(task, layout):
     env = segmented(task, 1, action_layout=layout)
     values = torch.stack((torch.linspace(-1, 1, 16), torch.linspace(1, 0, 16)), -1)[None]
-    action = env.nodes.act(env.env, env.labels, values)
+    action = env.nodes.to_grid(env.env, env.labels, values)
     state, spec = env.env.env_state, env.env.spec
     centre = in_window(spec.reach, state.centre, state.origin)
     field = place(to_grid_layout(action, layout), centre, 128)
     robot = state.particles.x[:, : env.env.model.robot]
-    centres, _ = averages(robot, env.labels, 16)
+    centres, _ = segment_means(robot, env.labels, 16)
     for point in robot[0, ::50]:
         i, j = ((point - state.origin[0]) * 128).round().long().tolist()
         node = state.origin[0] + torch.tensor([i, j]) / 128
@@ -148,8 +148,8 @@ def test_other_action_grids_are_refused():
     env = TorchEnv("run", 1, 8, particles=100)
     env.reset(seed=0)
     labels = torch.zeros(1, 100, dtype=torch.int64)
-    with pytest.raises(ValueError, match="env: got an action grid of 8, allowed 64"):
-        Nodes(2, False).act(env, labels, torch.zeros(1, 2, 2))
+    with pytest.raises(ValueError, match=r"64.*got 8"):
+        Nodes(2, False).to_grid(env, labels, torch.zeros(1, 2, 2))
 
 
 def test_reset_of_some_leaves_the_others_alone():

@@ -222,7 +222,7 @@ def test_restart_of_a_neighbour_leaves_the_particles_that_were_close(monkeypatch
     monkeypatch.setattr(shac_rollout, "training_reward", watch)
     algorithm.rollout.play(algorithm.actor, lambda seen: algorithm.value(algorithm.target, seen))
     assert algorithm.env.env_state.steps.tolist() == [2, 6]  # the first robot began anew after four steps
-    for first, last in zip(*((pairs.other, pairs.distance) for pairs in (seen[0], seen[-1])), strict=True):
+    for first, last in zip(*((pairs.neighbours, pairs.distance) for pairs in (seen[0], seen[-1])), strict=True):
         assert torch.equal(first[1], last[1]) and not torch.equal(first[0], last[0])
 
 
@@ -310,7 +310,7 @@ def test_policy_of_the_state_says_what_it_needs(tmp_path):
     with pytest.raises(RuntimeError, match="call attached"):
         policy.predict(np.zeros((1, 3, 64, 64), np.uint8))
     kick = TorchEnv("kick", 1, particles=100)
-    with pytest.raises(ValueError, match="env: got 'kick'"):
+    with pytest.raises(ValueError, match="got 'kick'"):
         policy.attached(kick)
     path = tmp_path / "policy.safetensors"
     algorithm.save_policy(path, origin(algorithm.config, "shac", 0, 0))

@@ -14,9 +14,10 @@ import dittogym
 from dittogym import core as dynamics
 from dittogym.action import patch_field, place
 from dittogym.observation.window import in_window
-from torchmpm import muscle
+from torchmpm.boundary import constrain
 from torchmpm.grid import PAD
-from torchmpm.solver import grid_velocity
+from torchmpm.substep import grid_velocity, particles_to_grid
+from torchmpm.transfer import interpolate
 
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "reference"
 
@@ -114,13 +115,14 @@ def _first_grid(data: dict[str, np.ndarray], env: dittogym.TorchEnv, recorded: t
     patch = patch_field(action(data, env, 0), spec.patch, spec.max_actuation)
     ours = place(patch, in_window(spec.reach, start.centre, start.origin), solver.grid.resolution)
     scene = solver.scene(start.particles, recorded, start.origin)
-    grid = solver.to_grid(scene, start.particles.planes())
-    along = torch.stack(muscle.sample(grid.nodes, scene.actuation), -1)[0]
+    grid = particles_to_grid(scene, start.particles.planes())
+    along = torch.stack(interpolate(grid.nodes, scene.actuation), -1)[0]
 
     def on_nodes(values: torch.Tensor) -> torch.Tensor:
         return values.view(solver.grid.width, solver.grid.width)[PAD:-PAD, PAD:-PAD]
 
-    velocity = torch.stack([on_nodes(v[0]) for v in grid_velocity(scene, grid.momentum)], -1)
+    velocity = constrain(scene.faces, grid_velocity(scene, grid.momentum))
+    velocity = torch.stack([on_nodes(v[0]) for v in velocity], -1)
     heavy = data["sub1_grid_m"][..., None] > 1e-9
     return {
         "sub1_grid_actuation": worst(ours, recorded.numpy()),

@@ -13,7 +13,7 @@ from test_native_adjoint import assert_gradients_close, gradients, state_leaves
 from torch import Tensor
 
 from torchmpm.backends import compiler_found
-from torchmpm.native import ops
+from torchmpm.native import operator
 
 pytestmark = [
     pytest.mark.skipif(not compiler_found(), reason="no C++ compiler"),
@@ -24,9 +24,9 @@ graphs, programs = cuda.graphs, cuda.programs
 
 def operator_calls(run: Callable[[], object]) -> list[tuple[object, ...]]:
     """Arguments with which the operator is called."""
-    calls, step = [], ops.native_step
+    calls, step = [], operator.native_step
     with pytest.MonkeyPatch.context() as patch, torch.no_grad():
-        patch.setattr(ops, "native_step", lambda *arguments: calls.append(arguments) or step(*arguments))
+        patch.setattr(operator, "native_step", lambda *arguments: calls.append(arguments) or step(*arguments))
         run()
     return calls
 
@@ -36,8 +36,8 @@ def program(seed: int, adjoint: bool) -> programs.Program:
     state, field, origin = (t.to(DEVICE) for t in moving(12, 2))
     state, solver = replace(state, v=seed * state.v), replace(solvers(12, 2)["three bodies"], backend="native")
     calls = operator_calls(lambda: solver.step(state, seed * field, substeps=2, origin=origin))
-    ((*tensors, description, substeps),) = calls
-    tables = cuda.tables.unpack(tuple(description.tolist()), torch.float64, tensors[0].device)
+    ((*tensors, handle, substeps),) = calls
+    tables = cuda.tables.device_tables(handle, torch.float64, tensors[0].device)
     if not adjoint:
         return programs.Forward(programs.Inputs(*tensors), tables, substeps)
     bars = normal(*tensors[0].shape, seed=seed).to(DEVICE)
@@ -207,6 +207,6 @@ def test_within_a_graph_of_the_caller() -> None:
     (arguments,) = operator_calls(lambda: solver.step(state, substeps=5))
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
-        planes = ops.native_step(*arguments)
+        planes = operator.native_step(*arguments)
     graph.replay()
     torch.testing.assert_close(planes[0], expected.x[..., 0], rtol=0, atol=1e-12)

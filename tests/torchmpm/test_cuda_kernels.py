@@ -22,7 +22,7 @@ from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Soil, Solver, VelocityRule, VonMises
 from torchmpm.backends import compiler_found
-from torchmpm.native import ops
+from torchmpm.native.kernels import Kernels
 
 pytestmark = [
     pytest.mark.skipif(not compiler_found(), reason="no C++ compiler"),
@@ -185,7 +185,7 @@ def test_a_broken_element_harms_no_other(name: str, value: float) -> None:
 
 def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     """Into calls whose tape stays within bounds; the gradients are the same."""
-    monkeypatch.setattr(ops, "tape_limit", lambda *_: 2)
+    monkeypatch.setattr(Kernels, "tape_limit", lambda *_: 2)
     given = state_leaves(15, 1)
     both_gradients(lambda _: solvers(15, 1)["three bodies"], given, ("x", "v", "actuation", "origin"), 5)
 

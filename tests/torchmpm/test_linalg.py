@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scenes import normal
 from torch import Tensor
 
-from torchmpm import linalg
+from torchmpm.materials import linalg
 
 ENTRY = st.floats(-3.0, 3.0).filter(lambda number: number == 0.0 or abs(number) > 1e-6)
 MATRIX = st.tuples(ENTRY, ENTRY, ENTRY, ENTRY)
@@ -24,7 +24,7 @@ def matrix(planes: linalg.Mat2) -> Tensor:
 
 
 def polar(F: Tensor) -> Tensor:
-    return matrix(linalg.polar(planes(F)))
+    return matrix(linalg.orthogonal(planes(F)))
 
 
 def turn(angle: float) -> Tensor:
@@ -104,9 +104,9 @@ def test_products(first: tuple[float, ...], second: tuple[float, ...]) -> None:
 @given(MATRIX)
 def test_split_gives_the_singular_values(entries: tuple[float, ...]) -> None:
     F = torch.tensor(entries, dtype=torch.float64).view(2, 2)
-    p, q, r, s = linalg.split(planes(F))
-    lengths = torch.stack((torch.hypot(p, q), torch.hypot(r, s))).sort(descending=True).values
+    m1, m2, n1, n2, proper = linalg.split(planes(F))
+    lengths = torch.stack((torch.hypot(m1, m2), torch.hypot(n1, n2)))
     sigma = torch.linalg.svdvals(F)
     torch.testing.assert_close(lengths, torch.stack((sigma.sum(), sigma[0] - sigma[1])), rtol=1e-12, atol=1e-12)
-    half = 0.5 * torch.stack((p + r, s - q, q + s, p - r))
+    half = 0.5 * torch.stack(linalg.join(linalg.Parts(m1, m2, n1, n2, proper)))
     torch.testing.assert_close(half.view(2, 2), F, rtol=0, atol=1e-15)

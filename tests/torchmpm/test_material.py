@@ -9,7 +9,9 @@ from scenes import generator, normal
 from torch import Tensor
 
 from torchmpm import Elastic, VonMises, lame
-from torchmpm.material import column, corotated_energy, corotated_stress, von_mises_return, yield_values
+from torchmpm.materials.base import broadcast_plane
+from torchmpm.materials.elastic import corotated_energy, corotated_stress
+from torchmpm.materials.von_mises import von_mises_return, yield_surface
 
 MU, LAM, YIELD = 500.0, 50.0, 62.0
 LIMIT = YIELD / (2 * MU)
@@ -152,8 +154,8 @@ def test_yield_in_single_precision(limit: float) -> None:
     difference = min(math.sqrt(2.0 * (single.item() ** 2 - 1e-8)), 40.0)
     ratio = math.exp(difference)
     exact = [math.tanh(difference / 2), ratio, 2 * math.cosh(difference / 2), 2 * math.sinh(difference / 2)]
-    assert yield_values(single.item()) == pytest.approx(exact, rel=1e-13)
-    assert [value.item() for value in yield_values(single)] == pytest.approx(
+    assert yield_surface(single.item()) == pytest.approx(exact, rel=1e-13)
+    assert [value.item() for value in yield_surface(single)] == pytest.approx(
         exact, rel=3e-6 if difference > 4 else 1e-6
     )
 
@@ -319,20 +321,20 @@ def test_lame() -> None:
 )
 def test_column_shapes(shape: tuple[int, ...], result: tuple[int, ...]) -> None:
     value = normal(*shape, seed=0)
-    found = column(value, torch.ones(3, 5))
+    found = broadcast_plane(value, torch.ones(3, 5))
     assert found.shape == result
     assert found.dtype == torch.float32
     torch.testing.assert_close(found.flatten(), value.float().flatten())
 
 
 def test_column_leaves_numbers_alone() -> None:
-    assert column(2.5, torch.ones(3, 5)) == 2.5
+    assert broadcast_plane(2.5, torch.ones(3, 5)) == 2.5
 
 
 @pytest.mark.parametrize("shape", [(5,), (2,), (1,), (2, 5), (3, 4), (3, 5, 1), (5, 3)])
 def test_column_names_what_does_not_fit(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"^stiffness must be a number or have shape \(\), \(3,\) or \(3, 5\), got"):
-        column(torch.ones(shape), torch.ones(3, 5), "stiffness")
+        broadcast_plane(torch.ones(shape), torch.ones(3, 5), "stiffness")
 
 
 @pytest.mark.parametrize("name", ["mu", "lam", "yield_stress"])

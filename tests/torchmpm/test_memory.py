@@ -15,7 +15,7 @@ from scenes import lively, normal, robot, robot_and_ball
 from torchmpm import Solver, estimate_memory, segment_for, trajectory
 from torchmpm.backends import compiler_found
 from torchmpm.memory import PeakMemory
-from torchmpm.native import ops
+from torchmpm.native.cpu import call
 
 needs_compiler = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
 
@@ -63,7 +63,7 @@ def test_eager(count: int, batch: int, substeps: int, segment: int | None, env_s
 )
 def test_native(count: int, batch: int, substeps: int, env_steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Much nearer than a quarter."""
-    asked, scratch = [], ops._scratch
+    asked, scratch = [], call._scratch
 
     @contextlib.contextmanager
     def watched(size: int) -> Iterator[int]:
@@ -71,7 +71,7 @@ def test_native(count: int, batch: int, substeps: int, env_steps: int, monkeypat
         with scratch(size) as address:
             yield address
 
-    monkeypatch.setattr(ops, "_scratch", watched)
+    monkeypatch.setattr(call, "_scratch", watched)
     solver = robot(count, backend="native")
     predicted = estimate_memory(solver, (batch, count, torch.float64), substeps=substeps, env_steps=env_steps)
     tensors = measured(solver, batch, substeps, None, env_steps)
@@ -141,8 +141,8 @@ def test_the_native_tape_follows_the_budget(monkeypatch: pytest.MonkeyPatch) -> 
     assert segment is not None and 1 < segment < 40
     assert estimate_memory(solver, state, substeps=40, segment=segment) <= whole // 2
     sizes: list[int] = []
-    scratch = ops._scratch
-    monkeypatch.setattr(ops, "_scratch", lambda size: (sizes.append(size), scratch(size))[1])
+    scratch = call._scratch
+    monkeypatch.setattr(call, "_scratch", lambda size: (sizes.append(size), scratch(size))[1])
 
     def gradient(segment: int | None) -> tuple[torch.Tensor, int]:
         sizes.clear()

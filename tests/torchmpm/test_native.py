@@ -14,7 +14,7 @@ from scenes import assert_close, assert_identical, lively, normal, robot
 from torchmpm import Body, Grid, ParticleState, Soil, Solver, VelocityRule, VonMises
 from torchmpm.backends import compiler_found
 from torchmpm.grid import PAD
-from torchmpm.native import pack
+from torchmpm.native.kernels import MAX_PARTICLES, MAX_RESOLUTION
 
 pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
 
@@ -184,7 +184,7 @@ def test_unsupported_scenes_are_named() -> None:
 
     body = Body(10, Own(500.0, 50.0, 60.0))
     with pytest.raises(
-        ValueError, match="cannot run this: it knows the materials Elastic, VonMises, Soil, a body has Own"
+        ValueError, match="cannot run this: it supports the materials Elastic, VonMises, Snow, a body has Own"
     ):
         robot(10, bodies=(body,), backend="native").step(lively(10))
     rules = (VelocityRule("-y"),) * 300
@@ -194,13 +194,13 @@ def test_unsupported_scenes_are_named() -> None:
 
 def test_sizes_beyond_the_kernels_addresses_are_refused() -> None:
     """Eight numbers of each node of a simulation, and its particles, must have places below 2^31."""
-    assert 8 * (pack.MAX_RESOLUTION + 2 * PAD) ** 2 < 2**31
+    assert 8 * (MAX_RESOLUTION + 2 * PAD) ** 2 < 2**31
     cpu = torch.device("cpu")
-    wide = robot(1, grid=Grid(pack.MAX_RESOLUTION + 1), dt=1e-9)
-    many = robot(pack.MAX_PARTICLES + 1)
-    assert pack.unsupported(wide, cpu) == "it takes at most 16,000 nodes per axis, got 16,001"
-    assert "at most 1,073,741,824 particles a simulation, got 1,073,741,825" in str(pack.unsupported(many, cpu))
-    assert pack.unsupported(robot(pack.MAX_PARTICLES, grid=Grid(pack.MAX_RESOLUTION), dt=1e-9), cpu) is None
+    wide = robot(1, grid=Grid(MAX_RESOLUTION + 1), dt=1e-9)
+    many = robot(MAX_PARTICLES + 1)
+    assert wide.kernels.unsupported(cpu) == "it takes at most 16,000 nodes per axis, got 16,001"
+    assert "at most 1,073,741,824 particles per simulation, got 1,073,741,825" in str(many.kernels.unsupported(cpu))
+    assert robot(MAX_PARTICLES, grid=Grid(MAX_RESOLUTION), dt=1e-9).kernels.unsupported(cpu) is None
 
 
 @pytest.mark.slow

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torchmpm import Body, Elastic, ParticleState, Soil, Solver, VonMises, trajectory
 from torchmpm.backends import compiler_found
-from torchmpm.native import ops
+from torchmpm.native import operator
+from torchmpm.native.cpu import call
 
 pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
 
@@ -241,9 +242,10 @@ def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     """To keep the tape within bounds; the gradients are the same."""
     given, wanted = state_leaves(60, 2), ("x", "v", "actuation", "origin")
     whole = gradients(lambda _: solvers(60, 2)["three bodies"], given, wanted, 10, "native")
-    calls, step = [], ops.native_step
-    monkeypatch.setattr(ops, "native_step", lambda *arguments: calls.append(arguments[-1]) or step(*arguments))
-    monkeypatch.setattr(ops, "KEPT_BYTES", 4 * ops.KEPT_BYTES // ops.tape_limit(torch.empty(13, 2, 60).double(), 22))
+    calls, step = [], operator.native_step
+    monkeypatch.setattr(operator, "native_step", lambda *arguments: calls.append(arguments[-1]) or step(*arguments))
+    limit = solvers(60, 2)["three bodies"].kernels.tape_limit(torch.empty(13, 2, 60).double())
+    monkeypatch.setattr(call, "KEPT_BYTES", 4 * call.KEPT_BYTES // limit)
     cut = gradients(lambda _: solvers(60, 2)["three bodies"], given, wanted, 10, "native")
     assert calls == [4, 4, 2]
     assert_gradients_close(cut, whole, 1e-14)
@@ -251,10 +253,10 @@ def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_scratch_memory_is_kept_once_and_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     robot(10, backend="native").step(lively(10), substeps=2)
-    assert len(ops._kept) == 1 and ops._kept[0].numel() <= ops.KEPT_BYTES
-    monkeypatch.setattr(ops, "KEPT_BYTES", 10)
+    assert len(call._kept) == 1 and call._kept[0].numel() <= call.KEPT_BYTES
+    monkeypatch.setattr(call, "KEPT_BYTES", 10)
     robot(10, backend="native").step(lively(10), substeps=2)
-    assert ops._kept == []
+    assert call._kept == []
 
 
 def test_second_derivatives_are_refused() -> None:
@@ -275,10 +277,10 @@ def test_no_graph_without_gradients() -> None:
 
 def operator_arguments() -> tuple[object, ...]:
     """Arguments of the operator as Solver.step passes them."""
-    seen, step = [], ops.native_step
+    seen, step = [], operator.native_step
     state, field, origin = moving(30, 2)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ops, "native_step", lambda *arguments: seen.append(arguments) or step(*arguments))
+        patch.setattr(operator, "native_step", lambda *arguments: seen.append(arguments) or step(*arguments))
         solver = replace(solvers(30, 2)["tensor values"], backend="native")
         solver.step(state, field, substeps=2, origin=origin)
     (arguments,) = seen
@@ -292,4 +294,4 @@ def test_operator_keeps_the_rules_of_torch() -> None:
         for k, a in enumerate(operator_arguments())
     ]
     tests = ("test_schema", "test_autograd_registration", "test_faketensor")
-    torch.library.opcheck(ops.native_step, tuple(arguments), test_utils=tests)
+    torch.library.opcheck(operator.native_step, tuple(arguments), test_utils=tests)

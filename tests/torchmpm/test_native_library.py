@@ -10,7 +10,7 @@ import torch
 from scenes import lively, robot
 
 from torchmpm.backends import compiler_found
-from torchmpm.native import library
+from torchmpm.native.cpu import library
 
 
 @pytest.fixture(autouse=True)

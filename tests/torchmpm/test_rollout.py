@@ -182,18 +182,13 @@ def test_one_buffer_for_all_inputs_is_refused() -> None:
     assert x.grad.tolist() == [12.0, 12.0]
 
 
-FACTOR = torch.tensor(3.0)
-
-
-@pytest.mark.parametrize("name", ["state", "gain", "FACTOR"])
-def test_what_a_step_reads_lasts_until_its_replay(name: str) -> None:
-    """The start, and what a step names, whether from a function around it or from its module."""
-    x, gain = torch.ones(2, requires_grad=True), torch.tensor(2.0)
+def test_a_state_lasts_until_its_replay() -> None:
+    x = torch.ones(2, requires_grad=True)
     state = x + 0.0
-    (final,) = repeated(lambda s: (s[0] + FACTOR * gain * s[0],), (state,), 4, segment=2)
+    (final,) = repeated(lambda s: (s[0].sin(),), (state,), 4, segment=2)
     with torch.no_grad():
-        {"state": state, "gain": gain, "FACTOR": FACTOR}[name].add_(1.0)
-    with pytest.raises(RuntimeError, match=f"^{name}.* {CHANGED}"):
+        state.add_(1.0)
+    with pytest.raises(RuntimeError, match=f"^state {CHANGED}"):
         final.sum().backward()
 
 
@@ -212,21 +207,6 @@ def test_a_step_reads_the_same_in_the_backward_pass(name: str, changed: str) -> 
     final.x.sum().backward(retain_graph=True)
     tensors[name].mul_(0.1).add_(0.01)
     with pytest.raises(RuntimeError, match=f"^{changed} {CHANGED}"):
-        final.x.sum().backward()
-
-
-@pytest.mark.parametrize("backend", ["eager", pytest.param("native", marks=NATIVE)])
-def test_a_trajectory_watches_what_its_solver_reads(backend: str) -> None:
-    """Also what is made anew in every step, here a view of a changed field."""
-    solver, state = robot(5, backend=backend), lively(5)
-    fields, v = normal(2, 1, 2, 16, 16, seed=1), state.v.clone().requires_grad_()
-    drive = {"fields": fields}
-    final, _ = trajectory(
-        lambda s, k: solver.step(s, drive["fields"][k]), replace(state, v=v), range(2), observe=lambda s: None
-    )
-    final.x.sum().backward(retain_graph=True)
-    fields.add_(1.0)
-    with pytest.raises(RuntimeError, match=f"^actuation {CHANGED}"):
         final.x.sum().backward()
 
 

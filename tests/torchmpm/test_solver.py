@@ -23,6 +23,8 @@ from scenes import (
 from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VelocityRule, VonMises, diagnostics, fixed
+from torchmpm.materials.body import per_particle, slices
+from torchmpm.substep import particles_to_grid
 
 pytestmark = pytest.mark.usefixtures("backend")
 
@@ -292,7 +294,7 @@ def momentum_balance(
     mass, before = diagnostics.mass(solver, state), diagnostics.momentum(solver, state)
     impulses = {name: torch.zeros_like(before) for name in ("gravity", "damping", "boundary")}
     for _ in range(substeps):
-        on_grid = solver.to_grid(solver.scene(state, actuation), state.planes()).momentum[0].sum(-1)
+        on_grid = particles_to_grid(solver.scene(state, actuation), state.planes()).momentum[0].sum(-1)
         torch.testing.assert_close(on_grid, mass, rtol=1e-12, atol=0)
         for name, impulse in diagnostics.impulses(solver, state, actuation).items():
             impulses[name] += impulse
@@ -324,7 +326,7 @@ def test_mass_and_momentum(muscles: bool, contact: bool, ball: bool) -> None:
 
 def test_what_momentum_lacks_is_the_mass_regulariser(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the 1e-10 kg on each node, whose share is all of the error above, the balance closes to rounding."""
-    for module in ("solver", "diagnostics"):
+    for module in ("substep", "native.tables"):
         monkeypatch.setattr(f"torchmpm.{module}.MASS_EPSILON", 1e-30)
     error, _ = momentum_balance(robot_and_ball(300, 100, rules=CONTACT, damping=0.999), lively(400), field(), 100)
     assert error <= 1e-13, f"relative error {error:.1e}"
@@ -540,12 +542,15 @@ def test_mistakes_are_named(name: str) -> None:
 def test_bodies_lie_one_after_the_other() -> None:
     solver = robot_and_ball(30, 12)
     assert solver.num_particles == 42
-    assert [part for _, part in solver.parts()] == [slice(0, 30), slice(30, 42)]
-    mass = solver.per_particle(lively(42, 2), "mass")
+    assert [part for _, part in slices(solver.bodies)] == [slice(0, 30), slice(30, 42)]
+    mass = per_particle(solver.bodies, "mass", lively(42, 2).Jp)
     assert mass.tolist() == [[2.0] * 30 + [5.0] * 12]
-    assert solver.per_particle(lively(42, 2), "volume").tolist() == [[1.0] * 30 + [1.5] * 12]
+    assert per_particle(solver.bodies, "volume", lively(42, 2).Jp).tolist() == [[1.0] * 30 + [1.5] * 12]
     mixed = robot(42, bodies=(Body(30, Elastic(1.0, 1.0)), Body(12, Elastic(1.0, 1.0), mass=torch.tensor([2.0, 3.0]))))
-    assert mixed.per_particle(lively(42, 2), "mass")[:, [0, 29, 30, 41]].tolist() == [[1, 1, 2, 2], [1, 1, 3, 3]]
+    assert per_particle(mixed.bodies, "mass", lively(42, 2).Jp)[:, [0, 29, 30, 41]].tolist() == [
+        [1, 1, 2, 2],
+        [1, 1, 3, 3],
+    ]
 
 
 def test_spacing_is_only_a_unit() -> None:

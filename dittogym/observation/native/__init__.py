@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from dittogym.observation.raster import CLIP, SATURATION, SIZE
-from torchmpm.backends import runs_native
-from torchmpm.native.library import Call, build, thread_pool
+from torchmpm.native.cpu.library import POOL, build, thread_pool
 
 if TYPE_CHECKING:
     from dittogym.core import EnvState, Model
@@ -30,7 +29,7 @@ class Picture(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_int64) for name in ("batch", "particles", "threads", "pixels")),
-        *((name, ctypes.c_void_p) for name in Call._POOL),
+        *((name, ctypes.c_void_p) for name in POOL),
         *((name, ctypes.c_int64) for name in ("bodies", "boxes")),
         *((name, ctypes.c_void_p) for name in ("body", "box")),
         ("view", ctypes.c_double * 2),
@@ -95,4 +94,4 @@ class Painter:
 
 def paints(model: Model, state: EnvState) -> bool:
     """Whether the observation of this state is one for :class:`Painter`: wherever the physics runs natively."""
-    return state.particles.device.type == "cpu" and runs_native(model.solver, state.particles)
+    return state.particles.device.type == "cpu" and model.solver.runs_native(state.particles)

@@ -1,4 +1,4 @@
-"""The substep as Triton kernels on CUDA; the operators of :mod:`torchmpm.native.ops` on tensors that live there.
+"""The substep as Triton kernels on CUDA; the operators of :mod:`torchmpm.native.operator` on tensors that live there.
 
 ``programs`` launches the kernels of a step and of its adjoint, ``graphs`` keeps the launches as CUDA graphs. Kernels,
 in order, each built on those before: ``linalg``, ``material``, ``transfer``, ``grid``, ``step``; for the adjoint
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchmpm.native.cuda.graphs import KEPT_SHARE, cache
 from torchmpm.native.cuda.programs import Backward, Forward, Inputs, Program
-from torchmpm.native.cuda.tables import unpack
+from torchmpm.native.cuda.tables import device_tables
 
 __all__ = ["backward", "cache", "forward"]
 
@@ -30,12 +30,12 @@ def forward(
     gravity: Tensor,
     values: Tensor,
     shift: Tensor,
-    description: Tensor,
+    handle: int,
     substeps: int,
 ) -> Tensor:
-    """Advance all simulations; see :func:`torchmpm.native.ops.native_step`."""
+    """Advance all simulations; see :func:`torchmpm.native.operator.native_step`."""
     inputs = Inputs(planes, field, origin, gravity, values, shift)
-    (result,) = _run(Forward, inputs, description, substeps)
+    (result,) = _run(Forward, inputs, handle, substeps)
     return result
 
 
@@ -47,24 +47,24 @@ def backward(
     gravity: Tensor,
     values: Tensor,
     shift: Tensor,
-    description: Tensor,
+    handle: int,
     substeps: int,
     wants_field: bool,
     wants_values: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Adjoint of :func:`forward`; see :func:`torchmpm.native.ops.native_step_backward`."""
+    """Adjoint of :func:`forward`; see :func:`torchmpm.native.operator.native_step_backward`."""
     inputs = Inputs(planes, field, origin, gravity, values, shift, result_bar)
     planes_bar, field_bar, origin_bar, gravity_bar, values_bar = _run(
-        Backward, inputs, description, substeps, wants_field, wants_values
+        Backward, inputs, handle, substeps, wants_field, wants_values
     )
     return planes_bar, field_bar, origin_bar, gravity_bar, values_bar
 
 
-def _run(kind: type[Program], inputs: Inputs, description: Tensor, substeps: int, *wants: bool) -> tuple[Tensor, ...]:
+def _run(kind: type[Program], inputs: Inputs, handle: int, substeps: int, *wants: bool) -> tuple[Tensor, ...]:
     """Run a program, from a graph where that works: not while a caller records a graph of their own."""
     inputs = inputs.map(Tensor.contiguous)
-    planes, numbers = inputs.planes, tuple(description.tolist())
-    tables = unpack(numbers, planes.dtype, planes.device)
+    planes = inputs.planes
+    tables = device_tables(handle, planes.dtype, planes.device)
 
     def build(own: Inputs) -> Program:
         return kind(own, tables, substeps, *wants)
@@ -78,7 +78,7 @@ def _run(kind: type[Program], inputs: Inputs, description: Tensor, substeps: int
         # Two streams may run at once, so each has buffers of its own.
         stream = torch.cuda.current_stream().cuda_stream
         most = KEPT_SHARE * torch.cuda.get_device_properties(planes.device).total_memory
-        return cache.run((kind, numbers, substeps, wants, shapes, stream), build, inputs, most)
+        return cache.run((kind, handle, substeps, wants, shapes, stream), build, inputs, most)
 
 
 def _launched(program: Program) -> tuple[Tensor, ...]:

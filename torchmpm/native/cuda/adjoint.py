@@ -8,7 +8,17 @@ from torchmpm.native.cuda.linalg import matmul
 from torchmpm.native.cuda.material import DT, INVERSE_H, H, read_values
 from torchmpm.native.cuda.material_adjoint import material_adjoint
 from torchmpm.native.cuda.step import deform, load_matrix, own_particles, store_matrix, values_at
-from torchmpm.native.cuda.transfer import SIZES, field_at, gather, include, locate, pull, scatter, weight, weight_slope
+from torchmpm.native.cuda.transfer import (
+    SIZES,
+    actuation_at,
+    field_at,
+    gather,
+    include,
+    locate,
+    scatter,
+    weight,
+    weight_slope,
+)
 
 
 @triton.jit
@@ -80,12 +90,12 @@ def begin_adjoint(
     on, i, j, fx, fy = locate(x, y, origin + 2 * element, valid, constants, resolution)
     node = i * width + j
     sums += ADJOINT * element * width * width
-    pull_x, pull_y = tl.zeros_like(x), tl.zeros_like(x)
+    act_x, act_y = tl.zeros_like(x), tl.zeros_like(x)
     if MUSCLE:
         plane = 2 * resolution * resolution * element
-        pull_x, pull_y = pull(field + plane, i, j, fx, fy, on, resolution)
+        act_x, act_y = actuation_at(field + plane, i, j, fx, fy, on, resolution)
     _, _, _, _, _, xx, xy, yy = deform(
-        dt, c0, c1, c2, c3, f0, f1, f2, f3, Jp, factor, mu2, lam, s0, s1, s2, s3, pull_x, pull_y, constants, bounds,
+        dt, c0, c1, c2, c3, f0, f1, f2, f3, Jp, factor, mu2, lam, s0, s1, s2, s3, act_x, act_y, constants, bounds,
         KIND,
     )  # fmt: skip
     include(box + 4 * element, i, j, on)
@@ -130,19 +140,19 @@ def finish_adjoint(
     field += plane
     field_bar += plane
     origin_bar += 2 * element
-    pull_x, pull_y = tl.zeros_like(x), tl.zeros_like(x)
+    act_x, act_y = tl.zeros_like(x), tl.zeros_like(x)
     if MUSCLE:
-        pull_x, pull_y = pull(field, i, j, fx, fy, on, resolution)
+        act_x, act_y = actuation_at(field, i, j, fx, fy, on, resolution)
     # What the nodes say of momentum (m v) and affine momentum.
     px_bar, py_bar, pxx_bar, pxy_bar, pyx_bar, pyy_bar = gather(answers + 2, node, width, fx, fy, on, ADJOINT)
     pxx_bar, pxy_bar, pyx_bar, pyy_bar = h * pxx_bar, h * pxy_bar, h * pyx_bar, h * pyy_bar
     g0, g1, g2, g3 = 1.0 + dt * c0, dt * c1, dt * c2, 1.0 + dt * c3
     t0, t1, t2, t3 = matmul(g0, g1, g2, g3, f0, f1, f2, f3)
     (
-        e0_bar, e1_bar, e2_bar, e3_bar, new_Jp_bar, xx, xy, yy, pull_x_bar, pull_y_bar,
+        e0_bar, e1_bar, e2_bar, e3_bar, new_Jp_bar, xx, xy, yy, act_x_bar, act_y_bar,
         factor_bar, mu2_bar, lam_bar, s0_bar, s1_bar, s2_bar, s3_bar,
     ) = material_adjoint(
-        t0, t1, t2, t3, Jp, factor, mu2, lam, s0, s1, s2, s3, pull_x, pull_y, pxx_bar, pxy_bar + pyx_bar, pyy_bar,
+        t0, t1, t2, t3, Jp, factor, mu2, lam, s0, s1, s2, s3, act_x, act_y, pxx_bar, pxy_bar + pyx_bar, pyy_bar,
         f0_bar, f1_bar, f2_bar, f3_bar, Jp_bar, constants, bounds, KIND,
     )  # fmt: skip
     d0, d1, d2, d3 = matmul(e0_bar, e1_bar, e2_bar, e3_bar, f0, f2, f1, f3)
@@ -155,7 +165,7 @@ def finish_adjoint(
         answers, node, width, fx, fy, on, vx_bar + dt * x_bar, vy_bar + dt * y_bar, mass * vx, mass * vy, mass,
         scale * c0_bar, scale * c1_bar, scale * c2_bar, scale * c3_bar,
         h * (xx + mass * c0), h * (xy + mass * c1), h * (xy + mass * c2), h * (yy + mass * c3),
-        field, i, j, pull_x_bar, pull_y_bar, resolution, MUSCLE,
+        field, i, j, act_x_bar, act_y_bar, resolution, MUSCLE,
     )  # fmt: skip
     fx_bar, fy_bar = tl.where(on, fx_bar * inverse_h, 0.0), tl.where(on, fy_bar * inverse_h, 0.0)
     tl.atomic_add(origin_bar, -tl.sum(fx_bar, axis=0), sem="relaxed")
@@ -172,8 +182,8 @@ def finish_adjoint(
             for q in tl.static_range(3):
                 place, exists = field_at(field_bar, i, j, p, q, on, resolution)
                 w = weight(fx, p) * weight(fy, q)
-                tl.atomic_add(place, w * pull_x_bar, exists, sem="relaxed")
-                tl.atomic_add(place + resolution * resolution, w * pull_y_bar, exists, sem="relaxed")
+                tl.atomic_add(place, w * act_x_bar, exists, sem="relaxed")
+                tl.atomic_add(place + resolution * resolution, w * act_y_bar, exists, sem="relaxed")
     if WANT_VALUES:
         mass_bar = vx * px_bar + vy * py_bar + pxx_bar * c0 + pxy_bar * c1 + pyx_bar * c2 + pyy_bar * c3 + masses
         add(values_bar + at, mass_bar, on)

@@ -9,7 +9,7 @@ import triton.language as tl
 from torchmpm.native.cuda.material import DAMPING, DT, MASS_EPSILON
 from torchmpm.native.cuda.transfer import PAD, SIZES
 
-#: Numbers of a velocity rule, see :class:`torchmpm.native.cuda.tables.Tables`.
+#: Numbers of a velocity rule, see :class:`torchmpm.native.cuda.tables.DeviceTables`.
 RULE = tl.constexpr(9)
 #: Numbers of a node: sums forward, and sums and answers of the adjoint.
 SUMS = tl.constexpr(4)

@@ -1,4 +1,4 @@
-"""2x2 matrices as the sum of a scaled rotation and a scaled reflection, for kernels; see :mod:`torchmpm.linalg`.
+"""2x2 matrices as the sum of a scaled rotation and a scaled reflection; see :mod:`torchmpm.materials.linalg`.
 
 A matrix is four numbers, row by row; its parts are the larger one (m1, m2), the smaller one (n1, n2), and whether the
 larger one is the rotation.
@@ -61,6 +61,6 @@ def at_least(value, floor):
 
 
 @triton.jit
-def clamped(value, low, high):
+def clamp(value, low, high):
     """Value within [low, high]; one that is no number stays."""
     return tl.where(value < low, low, tl.where(value > high, high, value))

@@ -1,18 +1,18 @@
-"""Return maps and stresses in kernels; see :mod:`torchmpm.material` for the formulas and their sources.
+"""Return maps and stresses in kernels; see :mod:`torchmpm.materials` for the formulas and their sources.
 
-A particle's values are the eight numbers of :func:`torchmpm.native.pack.values`: mass, factor = -dt V 4/h^2, 2 mu, lam,
-and four that belong to the material (``s0`` to ``s3``).
+A particle's values are the eight numbers of :func:`torchmpm.native.tables.make_values`: mass, factor = -dt V 4/h^2,
+2 mu, lam, and four that belong to the material (``s0`` to ``s3``).
 """
 
 import triton
 import triton.language as tl
 
-from torchmpm.native.cuda.linalg import at_least, clamped, direction, join, larger_is_rotation, split
+from torchmpm.native.cuda.linalg import at_least, clamp, direction, join, larger_is_rotation, split
 
-#: Places in ``pack.KINDS``.
+#: Places in ``tables.KINDS``.
 VON_MISES = tl.constexpr(1)
-SOIL = tl.constexpr(2)
-#: Places in the table of constants, see :class:`torchmpm.native.cuda.tables.Tables`.
+SNOW = tl.constexpr(2)
+#: Places in the table of constants, see :class:`torchmpm.native.cuda.tables.DeviceTables`.
 H, INVERSE_H, DT, MARGIN, EXTENT, DAMPING, MASS_EPSILON, STRETCH_FLOOR, LARGEST_JP = (tl.constexpr(k) for k in range(9))
 
 
@@ -28,27 +28,27 @@ def read_values(values, values_batch, columns, at, mask):
 
 
 @triton.jit
-def von_mises_return(a, b, c, d, slope2, ratio, plus, minus, constants):
+def von_mises_return(a, b, c, d, tanh2, exp, cosh2, sinh2, constants):
     """Returned deformation gradient."""
     proper = larger_is_rotation(a, b, c, d)
     m1, m2, n1, n2 = split(a, b, c, d, proper)
     total, _, cos, sin, _ = direction(m1, m2)
     floor = tl.load(constants + STRETCH_FLOOR)
     small = n1 * n1 + n2 * n2
-    beyond = small > slope2 * (m1 * m1 + m2 * m2)
-    total = tl.where(beyond, total, 1.0)
-    difference = tl.sqrt(tl.where(beyond, small, 0.25))
+    outside = small > tanh2 * (m1 * m1 + m2 * m2)
+    total = tl.where(outside, total, 1.0)
+    difference = tl.sqrt(tl.where(outside, small, 0.25))
     major, minor = at_least(0.5 * (total + difference), floor), at_least(0.5 * (total - difference), floor)
-    yields = beyond & (major > minor * ratio)
+    yields = outside & (major > minor * exp)
     mean = 0.5 * tl.sqrt(major * minor)
-    grow_total, grow_difference = mean * plus, mean * (minus / difference)
+    grow_total, grow_difference = mean * cosh2, mean * (sinh2 / difference)
     e, f, g, h = join(grow_total * cos, grow_total * sin, grow_difference * n1, grow_difference * n2, proper)
     return tl.where(yields, e, a), tl.where(yields, f, b), tl.where(yields, g, c), tl.where(yields, h, d)
 
 
 @triton.jit
-def soil_parts(m1, m2, n1, n2, low, high, shear_cutoff):
-    """What the return map of soil and its adjoint share: the smaller part without its dropped shear, and stretches."""
+def snow_parts(m1, m2, n1, n2, low, high, shear_cutoff):
+    """What the return map of snow and its adjoint share: the smaller part without its dropped shear, and stretches."""
     total, _, cos, sin, _ = direction(m1, m2)
     along = n1 * cos + n2 * sin
     drop = tl.abs(n2 * cos - n1 * sin) < 2.0 * shear_cutoff
@@ -58,19 +58,19 @@ def soil_parts(m1, m2, n1, n2, low, high, shear_cutoff):
     root = tl.sqrt(tl.where(even, 1.0, square))
     difference = tl.where(even, 0.0, root)
     first, second = 0.5 * (total + difference), 0.5 * (total - difference)
-    major, minor = clamped(first, low, high), clamped(second, low, high)
+    major, minor = clamp(first, low, high), clamp(second, low, high)
     kept = tl.where((first >= low) & (first <= high), 1.0, 0.0)
     ratio = 0.5 * tl.where(even, kept, (major - minor) / root)
     return n1, n2, along, drop, even, root, first, second, major, minor, ratio
 
 
 @triton.jit
-def soil_return(a, b, c, d, Jp, low, high, constants, bounds):
+def snow_return(a, b, c, d, Jp, low, high, constants, bounds):
     """Returned deformation gradient and Jp."""
     proper = larger_is_rotation(a, b, c, d)
     m1, m2, n1, n2 = split(a, b, c, d, proper)
     _, _, cos, sin, _ = direction(m1, m2)
-    n1, n2, _, _, _, _, first, second, major, minor, ratio = soil_parts(m1, m2, n1, n2, low, high, tl.load(bounds + 2))
+    n1, n2, _, _, _, _, first, second, major, minor, ratio = snow_parts(m1, m2, n1, n2, low, high, tl.load(bounds + 2))
     sum = 0.5 * (major + minor)
     e, f, g, h = join(sum * cos, sum * sin, ratio * n1, ratio * n2, proper)
     largest = tl.load(constants + LARGEST_JP)
@@ -83,17 +83,17 @@ def return_map(a, b, c, d, Jp, s0, s1, s2, s3, constants, bounds, KIND: tl.const
     """Projected deformation gradient and Jp of one material."""
     if KIND == VON_MISES:
         a, b, c, d = von_mises_return(a, b, c, d, s0, s1, s2, s3, constants)
-    elif KIND == SOIL:
-        a, b, c, d, Jp = soil_return(a, b, c, d, Jp, s0, s1, constants, bounds)
+    elif KIND == SNOW:
+        a, b, c, d, Jp = snow_return(a, b, c, d, Jp, s0, s1, constants, bounds)
     return a, b, c, d, Jp
 
 
 @triton.jit
-def hardened(Jp, hardening, bounds, KIND: tl.constexpr):
+def hardening_factor(Jp, hardening, bounds, KIND: tl.constexpr):
     """Factor on the elastic constants; Jp is that of before the return map."""
     factor = tl.full(Jp.shape, 1.0, Jp.dtype)
-    if KIND == SOIL:
-        factor = clamped(tl.exp(hardening * (1.0 - Jp)), tl.load(bounds), tl.load(bounds + 1))
+    if KIND == SNOW:
+        factor = clamp(tl.exp(hardening * (1.0 - Jp)), tl.load(bounds), tl.load(bounds + 1))
     return factor
 
 
@@ -108,14 +108,14 @@ def orthogonal(a, b, c, d):
 
 
 @triton.jit
-def stress(a, b, c, d, r0, r1, r2, r3, mu2, lam, pull_x, pull_y, KIND: tl.constexpr):
+def stress(a, b, c, d, r0, r1, r2, r3, mu2, lam, act_x, act_y, KIND: tl.constexpr):
     """Kirchhoff stress (xx, xy, yy) of the fixed corotated solid with the orthogonal factor r, and of the muscles."""
     e, f, g, h = a - r0, b - r1, c - r2, d - r3
     J = a * d - b * c
-    if KIND == SOIL:
+    if KIND == SNOW:
         J = tl.abs(J)
     pressure = lam * (J * (J - 1.0))
-    xx = mu2 * (e * a + f * b) + pressure + pull_x * a * a + pull_y * b * b
-    xy = mu2 * (e * c + f * d) + pull_x * a * c + pull_y * b * d
-    yy = mu2 * (g * c + h * d) + pressure + pull_x * c * c + pull_y * d * d
+    xx = mu2 * (e * a + f * b) + pressure + act_x * a * a + act_y * b * b
+    xy = mu2 * (e * c + f * d) + act_x * a * c + act_y * b * d
+    yy = mu2 * (g * c + h * d) + pressure + act_x * c * c + act_y * d * d
     return xx, xy, yy

@@ -1,6 +1,6 @@
 """Adjoints of the material laws in kernels. Names with ``bar`` are derivatives of a loss.
 
-At corners the derivative is that of the side which automatic differentiation of :mod:`torchmpm.material` takes.
+At corners the derivative is that of the side which automatic differentiation of :mod:`torchmpm.materials` takes.
 """
 
 import triton
@@ -9,19 +9,19 @@ import triton.language as tl
 from torchmpm.native.cuda.linalg import at_least, direction, direction_adjoint, join, larger_is_rotation, split
 from torchmpm.native.cuda.material import (
     LARGEST_JP,
-    SOIL,
+    SNOW,
     STRETCH_FLOOR,
     VON_MISES,
-    hardened,
+    hardening_factor,
     orthogonal,
     return_map,
-    soil_parts,
+    snow_parts,
     stress,
 )
 
 
 @triton.jit
-def stress_adjoint(a, b, c, d, r0, r1, r2, r3, proper, mu2, lam, pull_x, pull_y, xx, xy, yy, KIND: tl.constexpr):
+def stress_adjoint(a, b, c, d, r0, r1, r2, r3, proper, mu2, lam, act_x, act_y, xx, xy, yy, KIND: tl.constexpr):
     """From the derivative in the Kirchhoff stress (xx, xy, yy) to those in all that made it.
 
     Returns:
@@ -33,50 +33,50 @@ def stress_adjoint(a, b, c, d, r0, r1, r2, r3, proper, mu2, lam, pull_x, pull_y,
     cos_bar, sin_bar, _, _ = split(e_bar, f_bar, g_bar, h_bar, proper)
     signed = a * d - b * c
     J, side = signed, 1.0
-    if KIND == SOIL:
+    if KIND == SNOW:
         J = tl.abs(signed)
         side = tl.where(signed > 0, 1.0, tl.where(signed < 0, -1.0, 0.0))
     area = side * ((xx + yy) * lam * (2.0 * J - 1.0))
-    xa, xc, yb, yd = pull_x * a, pull_x * c, pull_y * b, pull_y * d
+    xa, xc, yb, yd = act_x * a, act_x * c, act_y * b, act_y * d
     a_bar = e_bar + mu2 * xx * e + area * d + 2.0 * xx * xa + xy * xc
     b_bar = f_bar + mu2 * xx * f - area * c + 2.0 * xx * yb + xy * yd
     c_bar = g_bar + mu2 * (xy * e + yy * g) - area * b + xy * xa + 2.0 * yy * xc
     d_bar = h_bar + mu2 * (xy * f + yy * h) + area * a + xy * yb + 2.0 * yy * yd
-    pull_x_bar = xx * a * a + xy * a * c + yy * c * c
-    pull_y_bar = xx * b * b + xy * b * d + yy * d * d
+    act_x_bar = xx * a * a + xy * a * c + yy * c * c
+    act_y_bar = xx * b * b + xy * b * d + yy * d * d
     of_mu2 = xx * (e * a + f * b) + xy * (e * c + f * d) + yy * (g * c + h * d)
     of_lam = (xx + yy) * (J * (J - 1.0))
-    return a_bar, b_bar, c_bar, d_bar, -cos_bar, -sin_bar, pull_x_bar, pull_y_bar, of_mu2, of_lam
+    return a_bar, b_bar, c_bar, d_bar, -cos_bar, -sin_bar, act_x_bar, act_y_bar, of_mu2, of_lam
 
 
 @triton.jit
 def von_mises_adjoint(
-    a, b, c, d, slope2, ratio, plus, minus, a_bar, b_bar, c_bar, d_bar, cos_bar, sin_bar, constants
+    a, b, c, d, tanh2, exp, cosh2, sinh2, a_bar, b_bar, c_bar, d_bar, cos_bar, sin_bar, constants
 ):  # fmt: skip
-    """From derivatives in the returned F and in R to those in the trial F (four), in plus and in minus."""
+    """From derivatives in the returned F and in R to those in the trial F (four), in cosh2 and sinh2."""
     floor = tl.load(constants + STRETCH_FLOOR)
     proper = larger_is_rotation(a, b, c, d)
     m1, m2, n1, n2 = split(a, b, c, d, proper)
     total, inverse_total, cos, sin, empty = direction(m1, m2)
     small = n1 * n1 + n2 * n2
-    beyond = small > slope2 * (m1 * m1 + m2 * m2)
-    difference = tl.sqrt(tl.where(beyond, small, 0.25))
+    outside = small > tanh2 * (m1 * m1 + m2 * m2)
+    difference = tl.sqrt(tl.where(outside, small, 0.25))
     inverse = 1.0 / difference
-    total = tl.where(beyond, total, 1.0)
+    total = tl.where(outside, total, 1.0)
     first, second = 0.5 * (total + difference), 0.5 * (total - difference)
     major, minor = at_least(first, floor), at_least(second, floor)
-    yields = beyond & (major > minor * ratio)
+    yields = outside & (major > minor * exp)
     mean = 0.5 * tl.sqrt(major * minor)
-    grow_total, grow_difference = mean * plus, mean * (minus * inverse)
+    grow_total, grow_difference = mean * cosh2, mean * (sinh2 * inverse)
 
     m1_bar, m2_bar, n1_bar, n2_bar = split(a_bar, b_bar, c_bar, d_bar, proper)
     of_total, of_difference = m1_bar * cos + m2_bar * sin, n1_bar * n1 + n2_bar * n2
-    mean_bar = of_total * plus + of_difference * minus * inverse
+    mean_bar = of_total * cosh2 + of_difference * sinh2 * inverse
     major_bar = tl.where(first >= floor, mean_bar * mean / (2.0 * major), 0.0)
     minor_bar = tl.where(second >= floor, mean_bar * mean / (2.0 * minor), 0.0)
     along = (0.5 * (major_bar - minor_bar) - of_difference * grow_difference * inverse) * inverse
-    plus_bar = tl.where(yields, of_total * mean, 0.0)
-    minus_bar = tl.where(yields, of_difference * mean * inverse, 0.0)
+    cosh2_bar = tl.where(yields, of_total * mean, 0.0)
+    sinh2_bar = tl.where(yields, of_difference * mean * inverse, 0.0)
     total_bar = tl.where(yields, 0.5 * (major_bar + minor_bar), 0.0)
     cos_bar += tl.where(yields, grow_total * m1_bar, 0.0)
     sin_bar += tl.where(yields, grow_total * m2_bar, 0.0)
@@ -85,18 +85,18 @@ def von_mises_adjoint(
     n2_bar = tl.where(yields, grow_difference * n2_bar + along * n2, 0.0)
     e, f, g, h = join(m1_bar, m2_bar, n1_bar, n2_bar, proper)
     e, f = e + tl.where(yields, 0.0, a_bar), f + tl.where(yields, 0.0, b_bar)
-    return e, f, g + tl.where(yields, 0.0, c_bar), h + tl.where(yields, 0.0, d_bar), plus_bar, minus_bar
+    return e, f, g + tl.where(yields, 0.0, c_bar), h + tl.where(yields, 0.0, d_bar), cosh2_bar, sinh2_bar
 
 
 @triton.jit
-def soil_adjoint(
+def snow_adjoint(
     a, b, c, d, Jp, low, high, a_bar, b_bar, c_bar, d_bar, cos_bar, sin_bar, Jp_bar, constants, bounds
 ):  # fmt: skip
     """From derivatives in the returned F, in R and Jp to those in the trial F (four), in Jp, and in low and high."""
     proper = larger_is_rotation(a, b, c, d)
     m1, m2, p1, p2 = split(a, b, c, d, proper)
     _, inverse, cos, sin, empty = direction(m1, m2)
-    n1, n2, along, drop, even, root, first, second, major, minor, ratio = soil_parts(
+    n1, n2, along, drop, even, root, first, second, major, minor, ratio = snow_parts(
         m1, m2, p1, p2, low, high, tl.load(bounds + 2)
     )
     sum = 0.5 * (major + minor)
@@ -142,8 +142,8 @@ def elastic_adjoint(a, b, c, d, a_bar, b_bar, c_bar, d_bar, cos_bar, sin_bar):
 
 
 @triton.jit
-def hardened_adjoint(Jp, hardening, hard_bar, bounds):
-    """Derivatives in Jp and in the exponent through the hardening factor of soil."""
+def hardening_adjoint(Jp, hardening, hard_bar, bounds):
+    """Derivatives in Jp and in the exponent through the hardening factor of snow."""
     power = tl.exp(hardening * (1.0 - Jp))
     free = (power >= tl.load(bounds)) & (power <= tl.load(bounds + 1))
     exponent = tl.where(free, hard_bar * power, 0.0)
@@ -152,7 +152,7 @@ def hardened_adjoint(Jp, hardening, hard_bar, bounds):
 
 @triton.jit
 def material_adjoint(
-    a, b, c, d, Jp, factor, mu2, lam, s0, s1, s2, s3, pull_x, pull_y, xx_bar, xy_bar, yy_bar,
+    a, b, c, d, Jp, factor, mu2, lam, s0, s1, s2, s3, act_x, act_y, xx_bar, xy_bar, yy_bar,
     a_bar, b_bar, c_bar, d_bar, Jp_bar, constants, bounds, KIND: tl.constexpr,
 ):  # fmt: skip
     """Adjoint of return map and stress together.
@@ -165,11 +165,11 @@ def material_adjoint(
     """
     e, f, g, h, _ = return_map(a, b, c, d, Jp, s0, s1, s2, s3, constants, bounds, KIND)
     r0, r1, r2, r3 = orthogonal(a, b, c, d)
-    hard = hardened(Jp, s2, bounds, KIND)
-    xx, xy, yy = stress(e, f, g, h, r0, r1, r2, r3, hard * mu2, hard * lam, pull_x, pull_y, KIND)
+    hard = hardening_factor(Jp, s2, bounds, KIND)
+    xx, xy, yy = stress(e, f, g, h, r0, r1, r2, r3, hard * mu2, hard * lam, act_x, act_y, KIND)
     factor_bar = xx_bar * xx + xy_bar * xy + yy_bar * yy
-    e_bar, f_bar, g_bar, h_bar, cos_bar, sin_bar, pull_x_bar, pull_y_bar, of_mu2, of_lam = stress_adjoint(
-        e, f, g, h, r0, r1, r2, r3, larger_is_rotation(a, b, c, d), hard * mu2, hard * lam, pull_x, pull_y,
+    e_bar, f_bar, g_bar, h_bar, cos_bar, sin_bar, act_x_bar, act_y_bar, of_mu2, of_lam = stress_adjoint(
+        e, f, g, h, r0, r1, r2, r3, larger_is_rotation(a, b, c, d), hard * mu2, hard * lam, act_x, act_y,
         factor * xx_bar, factor * xy_bar, factor * yy_bar, KIND,
     )  # fmt: skip
     a_bar, b_bar, c_bar, d_bar = a_bar + e_bar, b_bar + f_bar, c_bar + g_bar, d_bar + h_bar
@@ -179,15 +179,15 @@ def material_adjoint(
         a_bar, b_bar, c_bar, d_bar, s2_bar, s3_bar = von_mises_adjoint(
             a, b, c, d, s0, s1, s2, s3, a_bar, b_bar, c_bar, d_bar, cos_bar, sin_bar, constants
         )
-    elif KIND == SOIL:
-        Jp_hard, s2_bar = hardened_adjoint(Jp, s2, mu2 * of_mu2 + lam * of_lam, bounds)
-        a_bar, b_bar, c_bar, d_bar, Jp_bar, s0_bar, s1_bar = soil_adjoint(
+    elif KIND == SNOW:
+        Jp_hard, s2_bar = hardening_adjoint(Jp, s2, mu2 * of_mu2 + lam * of_lam, bounds)
+        a_bar, b_bar, c_bar, d_bar, Jp_bar, s0_bar, s1_bar = snow_adjoint(
             a, b, c, d, Jp, s0, s1, a_bar, b_bar, c_bar, d_bar, cos_bar, sin_bar, Jp_bar, constants, bounds
         )
         Jp_bar += Jp_hard
     else:
         a_bar, b_bar, c_bar, d_bar = elastic_adjoint(a, b, c, d, a_bar, b_bar, c_bar, d_bar, cos_bar, sin_bar)
     return (
-        a_bar, b_bar, c_bar, d_bar, Jp_bar, factor * xx, factor * xy, factor * yy, pull_x_bar, pull_y_bar,
+        a_bar, b_bar, c_bar, d_bar, Jp_bar, factor * xx, factor * xy, factor * yy, act_x_bar, act_y_bar,
         factor_bar, hard * of_mu2, hard * of_lam, s0_bar, s1_bar, s2_bar, s3_bar,
     )  # fmt: skip

@@ -12,9 +12,9 @@ from torch import Tensor
 from torchmpm.native.cuda.adjoint import begin_adjoint, finish_adjoint
 from torchmpm.native.cuda.grid import ADJOINT, SUMS, node_adjoint, node_velocities, rule_codes
 from torchmpm.native.cuda.step import particles_pass
-from torchmpm.native.cuda.tables import Tables
+from torchmpm.native.cuda.tables import DeviceTables
 from torchmpm.native.cuda.transfer import NOWHERE
-from torchmpm.native.pack import VALUES
+from torchmpm.native.tables import VALUES
 
 #: Particles, or nodes, of a program: one per thread.
 BLOCK = 128
@@ -24,7 +24,7 @@ NODE_PROGRAMS = 4096
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Tensors of a call, contiguous and on one device; see :func:`torchmpm.native.ops.native_step`."""
+    """Tensors of a call, contiguous and on one device; see :func:`torchmpm.native.operator.native_step`."""
 
     planes: Tensor
     field: Tensor | None
@@ -55,14 +55,14 @@ class Program:
     particles, and tells the passes over the nodes where to read.
     """
 
-    def __init__(self, inputs: Inputs, tables: Tables, substeps: int, numbers: int) -> None:
+    def __init__(self, inputs: Inputs, tables: DeviceTables, substeps: int, numbers: int) -> None:
         planes = inputs.planes
-        self.inputs, self.tables, self.substeps = inputs, tables, substeps
+        self.inputs, self.device_tables, self.tables, self.substeps = inputs, tables, tables.tables, substeps
         self.batch, self.particles = planes.shape[1:]
-        self.cells = tables.width**2
+        self.cells = self.tables.width**2
         self.sums = planes.new_zeros(self.batch * self.cells * numbers)
         self.boxes = torch.empty(substeps, self.batch, 4, dtype=torch.int32, device=planes.device)
-        nodes = self.batch * self.cells if tables.slots else 1
+        nodes = self.batch * self.cells if self.tables.slots else 1
         self.codes = torch.empty(nodes, dtype=torch.int32, device=planes.device)
 
     def run(self) -> None:
@@ -78,7 +78,7 @@ class Program:
         self.boxes.fill_(NOWHERE.value)
         if not self.tables.slots:
             return
-        rules, programs = self.tables.rules, -(-self.cells // BLOCK)
+        rules, programs = self.device_tables.rules, -(-self.cells // BLOCK)
         sizes = (len(rules), self.tables.width, self.cells, programs)
         launch(rule_codes, self.batch * programs, self.codes, rules, self.inputs.shift, *sizes)
 
@@ -87,9 +87,9 @@ class Program:
         inputs, tables = self.inputs, self.tables
         field = inputs.origin if inputs.field is None else inputs.field  # nobody looks at one that is not there
         values_batch, columns = inputs.values.shape[1:]
-        for body in tables.bodies:
+        for k, body in enumerate(tables.bodies):
             blocks = -(-body.count // BLOCK)
-            constants = (tables.constants, tables.constants[body.bounds :])
+            constants = (self.device_tables.constants, self.device_tables.bounds_of(k))
             sizes = [self.particles, self.batch * self.particles, body.first, body.count, blocks]
             sizes += [body.column, columns, values_batch, tables.resolution, tables.width]
             muscle = body.muscle and inputs.field is not None
@@ -112,7 +112,7 @@ class Program:
         """Launch a pass over the nodes: ``buffers`` are sums, answers, and the box of the substep."""
         tables, inputs = self.tables, self.inputs
         programs = max(1, min(-(-self.cells // BLOCK), NODE_PROGRAMS // self.batch))
-        tensors = (*buffers, self.codes, tables.rules, inputs.gravity, *bars, tables.constants)
+        tensors = (*buffers, self.codes, self.device_tables.rules, inputs.gravity, *bars, self.device_tables.constants)
         sizes = (tables.resolution, tables.width, programs)
         launch(kernel, self.batch * programs, *tensors, *sizes, SLOTS=tables.slots)
 
@@ -120,7 +120,7 @@ class Program:
 class Forward(Program):
     """A step: a pass over the particles, then over the nodes, for each substep."""
 
-    def __init__(self, inputs: Inputs, tables: Tables, substeps: int) -> None:
+    def __init__(self, inputs: Inputs, tables: DeviceTables, substeps: int) -> None:
         super().__init__(inputs, tables, substeps, SUMS.value)
         self.state = torch.empty_like(inputs.planes)
         self.velocity = inputs.planes.new_empty(self.batch * self.cells * 2)
@@ -142,7 +142,9 @@ class Backward(Program):
     What the nodes were is not on the tape: going back, mass and momentum are added up once more.
     """
 
-    def __init__(self, inputs: Inputs, tables: Tables, substeps: int, wants_field: bool, wants_values: bool) -> None:
+    def __init__(
+        self, inputs: Inputs, tables: DeviceTables, substeps: int, wants_field: bool, wants_values: bool
+    ) -> None:
         super().__init__(inputs, tables, substeps, ADJOINT.value)
         planes, nothing = inputs.planes, inputs.planes.new_empty(0)
         length = -(-planes.numel() // 4) * 4  # whole fours, see tables

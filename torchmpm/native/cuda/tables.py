@@ -1,4 +1,4 @@
-"""What kernels on CUDA need to know of a solver, unpacked from :func:`torchmpm.native.pack.description`."""
+"""The tables of :mod:`torchmpm.native.tables` on a CUDA device."""
 
 from __future__ import annotations
 
@@ -8,85 +8,49 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchmpm.grid import PAD
-from torchmpm.material import LARGEST_JP
-from torchmpm.native.pack import BODY_NUMBERS, HEAD, RULE_NUMBERS
-
-
-@dataclass(frozen=True)
-class BodyPart:
-    """The particles of one body.
-
-    Attributes:
-        first: Its first particle.
-        count: Number of particles.
-        kind: Place of its material in :data:`torchmpm.native.pack.KINDS`.
-        muscle: Whether the actuation acts on it.
-        varying: Whether its values have one column per particle.
-        column: Its first column in the table of values.
-        bounds: Where its bounds stand among the constants.
-    """
-
-    first: int
-    count: int
-    kind: int
-    muscle: bool
-    varying: bool
-    column: int
-    bounds: int
+from torchmpm.materials.snow import LARGEST_JP
+from torchmpm.native.tables import RuleTable, Tables, tables_of
 
 
 @dataclass(frozen=True, eq=False)
-class Tables:
+class DeviceTables:
     """Everything constant about a solver, on a device.
 
     Attributes:
-        resolution: Nodes per axis.
-        bodies: The bodies.
-        slots: Number of directions that have velocity rules.
+        tables: The description.
         constants: h, 1/h, dt, margin and extent of the window, damping, mass epsilon, stretch floor, largest Jp; then
-            for each body the bounds of hardening and the shear cutoff.
-        rules: (rules, 9) float64: the numbers of a rule in the description, and its slot. Slots apply in their order.
+            for each body the bounds of hardening and the shear cutoff, from :meth:`bounds_of`.
+        rules: (rules, 9) float64: the numbers of each rule.
     """
 
-    resolution: int
-    bodies: tuple[BodyPart, ...]
-    slots: int
+    tables: Tables
     constants: Tensor
     rules: Tensor
 
-    @property
-    def width(self) -> int:
-        """Nodes per axis with their padding."""
-        return self.resolution + 2 * PAD
+    def bounds_of(self, body: int) -> Tensor:
+        """The constants from the first one of a body."""
+        return self.constants[12 + 4 * body :]
 
 
 @functools.lru_cache(maxsize=64)
-def unpack(description: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tables:
-    """The tables of a description, remembered, because to copy them to a device waits for it."""
-    resolution, h, dt, margin, damping, mass_epsilon, stretch_floor = description[:7]
-    extent = resolution * h - margin
-    constants = [h, 1.0 / h, dt, margin, extent, damping, mass_epsilon, stretch_floor, LARGEST_JP]
+def device_tables(handle: int, dtype: torch.dtype, device: torch.device) -> DeviceTables:
+    """The tables of a handle on a device; kept, because a copy to a device waits for it."""
+    tables = tables_of(handle)
+    extent = tables.resolution * tables.h - tables.margin
+    constants = [tables.h, 1.0 / tables.h, tables.dt, tables.margin, extent, tables.damping, tables.mass_epsilon]
+    constants += [tables.stretch_floor, LARGEST_JP]
     constants += [0.0] * 3  # parts of a table begin at whole fours, as Triton compiles a kernel anew for others
-    body_count, rule_count = int(description[7]), int(description[8])
-    bodies, first = [], 0
-    for start in range(HEAD, HEAD + BODY_NUMBERS * body_count, BODY_NUMBERS):
-        count, kind, muscle, columns, column, *bounds = description[start : start + BODY_NUMBERS]
-        part = BodyPart(first, int(count), int(kind), bool(muscle), columns > 1, int(column), len(constants))
-        bodies.append(part)
-        constants += [*bounds, 0.0]
-        first += int(count)
-    start = HEAD + BODY_NUMBERS * body_count
-    rows: list[list[float]] = []
-    slots: dict[tuple[float, ...], int] = {}
-    for at in range(start, start + RULE_NUMBERS * rule_count, RULE_NUMBERS):
-        rule = description[at : at + RULE_NUMBERS]
-        rows.append([*rule, slots.setdefault(rule[:2], len(slots))])
+    for body in tables.bodies:
+        constants += [body.hardening_low, body.hardening_high, body.shear_cutoff, 0.0]
+    rows = [_row(rule) for rule in tables.rules] or [[0.0] * 9]
     with torch.inference_mode(False):
-        return Tables(
-            resolution=int(resolution),
-            bodies=tuple(bodies),
-            slots=len(slots),
+        return DeviceTables(
+            tables=tables,
             constants=torch.tensor(constants, dtype=dtype, device=device),
-            rules=torch.tensor(rows or [[0.0] * (RULE_NUMBERS + 1)], dtype=torch.float64, device=device),
+            rules=torch.tensor(rows, dtype=torch.float64, device=device),
         )
+
+
+def _row(rule: RuleTable) -> list[float]:
+    ends = [rule.i_low, rule.i_high, rule.j_low, rule.j_high]
+    return [rule.axis, rule.sign, *ends, rule.friction, rule.world, rule.slot]

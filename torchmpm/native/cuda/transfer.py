@@ -122,7 +122,7 @@ def field_at(field, i, j, p: tl.constexpr, q: tl.constexpr, on, resolution):
 
 
 @triton.jit
-def pull(field, i, j, fx, fy, on, resolution):
+def actuation_at(field, i, j, fx, fy, on, resolution):
     """Muscle actuation of particles from the field (2, G, G)."""
     ax, ay = tl.zeros_like(fx), tl.zeros_like(fx)
     for p in tl.static_range(3):

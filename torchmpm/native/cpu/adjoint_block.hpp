@@ -16,7 +16,7 @@ struct alignas(64) Nodes {
 };
 
 // Muscle actuation from the nodes that were read.
-PASS void sample(const Nodes& field, const Stencil& at, Pull& out) {
+PASS void sample(const Nodes& field, const Stencil& at, Actuation& out) {
 #pragma omp simd
     for (int k = 0; k < LANES; ++k) {
         Real sum[2] = {0, 0};
@@ -52,7 +52,7 @@ struct alignas(64) Momentum {
     Real affine_bar[4][LANES];  // derivative in the affine momentum
     Real affine[4][LANES];      // the affine momentum itself
     Real C_bar[4][LANES];       // derivative in the affine matrix before the substep
-    Real pull_bar[2][LANES];    // derivative in the muscle actuation, zero for particles that take no part
+    Real act_bar[2][LANES];    // derivative in the muscle actuation, zero for particles that take no part
 
     PASS_MEMBER void collect(const Scene& scene, const Nodes& p_bar, const Stencil& at) {
         const Real h = scene.h;
@@ -83,7 +83,7 @@ struct alignas(64) Momentum {
 // Adjoint of deform_one. The bars of F and Jp go from after the substep to before it; what the others need is kept in
 // `momentum`.
 template <Kind kind, bool wants_values>
-INLINE void deform_adjoint_one(Real dt, Values m, Bounds bounds, bool on, Real pull_x, Real pull_y, int k,
+INLINE void deform_adjoint_one(Real dt, Values m, Bounds bounds, bool on, Real act_x, Real act_y, int k,
                                const Block& state, Momentum& momentum, Block& bar, Real* values_bar) {
     const Mat2 C = matrix(state, C0, k), F = matrix(state, F0, k), grown = growth(dt, C), trial = matmul(grown, F);
     const Mat2 P_bar{momentum.affine_bar[0][k], momentum.affine_bar[1][k], momentum.affine_bar[2][k],
@@ -93,7 +93,7 @@ INLINE void deform_adjoint_one(Real dt, Values m, Bounds bounds, bool on, Real p
     Mat2 F_bar = old_F_bar;
     Real Jp_bar = old_Jp_bar;
     Sym2 S;
-    const MaterialBar out = material_adjoint<kind>(m, bounds, trial, state.v[JP][k], pull_x, pull_y,
+    const MaterialBar out = material_adjoint<kind>(m, bounds, trial, state.v[JP][k], act_x, act_y,
                                                    {P_bar.a, P_bar.b + P_bar.c, P_bar.d}, F_bar, Jp_bar, S);
     const Mat2 C_bar = m.mass * P_bar + dt * matmul(F_bar, transposed(F));
     F_bar = matmul(transposed(grown), F_bar);
@@ -102,10 +102,10 @@ INLINE void deform_adjoint_one(Real dt, Values m, Bounds bounds, bool on, Real p
     momentum.affine[2][k] = S.xy + m.mass * C.c, momentum.affine[3][k] = S.yy + m.mass * C.d;
     momentum.C_bar[0][k] = C_bar.a, momentum.C_bar[1][k] = C_bar.b;
     momentum.C_bar[2][k] = C_bar.c, momentum.C_bar[3][k] = C_bar.d;
-    momentum.pull_bar[0][k] = on ? out.pull_x : 0, momentum.pull_bar[1][k] = on ? out.pull_y : 0;
+    momentum.act_bar[0][k] = on ? out.act_x : 0, momentum.act_bar[1][k] = on ? out.act_y : 0;
     bar.v[F0][k] = on ? F_bar.a : old_F_bar.a, bar.v[F1][k] = on ? F_bar.b : old_F_bar.b;
     bar.v[F2][k] = on ? F_bar.c : old_F_bar.c, bar.v[F3][k] = on ? F_bar.d : old_F_bar.d;
-    if (kind == Kind::soil) bar.v[JP][k] = on ? Jp_bar : old_Jp_bar;
+    if (kind == Kind::snow) bar.v[JP][k] = on ? Jp_bar : old_Jp_bar;
     if (!wants_values) return;
     const Real mass_bar = state.v[VX][k] * momentum.v_bar[0][k] + state.v[VY][k] * momentum.v_bar[1][k] +
                           P_bar.a * C.a + P_bar.b * C.b + P_bar.c * C.c + P_bar.d * C.d;
@@ -113,26 +113,26 @@ INLINE void deform_adjoint_one(Real dt, Values m, Bounds bounds, bool on, Real p
     values_bar[LANES + k] += on ? out.values.factor : 0;
     values_bar[2 * LANES + k] += on ? out.values.mu2 : 0;
     values_bar[3 * LANES + k] += on ? out.values.lam : 0;
-    values_bar[4 * LANES + k] += on ? out.values.slope2 : 0;
-    values_bar[5 * LANES + k] += on ? out.values.ratio : 0;
-    values_bar[6 * LANES + k] += on ? out.values.plus : 0;
-    values_bar[7 * LANES + k] += on ? out.values.minus : 0;
+    values_bar[4 * LANES + k] += on ? out.values.tanh2 : 0;
+    values_bar[5 * LANES + k] += on ? out.values.exp : 0;
+    values_bar[6 * LANES + k] += on ? out.values.cosh2 : 0;
+    values_bar[7 * LANES + k] += on ? out.values.sinh2 : 0;
 }
 
 template <Kind kind, bool varying, bool wants_values>
-void deform_adjoint(const Scene& scene, const Real* table, Bounds bounds, const Stencil& at, const Pull& pull,
+void deform_adjoint(const Scene& scene, const Real* table, Bounds bounds, const Stencil& at, const Actuation& actuation,
                     const Block& state, Momentum& momentum, Block& bar, Real* values_bar) {
     const Real dt = scene.dt;
     const Values shared = values_at<false>(table, 0);
 #pragma omp simd
     for (int k = 0; k < LANES; ++k)
         deform_adjoint_one<kind, wants_values>(dt, varying ? values_at<true>(table, k) : shared, bounds, at.on[k] != 0,
-                                               pull.x[k], pull.y[k], k, state, momentum, bar, values_bar);
+                                               actuation.x[k], actuation.y[k], k, state, momentum, bar, values_bar);
 }
 
-INLINE void deform_adjoint(const Scene& scene, const Body& body, const Real* table, const Stencil& at, const Pull& pull,
+INLINE void deform_adjoint(const Scene& scene, const Body& body, const Real* table, const Stencil& at, const Actuation& actuation,
                            const Block& state, Momentum& momentum, Block& bar, Real* values_bar) {
-    using Function = void (*)(const Scene&, const Real*, Bounds, const Stencil&, const Pull&, const Block&, Momentum&,
+    using Function = void (*)(const Scene&, const Real*, Bounds, const Stencil&, const Actuation&, const Block&, Momentum&,
                               Block&, Real*);
 #define VARIANTS(kind)                                                                     \
     {                                                                                      \
@@ -141,9 +141,9 @@ INLINE void deform_adjoint(const Scene& scene, const Body& body, const Real* tab
         }                                                                                  \
     }
     static constexpr Function table_of[3][2][2] = {VARIANTS(Kind::elastic), VARIANTS(Kind::von_mises),
-                                                   VARIANTS(Kind::soil)};
+                                                   VARIANTS(Kind::snow)};
 #undef VARIANTS
-    table_of[int(body.kind)][body.varying][values_bar != nullptr](scene, table, body.bounds, at, pull, state, momentum,
+    table_of[int(body.kind)][body.varying][values_bar != nullptr](scene, table, body.bounds, at, actuation, state, momentum,
                                                                   bar, values_bar);
 }
 
@@ -163,7 +163,7 @@ PASS void position_adjoint(const Scene& scene, const Stencil& at, const Nodes& v
         const Real cyx = scale * bar.v[C2][k], cyy = scale * bar.v[C3][k];
         const Real pxx = h * momentum.affine[0][k], pxy = h * momentum.affine[1][k];
         const Real pyx = h * momentum.affine[2][k], pyy = h * momentum.affine[3][k];
-        const Real gx = momentum.pull_bar[0][k], gy = momentum.pull_bar[1][k];
+        const Real gx = momentum.act_bar[0][k], gy = momentum.act_bar[1][k];
         const Real slope_x[3] = {fx - Real(1.5), 2 - 2 * fx, fx - Real(0.5)};
         const Real slope_y[3] = {fy - Real(1.5), 2 - 2 * fy, fy - Real(0.5)};
         Real fx_bar = 0, fy_bar = 0, masses = 0;
@@ -212,9 +212,9 @@ PASS void velocity_bars(const Scene& scene, const Stencil& at, const Block& bar,
 }
 
 // Add the derivatives in the muscle actuation to the nodes of the field.
-PASS void scatter_pull(const Scene& scene, const Momentum& momentum, const Stencil& at, Real* grid) {
+PASS void scatter_actuation(const Scene& scene, const Momentum& momentum, const Stencil& at, Real* grid) {
     for (int k = 0; k < LANES; k += 8) {
-        const Real8 x = eight(momentum.pull_bar[0] + k), y = eight(momentum.pull_bar[1] + k);
+        const Real8 x = eight(momentum.act_bar[0] + k), y = eight(momentum.act_bar[1] + k);
         add_eight(at.node + k, scene.width, grid, [&](int p, int q, Real8(&out)[4]) {
             const Real8 w = eight(at.wx[p] + k) * eight(at.wy[q] + k);
             out[0] = w * x, out[1] = w * y;

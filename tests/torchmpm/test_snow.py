@@ -9,7 +9,8 @@ from test_material import deformations, matrix, planes, stretched, symmetric, tu
 from torch import Tensor
 
 from torchmpm import Soil, lame
-from torchmpm.material import clamp_stretches, corotated_stress
+from torchmpm.materials.elastic import corotated_stress
+from torchmpm.materials.snow import snow_return
 
 MU, LAM = lame(5000.0, 0.2)
 LOW, HIGH = 0.975, 1.0045
@@ -35,7 +36,7 @@ def by_svd(F: np.ndarray, cutoff: float) -> tuple[np.ndarray, float]:
 def test_clamp_against_svd(cutoff: float) -> None:
     """All around the range, some inverted; the large cutoff catches about half of them."""
     F = torch.cat((deformations(300, 0.96, 1.03, seed=1), deformations(100, 0.2, 3.0, seed=2)), 1)
-    clamped, squeezed = clamp_stretches(planes(F), LOW, HIGH, cutoff)
+    clamped, squeezed = snow_return(planes(F), LOW, HIGH, cutoff)
     expected = [by_svd(f, cutoff) for f in F[0].numpy()]
     np.testing.assert_allclose(matrix(clamped)[0].numpy(), np.stack([e[0] for e in expected]), rtol=0, atol=2e-14)
     np.testing.assert_allclose(squeezed[0].numpy(), [e[1] for e in expected], rtol=1e-13)

@@ -62,14 +62,14 @@ private:
     Stencil at;
     Nodes velocity, p_bar, field;
     Masses mass_bar;
-    Pull pull;
+    Actuation actuation;
     Momentum momentum;
     Impulse impulse;
 
     Real* origin_bar(int part) { return work.origin_bar + size_t(part) * 2 * LANES; }
 
     void prepare() {
-        pull.none();
+        actuation.none();
         for (int part = member.rank; part < scene.parts; part += member.size) {
             std::fill_n(origin_bar(part), 2 * LANES, Real(0));
             if (!work.field_bar.empty()) work.field_bar[part].cleared = {};
@@ -113,12 +113,12 @@ private:
     void take(int index, const Block& state, int part) {
         const Body& body = scene.body(index);
         Block& bar = work.bars[index];
-        const bool pulls = body.muscle && scene.muscles;
-        if (pulls) {
+        const bool actuated = body.muscle && scene.muscles;
+        if (actuated) {
             field.read(scene, at, work.field);
-            sample(field, at, pull);
+            sample(field, at, actuation);
         } else if (scene.muscles) {
-            pull.none();
+            actuation.none();
         }
         velocity.read(scene, at, work.velocity);
         p_bar.read(scene, at, work.nodes.momentum);
@@ -126,13 +126,13 @@ private:
         momentum.collect(scene, p_bar, at);
         Real uniform[VALUES];
         Real* values_bar = work.values_bar ? work.values_bar + size_t(index) * VALUES * LANES : nullptr;
-        deform_adjoint(scene, body, work.values_of(scene, index, element, uniform), at, pull, state, momentum, bar,
+        deform_adjoint(scene, body, work.values_of(scene, index, element, uniform), at, actuation, state, momentum, bar,
                        values_bar);
-        const auto positions = pulls ? position_adjoint<true> : position_adjoint<false>;
+        const auto positions = actuated ? position_adjoint<true> : position_adjoint<false>;
         positions(scene, at, velocity, p_bar, mass_bar, field, state, momentum, bar, origin_bar(part), values_bar);
-        if (pulls && !work.field_bar.empty()) {
+        if (actuated && !work.field_bar.empty()) {
             work.field_bar[part].reserve(at.box, scene.width);
-            scatter_pull(scene, momentum, at, work.field_bar[part].nodes);
+            scatter_actuation(scene, momentum, at, work.field_bar[part].nodes);
         }
     }
 

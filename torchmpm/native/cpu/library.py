@@ -31,56 +31,44 @@ _FLAGS = (
     "-pthread",
 )
 _X86_FLAGS = ("-mprefer-vector-width=512",)
-#: What a user reads behind the name of the backend.
+#: Completes the message "backend 'native' ...".
 NO_COMPILER = "needs a C++ compiler (g++, clang++ or $CXX), found none: use 'eager'"
 _logger = logging.getLogger(__name__)
-#: What this process has loaded: looking for a compiler again would cost more than a substep.
+#: Libraries that this process has loaded; looking for a compiler again would cost more than a substep.
 _loaded: dict[tuple[Path, tuple[str, ...]], ctypes.CDLL] = {}
 
 
-class Call(ctypes.Structure):
-    """The arguments of one call, as ``struct Call`` in ``scene.hpp``."""
-
-    _POOL = ("pool_parallel", "pool_rank", "pool_team_size")
-    _NUMBERS = ("batch", "particles", "substeps", "threads")
-    _INPUTS = ("description", "planes", "field", "origin", "shift", "gravity", "values")
-    _SIZES = ("values_batch", "columns")
-    _OUTPUTS = ("result", "result_bar", "planes_bar", "field_bar", "origin_bar", "gravity_bar", "values_bar")
-    _fields_ = [
-        *((name, ctypes.c_int64) for name in _NUMBERS),
-        *((name, ctypes.c_void_p) for name in _POOL),
-        *((name, ctypes.c_void_p) for name in _INPUTS),
-        *((name, ctypes.c_int64) for name in _SIZES),
-        *((name, ctypes.c_void_p) for name in _OUTPUTS),
-    ]
+#: Members of ``struct Pool`` in ``team.hpp``.
+POOL = ("pool_parallel", "pool_rank", "pool_team_size")
 
 
 @functools.cache
 def thread_pool() -> dict[str, int]:
-    """Addresses of the functions through which torch's OpenMP threads are reached; empty where it uses others.
+    """Addresses of the functions through which torch's OpenMP threads are reached; empty if torch uses other threads.
 
-    Also empty in a process forked from one that had them: there they do not exist, and calling them would never return.
+    Also empty in a forked process, which does not have the threads of its parent: calling them would never return.
     """
     functions = ("GOMP_parallel", "omp_get_thread_num", "omp_get_num_threads")
     program = ctypes.CDLL(None)
     if _forked or not all(hasattr(program, function) for function in functions):
         return {}
     addresses = [ctypes.cast(getattr(program, function), ctypes.c_void_p).value for function in functions]
-    return {name: address for name, address in zip(Call._POOL, addresses, strict=True) if address}
+    return {name: address for name, address in zip(POOL, addresses, strict=True) if address}
 
 
 _forked = False
 
 
 def _after_fork() -> None:
-    """Torch, too, would wait for ever for threads that a forked process does not have; with one it asks for none."""
+    """Use one thread in a forked process, in which torch too would wait forever for the threads of its parent."""
     global _forked
     _forked = True
     thread_pool.cache_clear()
     torch.set_num_threads(1)
 
 
-os.register_at_fork(after_in_child=_after_fork)
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 def find_compiler() -> tuple[str, ...] | None:
@@ -110,14 +98,14 @@ def load(real: str) -> ctypes.CDLL:
 
 
 def build(source: Path, *options: str) -> ctypes.CDLL:
-    """A C++ file, which finds the headers of this folder and of its own, as a loaded library.
+    """Compile a C++ file, which may include the headers of this folder and of its own, and load it.
 
     The first call on a machine compiles it, which takes some seconds; later processes find it in
-    :func:`cache_folder`. Where that cannot be written each process compiles its own.
+    :func:`cache_folder`. If that folder cannot be written, each process compiles its own.
 
     Args:
         source: The file.
-        options: For the compiler, beside those that all kernels are compiled with.
+        options: For the compiler, in addition to those that all kernels are compiled with.
 
     Raises:
         ValueError: There is no compiler, or it failed; the message holds what it said.
@@ -133,7 +121,7 @@ def build(source: Path, *options: str) -> ctypes.CDLL:
 
 @functools.cache
 def _load(source: Path, options: tuple[str, ...], folder: str, *_: str | None) -> ctypes.CDLL | str:
-    """Find or build the library; a failure comes back as text, so that it is not tried again in this process."""
+    """Find or build the library; returns a failure as text, so that it is not tried again in this process."""
     compiler = find_compiler()
     if compiler is None:
         return NO_COMPILER
@@ -159,7 +147,7 @@ def _load(source: Path, options: tuple[str, ...], folder: str, *_: str | None) -
                 f"could not be built: {shlex.join(command)} failed with code {done.returncode}:\n{done.stderr[-4000:]}"
             )
         if path.name:
-            os.replace(fresh, path)  # in one piece, whoever else builds at the same time
+            os.replace(fresh, path)  # atomic: another process may build at the same time
             fresh = path
         try:
             return ctypes.CDLL(str(fresh))
@@ -168,7 +156,7 @@ def _load(source: Path, options: tuple[str, ...], folder: str, *_: str | None) -
 
 
 def _key(command: list[str], folder: Path) -> str:
-    """Changes with the sources, the command, the compiler itself, and the processor it compiles for."""
+    """Hash of the sources, the command, the compiler and the processor it compiles for."""
     compiler = Path(shutil.which(command[0]) or command[0])
     facts = [*command[:-2], f"{compiler.resolve()} {compiler.stat().st_mtime_ns}", _processor()]
     digest = hashlib.sha256("\n".join(facts).encode())

@@ -29,7 +29,7 @@ struct Workspace {
     Real* field;       // actuation, two numbers a node
     Real* velocity;    // two numbers a node
     Real* total;       // [threads of the team] one row of nodes of four numbers
-    RuleTable rules;
+    RuleCodes rules;
     std::vector<Sums> sums;  // [parts]
     Team team;
     std::atomic<int64_t> element{0};

@@ -9,7 +9,7 @@ struct alignas(64) Impulse {
 };
 
 // Muscle actuation of a block's particles.
-struct alignas(64) Pull {
+struct alignas(64) Actuation {
     Real x[LANES], y[LANES];
 
     void none() { std::fill_n(x, LANES, Real(0)), std::fill_n(y, LANES, Real(0)); }
@@ -66,14 +66,14 @@ INLINE Mat2 growth(Real dt, Mat2 C) { return {1 + dt * C.a, dt * C.b, dt * C.c, 
 // Deform one particle and find what it gives to the nodes. A function of its own, because structures that are declared in
 // the body of a vector loop would be kept in memory.
 template <Kind kind>
-INLINE void deform_one(Real dt, Values m, Bounds bounds, bool on, Real pull_x, Real pull_y, int k, Block& block,
+INLINE void deform_one(Real dt, Values m, Bounds bounds, bool on, Real act_x, Real act_y, int k, Block& block,
                        Impulse& out) {
     const Mat2 C = matrix(block, C0, k), old = matrix(block, F0, k);
-    const Real before = block.v[JP][k], hard = hardened<kind>(m, bounds, before);
+    const Real before = block.v[JP][k], hard = hardening_factor<kind>(m, bounds, before);
     Mat2 F = matmul(growth(dt, C), old);
     Real Jp = before;
     const Direction R = return_map<kind>(m, bounds, F, Jp);
-    const Sym2 tau = stress<kind>(m, hard, F, R, pull_x, pull_y);
+    const Sym2 tau = stress<kind>(m, hard, F, R, act_x, act_y);
     out.mass[k] = on ? m.mass : 0;
     out.vx[k] = on ? m.mass * block.v[VX][k] : 0;
     out.vy[k] = on ? m.mass * block.v[VY][k] : 0;
@@ -83,29 +83,29 @@ INLINE void deform_one(Real dt, Values m, Bounds bounds, bool on, Real pull_x, R
     out.affine[3][k] = on ? m.factor * tau.yy + m.mass * C.d : 0;
     block.v[F0][k] = on ? F.a : old.a, block.v[F1][k] = on ? F.b : old.b;
     block.v[F2][k] = on ? F.c : old.c, block.v[F3][k] = on ? F.d : old.d;
-    if (kind == Kind::soil) block.v[JP][k] = on ? Jp : before;
+    if (kind == Kind::snow) block.v[JP][k] = on ? Jp : before;
 }
 
 template <Kind kind, bool varying>
-void deform(const Scene& scene, const Real* table, Bounds bounds, const Stencil& at, const Pull& pull, Block& block,
+void deform(const Scene& scene, const Real* table, Bounds bounds, const Stencil& at, const Actuation& actuation, Block& block,
             Impulse& out) {
     const Real dt = scene.dt;
     const Values shared = values_at<false>(table, 0);
 #pragma omp simd
     for (int k = 0; k < LANES; ++k)
-        deform_one<kind>(dt, varying ? values_at<true>(table, k) : shared, bounds, at.on[k] != 0, pull.x[k], pull.y[k],
+        deform_one<kind>(dt, varying ? values_at<true>(table, k) : shared, bounds, at.on[k] != 0, actuation.x[k], actuation.y[k],
                          k, block, out);
 }
 
-INLINE void deform(const Scene& scene, const Body& body, const Real* table, const Stencil& at, const Pull& pull,
+INLINE void deform(const Scene& scene, const Body& body, const Real* table, const Stencil& at, const Actuation& actuation,
                    Block& block, Impulse& out) {
-    using Function = void (*)(const Scene&, const Real*, Bounds, const Stencil&, const Pull&, Block&, Impulse&);
+    using Function = void (*)(const Scene&, const Real*, Bounds, const Stencil&, const Actuation&, Block&, Impulse&);
     static constexpr Function table_of[3][2] = {
         {deform<Kind::elastic, false>, deform<Kind::elastic, true>},
         {deform<Kind::von_mises, false>, deform<Kind::von_mises, true>},
-        {deform<Kind::soil, false>, deform<Kind::soil, true>},
+        {deform<Kind::snow, false>, deform<Kind::snow, true>},
     };
-    table_of[int(body.kind)][body.varying](scene, table, body.bounds, at, pull, block, out);
+    table_of[int(body.kind)][body.varying](scene, table, body.bounds, at, actuation, block, out);
 }
 
 // Add mass and momentum to the nodes.
@@ -176,7 +176,7 @@ private:
     const Tape tape;
     int64_t element = 0;
     Stencil at;
-    Pull pull;
+    Actuation actuation;
     Impulse impulse;
 
     void prepare() {
@@ -186,7 +186,7 @@ private:
         });
         if (member.rank == 0) work.rules.build(scene, scene.call.shift + 2 * element);
         if (member.rank == member.size - 1 && scene.muscles) load_field(scene, element, work.field);
-        pull.none();
+        actuation.none();
         member.wait(false);
         if (member.rank == 0) work.team.begin(false);
     }
@@ -210,20 +210,20 @@ private:
 
     // Only soil has a Jp that anyone asks for.
     static void keep(const Block& block, const Body& body, Block& to) {
-        const int planes = body.kind == Kind::soil ? PLANES : JP;
+        const int planes = body.kind == Kind::snow ? PLANES : JP;
         std::copy_n(block.v[0], planes * LANES, to.v[0]);
     }
 
     void give(int index, Block& block, Sums& sums) {
         const Body& body = scene.body(index);
-        const bool pulls = body.muscle && scene.muscles;
-        if (pulls) {
-            pull.sample(scene, at, work.field);
+        const bool actuated = body.muscle && scene.muscles;
+        if (actuated) {
+            actuation.sample(scene, at, work.field);
         } else if (scene.muscles) {
-            pull.none();
+            actuation.none();
         }
         Real uniform[VALUES];
-        deform(scene, body, work.values_of(scene, index, element, uniform), at, pull, block, impulse);
+        deform(scene, body, work.values_of(scene, index, element, uniform), at, actuation, block, impulse);
         sums.reserve(at.box, scene.width);
         sums.box.include(at.box);
         scatter(scene, impulse, at, sums.nodes);

@@ -3,7 +3,7 @@
 #include "transfer.hpp"
 
 // Which rule holds on each node: one byte per slot, 0 for none, else its index plus one.
-struct RuleTable {
+struct RuleCodes {
     uint32_t* code;
 
     void build(const Scene& scene, const int64_t* shift) {
@@ -84,7 +84,7 @@ struct Record {
 };
 
 // Velocities of row i from the collected mass and momentum.
-INLINE void node_velocities(const Scene& scene, const Real* gravity, const RuleTable& rules, const Box& box, int i,
+INLINE void node_velocities(const Scene& scene, const Real* gravity, const RuleCodes& rules, const Box& box, int i,
                             const Real* total, Real* velocity, Record record) {
     const Span span(scene, box, i);
     const Real gx = scene.dt * gravity[0], gy = scene.dt * gravity[1], damping = scene.damping;

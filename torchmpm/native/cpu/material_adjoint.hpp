@@ -6,13 +6,13 @@
 // Derivatives in the material values, the muscles, the hardening factor, and the direction R.
 struct MaterialBar {
     Values values;
-    Real pull_x, pull_y, hard;
+    Real act_x, act_y, hard;
     DirectionBar R;
 };
 
 // From the derivative in the Kirchhoff stress to those in the returned F (added to F_bar) and in all else.
 template <Kind kind>
-INLINE void stress_adjoint(const Values& m, Real hard, Mat2 F, Direction R, Real pull_x, Real pull_y, Sym2 bar,
+INLINE void stress_adjoint(const Values& m, Real hard, Mat2 F, Direction R, Real act_x, Real act_y, Sym2 bar,
                            Mat2& F_bar, MaterialBar& out) {
     const Mat2 D = F + Real(-1) * orthogonal(R);
     const Real mu2 = hard * m.mu2, xx = bar.xx, xy = bar.xy, yy = bar.yy;
@@ -20,18 +20,18 @@ INLINE void stress_adjoint(const Values& m, Real hard, Mat2 F, Direction R, Real
     const Parts R_bar = split(D_bar, R.proper);
     out.R = {0, -R_bar.m1, -R_bar.m2};
 
-    const Real signed_J = det(F), J = kind == Kind::soil ? std::abs(signed_J) : signed_J;
+    const Real signed_J = det(F), J = kind == Kind::snow ? std::abs(signed_J) : signed_J;
     const Real J_bar = (xx + yy) * hard * m.lam * (2 * J - 1);
-    const Real side = kind != Kind::soil ? Real(1) : signed_J > 0 ? Real(1) : signed_J < 0 ? Real(-1) : Real(0);
+    const Real side = kind != Kind::snow ? Real(1) : signed_J > 0 ? Real(1) : signed_J < 0 ? Real(-1) : Real(0);
     const Real area = side * J_bar;
 
-    const Real pull_xa = pull_x * F.a, pull_xc = pull_x * F.c, pull_yb = pull_y * F.b, pull_yd = pull_y * F.d;
-    F_bar.a += D_bar.a + mu2 * xx * D.a + area * F.d + 2 * xx * pull_xa + xy * pull_xc;
-    F_bar.b += D_bar.b + mu2 * xx * D.b - area * F.c + 2 * xx * pull_yb + xy * pull_yd;
-    F_bar.c += D_bar.c + mu2 * (xy * D.a + yy * D.c) - area * F.b + xy * pull_xa + 2 * yy * pull_xc;
-    F_bar.d += D_bar.d + mu2 * (xy * D.b + yy * D.d) + area * F.a + xy * pull_yb + 2 * yy * pull_yd;
-    out.pull_x = xx * F.a * F.a + xy * F.a * F.c + yy * F.c * F.c;
-    out.pull_y = xx * F.b * F.b + xy * F.b * F.d + yy * F.d * F.d;
+    const Real act_xa = act_x * F.a, act_xc = act_x * F.c, act_yb = act_y * F.b, act_yd = act_y * F.d;
+    F_bar.a += D_bar.a + mu2 * xx * D.a + area * F.d + 2 * xx * act_xa + xy * act_xc;
+    F_bar.b += D_bar.b + mu2 * xx * D.b - area * F.c + 2 * xx * act_yb + xy * act_yd;
+    F_bar.c += D_bar.c + mu2 * (xy * D.a + yy * D.c) - area * F.b + xy * act_xa + 2 * yy * act_xc;
+    F_bar.d += D_bar.d + mu2 * (xy * D.b + yy * D.d) + area * F.a + xy * act_yb + 2 * yy * act_yd;
+    out.act_x = xx * F.a * F.a + xy * F.a * F.c + yy * F.c * F.c;
+    out.act_y = xx * F.b * F.b + xy * F.b * F.d + yy * F.d * F.d;
 
     const Real of_mu2 = xx * (D.a * F.a + D.b * F.b) + xy * (D.a * F.c + D.b * F.d) + yy * (D.c * F.c + D.d * F.d);
     const Real of_lam = (xx + yy) * (J * (J - 1));
@@ -40,8 +40,8 @@ INLINE void stress_adjoint(const Values& m, Real hard, Mat2 F, Direction R, Real
 }
 
 // Derivative in Jp through the hardening factor; that in the exponent goes to the values.
-template <Kind kind> INLINE Real hardened_adjoint(const Values& m, Bounds bounds, Real Jp, MaterialBar& bar) {
-    if (kind != Kind::soil) return 0;
+template <Kind kind> INLINE Real hardening_adjoint(const Values& m, Bounds bounds, Real Jp, MaterialBar& bar) {
+    if (kind != Kind::snow) return 0;
     const Real power = exponential(m.hardening() * (1 - Jp));
     const bool free = (power >= bounds.hardening_low) & (power <= bounds.hardening_high);
     const Real exponent = free ? bar.hard * power : 0;
@@ -58,24 +58,24 @@ INLINE void von_mises_adjoint(const Values& m, Bounds bounds, Mat2 F, MaterialBa
     const Parts v = split(F);
     const Direction R = direction(v);
     const Real large = square(v.m1) + square(v.m2), small = square(v.n1) + square(v.n2);
-    const bool beyond = small > m.slope2 * large;
-    const Real total = beyond ? R.total : Real(1), inverse = 1 / std::sqrt(beyond ? small : Real(0.25));
-    const Real difference = beyond ? small * inverse : Real(0.5);
+    const bool outside = small > m.tanh2 * large;
+    const Real total = outside ? R.total : Real(1), inverse = 1 / std::sqrt(outside ? small : Real(0.25));
+    const Real difference = outside ? small * inverse : Real(0.5);
     const Real first = Real(0.5) * (total + difference), second = Real(0.5) * (total - difference);
     const Real major = at_least(first, bounds.stretch_floor), minor = at_least(second, bounds.stretch_floor);
-    const bool yields = beyond & (major > minor * m.ratio);
+    const bool yields = outside & (major > minor * m.exp);
     const Real mean = Real(0.5) * std::sqrt(major * minor);
-    const Real grow_total = mean * m.plus, grow_difference = mean * (m.minus * inverse);
+    const Real grow_total = mean * m.cosh2, grow_difference = mean * (m.sinh2 * inverse);
 
     const Parts v_bar = split(F_bar, v.proper);
     const Real of_total = v_bar.m1 * R.cos + v_bar.m2 * R.sin, of_difference = v_bar.n1 * v.n1 + v_bar.n2 * v.n2;
-    const Real mean_bar = of_total * m.plus + of_difference * m.minus * inverse;
+    const Real mean_bar = of_total * m.cosh2 + of_difference * m.sinh2 * inverse;
     const Real major_bar = first >= bounds.stretch_floor ? mean_bar * mean / (2 * major) : 0;
     const Real minor_bar = second >= bounds.stretch_floor ? mean_bar * mean / (2 * minor) : 0;
     const Real difference_bar = Real(0.5) * (major_bar - minor_bar) - of_difference * grow_difference * inverse;
     const Real along = difference_bar * inverse;
-    bar.values.plus = yields ? of_total * mean : 0;
-    bar.values.minus = yields ? of_difference * mean * inverse : 0;
+    bar.values.cosh2 = yields ? of_total * mean : 0;
+    bar.values.sinh2 = yields ? of_difference * mean * inverse : 0;
     bar.R.total = yields ? Real(0.5) * (major_bar + minor_bar) : 0;
     bar.R.cos += yields ? grow_total * v_bar.m1 : 0;
     bar.R.sin += yields ? grow_total * v_bar.m2 : 0;
@@ -85,10 +85,10 @@ INLINE void von_mises_adjoint(const Values& m, Bounds bounds, Mat2 F, MaterialBa
     F_bar = through + join(adjoint(R, bar.R, n1, n2));
 }
 
-// Begins with the lines of soil_return: handed over in a struct, their values keep the compiler from vectorising the return
+// Begins with the lines of snow_return: handed over in a struct, their values keep the compiler from vectorising the return
 // map, and a step of soil takes three times as long.
 // Takes the derivative in Jp along: from that of after the return map to the part of it that reaches the one before.
-INLINE void soil_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, MaterialBar& bar, Mat2& F_bar, Real& Jp_bar) {
+INLINE void snow_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, MaterialBar& bar, Mat2& F_bar, Real& Jp_bar) {
     const Real low = m.low(), high = m.high();
     const Parts v = split(F);
     const Direction R = direction(v);
@@ -99,7 +99,7 @@ INLINE void soil_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, Materi
     const bool round = square2 == 0;
     const Real root = std::sqrt(round ? Real(1) : square2), difference = round ? Real(0) : root;
     const Real first = Real(0.5) * (R.total + difference), second = Real(0.5) * (R.total - difference);
-    const Real major = clamped(first, low, high), minor = clamped(second, low, high);
+    const Real major = clamp(first, low, high), minor = clamp(second, low, high);
     const Real kept = (first >= low) & (first <= high) ? Real(1) : Real(0);
     const Real ratio = Real(0.5) * (round ? kept : (major - minor) / root), sum = Real(0.5) * (major + minor);
     const Real squeezed = first * second / (major * minor);
@@ -132,22 +132,22 @@ INLINE void soil_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, Materi
 // Adjoint of return map and stress together. `F` is the trial deformation, `S_bar` the derivative in S = factor tau, which
 // becomes `S`; F_bar and Jp_bar go from the returned to the trial ones in place.
 template <Kind kind>
-INLINE MaterialBar material_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, Real pull_x, Real pull_y,
+INLINE MaterialBar material_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, Real act_x, Real act_y,
                                     Sym2 S_bar, Mat2& F_bar, Real& Jp_bar, Sym2& S) {
     MaterialBar bar{};
     Mat2 returned = F;
     Real Jp_after = Jp;
     const Direction R = return_map<kind>(m, bounds, returned, Jp_after);
-    const Real hard = hardened<kind>(m, bounds, Jp);
-    const Sym2 tau = stress<kind>(m, hard, returned, R, pull_x, pull_y);
+    const Real hard = hardening_factor<kind>(m, bounds, Jp);
+    const Sym2 tau = stress<kind>(m, hard, returned, R, act_x, act_y);
     bar.values.factor = S_bar.xx * tau.xx + S_bar.xy * tau.xy + S_bar.yy * tau.yy;
     S = {m.factor * tau.xx, m.factor * tau.xy, m.factor * tau.yy};
     const Sym2 tau_bar{m.factor * S_bar.xx, m.factor * S_bar.xy, m.factor * S_bar.yy};
-    stress_adjoint<kind>(m, hard, returned, R, pull_x, pull_y, tau_bar, F_bar, bar);
-    const Real Jp_hard = hardened_adjoint<kind>(m, bounds, Jp, bar);
+    stress_adjoint<kind>(m, hard, returned, R, act_x, act_y, tau_bar, F_bar, bar);
+    const Real Jp_hard = hardening_adjoint<kind>(m, bounds, Jp, bar);
     if (kind == Kind::elastic) elastic_adjoint(F, bar, F_bar);
     if (kind == Kind::von_mises) von_mises_adjoint(m, bounds, F, bar, F_bar);
-    if (kind == Kind::soil) soil_adjoint(m, bounds, F, Jp, bar, F_bar, Jp_bar);
+    if (kind == Kind::snow) snow_adjoint(m, bounds, F, Jp, bar, F_bar, Jp_bar);
     Jp_bar += Jp_hard;
     return bar;
 }

@@ -2,20 +2,20 @@
 #pragma once
 #include "linalg.hpp"
 
-enum class Kind : int { elastic = 0, von_mises = 1, soil = 2 };
+enum class Kind : int { elastic = 0, von_mises = 1, snow = 2 };
 
-// One column of the table of values. `factor` is -dt V 4/h^2; `slope2` the square of difference over sum of the stretches
-// at yield, `ratio` their ratio, `plus` and `minus` sum and difference of its square root and the inverse. Soil has its
+// One column of the table of values. `factor` is -dt V 4/h^2; `tanh2` the square of difference over sum of the stretches
+// at yield, `ratio` their ratio, `cosh2` and `sinh2` sum and difference of its square root and the inverse. Soil has its
 // own meaning for three of these.
 struct Values {
-    Real mass, factor, mu2, lam, slope2, ratio, plus, minus;
+    Real mass, factor, mu2, lam, tanh2, exp, cosh2, sinh2;
 
-    INLINE Real& low() { return slope2; }
-    INLINE Real& high() { return ratio; }
-    INLINE Real& hardening() { return plus; }
-    INLINE Real low() const { return slope2; }
-    INLINE Real high() const { return ratio; }
-    INLINE Real hardening() const { return plus; }
+    INLINE Real& low() { return tanh2; }
+    INLINE Real& high() { return exp; }
+    INLINE Real& hardening() { return cosh2; }
+    INLINE Real low() const { return tanh2; }
+    INLINE Real high() const { return exp; }
+    INLINE Real hardening() const { return cosh2; }
 };
 constexpr int VALUES = 8;
 constexpr Real LARGEST_JP = Real(1e30);  // as in material.py
@@ -43,22 +43,22 @@ INLINE Direction von_mises_return(const Values& m, Bounds bounds, Mat2& F) {
     const Parts v = split(F);
     const Direction R = direction(v);
     const Real large = square(v.m1) + square(v.m2), small = square(v.n1) + square(v.n2);
-    const bool beyond = small > m.slope2 * large;
-    const Real total = beyond ? R.total : Real(1), difference = std::sqrt(beyond ? small : Real(0.25));
+    const bool outside = small > m.tanh2 * large;
+    const Real total = outside ? R.total : Real(1), difference = std::sqrt(outside ? small : Real(0.25));
     const Real major = at_least(Real(0.5) * (total + difference), bounds.stretch_floor);
     const Real minor = at_least(Real(0.5) * (total - difference), bounds.stretch_floor);
-    const bool yields = beyond & (major > minor * m.ratio);
+    const bool yields = outside & (major > minor * m.exp);
     const Real mean = Real(0.5) * std::sqrt(major * minor);
-    const Real grow_total = mean * m.plus, grow_difference = mean * (m.minus / difference);
+    const Real grow_total = mean * m.cosh2, grow_difference = mean * (m.sinh2 / difference);
     const Mat2 returned = join(
         {grow_total * R.cos, grow_total * R.sin, grow_difference * v.n1, grow_difference * v.n2, v.proper});
     F = select(yields, returned, F);
     return R;
 }
 
-INLINE Real clamped(Real s, Real low, Real high) { return s < low ? low : (s > high ? high : s); }
+INLINE Real clamp(Real s, Real low, Real high) { return s < low ? low : (s > high ? high : s); }
 
-INLINE Direction soil_return(const Values& m, Bounds bounds, Mat2& F, Real& Jp) {
+INLINE Direction snow_return(const Values& m, Bounds bounds, Mat2& F, Real& Jp) {
     const Real low = m.low(), high = m.high();
     const Parts v = split(F);
     const Direction R = direction(v);
@@ -69,7 +69,7 @@ INLINE Direction soil_return(const Values& m, Bounds bounds, Mat2& F, Real& Jp) 
     const bool round = square2 == 0;
     const Real root = std::sqrt(round ? Real(1) : square2), difference = round ? Real(0) : root;
     const Real first = Real(0.5) * (R.total + difference), second = Real(0.5) * (R.total - difference);
-    const Real major = clamped(first, low, high), minor = clamped(second, low, high);
+    const Real major = clamp(first, low, high), minor = clamp(second, low, high);
     const Real kept = (first >= low) & (first <= high) ? Real(1) : Real(0);
     const Real ratio = Real(0.5) * (round ? kept : (major - minor) / root), sum = Real(0.5) * (major + minor);
     F = join({sum * R.cos, sum * R.sin, ratio * n1, ratio * n2, v.proper});
@@ -80,23 +80,23 @@ INLINE Direction soil_return(const Values& m, Bounds bounds, Mat2& F, Real& Jp) 
 
 template <Kind kind> INLINE Direction return_map(const Values& m, Bounds bounds, Mat2& F, Real& Jp) {
     if (kind == Kind::von_mises) return von_mises_return(m, bounds, F);
-    if (kind == Kind::soil) return soil_return(m, bounds, F, Jp);
+    if (kind == Kind::snow) return snow_return(m, bounds, F, Jp);
     return elastic_return(F);
 }
 
 // Factor on the elastic constants; Jp is that of before the return map.
-template <Kind kind> INLINE Real hardened(const Values& m, Bounds bounds, Real Jp) {
-    if (kind != Kind::soil) return 1;
-    return clamped(exponential(m.hardening() * (1 - Jp)), bounds.hardening_low, bounds.hardening_high);
+template <Kind kind> INLINE Real hardening_factor(const Values& m, Bounds bounds, Real Jp) {
+    if (kind != Kind::snow) return 1;
+    return clamp(exponential(m.hardening() * (1 - Jp)), bounds.hardening_low, bounds.hardening_high);
 }
 
-// Kirchhoff stress of the fixed corotated solid plus the muscles' F diag(pull) F^T.
-template <Kind kind> INLINE Sym2 stress(const Values& m, Real hard, Mat2 F, Direction R, Real pull_x, Real pull_y) {
+// Kirchhoff stress of the fixed corotated solid cosh2 the muscles' F diag(actuation) F^T.
+template <Kind kind> INLINE Sym2 stress(const Values& m, Real hard, Mat2 F, Direction R, Real act_x, Real act_y) {
     const Mat2 D = F + Real(-1) * orthogonal(R);
-    const Real J = kind == Kind::soil ? std::abs(det(F)) : det(F);
+    const Real J = kind == Kind::snow ? std::abs(det(F)) : det(F);
     const Real pressure = hard * m.lam * (J * (J - 1)), mu2 = hard * m.mu2;
-    const Real xx = mu2 * (D.a * F.a + D.b * F.b) + pressure + pull_x * F.a * F.a + pull_y * F.b * F.b;
-    const Real xy = mu2 * (D.a * F.c + D.b * F.d) + pull_x * F.a * F.c + pull_y * F.b * F.d;
-    const Real yy = mu2 * (D.c * F.c + D.d * F.d) + pressure + pull_x * F.c * F.c + pull_y * F.d * F.d;
+    const Real xx = mu2 * (D.a * F.a + D.b * F.b) + pressure + act_x * F.a * F.a + act_y * F.b * F.b;
+    const Real xy = mu2 * (D.a * F.c + D.b * F.d) + act_x * F.a * F.c + act_y * F.b * F.d;
+    const Real yy = mu2 * (D.c * F.c + D.d * F.d) + pressure + act_x * F.c * F.c + act_y * F.d * F.d;
     return {xx, xy, yy};
 }

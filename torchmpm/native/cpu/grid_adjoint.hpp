@@ -39,7 +39,7 @@ struct NodeBars {
 
 // Row i: from the derivatives in the velocities (`total`, four numbers a node from box.j0, two in use) to those in momentum
 // and mass. Also makes the velocities anew, and adds to the derivative in the velocity that gravity gave.
-INLINE void node_adjoint(const Scene& scene, const Real* gravity, const RuleTable& rules, const Box& box, int i,
+INLINE void node_adjoint(const Scene& scene, const Real* gravity, const RuleCodes& rules, const Box& box, int i,
                          const Real* total, Record record, Real* velocity, NodeBars out, Real* gravity_bar) {
     const Span span(scene, box, i);
     const Real gx = scene.dt * gravity[0], gy = scene.dt * gravity[1], damping = scene.damping;

@@ -1,0 +1,97 @@
+"""What all materials share: their interface, and the shapes of their constants."""
+
+from __future__ import annotations
+
+from typing import Protocol, TypeAlias, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from torchmpm import checks
+from torchmpm.materials.linalg import Mat2, Sym2
+
+#: A number, or a tensor of shape (), (B,) for one value per simulation, or (B, N) for one per particle.
+Value: TypeAlias = "float | Tensor"
+
+
+@runtime_checkable
+class Material(Protocol):
+    """Interface of a constitutive law.
+
+    All methods take ``F``, the planes (B, N) of a deformation gradient, and ``Jp``, the plastic volume ratio (B, N).
+    """
+
+    def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
+        """Project the trial ``F`` onto the elastic range; returns the new planes (B, N) and ``Jp`` (B, N)."""
+
+    def stress(self, F: Mat2, Jp: Tensor) -> Sym2:
+        """Kirchhoff stress of the projected ``F``, planes (B, N), Pa; ``Jp`` is from before the projection."""
+
+    def energy(self, F: Mat2, Jp: Tensor) -> Tensor:
+        """Stored energy per unit volume at ``F`` and ``Jp``, (B, N), J/m^2 (two-dimensional)."""
+
+    def stiffness(self) -> Value:
+        """Largest ratio of stress to strain (Frobenius norms) in undeformed material, Pa."""
+
+
+def lame(young: Value, poisson: Value) -> tuple[Value, Value]:
+    """Lame parameters in plane strain.
+
+    Args:
+        young: Young's modulus, Pa; a number or a tensor of any shape, such as (B,).
+        poisson: Poisson's ratio, between -1 and 0.5; likewise a number or a tensor.
+
+    Returns:
+        (mu, lam) in Pa, numbers or tensors of the arguments' shape.
+
+    Raises:
+        ValueError: A number is out of range.
+    """
+    checks.value("young", young, least=0.0)
+    checks.value("poisson", poisson)
+    if not isinstance(poisson, Tensor) and not -1 < poisson < 0.5:
+        raise ValueError(f"poisson must be above -1 and below 0.5, got {poisson}")
+    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+
+
+def broadcast_plane(value: Value, like: Tensor, name: str = "value") -> Value:
+    """Bring a constant to a shape that broadcasts against planes (B, N).
+
+    Args:
+        value: The constant.
+        like: (B, N), gives shape, dtype and device.
+        name: Its name in error messages.
+
+    Returns:
+        The number itself, or a tensor of shape (), (B, 1), (B, N) or (1, N).
+
+    Raises:
+        ValueError: A tensor has a shape other than (), (B,), (B, N) or (1, N).
+    """
+    if not isinstance(value, Tensor):
+        return value
+    value = value.to(like)
+    batch, count = like.shape
+    if value.ndim == 1 and value.shape[0] == batch:
+        return value[:, None]
+    if value.ndim == 0 or (value.ndim == 2 and value.shape[0] in (1, batch) and value.shape[1] in (1, count)):
+        return value
+    raise ValueError(f"{name} must be a number or have shape (), ({batch},) or ({batch}, {count}), got {value.shape}")
+
+
+def detached_column(value: Value) -> Value:
+    """A constant in float64 on the CPU, without graph; (B,) becomes (B, 1), so that it broadcasts against others."""
+    if not isinstance(value, Tensor):
+        return value
+    value = value.detach().to("cpu", torch.float64)
+    return value[:, None] if value.ndim == 1 else value
+
+
+def check_not_negative(material: object, *names: str) -> None:
+    """Check constants of a material.
+
+    Raises:
+        ValueError: One of them is negative or not a number.
+    """
+    for name in names:
+        checks.value(name, getattr(material, name), least=0.0)

@@ -1,0 +1,74 @@
+"""Bodies: runs of consecutive particles of one material."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchmpm import checks
+from torchmpm.materials.base import Material, Value, broadcast_plane
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A run of consecutive particles of one material.
+
+    Attributes:
+        count: Number of particles.
+        material: Constitutive law, such as :class:`torchmpm.VonMises`.
+        mass: Mass of a particle, kg; a number or a tensor of shape (), (B,) or (B, count).
+        volume: Undeformed volume of a particle, m^2 (two-dimensional); a number, (), (B,) or (B, count).
+        muscle: Whether the actuation field acts on it.
+
+    Raises:
+        ValueError: ``count`` is below 1, or ``mass`` or ``volume`` is not positive.
+        TypeError: The material is not a :class:`torchmpm.Material`.
+    """
+
+    count: int
+    material: Material
+    mass: Value = 1.0
+    volume: Value = 1.0
+    muscle: bool = False
+
+    def __post_init__(self) -> None:
+        checks.whole("count", self.count, 1)
+        checks.instance("material", self.material, Material)
+        for name in ("mass", "volume"):
+            checks.value(name, getattr(self, name), above=0.0)
+
+    def constants(self) -> dict[str, Value]:
+        """All constants of the body and its material that may be tensors, by name, such as ``material.mu``."""
+        own = {name: getattr(self, name) for name in ("mass", "volume")}
+        return own | {f"material.{name}": value for name, value in vars(self.material).items()}
+
+
+def slices(bodies: Sequence[Body]) -> Iterator[tuple[Body, slice]]:
+    """The bodies with their ranges of particles."""
+    start = 0
+    for body in bodies:
+        yield body, slice(start, start + body.count)
+        start += body.count
+
+
+def per_particle(bodies: Sequence[Body], name: str, like: Tensor) -> Tensor:
+    """A constant of the bodies as a plane over all particles.
+
+    Args:
+        bodies: The bodies.
+        name: ``"mass"`` (kg) or ``"volume"`` (m^2).
+        like: (B, N), gives shape, dtype and device.
+
+    Returns:
+        (1, N) or (B, N).
+    """
+    like = like.detach()
+    columns = []
+    for body, part in slices(bodies):
+        value = broadcast_plane(getattr(body, name), like[:, part], name)
+        columns.append(value * torch.ones_like(like[:1, part]))
+    batch = max(len(column) for column in columns)
+    return torch.cat([column.expand(batch, -1) for column in columns], dim=1)

@@ -1,0 +1,24 @@
+"""Muscles: active stress along material directions."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from torchmpm.materials.linalg import Mat2, Sym2
+
+
+def muscle_stress(F: Mat2, actuation: tuple[Tensor, Tensor]) -> Sym2:
+    """Kirchhoff stress F diag(a) F^T (DittoGym, Huang et al., 2024, section 3). Positive actuation contracts.
+
+    Between two F the muscle directions turn and stretch with the material: they are material directions.
+
+    Args:
+        F: Deformation gradient, planes (B, N).
+        actuation: Planes (B, N) along material x and y, Pa.
+
+    Returns:
+        Planes (B, N), Pa.
+    """
+    a, b, c, d = F
+    ax, ay = actuation
+    return ax * a * a + ay * b * b, ax * a * c + ay * b * d, ax * c * c + ay * d * d

@@ -1,0 +1,133 @@
+"""Snow plasticity (Stomakhin et al., "A material point method for snow simulation", 2013)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from numbers import Real
+
+import torch
+from torch import Tensor
+
+from torchmpm import checks
+from torchmpm.materials.base import Value, broadcast_plane, check_not_negative
+from torchmpm.materials.elastic import Elastic, corotated_energy, corotated_stress
+from torchmpm.materials.linalg import Mat2, Parts, Sym2, det, direction, join, split
+
+#: Jp stays below this. A grain that is pulled apart forever has lost all stiffness long before, at Jp = 1.23; without
+#: the bound its Jp would grow until it overflows, and spoil gradients.
+LARGEST_JP = 1e30
+
+
+def snow_return(F: Mat2, low: Value, high: Value, shear_cutoff: float = 0.0) -> tuple[Mat2, Tensor]:
+    """Bring both principal stretches of F into [low, high].
+
+    Sum and difference of the new stretches rescale the two parts of F (see ``torchmpm.materials.linalg``).
+
+    Args:
+        F: Trial deformation gradient, planes (B, N).
+        low: Smallest stretch, broadcastable to (B, N).
+        high: Largest stretch.
+        shear_cutoff: An off-diagonal entry of S in F = R S below this is dropped first, as in the reference
+            implementation.
+
+    Returns:
+        The new F, and the factor by which its area |det F| was reduced, |det F| before over after, (B, N).
+    """
+    parts = split(F)
+    total, cos, sin = direction(parts)
+    n1, n2 = parts.n1, parts.n2
+    if shear_cutoff:
+        along = n1 * cos + n2 * sin
+        drop = (n2 * cos - n1 * sin).abs() < 2.0 * shear_cutoff
+        n1, n2 = torch.where(drop, along * cos, n1), torch.where(drop, along * sin, n2)
+    square = n1.square() + n2.square()
+    isotropic = square == 0  # equal stretches: any axes are principal, and no square root is taken of zero
+    difference = torch.where(isotropic, 0.0, torch.where(isotropic, 1.0, square).sqrt())
+    stretches = 0.5 * (total + difference), 0.5 * (total - difference)
+    major, minor = (_clamp(stretch, low, high) for stretch in stretches)
+    # For equal stretches the ratio multiplies zeros; its value is the limit for a small difference.
+    inside = ((stretches[0] >= low) & (stretches[0] <= high)).to(total.dtype)
+    ratio = 0.5 * torch.where(isotropic, inside, (major - minor) / torch.where(isotropic, 1.0, difference))
+    mean = 0.5 * (major + minor)
+    returned = join(Parts(mean * cos, mean * sin, ratio * n1, ratio * n2, parts.proper))
+    return returned, stretches[0] * stretches[1] / (major * minor)
+
+
+def _clamp(stretch: Tensor, low: Value, high: Value) -> Tensor:
+    """Clamp whose derivative at the bounds is that of the inside."""
+    return torch.where(stretch < low, low, torch.where(stretch > high, high, stretch))
+
+
+@dataclass(frozen=True, eq=False)
+class Snow(Elastic):
+    """Snow or loose ground: stretches leave a narrow range plastically, and compaction hardens.
+
+    The default values are those of the soil in DittoGym's DIG. The plastic volume ratio Jp collects the area that
+    stretches lost to their bounds; the elastic constants are multiplied by ``exp(hardening (1 - Jp))`` within
+    ``hardening_range``, with Jp of the substep before. A constant is a number or a tensor of shape (), (B,) or (B, N).
+
+    Attributes:
+        mu: Second Lame parameter at Jp = 1, Pa.
+        lam: First Lame parameter at Jp = 1, Pa.
+        compression: Principal stretches are kept above 1 - compression.
+        stretch: Principal stretches are kept below 1 + stretch.
+        hardening: Exponent.
+        hardening_range: Bounds of the factor on the elastic constants.
+        shear_cutoff: Shear stretch below this is dropped in every substep, so the material creeps. 1e-5 is the
+            threshold of the reference implementation's singular value decomposition, and part of DIG; 0 turns it off.
+
+    Raises:
+        ValueError: A value is negative, ``compression`` is not below 1, or ``hardening_range`` is not a range.
+    """
+
+    compression: Value = 0.025
+    stretch: Value = 0.0045
+    hardening: Value = 10.0
+    hardening_range: tuple[float, float] = (0.1, 5.0)
+    shear_cutoff: float = 1e-5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_not_negative(self, "compression", "stretch", "hardening")
+        checks.number("shear_cutoff", self.shear_cutoff, least=0.0)
+        if not isinstance(self.compression, Tensor) and not self.compression < 1:
+            raise ValueError(f"compression must be below 1, got {self.compression}")
+        given = self.hardening_range
+        numbers = isinstance(given, tuple) and len(given) == 2 and all(isinstance(bound, Real) for bound in given)
+        if not numbers or not 0 <= given[0] <= given[1]:
+            raise ValueError(f"hardening_range must be (low, high) with 0 <= low <= high, got {given!r}")
+
+    def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
+        """Bring the principal stretches of ``F`` into their range; its planes (B, N), and the new ``Jp`` (B, N).
+
+        See :func:`snow_return`.
+        """
+        low = 1.0 - broadcast_plane(self.compression, Jp, "compression")
+        high = 1.0 + broadcast_plane(self.stretch, Jp, "stretch")
+        F, reduction = snow_return(F, low, high, self.shear_cutoff)
+        return F, (Jp * reduction).clamp_max(LARGEST_JP)
+
+    def stress(self, F: Mat2, Jp: Tensor) -> Sym2:
+        """Kirchhoff stress at ``F`` and ``Jp``, planes (B, N), Pa; an inverted element rests in its mirrored shape."""
+        mu, lam = self._hardened(Jp)
+        return corotated_stress(F, mu, lam, det(F).abs())
+
+    def energy(self, F: Mat2, Jp: Tensor) -> Tensor:
+        """Stored energy per unit volume at ``F`` and ``Jp``, (B, N), J/m^2."""
+        mu, lam = self._hardened(Jp)
+        return corotated_energy(F, mu, lam, det(F).abs())
+
+    def stiffness(self) -> Value:
+        """As that of :class:`Elastic`, at Jp = 1, Pa: a number or a tensor of shape (), (B, 1) or (B, N)."""
+        low, high = self.hardening_range
+        return min(max(1.0, low), high) * super().stiffness()
+
+    def _hardened(self, Jp: Tensor) -> tuple[Value, Value]:
+        """Elastic constants at ``Jp``."""
+        low, high = self.hardening_range
+        exponent = broadcast_plane(self.hardening, Jp, "hardening") * (1.0 - Jp)
+        if high > 0:  # beyond it the exponential could overflow, and its derivative would be NaN even where clamped
+            exponent = exponent.clamp_max(math.log(high) + 0.01)
+        factor = exponent.exp().clamp(low, high)
+        return factor * broadcast_plane(self.mu, Jp, "mu"), factor * broadcast_plane(self.lam, Jp, "lam")

@@ -1,0 +1,126 @@
+"""Von Mises plasticity in principal logarithmic strains, the robot material of DittoGym (Huang et al., 2024)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchmpm import checks
+from torchmpm.materials.base import Value, broadcast_plane, check_not_negative
+from torchmpm.materials.elastic import Elastic
+from torchmpm.materials.linalg import Mat2, Parts, join, split
+
+#: Lower bound of the principal stretches in the yield test.
+STRETCH_FLOOR = 0.05
+#: Constant under the square root of the norm of the deviatoric strain.
+NORM_EPSILON = 1e-8
+#: No difference of principal logarithmic strains reaches this: a larger yield limit never acts, but would overflow.
+LARGEST_DIFFERENCE = 40.0
+
+
+class YieldSurface(NamedTuple):
+    """Functions of d, the difference of the principal logarithmic strains at yield.
+
+    Attributes:
+        tanh: tanh(d/2), difference over sum of the principal stretches.
+        exp: e^d, ratio of the principal stretches.
+        cosh2: 2 cosh(d/2), sum of the principal stretches of area one.
+        sinh2: 2 sinh(d/2), their difference.
+    """
+
+    tanh: Value
+    exp: Value
+    cosh2: Value
+    sinh2: Value
+
+
+def yield_surface(limit: Value) -> YieldSurface:
+    """Constants of the yield test and the return map.
+
+    Computed from e^d - 1, which keeps the digits that e^d would lose for small d.
+
+    Args:
+        limit: Deviatoric strain at yield, yield stress / (2 mu).
+    """
+    square = 2.0 * (limit * limit - NORM_EPSILON)
+    expm1: Value
+    root: Value
+    if isinstance(square, Tensor):
+        d = square.clamp(NORM_EPSILON, LARGEST_DIFFERENCE**2).sqrt()
+        expm1, root = d.expm1(), (0.5 * d).exp()
+    else:
+        number = math.sqrt(min(max(square, NORM_EPSILON), LARGEST_DIFFERENCE**2))
+        expm1, root = math.expm1(number), math.exp(0.5 * number)
+    return YieldSurface(expm1 / (expm1 + 2.0), expm1 + 1.0, root + 1.0 / root, expm1 / root)
+
+
+def von_mises_return(F: Mat2, limit: Value) -> Mat2:
+    """Closest point on the von Mises yield surface in principal logarithmic strains.
+
+    With e_1 >= e_2 the logarithms of the principal stretches (floored at 0.05), the deviator has the norm
+    ``sqrt((e_1 - e_2)^2 / 2 + 1e-8)``. Where it exceeds ``limit`` = yield stress / (2 mu), the difference e_1 - e_2 is
+    brought back to its value d at yield and the volume is kept: plastic flow is isochoric. Elsewhere F is returned
+    unchanged. No logarithm and no SVD are needed: with g the geometric mean of the stretches, their sum and difference
+    after the return are 2 g cosh(d/2) and 2 g sinh(d/2), which rescale the two parts of F (see
+    ``torchmpm.materials.linalg``).
+
+    The derivative jumps at the yield surface; exactly on it this returns the elastic side.
+
+    Args:
+        F: Trial deformation gradient, planes (B, N).
+        limit: Yield stress / (2 mu), a number or broadcastable to (B, N).
+
+    Returns:
+        Planes (B, N) of the returned deformation gradient.
+    """
+    tanh, exp, cosh2, sinh2 = yield_surface(limit)
+    m1, m2, n1, n2, proper = split(F)
+    sum2, difference2 = m1.square() + m2.square(), n1.square() + n2.square()
+    outside = difference2 > tanh * tanh * sum2
+    # Where nothing yields, harmless numbers go through the square roots, so that no infinite derivative meets a zero.
+    total = torch.where(outside, sum2, 1.0).sqrt()
+    difference = torch.where(outside, difference2, 0.25).sqrt()
+    major = (0.5 * (total + difference)).clamp_min(STRETCH_FLOOR)
+    minor = (0.5 * (total - difference)).clamp_min(STRETCH_FLOOR)
+    yields = outside & (major > minor * exp)
+    mean = 0.5 * (major * minor).sqrt()
+    grow_sum, grow_difference = mean * cosh2 / total, mean * sinh2 / difference
+    returned = join(Parts(m1 * grow_sum, m2 * grow_sum, n1 * grow_difference, n2 * grow_difference, proper))
+    a, b, c, d = (torch.where(yields, new, old) for new, old in zip(returned, F, strict=True))
+    return a, b, c, d
+
+
+@dataclass(frozen=True, eq=False)
+class VonMises(Elastic):
+    """Fixed corotated solid that flows plastically once its deviatoric strain reaches a limit.
+
+    The robot material of DittoGym (Huang et al., ICLR 2024): soft enough to be driven by muscles, plastic enough to
+    keep a new shape. A constant is a number or a tensor of shape (), (B,) or (B, N).
+
+    Attributes:
+        mu: Second Lame parameter, Pa.
+        lam: First Lame parameter, Pa.
+        yield_stress: von Mises yield stress, Pa; the deviatoric strain at yield is ``yield_stress / (2 mu)``.
+
+    Raises:
+        ValueError: ``mu`` is not positive, ``lam`` below -mu, or the yield stress negative.
+    """
+
+    yield_stress: Value
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.value("mu", self.mu, above=0.0)  # the strain at yield is a stress divided by it
+        check_not_negative(self, "yield_stress")
+
+    def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
+        """Isochoric return of ``F`` to the yield surface, planes (B, N), and ``Jp`` (B, N) as it is.
+
+        See :func:`von_mises_return`.
+        """
+        yield_stress, mu = broadcast_plane(self.yield_stress, Jp, "yield_stress"), broadcast_plane(self.mu, Jp, "mu")
+        return von_mises_return(F, yield_stress / (2.0 * mu)), Jp

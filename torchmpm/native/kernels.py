@@ -1,0 +1,176 @@
+"""What the solver calls: whether the kernels can run, and a step through them."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from torchmpm.boundary import VelocityRule, node_shift
+from torchmpm.grid import Grid
+from torchmpm.materials.body import Body
+from torchmpm.native import operator
+from torchmpm.native.cpu import call
+from torchmpm.native.tables import KINDS, Tables, handle_of, make_tables, make_values, upload
+from torchmpm.rollout import Segment
+from torchmpm.state import ParticleState
+
+#: A node remembers its rule in one byte.
+MAX_RULES = 254
+#: Addresses of a node's numbers, at most eight, and of particles within one simulation have 32 bits. Those of all
+#: simulations together have 64.
+MAX_RESOLUTION, MAX_PARTICLES = 16_000, 2**30
+#: The tape on CUDA takes no more than this, bytes.
+CUDA_TAPE_BYTES = 2**31
+
+
+@dataclass(frozen=True, eq=False)
+class Kernels:
+    """The kernels for one solver; builds its tables once.
+
+    Attributes:
+        grid: The window of nodes.
+        bodies: The bodies.
+        rules: The velocity rules.
+        dt: Duration of a substep, s.
+        damping: Factor on node velocities in a substep.
+    """
+
+    grid: Grid
+    bodies: tuple[Body, ...]
+    rules: tuple[VelocityRule, ...]
+    dt: float
+    damping: float
+    _kept: dict[tuple[torch.dtype, torch.device], Tensor] = field(default_factory=dict, init=False, repr=False)
+
+    def unsupported(self, device: torch.device) -> str | None:
+        """Why the kernels cannot run on a device, or ``None`` if they can."""
+        if device.type not in ("cpu", "cuda"):
+            return f"it runs on the CPU and on CUDA, the state is on {device}"
+        if device.type == "cuda":
+            missing = triton_missing(os.environ.get("CC"), os.environ.get("PATH"))
+            if missing is not None:
+                return missing
+            if torch.are_deterministic_algorithms_enabled() and not (
+                torch.is_deterministic_algorithms_warn_only_enabled()
+            ):
+                return "on CUDA it adds in no fixed order, which torch.use_deterministic_algorithms(True) forbids"
+        return self._unsupported
+
+    @functools.cached_property
+    def _unsupported(self) -> str | None:
+        if type(self.grid) is not Grid:
+            return f"it supports torchmpm.Grid itself, the grid is a {type(self.grid).__name__}"
+        for body in self.bodies:
+            if type(body.material) not in KINDS:
+                names = ", ".join(kind.__name__ for kind in KINDS)
+                return f"it supports the materials {names}, a body has {type(body.material).__name__}"
+        if len(self.rules) > MAX_RULES:
+            return f"it takes at most {MAX_RULES} velocity rules, got {len(self.rules)}"
+        if self.grid.resolution > MAX_RESOLUTION:
+            return f"it takes at most {MAX_RESOLUTION:,} nodes per axis, got {self.grid.resolution:,}"
+        particles = sum(body.count for body in self.bodies)
+        if particles > MAX_PARTICLES:
+            return f"it takes at most {MAX_PARTICLES:,} particles per simulation, got {particles:,}"
+        return None
+
+    def load(self, dtype: torch.dtype) -> None:
+        """Compile and load the C++ kernels for a dtype, unless that has been done.
+
+        Raises:
+            ValueError: There is no compiler, or it failed.
+        """
+        call.library_for(dtype)
+
+    @functools.cached_property
+    def tables(self) -> Tables:
+        """All that is constant but the values."""
+        return make_tables(self.grid, self.bodies, self.rules, self.dt, self.damping)
+
+    @functools.cached_property
+    def handle(self) -> int:
+        """Stands for the tables in operators of torch."""
+        return handle_of(self.tables)
+
+    def values(self, like: Tensor) -> Tensor:
+        """The table of values (8, 1 or B, columns); kept where all of them are numbers.
+
+        Args:
+            like: (B, N) a plane of the state.
+        """
+        key = like.dtype, like.device
+        if key in self._kept:
+            return self._kept[key]
+        values = make_values(self.bodies, self.dt, self.grid.h, like)
+        numbers = not any(isinstance(v, Tensor) for body in self.bodies for v in body.constants().values())
+        if numbers and type(values) is Tensor:  # fake tensors of a trace must not be kept
+            with torch.inference_mode(False):  # a tensor made in inference mode could not serve gradients later
+                self._kept[key] = values = values.clone()
+        return values
+
+    def step(
+        self,
+        state: ParticleState,
+        actuation: Tensor | None,
+        origin: Tensor,
+        gravity: Sequence[float] | Tensor,
+        substeps: int,
+        segment: Segment = "auto",
+    ) -> ParticleState:
+        """Advance a state whose arguments were checked; see :meth:`torchmpm.Solver.step`.
+
+        Args:
+            state: The current state, at least one simulation.
+            actuation: (B, 2, G, G) or ``None``.
+            origin: (B, 2).
+            gravity: Two numbers, or a tensor (2,) or (B, 2).
+            substeps: Number of substeps, at least 1.
+            segment: With gradients, at most so many substeps are taped at once.
+
+        Raises:
+            ValueError: There is no compiler, or it failed.
+        """
+        origin = origin.contiguous()
+        actuation = None if actuation is None else actuation.contiguous()
+        given = gravity if isinstance(gravity, Tensor) else upload(gravity, state.Jp)
+        gravity = given.to(state.Jp).expand(state.batch_size, 2).contiguous()
+        values, shift = self.values(state.Jp), node_shift(self.grid, origin)
+        planes = state.stack()
+        # With gradients a call keeps its start and needs a tape of all its substeps later, whose size must be bounded.
+        limit = self.tape_limit(planes, segment) if torch.is_grad_enabled() else substeps
+        for start in range(0, substeps, limit):
+            length = min(limit, substeps - start)
+            planes = operator.native_step(planes, actuation, origin, gravity, values, shift, self.handle, length)
+        return ParticleState.from_stack(planes)
+
+    def tape_limit(self, planes: Tensor, segment: Segment = "auto") -> int:
+        """How many substeps the adjoint can replay at once within the memory that is kept for its tape.
+
+        Args:
+            planes: (13, B, N).
+            segment: Not more than so many, if it is a number.
+        """
+        rows, batch, particles = planes.shape
+        if planes.is_cuda:
+            limit = CUDA_TAPE_BYTES // (planes.element_size() * rows * particles * batch)
+        else:
+            nodes = 3 * self.tables.width**2
+            substep = planes.element_size() * (rows * particles + nodes) * min(batch, torch.get_num_threads())
+            limit = call.KEPT_BYTES // substep
+        return max(1, min(limit, segment) if isinstance(segment, int) else limit)
+
+
+@functools.cache
+def triton_missing(compiler: str | None, path: str | None) -> str | None:
+    """Why Triton cannot work, or ``None`` if it can, with $CC and $PATH as given."""
+    if importlib.util.find_spec("triton") is None:
+        return "on CUDA it needs Triton, which is not installed (torch's builds for CUDA bring it along)"
+    if compiler is None and not any(shutil.which(name, path=path) for name in ("gcc", "clang")):
+        return "on CUDA it needs a C compiler for Triton ($CC, gcc or clang), found none"
+    return None

@@ -1,0 +1,46 @@
+"""The largest stable substep."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+
+from torchmpm.materials.base import Value, detached_column
+from torchmpm.materials.body import Body
+
+
+def stable_dt(bodies: Sequence[Body], h: float, actuation: Value = 0.0) -> float:
+    """Largest duration of a substep for which small strains of undeformed material do not grow, s.
+
+    ``h / sqrt((k + 2 |a|) V / m)``, least over all particles, with the stiffness k = 2 (mu + lam) and the actuation a.
+    It holds for any arrangement of particles: the strain rate C of a particle cannot exceed what the kinetic energy of
+    its nodes allows, ``h^2/4 |C|^2 <= sum w |v_i|^2``, and a particle alone reaches that.
+
+    Args:
+        bodies: The bodies.
+        h: Distance between nodes, m.
+        actuation: Of the muscles, Pa; a number or a tensor of shape (), (B,) or (B, count).
+
+    Raises:
+        ValueError: Shapes of a body's values do not go together, or they are not finite or have a wrong sign.
+    """
+    rates = [0.0]
+    for k, body in enumerate(bodies):
+        try:
+            stiffness: Value = body.material.stiffness()
+            if body.muscle:
+                stiffness = stiffness + 2.0 * torch.as_tensor(detached_column(actuation)).abs()
+            rate = stiffness * detached_column(body.volume) / detached_column(body.mass)
+        except RuntimeError as error:
+            raise ValueError(f"values of bodies[{k}] must have shapes that go together: {error}") from error
+        rate = torch.as_tensor(rate, dtype=torch.float64, device="cpu")
+        if not bool(((rate >= 0) & torch.isfinite(rate)).all()):
+            raise ValueError(
+                f"values of bodies[{k}] must be finite, its mass and volume positive and its stiffness not "
+                f"negative, got stiffness x volume / mass from {rate.min().item():g} to {rate.max().item():g}"
+            )
+        rates.append(float(rate.max()))
+    fastest = math.sqrt(max(rates))
+    return h / fastest if fastest > 0 else math.inf

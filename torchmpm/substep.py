@@ -1,0 +1,191 @@
+"""One substep of MLS-MPM (Hu et al., 2018) with APIC transfers (Jiang et al., 2015), on component planes.
+
+``substep`` reads like the algorithm in those papers: particles to grid, grid velocities, boundary, grid to particles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchmpm import transfer
+from torchmpm.boundary import Face, constrain
+from torchmpm.grid import PAD, Grid
+from torchmpm.materials.base import broadcast_plane
+from torchmpm.materials.body import Body, per_particle, slices
+from torchmpm.materials.linalg import Mat2, Sym2, matmul
+from torchmpm.materials.muscle import muscle_stress
+from torchmpm.spline import Stencil, stencil
+
+#: Added to the mass of a node before the division, kg, so that an empty node has velocity zero.
+MASS_EPSILON = 1e-10
+
+#: The 13 component planes of a state, (B, N) each, see :meth:`torchmpm.ParticleState.planes`.
+Planes = tuple[Tensor, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What stays the same during one step, in the form that a substep needs.
+
+    Attributes:
+        grid: The window.
+        bodies: The particles in their order.
+        dt: Duration of a substep, s.
+        origin: (B, 2) lower left corner of the window, m.
+        mass: (B or 1, N) particle masses, kg.
+        exists: (1, cells) 1 on nodes that exist, 0 on the padding.
+        gravity: (2, B or 1, cells) velocity gained by gravity in a substep, m/s.
+        damping: Factor on node velocities in a substep.
+        faces: Velocity rules as masks.
+        actuation: (2, B, cells) muscle actuation on the nodes, Pa, or ``None``.
+    """
+
+    grid: Grid
+    bodies: tuple[Body, ...]
+    dt: float
+    origin: Tensor
+    mass: Tensor
+    exists: Tensor
+    gravity: Tensor
+    damping: float
+    faces: tuple[Face, ...]
+    actuation: Tensor | None
+
+
+class Scattered(NamedTuple):
+    """Result of the first half of a substep.
+
+    Attributes:
+        nodes: The stencils.
+        inside: (B, N) which particles take part.
+        F: Planes (B, N) of the returned deformation gradient.
+        Jp: (B, N) plastic volume ratio.
+        momentum: (3, B, cells) mass (kg) and momentum (kg m/s) on the nodes.
+    """
+
+    nodes: Stencil
+    inside: Tensor
+    F: Mat2
+    Jp: Tensor
+    momentum: Tensor
+
+
+def make_scene(
+    grid: Grid,
+    bodies: tuple[Body, ...],
+    dt: float,
+    gravity: Tensor,
+    damping: float,
+    faces: tuple[Face, ...],
+    actuation: Tensor | None,
+    origin: Tensor,
+    like: Tensor,
+) -> Scene:
+    """Prepare what the substeps of one step share.
+
+    Args:
+        grid: The window.
+        bodies: The particles in their order.
+        dt: Duration of a substep, s.
+        gravity: (2,), (1, 2) or (B, 2) acceleration, m/s^2.
+        damping: Factor on node velocities in a substep.
+        faces: Velocity rules as masks.
+        actuation: (B, 2, G, G), Pa, or ``None``.
+        origin: (B, 2), m.
+        like: (B, N) a plane of the state.
+    """
+    exists = pad(like.new_ones(grid.resolution, grid.resolution), [PAD] * 4).flatten()[None]
+    if actuation is not None:
+        actuation = pad(actuation, [PAD] * 4).flatten(2).transpose(0, 1).contiguous()
+    return Scene(
+        grid=grid,
+        bodies=bodies,
+        dt=dt,
+        origin=origin,
+        mass=per_particle(bodies, "mass", like),
+        exists=exists,
+        gravity=(dt * gravity).reshape(-1, 2).T[..., None] * exists,
+        damping=damping,
+        faces=faces,
+        actuation=actuation,
+    )
+
+
+def substep(scene: Scene, planes: Planes) -> Planes:
+    """Advance all particles by one substep.
+
+    Args:
+        scene: What the substeps of a step share.
+        planes: The 13 component planes, (B, N) each.
+
+    Returns:
+        The new planes, (B, N) each.
+    """
+    scattered = particles_to_grid(scene, planes)
+    velocity = grid_velocity(scene, scattered.momentum)
+    velocity = constrain(scene.faces, velocity)
+    v, C = transfer.grid_to_particles(scene.grid, scattered.nodes, velocity)
+    x, y = planes[:2]
+    moved = (x + scene.dt * v[0], y + scene.dt * v[1], *v, *C, *scattered.F, scattered.Jp)
+    return tuple(torch.where(scattered.inside, new, old) for new, old in zip(moved, planes, strict=True))
+
+
+def particles_to_grid(scene: Scene, planes: Planes) -> Scattered:
+    """First half of a substep: deform the particles, evaluate their stress, collect mass and momentum on the nodes.
+
+    Args:
+        scene: What the substeps of a step share.
+        planes: The 13 component planes, (B, N) each.
+    """
+    x, y, vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, Jp = planes
+    dt, grid = scene.dt, scene.grid
+    inside = grid.contains(x, scene.origin[:, 0:1])
+    nodes = stencil(grid, x, y, scene.origin)
+    trial = matmul((1.0 + dt * c0, dt * c1, dt * c2, 1.0 + dt * c3), (f0, f1, f2, f3))
+    F, Jp, stress_momentum = _deform(scene, nodes, trial, Jp)
+    momentum = transfer.particles_to_grid(
+        grid, nodes, inside.to(x.dtype), (vx, vy), (c0, c1, c2, c3), scene.mass, stress_momentum
+    )
+    return Scattered(nodes, inside, F, Jp, momentum)
+
+
+def _deform(scene: Scene, nodes: Stencil, trial: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor, Sym2]:
+    """Returned deformation gradient, plastic volume ratio and ``-dt V 4/h^2 tau`` of all bodies."""
+    parts: list[tuple[Tensor, ...]] = []
+    for body, part in slices(scene.bodies):
+        a, b, c, d = trial
+        before = Jp[:, part]
+        F, after = body.material.return_map((a[:, part], b[:, part], c[:, part], d[:, part]), before)
+        tau = body.material.stress(F, before)
+        if body.muscle and scene.actuation is not None:
+            active = muscle_stress(F, transfer.interpolate(nodes.part(part), scene.actuation))
+            tau = (tau[0] + active[0], tau[1] + active[1], tau[2] + active[2])
+        factor = -scene.dt * (4.0 / scene.grid.h**2) * broadcast_plane(body.volume, before, "volume")
+        parts.append((*F, after, *(factor * component for component in tau)))
+    planes = zip(*parts, strict=True)
+    f0, f1, f2, f3, Jp, xx, xy, yy = (p[0] if len(p) == 1 else torch.cat(p, dim=1) for p in planes)
+    return (f0, f1, f2, f3), Jp, (xx, xy, yy)
+
+
+def grid_velocity(scene: Scene, momentum: Tensor) -> Tensor:
+    """Velocity of the nodes before the boundary: normalise, accelerate, damp.
+
+    Args:
+        scene: What the substeps of a step share.
+        momentum: (3, B, cells) mass and momentum.
+
+    Returns:
+        (2, B, cells) velocities, m/s; zero on padding nodes.
+    """
+    velocity = free_velocity(scene, momentum) + scene.gravity
+    return velocity * scene.damping if scene.damping != 1.0 else velocity
+
+
+def free_velocity(scene: Scene, momentum: Tensor) -> Tensor:
+    """Velocity of the nodes before gravity, (2, B, cells), m/s, from mass and momentum (3, B, cells)."""
+    return momentum[1:] * (scene.exists / (momentum[0] + MASS_EPSILON))
