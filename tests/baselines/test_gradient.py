@@ -162,6 +162,7 @@ def test_iteration_that_breaks_the_robot_is_undone(monkeypatch, loss):
     scalars = algorithm.update()
     assert not algorithm.theta.any() and scalars["train/failed"] == 1  # back to the start, the best so far
     monkeypatch.setattr(algorithm, "_episode", good)
+    algorithm.num_timesteps = 30  # the same place in the schedule
     assert algorithm.update()["train/learning_rate"] == pytest.approx(0.7 * scalars["train/learning_rate"])
     assert algorithm.theta.any() and algorithm.failed_in_a_row == 0
     monkeypatch.setattr(algorithm, "_episode", fail)

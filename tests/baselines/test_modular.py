@@ -84,7 +84,7 @@ def test_networks_have_the_documented_sizes(kind, actor, critics):
 
 
 def config(algo, **changes):
-    base = baselines.ALGORITHMS[algo].preset("run", "quick")
+    base = find(algo).preset("run", "quick")
     return replace(
         base,
         device="cpu",
@@ -192,10 +192,10 @@ def test_policy_must_be_shown_its_own_kind_of_task(tmp_path):
 
 @pytest.mark.parametrize("algo", ["gnn-16", "gnn-64", "transformer-16", "transformer-64"])
 def test_presets_learn_as_the_first_stage_does(algo):
-    assert baselines.ALGORITHMS[algo].sees == "state"
+    assert find(algo).sees == "state"
     for task in cfp.presets.TASKS:
         for name in ("quick", "paper"):
-            mine, ladder = baselines.ALGORITHMS[algo].preset(task, name), cfp.preset(task, name)
+            mine, ladder = find(algo).preset(task, name), cfp.preset(task, name)
             mine.check()
             assert (mine.learning, mine.environment, mine.steps) == (ladder.learning, ladder.environment, ladder.steps)
             assert (mine.alpha, mine.random_steps) == (ladder.alpha[0], ladder.random_steps[0])
