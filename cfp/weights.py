@@ -6,7 +6,6 @@ import dataclasses
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ import torch
 from torch import Tensor
 
 from cfp.agent.actor import Actor
-from cfp.agent.policies import ActorPolicy
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.spec import RESOLUTIONS, ActorSpec
 from cfp.config import LARGEST_SEED, Config, RunConfig
 from cfp.errors import CheckpointError, ConfigError
@@ -227,7 +226,7 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
         policy.actor.load_state_dict(tensors)
     policy.description = description
     policy.to(device)
-    policy.set_training_mode(False)
+    policy.eval()
     return policy
 
 
@@ -295,6 +294,4 @@ def is_same_task(task: str, option: str, one: str | None, other: str | None) -> 
         return True
     given: list[dict[str, Any]] = [{} if value is None else {option: value} for value in (one, other)]
     first, second = (make_spec(task, **options) for options in given)
-    if first.target is not None:  # such a task judges by a function made for the picture
-        second = replace(second, judge=first.judge)
     return first == second and np.array_equal(np.asarray(first.target), np.asarray(second.target))

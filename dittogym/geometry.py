@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from dittogym.observation.image import RASTER
 from torchmpm import VelocityRule, checks
 from torchmpm.boundary import Range
 
@@ -12,8 +13,8 @@ from torchmpm.boundary import Range
 NODES = 128
 #: Top of the floor in nodes; the surface lies between this node and the next.
 FLOOR_NODE = 19
-#: Ten fine pixels of the observation's raster, 1,024 to the metre.
-MARK = 10 / 1024
+#: Half the width of the mark of a goal: ten fine pixels of the observation's raster, m.
+MARK = 10 / RASTER
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from PIL import Image
 import dittogym
 from dittogym.bodies.positions import particle_counts
 from dittogym.geometry import Obstacle
-from dittogym.spec import Body, TaskSpec
-from torchmpm import Soil, VelocityRule
+from dittogym.spec import BodySpec, TaskSpec
+from torchmpm import Snow, VelocityRule
 
 DOCS = Path(__file__).resolve().parent
 NOTES, PAGES = DOCS / "tasks", DOCS / "generated"
@@ -155,9 +155,9 @@ def numbers(spec: TaskSpec) -> list[tuple[str, str]]:
     return rows
 
 
-def matter(body: Body) -> str:
+def matter(body: BodySpec) -> str:
     """Material of an object."""
-    return "soil" if isinstance(body.material, Soil) else "elastic"
+    return "soil" if isinstance(body.material, Snow) else "elastic"
 
 
 def centre(place: tuple[float | None, float | None]) -> str:

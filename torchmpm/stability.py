@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from torchmpm.materials.base import Value, detached_column
 from torchmpm.materials.body import Body
@@ -31,7 +32,8 @@ def stable_dt(bodies: Sequence[Body], h: float, actuation: Value = 0.0) -> float
         try:
             stiffness: Value = body.material.stiffness()
             if body.muscle:
-                stiffness = stiffness + 2.0 * torch.as_tensor(detached_column(actuation)).abs()
+                pull: Value = detached_column(actuation)
+                stiffness = stiffness + 2.0 * (pull.abs() if isinstance(pull, Tensor) else abs(pull))
             rate = stiffness * detached_column(body.volume) / detached_column(body.mass)
         except RuntimeError as error:
             raise ValueError(f"values of bodies[{k}] must have shapes that go together: {error}") from error

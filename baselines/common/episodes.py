@@ -1,4 +1,4 @@
-"""Episodes of a batch of simulations that are learned from: when they end, and on which layout the next begins."""
+"""Episodes of simulations that are learned from: when they end, and on which layout the next one starts."""
 
 from __future__ import annotations
 
@@ -13,72 +13,85 @@ from dittogym import TorchEnv
 
 
 class Episodes:
-    """What happens to the episodes of an environment.
+    """Ends the episodes of an environment and starts new ones.
 
-    Element i of the batch is first cut at ``age * (i + 1) / B`` steps, later at ``age``; so not all are young at once.
-    A simulation that is not finite ends like any other, and is counted.
+    Episodes are truncated after ``max_episode_steps``; the first one of element i of the batch already after a fraction
+    ``(i + 1) / B`` of them, so that the simulations are of different ages. A simulation that is not finite ends like
+    any other, and is counted.
 
     Args:
         env: The simulations; they are reset.
-        seed: Of the layouts.
-        age: Control steps after which an episode is cut; at most the task's own.
-        layouts: Particle layouts that are gone through.
+        seed: Seed of the layouts.
+        max_episode_steps: Control steps after which an episode is truncated; at most the task's own.
+        num_layouts: Number of particle layouts that episodes start from in turn.
 
     Attributes:
-        ended: Undiscounted returns of the episodes that ended since the list was last emptied.
+        recent_returns: Undiscounted returns of the episodes that ended since the list was last emptied.
         counts: Episodes so far, and how they ended.
     """
 
-    def __init__(self, env: TorchEnv, seed: int, age: int, layouts: int) -> None:
-        self.env, self.layouts = env, layouts
+    def __init__(self, env: TorchEnv, seed: int, max_episode_steps: int, num_layouts: int) -> None:
+        self.env, self.num_layouts = env, num_layouts
         count = env.num_envs
-        self.first_layout = seed + count
-        env.reset(seed=[self.first_layout + i % layouts for i in range(count)])
-        self.age = min(age, env.spec.horizon)
-        self.limit = torch.tensor([max(1, self.age * (i + 1) // count) for i in range(count)], device=env.device)
+        self.first_seed = seed + count
+        env.reset(seed=[self.first_seed + i % num_layouts for i in range(count)])
+        self.max_steps = min(max_episode_steps, env.spec.horizon)
+        self.limit = torch.tensor([max(1, self.max_steps * (i + 1) // count) for i in range(count)], device=env.device)
         self.returns = torch.zeros(count, device=env.device)
-        self.ended: list[float] = []
-        self.drawn = count
+        self.recent_returns: list[float] = []
+        self.num_started = count
         self.counts = {"episodes": 0, "terminated": 0, "nonfinite": 0}
 
-    def over(self, terminated: Tensor) -> Tensor:
-        """Which simulations are at the end of their episode, (B,) bool."""
+    def record(self, reward: Tensor, terminated: Tensor) -> Tensor:
+        """Add the rewards (B,) of a step to the returns; tell which episodes are over, (B,) bool.
+
+        Args:
+            reward: (B,).
+            terminated: (B,) bool, which episodes the task has ended.
+        """
+        self.returns += reward
         return terminated | (self.env.env_state.steps >= self.limit)
 
-    def restart(self, out: Tensor, terminated: Tensor, finite: Tensor) -> None:
-        """Begin new episodes where ``out`` (B,) says so, each on the next layout."""
+    def restart(self, done: Tensor, terminated: Tensor, finite: Tensor) -> None:
+        """Start new episodes, each on the next layout.
+
+        Args:
+            done: (B,) bool, where.
+            terminated: (B,) bool, which episodes the task has ended.
+            finite: (B,) bool, which simulations are finite.
+        """
         seeds = [0] * self.env.num_envs
-        for i in out.nonzero()[:, 0].tolist():
+        for i in done.nonzero()[:, 0].tolist():
             self.counts["episodes"] += 1
             self.counts["terminated"] += int(terminated[i])
             self.counts["nonfinite"] += int(~finite[i])
-            self.ended.append(float(self.returns[i]))
-            seeds[i] = self.first_layout + self.drawn % self.layouts
-            self.drawn += 1
-        if bool(out.any()):
-            self.env.reset(seed=seeds, options={"reset_mask": out})
-        self.returns = torch.where(out, 0.0, self.returns)
-        self.limit = torch.where(out, self.age, self.limit)
+            self.recent_returns.append(float(self.returns[i]))
+            seeds[i] = self.first_seed + self.num_started % self.num_layouts
+            self.num_started += 1
+        if bool(done.any()):
+            self.env.reset(seed=seeds, options={"reset_mask": done})
+        self.returns = torch.where(done, 0.0, self.returns)
+        self.limit = torch.where(done, self.max_steps, self.limit)
 
     def scalars(self) -> dict[str, float | None]:
-        """Counts, and the mean true return of the episodes that ended since the list was last emptied."""
+        """Counts, and the mean of `recent_returns`."""
         scalars: dict[str, float | None] = {f"train/{name}": float(count) for name, count in self.counts.items()}
-        return scalars | {"rollout/return": float(np.mean(self.ended)) if self.ended else None}
+        return scalars | {"rollout/return": float(np.mean(self.recent_returns)) if self.recent_returns else None}
 
     def state_dict(self) -> dict[str, Any]:
         """The episodes in progress, and what the next ones depend on."""
         return {
-            "episodes": TorchVecEnv(self.env).state_dict(),
+            "env": TorchVecEnv(self.env).state_dict(),
             "limit": self.limit.cpu(),
             "returns": self.returns.cpu(),
-            "drawn": self.drawn,
+            "num_started": self.num_started,
             "counts": dict(self.counts),
-            "ended": list(self.ended),
+            "recent_returns": list(self.recent_returns),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Undo `state_dict`."""
-        TorchVecEnv(self.env).load_state_dict(state["episodes"])
+        """Restore a state of `state_dict`."""
+        TorchVecEnv(self.env).load_state_dict(state["env"])
         self.limit, self.returns = state["limit"].to(self.limit), state["returns"].to(self.returns)
-        self.drawn, self.counts = state["drawn"], dict(state["counts"])
-        self.ended = list(state.get("ended", ()))  # checkpoints from before have none
+        self.num_started, self.counts = state["num_started"], dict(state["counts"])
+        self.recent_returns = list(state["recent_returns"])

@@ -1,4 +1,4 @@
-"""Dataset aggregation (DAgger; Ross et al., AISTATS 2011): the student moves, the teacher says what it should do."""
+"""Dataset aggregation (DAgger; Ross et al., AISTATS 2011): the student acts, the teacher labels the visited states."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchmpm import tree
 
 
 class Labels(NamedTuple):
-    """Some states and what to do there.
+    """Observations and the teacher's actions.
 
     Attributes:
         observations: (n, 3, 64, 64) uint8.
@@ -34,81 +34,81 @@ class Dataset:
     """The labels of all rounds; the oldest rounds are dropped when there are too many.
 
     Args:
-        capacity: Labels that are kept at most; an image is 12 KiB, an action 8 R R bytes.
+        capacity: Largest number of labels; an image takes 12 KiB, an action 8 R R bytes.
     """
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
         self.rounds: list[Labels] = []
-        self._packed: list[bytes | None] = []
+        self._compressed: list[bytes | None] = []
 
     def __len__(self) -> int:
         """Number of labels."""
         return sum(len(labels.observations) for labels in self.rounds)
 
     def add(self, labels: Labels) -> None:
-        """Take a round in; the newest is kept whole even if it alone is too large."""
+        """Add a round; the newest is kept whole even if it alone exceeds the capacity."""
         self.rounds.append(labels)
-        self._packed.append(None)
+        self._compressed.append(None)
         while len(self.rounds) > 1 and len(self) > self.capacity:
-            del self.rounds[0], self._packed[0]
+            del self.rounds[0], self._compressed[0]
 
     def sample(self, count: int) -> Labels:
-        """Draw labels uniformly, with repetition, from torch's generator."""
+        """Draw labels uniformly with replacement, from torch's generator."""
         sizes = torch.tensor([len(labels.observations) for labels in self.rounds])
         ends = sizes.cumsum(0)
         picks = torch.randint(int(ends[-1]), (count,))
-        places = torch.searchsorted(ends, picks, right=True)
-        rows = (picks - (ends - sizes)[places]).tolist()
-        chosen = [(self.rounds[place], row) for place, row in zip(places.tolist(), rows, strict=True)]
+        rounds = torch.searchsorted(ends, picks, right=True)
+        rows = (picks - (ends - sizes)[rounds]).tolist()
+        chosen = [(self.rounds[index], row) for index, row in zip(rounds.tolist(), rows, strict=True)]
         return Labels(*(torch.stack([labels[part][row] for labels, row in chosen]) for part in (0, 1)))
 
     def state_dict(self) -> dict[str, Any]:
-        """All labels; images shrink thirtyfold, and each round is packed once."""
+        """All labels. Images are compressed, thirtyfold, and each round only once."""
         for index, labels in enumerate(self.rounds):
-            if self._packed[index] is None:
-                self._packed[index] = zlib.compress(labels.observations.numpy().tobytes(), 1)
-        packed = [torch.frombuffer(bytearray(images or b""), dtype=torch.uint8) for images in self._packed]
-        return {"observations": packed, "actions": [labels.actions for labels in self.rounds]}
+            if self._compressed[index] is None:
+                self._compressed[index] = zlib.compress(labels.observations.numpy().tobytes(), 1)
+        images = [torch.frombuffer(bytearray(content or b""), dtype=torch.uint8) for content in self._compressed]
+        return {"observations": images, "actions": [labels.actions for labels in self.rounds]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Undo `state_dict`."""
-        self._packed = [images.numpy().tobytes() for images in state["observations"]]
+        """Restore a state of `state_dict`."""
+        self._compressed = [images.numpy().tobytes() for images in state["observations"]]
         self.rounds = []
-        for images, actions in zip(self._packed, state["actions"], strict=True):
-            assert images is not None
-            pixels = np.frombuffer(bytearray(zlib.decompress(images)), np.uint8)
+        for content, actions in zip(self._compressed, state["actions"], strict=True):
+            assert content is not None
+            pixels = np.frombuffer(bytearray(zlib.decompress(content)), np.uint8)
             self.rounds.append(Labels(torch.from_numpy(pixels.reshape(-1, *TorchEnv.observation_shape)), actions))
 
 
-def lose(values: Tensor, share: float, grid: int | None = None) -> Tensor:
-    """Set a share of the entries to 0 in half of the elements, drawn from torch's generator.
+def drop_entries(values: Tensor, probability: float, grid: int | None = None) -> Tensor:
+    """Set entries to 0 in half of the elements, drawn from torch's generator.
 
     Args:
         values: (B, ..., A, A).
-        share: Of the entries.
-        grid: Rows and columns on which they are drawn, see `cfp.envs.disturbances.lose`; A if None.
+        probability: Of an entry, in these elements.
+        grid: Rows and columns on which entries are drawn, see `cfp.envs.disturbances.lose`; A if None.
     """
-    if not share:
+    if not probability:
         return values
-    lost = torch.rand(values.shape if grid is None else (*values.shape[:-2], grid, grid)) < share
-    lost &= torch.rand(len(values), *[1] * (values.ndim - 1)) < 0.5
-    return disturbances.lose(values, lost.to(values.device))
+    mask = torch.rand(values.shape if grid is None else (*values.shape[:-2], grid, grid)) < probability
+    mask &= torch.rand(len(values), *[1] * (values.ndim - 1)) < 0.5
+    return disturbances.lose(values, mask.to(values.device))
 
 
 class Collector:
-    """Lets a mixture of student and teacher move, and asks the teacher about every state.
+    """Lets a mixture of student and teacher act, and labels the states by the teacher.
 
-    Who moves a robot is drawn anew every ``leg`` steps. A label counts where the teacher looked at that very state, or
-    its answer is part of a plan which the robot has followed from its beginning.
+    Who controls a robot is drawn anew every ``switch_every`` steps. A label is kept where the teacher's action was
+    computed from that very state, or is part of a plan which the robot has followed from its beginning.
 
     Args:
-        env: The simulations, with actions as large as the patch, so that those of any grid can be carried out.
-        teacher: Who is asked.
-        episodes: Of the simulations.
-        leg: Control steps.
-        faults: Share of the entries that the student loses, see `lose`, while it looks and moves.
-        grid: Rows and columns of the grid on which it decides, where it loses actions; if None, of what it hands over.
+        env: The simulations, with the patch as action grid, so that actions of any grid can be carried out.
+        teacher: The teacher.
+        episodes: Episodes of the simulations.
+        switch_every: Control steps between draws of who controls a robot.
+        dropout: Probability with which entries of the student's observations and actions are lost, see `drop_entries`.
+        grid: The student's action grid, on which it loses entries of actions; if None, that of the actions it returns.
     """
 
     def __init__(
@@ -116,65 +116,72 @@ class Collector:
         env: TorchEnv,
         teacher: Teacher,
         episodes: Episodes,
-        leg: int,
-        faults: float = 0.0,
+        switch_every: int,
+        dropout: float = 0.0,
         grid: int | None = None,
     ) -> None:
-        self.env, self.teacher, self.episodes, self.leg = env, teacher, episodes, leg
-        self.faults, self.grid = faults, grid
-        self.position = leg
-        self.led = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
-        self.lost = self.led.clone()
+        self.env, self.teacher, self.episodes, self.switch_every = env, teacher, episodes, switch_every
+        self.dropout, self.grid = dropout, grid
+        self.steps_since_switch = switch_every
+        self.teacher_acts = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
+        self.left_plan = self.teacher_acts.clone()  # the robot is no longer where the teacher's plan takes it
 
     @torch.no_grad()
-    def collect(self, steps: int, share: float, student: Callable[[Tensor], Tensor]) -> Labels:
-        """Move all robots for some control steps.
+    def collect(self, steps: int, beta: float, student: Callable[[Tensor], Tensor]) -> Labels:
+        """Act for some control steps and return the labels.
 
         Args:
             steps: How many.
-            share: Of the legs that the teacher leads; draws come from torch's generator.
-            student: From images (B, 3, 64, 64) to actions (B, 2, R, R).
+            beta: Probability that the teacher controls a robot; drawn from torch's generator.
+            student: Actions (B, 2, R, R) from images (B, 3, 64, 64).
         """
         env, images, actions = self.env, [], []
-        self.episodes.ended = []
-        seen = dynamics.observe(env.model, env.env_state)
+        self.episodes.recent_returns = []
+        observation = dynamics.observe(env.model, env.env_state)
         for _ in range(steps):
-            told = self.teacher.act(env, seen)
+            teacher_action = self.teacher.act(env, observation)
             if self.teacher.fresh:
-                self.lost = torch.zeros_like(self.lost)
-                if self.position >= self.leg:
-                    self.led, self.position = torch.rand(env.num_envs).to(env.device) < share, 0
-            self.position += 1
-            follows = self.led & ~self.lost
-            counts = ~self.lost if self.teacher.fresh else follows
-            images.append(seen[counts].cpu())
-            actions.append(told[counts].cpu())
-            own = self._enlarged(lose(student(lose(seen, self.faults)), self.faults, self.grid))
-            seen = self._step(tree.where(follows, self._enlarged(told), own))
+                self.left_plan = torch.zeros_like(self.left_plan)
+                if self.steps_since_switch >= self.switch_every:
+                    draws = torch.rand(env.num_envs).to(env.device)
+                    self.teacher_acts, self.steps_since_switch = draws < beta, 0
+            self.steps_since_switch += 1
+            follows = self.teacher_acts & ~self.left_plan
+            valid = ~self.left_plan if self.teacher.fresh else follows
+            images.append(observation[valid].cpu())
+            actions.append(teacher_action[valid].cpu())
+            student_action = student(drop_entries(observation, self.dropout))
+            student_action = self._enlarge(drop_entries(student_action, self.dropout, self.grid))
+            observation = self._step(tree.where(follows, self._enlarge(teacher_action), student_action))
         return Labels(torch.cat(images), torch.cat(actions))
 
-    def _enlarged(self, action: Tensor) -> Tensor:
+    def _enlarge(self, action: Tensor) -> Tensor:
         return project(action, self.env.action_resolution, self.env.spec.patch)
 
     def _step(self, action: Tensor) -> Tensor:
-        """Carry out an action, begin new episodes where they are over, return the images."""
-        seen, reward, terminated, _, info = self.env.step(action)
-        self.episodes.returns += reward
-        out = self.episodes.over(terminated | ~info["finite"])
-        if bool(out.any()):
-            self.episodes.restart(out, terminated, info["finite"])
-            self.lost = self.lost | out
-            seen = dynamics.observe(self.env.model, self.env.env_state)
-        return seen
+        """Carry out an action, start new episodes where they are over, return the next observation."""
+        observation, reward, terminated, _, info = self.env.step(action)
+        done = self.episodes.record(reward, terminated | ~info["finite"])
+        if bool(done.any()):
+            self.episodes.restart(done, terminated, info["finite"])
+            self.left_plan = self.left_plan | done
+            observation = dynamics.observe(self.env.model, self.env.env_state)
+        return observation
 
     def state_dict(self) -> dict[str, Any]:
-        """What the next round depends on beside the student."""
-        own = {"position": self.position, "led": self.led.cpu(), "lost": self.lost.cpu()}
-        return {"episodes": self.episodes.state_dict(), "teacher": self.teacher.state_dict(), **own}
+        """Everything besides the student that the next round depends on."""
+        return {
+            "episodes": self.episodes.state_dict(),
+            "teacher": self.teacher.state_dict(),
+            "steps_since_switch": self.steps_since_switch,
+            "teacher_acts": self.teacher_acts.cpu(),
+            "left_plan": self.left_plan.cpu(),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Undo `state_dict`."""
+        """Restore a state of `state_dict`."""
         self.episodes.load_state_dict(state["episodes"])
         self.teacher.load_state_dict(state["teacher"])
-        self.position = state["position"]
-        self.led, self.lost = state["led"].to(self.led), state["lost"].to(self.lost)
+        self.steps_since_switch = state["steps_since_switch"]
+        self.teacher_acts = state["teacher_acts"].to(self.teacher_acts)
+        self.left_plan = state["left_plan"].to(self.left_plan)

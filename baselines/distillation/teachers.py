@@ -18,7 +18,7 @@ from cfp.policy import Policy, SeesState
 from cfp.sections import EnvironmentConfig
 from cfp.weights import check_trained_for, read_policy
 from dittogym import TorchEnv, make_spec
-from dittogym.action import Layout, bicubic_matrix, from_grid_layout, to_grid_layout
+from dittogym.action import ActionIndexing, bicubic_matrix, from_grid_indexing, to_grid_indexing
 
 
 class Teacher(ABC):
@@ -52,11 +52,11 @@ class PolicyTeacher(Teacher):
 
     Args:
         policy: Of any kind.
-        theirs: Layout of its actions, see `dittogym.TorchEnv`.
+        theirs: ActionIndexing of its actions, see `dittogym.TorchEnv`.
         layout: The one that is wanted.
     """
 
-    def __init__(self, policy: Policy, theirs: Layout, layout: Layout) -> None:
+    def __init__(self, policy: Policy, theirs: ActionIndexing, layout: ActionIndexing) -> None:
         self.policy, self.theirs, self.layout = policy, theirs, layout
         self.resolution = policy.resolution
         self._memory: tuple[np.ndarray, ...] | None = None
@@ -69,7 +69,7 @@ class PolicyTeacher(Teacher):
         memory = (steps,) if isinstance(policy, OpenLoop) else self._memory
         array, self._memory = policy.predict(seen.cpu().numpy(), memory, steps == 0, deterministic=True)
         action = torch.as_tensor(array, device=env.device)
-        return from_grid_layout(to_grid_layout(action, self.theirs), self.layout)
+        return from_grid_indexing(to_grid_indexing(action, self.theirs), self.layout)
 
     def state_dict(self) -> dict[str, Any]:
         """What the policy remembers."""

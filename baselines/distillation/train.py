@@ -18,7 +18,7 @@ import cfp
 from baselines.common.episodes import Episodes
 from baselines.common.grid import grid_size
 from baselines.distillation.config import DistillConfig
-from baselines.distillation.dagger import Collector, Dataset, Labels, lose
+from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entries
 from baselines.distillation.teacher_training import (
     TRAINED,
     copy_teacher,
@@ -30,7 +30,7 @@ from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teach
 from baselines.planning.gradient import GradientPlannerConfig
 from baselines.shac.networks import fix_std
 from cfp.agent.actor import build_actor
-from cfp.agent.policies import ActorPolicy
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device, make_torch_env
 from cfp.errors import NonFiniteError
@@ -245,7 +245,7 @@ class Distill(Algorithm):
 
     def _improve(self) -> float:
         labels = self.dataset.sample(self.config.batch_size)
-        loss = self._loss(lose(labels.observations, self.config.dropout), labels.actions)
+        loss = self._loss(drop_entries(labels.observations, self.config.dropout), labels.actions)
         if not math.isfinite(value := float(loss.detach())):
             raise NonFiniteError(
                 f"the loss became {value} after {self.num_timesteps} environment steps of the stage; "

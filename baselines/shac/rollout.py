@@ -1,137 +1,119 @@
-"""Windows of differentiable simulation, with episodes that begin anew on other particle layouts."""
+"""Windows of differentiable simulation, within which episodes end and start anew."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from baselines.common.episodes import Episodes
-from baselines.shac.reward import Neighbours, training_reward
+from baselines.shac.reward import Neighbours, RewardConfig, training_reward
 from cfp.errors import NonFiniteError
-from dittogym import TorchEnv
 from torchmpm import tree
 
-if TYPE_CHECKING:
-    from baselines.shac.train import ShacConfig
 
-
-@dataclass(frozen=True)
-class Window:
-    """What is learned from, T control steps of B simulations.
+class Window(NamedTuple):
+    """T control steps of B simulations, with their autograd graph.
 
     Attributes:
-        loss: Negative discounted rewards and final values of the window, mean over simulations and steps; with graph.
-        true_reward: Mean over steps and simulations.
-        seen: (T, B, ...) what the networks were given.
+        observations: (T, B, ...) inputs of the networks, detached.
         rewards: (T, B) training rewards.
-        targets: (T, B) TD(lambda) targets of the values of what was seen.
-        values: (T, B) the target critic's values after each step.
+        next_values: (T, B) values of the states after each step; 0 where the task has ended the episode.
+        done: (T, B) bool, whether the episode was over after the step.
+        true_reward: Mean of the task's own rewards.
     """
 
-    loss: Tensor
-    true_reward: float
-    seen: Tensor
+    observations: Tensor
     rewards: Tensor
-    targets: Tensor
-    values: Tensor
+    next_values: Tensor
+    done: Tensor
+    true_reward: float
 
 
 class Rollout:
-    """The simulations that are learned from, and what happens to their episodes.
+    """Collects windows from simulations that an actor drives.
 
-    Gradients that are not finite in one action of one simulation are left out and counted; the others stay.
+    Gradients with respect to the action of one simulation in one step that are not finite are left out and counted.
 
     Args:
-        config: The run's options.
-        env: The simulations; they are reset.
-        look: What the networks are given for their present state.
+        episodes: Episodes of the simulations.
+        observe: Returns the inputs of the networks for the present states.
+        reward: Options of the training reward.
+        steps: Control steps T of a window.
+        noise: Standard deviation of the actions before tanh.
+        seed: Seed of the noise.
     """
 
-    def __init__(self, config: ShacConfig, env: TorchEnv, look: Callable[[], Tensor]) -> None:
-        self.config, self.env, self.look = config, env, look
-        self.episodes = Episodes(env, config.seed, config.max_episode_steps, config.num_layouts)
-        self.generator = torch.Generator().manual_seed(config.seed)
+    def __init__(
+        self,
+        episodes: Episodes,
+        observe: Callable[[], Tensor],
+        reward: RewardConfig,
+        steps: int,
+        noise: float,
+        seed: int,
+    ) -> None:
+        self.env, self.episodes, self.observe, self.reward = episodes.env, episodes, observe, reward
+        self.steps, self.noise = steps, noise
+        self.generator = torch.Generator().manual_seed(seed)
         self.episodes.counts["dropped"] = 0
 
-    def play(self, actor: Callable[[Tensor], Tensor], value: Callable[[Tensor], Tensor]) -> Window:
-        """Make a window.
+    def collect(self, actor: Callable[[Tensor], Tensor], value: Callable[[Tensor], Tensor]) -> Window:
+        """Collect the next window.
 
         Args:
-            actor: From what is seen to the mean of actions before tanh, (B, 2, R, R).
-            value: From what is seen to the target critic's values (B,).
+            actor: Mean action before tanh, (B, 2, R, R), from an observation.
+            value: Values (B,) of an observation.
 
         Raises:
             NonFiniteError: The actor's actions are not finite.
         """
-        env, gamma = self.env, self.config.gamma
-        total = torch.zeros(env.num_envs, device=env.device)
-        discount = torch.ones_like(total)
-        seen, rewards, values, ends, truth = [], [], [], [], 0.0
-        now, pairs = self.look(), Neighbours.find(self._places())
-        for step in range(self.config.window):
-            seen.append(now.detach())
-            before = env.env_state.centre
-            _, smooth, terminated, _, info = env.step(self._act(actor(now)), soft=True)
-            reward = training_reward(self.config.reward, env, before, smooth, info, pairs).float()
-            truth += float(info["true_reward"].detach().mean())
-            self.episodes.returns += info["true_reward"].detach()
-            after = self.look()
-            out = self.episodes.over(terminated)
-            following = torch.where(terminated, 0.0, value(after))
-            total = total + discount * reward
-            last = out | (step + 1 == self.config.window)
-            total = total + torch.where(last, gamma * discount * following, 0.0)
-            discount = torch.where(out, 1.0, gamma * discount)
-            rewards.append(reward.detach())
-            values.append(following.detach())
-            ends.append(out)
-            if bool(out.any()):
-                self.episodes.restart(out, terminated, info["finite"])
-                pairs = tree.where(out, Neighbours.find(self._places()), pairs)
-                after = tree.where(out, self.look(), after)
-            now = after
-        targets = self._targets(rewards, values, ends)
-        loss = -total.mean() / self.config.window
-        parts = map(torch.stack, (seen, rewards, targets, values))
-        return Window(loss, truth / self.config.window, *parts)
+        env, true_reward = self.env, 0.0
+        steps: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+        observation, neighbours = self.observe(), Neighbours.find(self._robot_positions())
+        for _ in range(self.steps):
+            centre = env.env_state.centre
+            _, smooth_reward, terminated, _, info = env.step(self._act(actor(observation)), soft=True)
+            reward = training_reward(self.reward, env, centre, smooth_reward, info, neighbours).float()
+            next_observation = self.observe()
+            next_value = torch.where(terminated, 0.0, value(next_observation))
+            true_reward += float(info["true_reward"].detach().mean())
+            is_over = self.episodes.record(info["true_reward"].detach(), terminated)
+            steps.append((observation.detach(), reward, next_value, is_over))
+            if bool(is_over.any()):
+                self.episodes.restart(is_over, terminated, info["finite"])
+                neighbours = tree.where(is_over, Neighbours.find(self._robot_positions()), neighbours)
+                next_observation = tree.where(is_over, self.observe(), next_observation)
+            observation = next_observation
+        observations, rewards, next_values, done = (torch.stack(values) for values in zip(*steps, strict=True))
+        return Window(observations, rewards, next_values, done, true_reward / self.steps)
 
-    def _places(self) -> Tensor:
+    def _robot_positions(self) -> Tensor:
         """The robots' particles (B, N, 2), m."""
-        return self.env.state.x[:, : self.env.model.robot].detach()
+        return self.env.state.x[:, : self.env.model.num_robot_particles].detach()
 
     def _act(self, mean: Tensor) -> Tensor:
-        """Actions with noise; a gradient that is not finite ends here, for the whole simulation."""
+        """Actions with noise, which stop gradients that are not finite."""
         noise = torch.randn(mean.shape, generator=self.generator).to(mean)
-        action = (mean + self.config.noise * noise).tanh()
+        action = (mean + self.noise * noise).tanh()
         if not bool(action.isfinite().all()):
             raise NonFiniteError("the actor's actions became NaN or infinite; the last checkpoint is untouched")
         if action.requires_grad:
-            action.register_hook(self._drop)
+            action.register_hook(self._drop_nonfinite)
         return action
 
-    def _drop(self, gradient: Tensor) -> Tensor:
+    def _drop_nonfinite(self, gradient: Tensor) -> Tensor:
         finite = gradient.isfinite().flatten(1).all(1)
         self.episodes.counts["dropped"] += int((~finite).sum())
         return torch.where(finite[:, None, None, None], gradient, 0.0)
 
-    def _targets(self, rewards: list[Tensor], values: list[Tensor], ends: list[Tensor]) -> list[Tensor]:
-        """TD(lambda) targets (B,) of every step, from the values after it; values of terminated states are zero."""
-        mix, targets, later = self.config.td_lambda, [], values[-1]
-        for reward, value, end in zip(reversed(rewards), reversed(values), reversed(ends), strict=True):
-            later = torch.where(end, value, (1.0 - mix) * value + mix * later)
-            later = reward + self.config.gamma * later
-            targets.append(later)
-        return targets[::-1]
-
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the next window depends on besides the networks."""
-        return self.episodes.state_dict() | {"generator": self.generator.get_state()}
+        """Everything besides the networks that the next window depends on."""
+        return {"episodes": self.episodes.state_dict(), "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Undo `state_dict`."""
-        self.episodes.load_state_dict(state)
+        """Restore a state of `state_dict`."""
+        self.episodes.load_state_dict(state["episodes"])
         self.generator.set_state(state["generator"])

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor, nn
 
 import cfp
+from baselines.common.episodes import Episodes
 from baselines.common.grid import GridConfig
 from baselines.shac.features import StateFeatures
 from baselines.shac.networks import ImageActor, StateActor, StatePolicy, fix_std, image_critic, state_critic
 from baselines.shac.reward import RewardConfig
 from baselines.shac.rollout import Rollout, Window
-from cfp.agent.policies import ActorPolicy
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.config import RunConfig, check_training_layouts
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
@@ -151,7 +152,8 @@ class Shac(Algorithm):
         self.actor_adam = torch.optim.Adam(learning, config.learning_rate, BETAS)
         self.critic_adam = torch.optim.Adam(self.critic.parameters(), config.learning_rate, BETAS)
         self.skipped, self.skipped_in_a_row = 0, 0
-        self.rollout = Rollout(config, self.env, self.look)
+        episodes = Episodes(self.env, config.seed, config.max_episode_steps, config.num_layouts)
+        self.rollout = Rollout(episodes, self.observe, config.reward, config.window, config.noise, config.seed)
 
     def _make_networks(self) -> None:
         size, device = self.features.size(len(self.env.spec.bodies) - 1), self.env.device
@@ -199,7 +201,7 @@ class Shac(Algorithm):
             raise ConfigError(f"start_from: got a policy of levels {policy.spec.resolutions}, allowed {wanted}")
         return policy
 
-    def look(self) -> Tensor:
+    def observe(self) -> Tensor:
         """What the networks are given for the present state, (B, ...)."""
         if self.config.sees == "state":
             return self.features(self.env).float()
@@ -229,7 +231,7 @@ class Shac(Algorithm):
 
     def row(self) -> Scalars:
         """Scalars of the last update, and of the episodes that have ended since the last row."""
-        self.rollout.episodes.ended = []
+        self.rollout.episodes.recent_returns = []
         return self.scalars
 
     def update(self) -> Scalars:
@@ -241,7 +243,7 @@ class Shac(Algorithm):
         rate = self.config.learning_rate * (1.0 - (1.0 - FINAL_RATE) * min(self.num_timesteps / self.config.steps, 1.0))
         for adam in (self.actor_adam, self.critic_adam):
             adam.param_groups[0]["lr"] = rate
-        window = self.rollout.play(self.actor, lambda seen: self.value(self.target, seen))
+        window = self.rollout.collect(self.actor, lambda seen: self.value(self.target, seen))
         norm = self._improve_actor(window)
         error = self._improve_critic(window)
         with torch.no_grad():
@@ -249,9 +251,9 @@ class Shac(Algorithm):
                 slow.lerp_(fast, self.config.tau)
         self.num_timesteps += self.config.window * self.env.num_envs
         return self.rollout.episodes.scalars() | {
-            "train/reward": float(window.rewards.mean()) / self.config.reward.scale,
+            "train/reward": float(window.rewards.detach().mean()) / self.config.reward.scale,
             "train/true_reward": window.true_reward,
-            "train/value": float(window.values.mean()),
+            "train/value": float(window.next_values.detach().mean()),
             "train/critic_loss": error,
             "train/gradient_norm": norm,
             "train/learning_rate": rate,
@@ -261,7 +263,7 @@ class Shac(Algorithm):
     def _improve_actor(self, window: Window) -> float | None:
         """One step of Adam; returns the gradient's norm, None if it was not finite and the step not made."""
         self.actor_adam.zero_grad()
-        window.loss.backward()
+        actor_loss(window, self.config.gamma).backward()
         self.env.detach()
         parameters = self.actor_adam.param_groups[0]["params"]
         norm = float(nn.utils.clip_grad_norm_(parameters, self.config.max_grad_norm))
@@ -279,7 +281,8 @@ class Shac(Algorithm):
         return None
 
     def _improve_critic(self, window: Window) -> float:
-        seen, targets, loss = window.seen.flatten(0, 1), window.targets.flatten(), torch.zeros(())
+        targets = td_lambda_targets(window, self.config.gamma, self.config.td_lambda).flatten()
+        seen, loss = window.observations.flatten(0, 1), torch.zeros(())
         for _ in range(self.config.critic_updates):
             self.critic_adam.zero_grad()
             loss = (self.value(self.critic, seen) - targets).square().mean()
@@ -322,3 +325,40 @@ class Shac(Algorithm):
         for name in ("actor", "critic", "target", "actor_adam", "critic_adam", "rollout"):
             getattr(self, name).load_state_dict(state[name])
         self.skipped, self.skipped_in_a_row = state["skipped"]
+
+
+def actor_loss(window: Window, gamma: float) -> Tensor:
+    """Negative discounted rewards of a window and final values of its episodes, mean over simulations and steps.
+
+    The sum of ``gamma^t r_t`` over the steps of an episode within the window, plus ``gamma^h V(s_h)`` after the last of
+    them (Xu et al., ICLR 2022, equation 5).
+
+    Args:
+        window: With its autograd graph.
+        gamma: Discount factor.
+    """
+    steps = len(window.rewards)
+    total, discount = torch.zeros_like(window.rewards[0]), torch.ones_like(window.rewards[0])
+    for step, (reward, value, done) in enumerate(zip(window.rewards, window.next_values, window.done, strict=True)):
+        total = total + discount * reward
+        total = total + torch.where(done | (step + 1 == steps), gamma * discount * value, 0.0)
+        discount = torch.where(done, 1.0, gamma * discount)
+    return -total.mean() / steps
+
+
+@torch.no_grad()
+def td_lambda_targets(window: Window, gamma: float, td_lambda: float) -> Tensor:
+    """TD(lambda) targets (T, B) of the values of a window's observations.
+
+    Args:
+        window: Rewards, values and ends of episodes.
+        gamma: Discount factor.
+        td_lambda: Weight of the following target against the value after a single step.
+    """
+    targets = torch.empty_like(window.rewards)
+    target = window.next_values[-1]
+    for step in reversed(range(len(targets))):
+        value = window.next_values[step]
+        target = torch.where(window.done[step], value, (1.0 - td_lambda) * value + td_lambda * target)
+        target = targets[step] = window.rewards[step] + gamma * target
+    return targets

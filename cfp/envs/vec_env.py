@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import gymnasium
 import numpy as np
@@ -14,8 +14,9 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 from torch import Tensor
 
-from cfp.agent.policies import action_space, observation_space
+import dittogym.env
 from cfp.errors import NonFiniteError
+from dittogym import TorchEnv
 
 
 class BatchedEnv(Protocol):
@@ -54,7 +55,7 @@ class TorchVecEnv(VecEnv):
         """Take over an environment."""
         self.torch_env = env
         self.render_mode = "rgb_array"
-        own = (observation_space(), action_space(env.action_resolution)) if spaces is None else spaces
+        own = dittogym.env.spaces(cast(TorchEnv, env)) if spaces is None else spaces
         super().__init__(env.num_envs, *own)
         self._actions: Tensor | None = None
 

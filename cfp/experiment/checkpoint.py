@@ -10,10 +10,10 @@ from typing import Any
 
 import torch
 
-from cfp.agent.replay import ReplayArchive
 from cfp.config import RunConfig, to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.algorithm import Algorithm, Position
+from cfp.experiment.replay_archive import ReplayArchive
 from cfp.files import parse_json, write_atomically
 from cfp.from_dict import flatten
 

@@ -13,7 +13,7 @@ import cfp.train
 from baselines import Distill, GradientPlannerConfig, OpenLoop, Shac, distill
 from baselines.common.episodes import Episodes
 from baselines.compare.worker import _train
-from baselines.distillation.dagger import Collector, Dataset, Labels, lose
+from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entries
 from baselines.distillation.teachers import PolicyTeacher, Teacher, project, read_teacher
 from baselines.distillation.train import METRICS
 from baselines.modular import env as modular_env
@@ -28,7 +28,7 @@ from cfp.sections import EnvironmentConfig, ReportConfig
 from cfp.tables import read_table
 from cfp.weights import origin, read_policy, write_policy
 from dittogym import TASKS, TorchEnv
-from dittogym.action import patch_field, to_grid_layout
+from dittogym.action import patch_field, to_grid_indexing
 
 
 def make(**changes):
@@ -115,16 +115,16 @@ def test_impossible_options_are_named(changes, message):
 def test_faults_hit_half_of_what_they_may() -> None:
     torch.manual_seed(0)
     values = torch.full((400, 3, 16, 16), 7, dtype=torch.uint8)
-    left = (lose(values, 0.2) == 7).float().flatten(1).mean(1)
+    left = (drop_entries(values, 0.2) == 7).float().flatten(1).mean(1)
     whole = left == 1.0
     assert 0.4 < whole.float().mean() < 0.6
     assert left[~whole].mean() == pytest.approx(0.8, abs=0.01)
-    assert bool((values == 7).all()) and lose(values, 0.0) is values
+    assert bool((values == 7).all()) and drop_entries(values, 0.0) is values
 
 
 def test_actions_are_lost_on_the_grid_on_which_the_student_decides() -> None:
     env, taken = TorchEnv("run", 2, 64, particles=100, substeps=1), []
-    collector, step = Collector(env, Mirror(), Episodes(env, 0, 20, 3), 2, faults=0.5, grid=16), env.step
+    collector, step = Collector(env, Mirror(), Episodes(env, 0, 20, 3), 2, dropout=0.5, grid=16), env.step
     env.step = lambda action: taken.append(action) or step(action)
     collector.collect(8, 0.0, lambda seen: torch.ones(2, 2, 64, 64))
     cells = torch.cat(taken).unflatten(3, (16, 4)).unflatten(2, (16, 4)).transpose(3, 4).flatten(4)
@@ -301,9 +301,9 @@ def test_action_of_the_other_layout_acts_at_the_same_place():
     seen = torch.zeros(1, 3, 64, 64, dtype=torch.uint8)
     action = PolicyTeacher(record, "image", "image").act(env, seen)
     as_grid = PolicyTeacher(record, "image", "grid").act(env, seen)
-    assert torch.equal(as_grid, to_grid_layout(action, "image"))
+    assert torch.equal(as_grid, to_grid_indexing(action, "image"))
     back = PolicyTeacher(record, "grid", "image").act(env, seen)
-    assert torch.equal(to_grid_layout(back, "image"), action)
+    assert torch.equal(to_grid_indexing(back, "image"), action)
 
 
 def test_sequence_teaches_by_the_step_of_the_episode():

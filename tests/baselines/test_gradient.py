@@ -214,8 +214,9 @@ def test_only_polish_takes_place_where_the_result_is_judged():
     first, polish = (
         Gradient(make("run", environment=environment, train_particles=200, polish=1), stage) for stage in (1, 2)
     )
-    assert first.env.num_particles == 200 and max(first.env.model.shares) > 1 and not first.env.model.pixels
-    assert polish.env.num_particles == 300 and max(polish.env.model.shares) == 1 and polish.env.model.pixels
+    for env, count, scaled in ((first.env, 200, True), (polish.env, 300, False)):
+        assert env.num_particles == count and (max(env.model.particle_weight) > 1) is scaled
+        assert env.model.camera.pixels is not scaled
     assert first.env.action_layout == polish.env.action_layout == "grid"
 
 

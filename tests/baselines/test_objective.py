@@ -3,14 +3,14 @@ import numpy as np
 import pytest
 import torch
 
-from baselines.trajectory.objective import gaussian, make_objective
+from baselines.trajectory.objective import gaussian_matrix, make_objective
 from dittogym import TorchEnv
 
 
 @pytest.mark.parametrize("sigma", [0.0, 1.0, 3.5])
 def test_blur_is_a_gaussian_with_empty_surroundings(sigma):
     picture = np.random.default_rng(0).random((64, 64))
-    matrix = gaussian(sigma, 64)
+    matrix = gaussian_matrix(sigma, 64)
     ours = (matrix @ torch.from_numpy(picture) @ matrix.T).numpy()
     theirs = picture
     if sigma:

@@ -13,8 +13,10 @@ import cfp
 from baselines import Shac, StatePolicy
 from baselines.registry import configure
 from baselines.shac import rollout as shac_rollout
+from baselines.shac import train as shac_train
 from baselines.shac.reward import RewardConfig
-from baselines.shac.train import METRICS
+from baselines.shac.rollout import Window
+from baselines.shac.train import METRICS, actor_loss, td_lambda_targets
 from cfp.agent.actor import build_actor
 from cfp.agent.spec import ActorSpec
 from cfp.config import to_json
@@ -99,14 +101,15 @@ def test_gradient_of_the_window_is_that_of_the_loss(sees):
     environment = EnvironmentConfig(2, 300, 4, dtype="float64")
     algorithm = Shac(make(environment=environment, sees=sees, noise=0.0))
     algorithm.actor.double(), algorithm.target.double()
-    seen = (lambda: algorithm.features(algorithm.env)) if sees == "state" else look_in_double(algorithm)
-    algorithm.rollout.look = seen
+    env = algorithm.env
+    inputs = {"state": lambda: algorithm.features(env), "image": lambda: env.soft_observation() * (2.0 / 255.0) - 1.0}
+    algorithm.rollout.observe = inputs[sees]
     weight = [p for p in algorithm.actor.parameters() if p.requires_grad][-1]
     start = algorithm.env.save()
 
     def loss():
         algorithm.env.load(start)
-        return algorithm.rollout.play(algorithm.actor, lambda seen: algorithm.value(algorithm.target, seen)).loss
+        return actor_loss(collect(algorithm), algorithm.config.gamma)
 
     (gradient,) = torch.autograd.grad(loss(), weight)
     index = tuple(int(i) for i in np.unravel_index(int(gradient.abs().argmax()), gradient.shape))
@@ -117,8 +120,8 @@ def test_gradient_of_the_window_is_that_of_the_loss(sees):
     assert gradient[index].item() == pytest.approx((losses[0] - losses[1]) / 2e-4, rel=1e-3)
 
 
-def look_in_double(algorithm):
-    return lambda: algorithm.env.soft_observation() * (2.0 / 255.0) - 1.0
+def collect(algorithm):
+    return algorithm.rollout.collect(algorithm.actor, lambda seen: algorithm.value(algorithm.target, seen))
 
 
 @pytest.mark.parametrize("sees", ["state", "image"])
@@ -178,11 +181,9 @@ def test_gradients_of_single_actions_that_are_not_finite_are_left_out_and_counte
 
 def test_updates_without_a_finite_gradient_end_the_training(monkeypatch):
     algorithm = Shac(make())
-    play, before = algorithm.rollout.play, parameters(algorithm)
-    broken = lambda *given: replace(window := play(*given), loss=window.loss * float("nan"))  # noqa: E731
-    monkeypatch.setattr(algorithm.rollout, "play", broken)
-    monkeypatch.setattr(algorithm.rollout, "_drop", lambda gradient: gradient)
-    rows = []
+    before, rows = parameters(algorithm), []
+    weight = next(algorithm.actor.parameters())
+    monkeypatch.setattr(shac_train, "actor_loss", lambda window, gamma: weight.sum() * float("nan"))
     with pytest.raises(NonFiniteError, match="10 updates in a row"):
         algorithm.learn(8 * 20, EachUpdate(rows.append))
     assert rows[-1]["train/skipped"] == 9 and torch.equal(before, parameters(algorithm))
@@ -200,7 +201,7 @@ def test_episodes_are_cut_at_staggered_ages_and_change_layouts():
     algorithm = Shac(make(max_episode_steps=8, num_layouts=3))
     first = algorithm.env.state.x[0].clone()
     assert algorithm.rollout.episodes.limit.tolist() == [4, 8]
-    algorithm.rollout.play(algorithm.actor, lambda seen: algorithm.value(algorithm.target, seen))
+    collect(algorithm)
     assert algorithm.rollout.episodes.counts["episodes"] == 1 and algorithm.rollout.episodes.limit.tolist() == [8, 8]
     assert algorithm.env.env_state.steps.tolist() == [0, 4]
     assert not torch.equal(algorithm.env.state.x[0], first)
@@ -220,7 +221,7 @@ def test_restart_of_a_neighbour_leaves_the_particles_that_were_close(monkeypatch
         return reward(*given)
 
     monkeypatch.setattr(shac_rollout, "training_reward", watch)
-    algorithm.rollout.play(algorithm.actor, lambda seen: algorithm.value(algorithm.target, seen))
+    collect(algorithm)
     assert algorithm.env.env_state.steps.tolist() == [2, 6]  # the first robot began anew after four steps
     for first, last in zip(*((pairs.neighbours, pairs.distance) for pairs in (seen[0], seen[-1])), strict=True):
         assert torch.equal(first[1], last[1]) and not torch.equal(first[0], last[0])
@@ -229,30 +230,37 @@ def test_restart_of_a_neighbour_leaves_the_particles_that_were_close(monkeypatch
 def test_return_is_that_of_all_episodes_since_the_last_row():
     algorithm, rows = Shac(make(max_episode_steps=4)), []  # a window is as long as an episode
     algorithm.learn(8, EachUpdate(rows.append))
-    first = list(algorithm.rollout.episodes.ended)
+    first = list(algorithm.rollout.episodes.recent_returns)
     again = Shac(algorithm.config)
     again.load_state_dict(algorithm.state_dict())
     for each in (algorithm, again):
         each.learn(8, EachUpdate(rows.append))
-        ended = each.rollout.episodes.ended
+        ended = each.rollout.episodes.recent_returns
         assert len(ended) > len(first) > 0 and ended[: len(first)] == first
         assert rows[-1]["rollout/return"] == np.mean(ended)
     algorithm.row()
     algorithm.learn(8, EachUpdate(rows.append))
-    assert len(algorithm.rollout.episodes.ended) < len(ended)
+    assert len(algorithm.rollout.episodes.recent_returns) < len(ended)
+
+
+def window(done=(False, False, False)):
+    """Three steps of one simulation, rewards 1, 2, 3 and values 4, 8, 16 after them."""
+    rewards, values = (torch.tensor(numbers)[:, None] for numbers in ([1.0, 2.0, 3.0], [4.0, 8.0, 16.0]))
+    return Window(torch.zeros(3, 1), rewards, values, torch.tensor(done)[:, None], 0.0)
+
+
+def test_actor_loss_is_the_discounted_return_with_the_value_of_the_end():
+    assert actor_loss(window(), 0.5).item() == pytest.approx(-(1 + 0.5 * 2 + 0.25 * 3 + 0.125 * 16) / 3)
+    cut = actor_loss(window((False, True, False)), 0.5)
+    assert cut.item() == pytest.approx(-(1 + 0.5 * 2 + 0.25 * 8 + 3 + 0.5 * 16) / 3)
 
 
 def test_targets_are_those_of_td_lambda():
-    rollout = Shac(make(gamma=0.5, td_lambda=0.25)).rollout
-    rewards, values = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([4.0, 8.0, 16.0])
-    parts = [[row[None] for row in given] for given in (rewards, values)]
-    ends = [torch.tensor([end]) for end in (False, False, False)]
     last = 3 + 0.5 * 16
     middle = 2 + 0.5 * (0.75 * 8 + 0.25 * last)
-    targets = rollout._targets(*parts, ends)
-    assert [t.item() for t in targets] == pytest.approx([1 + 0.5 * (0.75 * 4 + 0.25 * middle), middle, last])
-    ends[1] = torch.tensor([True])
-    assert rollout._targets(*parts, ends)[1].item() == 2 + 0.5 * 8
+    targets = td_lambda_targets(window(), 0.5, 0.25)
+    assert targets.flatten().tolist() == pytest.approx([1 + 0.5 * (0.75 * 4 + 0.25 * middle), middle, last])
+    assert td_lambda_targets(window((False, True, False)), 0.5, 0.25)[1].item() == 2 + 0.5 * 8
 
 
 @pytest.mark.parametrize("sees", ["state", "image"])
@@ -286,7 +294,8 @@ def test_policy_of_the_image_is_one_of_cfp(tmp_path):
 def test_actor_on_the_image_begins_with_a_policy_of_any_algorithm(tmp_path):
     config = make(sees="image")
     actor, path = build_actor(ActorSpec((config.resolution(0),))), tmp_path / "policy.safetensors"
-    origins = cfp.Config(task="run", resolutions=(config.resolution(0),), gate_bias=(), environment=config.environment)
+    trained = configure({"algo": "coarse", "task": "run"})
+    origins = replace(trained, environment=config.environment, resolutions=(config.resolution(0),))
     save_policy(path, actor, describe(origins, 0, 5))
     warm = replace(config, start_from=str(path))
     algorithm = Shac(warm, 0, Shac.start(warm))

@@ -32,6 +32,7 @@ class FakeEnv:
         self.num_envs, self.action_resolution, self.horizon = num_envs, resolution, horizon
         self.end_above, self.faults, self.device = end_above, faults or {}, torch.device("cpu")
         self.start, self.push = start, push
+        self.observation_shape, self.action_shape = (3, 64, 64), (2, resolution, resolution)
         self.first = start + torch.arange(num_envs) / 10.0
         self.env_state = FakeState(self.first.clone(), torch.zeros(num_envs, dtype=torch.int64))
         self.actions, self.generators = [], {}

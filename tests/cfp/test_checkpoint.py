@@ -83,7 +83,9 @@ def test_resumed_training_equals_uninterrupted_training_to_the_last_bit(tmp_path
     assert all(torch.equal(*pair) for pair in zip(batch[:5], again[:5], strict=True))
 
 
-@pytest.mark.parametrize("writer", ["cfp.experiment.checkpoint.write_atomically", "cfp.agent.replay.write_atomically"])
+@pytest.mark.parametrize(
+    "writer", ["cfp.experiment.checkpoint.write_atomically", "cfp.experiment.replay_archive.write_atomically"]
+)
 def test_checkpoint_survives_a_crash_while_the_next_is_written(tmp_path, monkeypatch, writer):
     checkpoint, algorithm = Checkpoint(tmp_path), make()
     algorithm.learn(20)

@@ -7,7 +7,7 @@ import pytest
 
 from baselines import train as baselines_train
 from cfp import train
-from cfp.agent.policies import ActorPolicy
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.sac import CFP
 from cfp.config import Config
 from cfp.experiment.algorithm import mean_seconds

@@ -19,7 +19,7 @@ import cfp
 import dittogym
 from cfp import evaluate, train
 from cfp.agent.actor import build_actor
-from cfp.agent.policies import ActorPolicy
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.spec import ActorSpec
 from cfp.envs.vec_env import monitored
 from cfp.evaluation import plots as plot

@@ -9,7 +9,7 @@ import torch
 import cfp
 from cfp.agent.actor import build_actor
 from cfp.agent.networks import normalise_image
-from cfp.agent.policies import CFPPolicy, action_space, observation_space
+from cfp.agent.policies import CFPPolicy
 from cfp.agent.spec import ActorSpec
 from cfp.errors import CheckpointError, ConfigError
 from cfp.presets import preset
@@ -55,11 +55,13 @@ def test_loaded_policy_acts_as_the_saved_one(saved, name):
     ],
 )
 def test_what_is_no_image_is_refused(saved, image, given):
-    space = action_space(64)
-    whole = CFPPolicy(observation_space(), space, lambda _: 1e-3, ActorSpec((8, 16), (-1.0,), patch=64))
-    for policy in (cfp.load(saved[0]), whole):
-        with pytest.raises(ValueError, match=f"observation: got {given}, allowed a uint8 array"):
-            policy.predict(image)
+    policy = cfp.load(saved[0])
+    whole = CFPPolicy(
+        policy.observation_space, policy.action_space, lambda _: 1e-3, ActorSpec((8, 16), (-1.0,), patch=64)
+    )
+    for each in (policy, whole):
+        with pytest.raises(ValueError, match=f"observation must be a uint8 array of shape .*, got {given}"):
+            each.predict(image)
 
 
 def test_description_stands_beside_and_inside_the_weights(saved):

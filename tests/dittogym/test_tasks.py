@@ -7,7 +7,6 @@ import torch
 
 import dittogym
 from dittogym.observation import raster as obs
-from dittogym.observation.window import window_origin
 from torchmpm import Grid
 from torchmpm.boundary import constrain, faces
 from torchmpm.grid import PAD
@@ -114,7 +113,7 @@ def test_velocity_rules_are_the_published_ones(task: str) -> None:
     spec = dittogym.make_spec(task)
     generator = torch.Generator().manual_seed(0)
     com = torch.cat((torch.tensor([0.09]), torch.empty(39).uniform_(-1.5, 3.0, generator=generator)))
-    origins = window_origin(spec, torch.stack((com, com), 1))
+    origins = spec.window.origin(torch.stack((com, com), 1))
     rules = tuple(rule for obstacle in spec.obstacles for rule in obstacle.rules)
     for origin in origins:
         velocity = torch.randn(2, 128, 128, generator=generator)
@@ -169,5 +168,5 @@ def published_pixels(task: str, origin_x: float) -> torch.Tensor:
 @pytest.mark.parametrize("task", TABLES)
 @pytest.mark.parametrize("com", [0.09, 0.7131])
 def test_the_robot_sees_the_published_pixels(task: str, com: float) -> None:
-    origin = float(window_origin(dittogym.make_spec(task), torch.tensor([[com, 0.2]], dtype=torch.float64))[0, 0])
+    origin = float(dittogym.make_spec(task).window.origin(torch.tensor([[com, 0.2]], dtype=torch.float64))[0, 0])
     assert torch.equal(drawn_pixels(task, origin), published_pixels(task, origin))
