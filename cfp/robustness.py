@@ -97,15 +97,20 @@ def check_words(cases: Sequence[Case], words: Sequence[str], spec: TaskSpec, pol
             raise ConfigError(f"cases: got {word!r}, allowed words of cases that change something ({told})")
 
 
-def report(config: RunConfig, policy: Policy, cases: Sequence[Case], episodes: int) -> list[Result]:
+def report(
+    config: RunConfig, policy: Policy, cases: Sequence[Case], episodes: int, *, deterministic: bool | None = None
+) -> list[Result]:
     """Evaluate a policy in every case that changes something for it, on the same layouts with the same noise.
 
     Args:
         config: Options of the run that trained it.
-        policy: Acts as it is evaluated.
+        policy: The policy.
         cases: The unperturbed one first.
-        episodes: Of each case.
+        episodes: Episodes of each case.
+        deterministic: Act without noise; None: as the run that trained the policy evaluates it.
     """
+    if deterministic is None:
+        deterministic = policy.deterministic_by_default
     spec, seed = make_spec(config.task, **config.environment.task_options()), judging_seed(config)
     grid, results = 0 if isinstance(policy, Decides) else policy.description.get("resolution", policy.resolution), []
     for case in cases:
@@ -113,7 +118,6 @@ def report(config: RunConfig, policy: Policy, cases: Sequence[Case], episodes: i
             continue
         env = disturbed_env(config, policy.resolution, episodes, case, seed, grid)
         acting = policy.through(env.disturb) if isinstance(policy, Decides) else policy
-        deterministic = policy.deterministic_by_default
         results.append(evaluate(case.name, acting, env, episodes, deterministic=deterministic, seed=seed))
     return results
 

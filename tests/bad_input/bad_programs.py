@@ -165,27 +165,29 @@ OTHERS = [
     ),
     comparing("unknown tasks", "--tasks swim", "task must be catch"),
     comparing("unknown algorithms", "--algos alchemy", "algo: got 'alchemy', allowed cfp"),
-    comparing("a seed twice", "--seeds 1 1", "seeds: got 1 1, allowed one or more, each once"),
-    comparing("without seeds", "--seeds", "seeds: got none, allowed one or more"),
-    comparing("seed -1", "--seeds -1", "seeds: got -1, allowed 0 to 8999"),
-    comparing("no episodes", "--episodes 0", "episodes: got 0, allowed 1 or more"),
-    comparing("minus one worker", "--workers -1", "workers: got -1, allowed 0 or more"),
-    comparing(
-        "parts of a GPU at home", "--gpus-per-run 0.5", "gpus_per_run: got 0.5, allowed with --executor ray only"
-    ),
-    comparing("run 99", "--only 99", "only: got 99, allowed 0 to 3"),
+    comparing("a seed twice", "--seeds 1 1", "seeds must be one or more different values, got 1 1"),
+    comparing("without seeds", "--seeds", "seeds must be one or more different values, got none"),
+    comparing("seed -1", "--seeds -1", "seeds must be between 0 and 8999, got -1"),
+    comparing("no episodes", "--episodes 0", "episodes must be at least 1, got 0"),
+    comparing("minus one worker", "--workers -1", "workers must be at least 0, got -1"),
+    comparing("parts of a GPU at home", "--gpus-per-run 0.5", "gpus_per_run must be 0 without --executor ray, got 0.5"),
+    comparing("run 99", "--only 99", "only must be between 0 and 3, got 99"),
     comparing("a plan that is not there", "--plan none.json", "plan: none.json cannot be read"),
     planned("of a list", [1], "plan: plan.json cannot be read as JSON (it holds list"),
-    planned("of other parts", {"colour": 1}, "holds colour, allowed an object with common, tasks, algos"),
-    planned("with a part of nothing", {"common": None}, "plan: common: got None, allowed an object"),
-    planned("with a task of nothing", {"tasks": {"shapematch": 3}}, "plan: tasks.shapematch: got 3, allowed an object"),
-    planned("with a seed of its own", {"common": {"seed": 5}}, "plan: common: got seed, allowed are options that"),
-    planned("with another task", {"algos": {"cfp": {"task": "run"}}}, "plan: algos.cfp: got task, allowed are options"),
-    planned("with tasks of a number", {"algos": {"cfp": {"tasks": 3}}}, "plan: algos.cfp.tasks: got 3, allowed an obj"),
+    planned("of other parts", {"colour": 1}, "must hold common, tasks and algos only, got colour"),
+    planned("with a part of nothing", {"common": None}, "plan: common must be a JSON object, got None"),
+    planned(
+        "with a task of nothing", {"tasks": {"shapematch": 3}}, "plan: tasks.shapematch must be a JSON object, got 3"
+    ),
+    planned("with a seed of its own", {"common": {"seed": 5}}, "plan: common must not hold seed"),
+    planned("with another task", {"algos": {"cfp": {"task": "run"}}}, "plan: algos.cfp must not hold task"),
+    planned(
+        "with tasks of a number", {"algos": {"cfp": {"tasks": 3}}}, "plan: algos.cfp.tasks must be a JSON object, got 3"
+    ),
     planned(
         "with a device in a task",
         {"algos": {"cfp": {"tasks": {"run": {"device": "cpu"}}}}},
-        "plan: algos.cfp.tasks.run: got device, allowed are options",
+        "plan: algos.cfp.tasks.run must not hold device",
     ),
     planned("with unknown options", {"common": {"colour": 1}}, "zero on shapematch: colour is not an option"),
 ]

@@ -11,7 +11,9 @@ import cfp
 import cfp.train
 from baselines import Distill, GradientPlannerConfig, OpenLoop, Shac, distill
 from baselines.common.episodes import Episodes
-from baselines.compare.worker import _train
+from baselines.compare.evaluations import Protocol
+from baselines.compare.jobs import Job
+from baselines.compare.worker import train
 from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entries
 from baselines.distillation.teachers import PolicyTeacher, Teacher, project, read_teacher
 from baselines.distillation.train import METRICS
@@ -367,10 +369,10 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch, caps
     assert last in capsys.readouterr().out.splitlines()[-1]
     config = configure(json.loads((folder / "config.json").read_text()))
     with StopSignals() as signals:
-        _train(config, tmp_path / "noted", signals, False)
+        train(Job("distill", config, tmp_path / "noted", Protocol(1)), signals, False)
     (session,) = json.loads((tmp_path / "noted" / "sessions.json").read_text())["sessions"]
     assert (session["from"], session["to"], session["teacher"]["steps"]) == (0, 32, 32)
-    assert 0 < session["teacher"]["seconds"] < session["seconds"] - session["judging"]
+    assert 0 < session["teacher"]["seconds"] < session["seconds"] - session["evaluation_seconds"]
 
 
 @pytest.mark.parametrize(
