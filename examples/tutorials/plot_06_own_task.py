@@ -8,9 +8,9 @@ gradients, and with every algorithm.
 """
 
 # %%
-# The function gets a :class:`dittogym.spec.Moment` and returns named terms, one number for each simulation of the
-# batch. What all tasks share, the cost of actions, the end of a torn robot and the term for staying alive, is added
-# by the engine as the weights say.
+# The function gets a :class:`dittogym.contract.Moment` and returns named terms, one number for each simulation of the
+# batch. Each term is multiplied by its weight. The engine adds the terms that all tasks share: the action cost, the
+# penalty for a torn robot, and a constant for every step.
 
 import dataclasses
 
@@ -55,7 +55,7 @@ print(f"zero actions: return {total:.2f}, terms {sorted(info['reward_terms'])}, 
 
 # %%
 # The same task as a differentiable function: because ``reward_fn`` is made of torch operations, its reward can be
-# climbed.
+# maximised by gradient ascent.
 
 batch = dittogym.TorchEnv("hop", particles="lite")
 theta = torch.zeros(20, *batch.action_shape, requires_grad=True)

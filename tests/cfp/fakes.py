@@ -6,7 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchmpm import tree
 
+
+@tree.register
 @dataclass(frozen=True)
 class FakeState:
     """A number per element that actions push up and down, and the steps taken."""
