@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from cfp import train
 from cfp.config import RunConfig
-from cfp.envs.disturbances import Case, Decides, disturbed_env, idle, make_cases
+from cfp.envs.disturbances import Case, Decides, disturbed_env, make_cases, reason_without_effect
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection, judge
 from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
@@ -92,7 +92,9 @@ def check_words(cases: Sequence[Case], words: Sequence[str], spec: TaskSpec, pol
         ConfigError: No case with a word in its name changes anything; it says why.
     """
     for word in words:
-        reasons = {case.name: idle(case, spec, policy.sees_image) for case in cases[1:] if word in case.name}
+        reasons = {
+            case.name: reason_without_effect(case, spec, policy.sees_image) for case in cases[1:] if word in case.name
+        }
         if all(reasons.values()):
             told = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
             raise ConfigError(f"cases: got {word!r}, allowed words of cases that change something ({told})")
@@ -115,7 +117,7 @@ def report(
     spec, seed = make_spec(config.task, **config.environment.task_options()), evaluation_seed(config)
     grid, results = 0 if isinstance(policy, Decides) else policy.description.get("resolution", policy.resolution), []
     for case in cases:
-        if idle(case, spec, policy.sees_image):
+        if reason_without_effect(case, spec, policy.sees_image):
             continue
         env = disturbed_env(config, policy.resolution, episodes, case, seed, grid)
         acting = policy.through(env.disturb) if isinstance(policy, Decides) else policy

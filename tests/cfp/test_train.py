@@ -245,7 +245,7 @@ def test_damaged_checkpoint_is_an_error_that_names_it(tmp_path, capsys):
         (["--particles", "0"], "particles"),
         (["--target", "no/such.png"], "target"),
         (["--num-envs", "0"], "num_envs must be at least 1, got 0"),
-        (["--device", "abacus"], "device: got 'abacus'"),
+        (["--device", "abacus"], "device must be auto, cpu or cuda, got 'abacus'"),
         (["--config", "no/such.json"], "config: no/such.json cannot be read"),
         (["--backend", "slide-rule"], "backend"),
     ],
