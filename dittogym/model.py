@@ -137,14 +137,14 @@ def make_model(
         _bodies(spec, counts, weight, {}),
         gravity=spec.gravity,
         damping=spec.damping,
-        rules=tuple(rule for obstacle in spec.obstacles for rule in obstacle.rules),
+        rules=tuple(rule for obstacle in spec.obstacles for rule in obstacle.velocity_rules),
         backend=backend,
         allow_unstable=True,  # checked with the muscles, here and when a reset changes the matter
     )
     camera = Camera(
         view=spec.view,
         window=spec.window,
-        boxes=spec.drawn,
+        boxes=spec.observed_boxes,
         counts=counts,
         particle_weight=weight,
         hidden_velocity=tuple(body.hidden_velocity for body in spec.bodies),

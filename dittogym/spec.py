@@ -180,9 +180,9 @@ class TaskSpec:
         return x.new_tensor(self.goal)
 
     @property
-    def drawn(self) -> tuple[Box, ...]:
+    def observed_boxes(self) -> tuple[Box, ...]:
         """What the robot sees of obstacles and goal."""
-        boxes = tuple(box for obstacle in self.obstacles for box in obstacle.drawn)
+        boxes = tuple(box for obstacle in self.obstacles for box in obstacle.observed_boxes)
         return boxes if self.goal is None else (*boxes, mark(self.goal))
 
 

@@ -168,8 +168,8 @@ def centre(place: tuple[float | None, float | None]) -> str:
 
 def row(obstacle: Obstacle) -> tuple[str, str, str]:
     """Name, visibility and velocity rules of an obstacle."""
-    rules = "<br>".join(dict.fromkeys(map(rule, obstacle.rules)))
-    return obstacle.name, "yes" if obstacle.drawn else "no", rules
+    rules = "<br>".join(dict.fromkeys(map(rule, obstacle.velocity_rules)))
+    return obstacle.name, "yes" if obstacle.observed_boxes else "no", rules
 
 
 def rule(rule: VelocityRule) -> str:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
 
 from torchmpm.materials.base import Value, detached_column
 from torchmpm.materials.body import Body
@@ -27,13 +26,12 @@ def stable_dt(bodies: Sequence[Body], h: float, actuation: Value = 0.0) -> float
     Raises:
         ValueError: Shapes of a body's values do not go together, or they are not finite or have a wrong sign.
     """
-    rates = [0.0]
+    rates, pull = [0.0], torch.as_tensor(detached_column(actuation), dtype=torch.float64, device="cpu").abs()
     for k, body in enumerate(bodies):
         try:
             stiffness: Value = body.material.stiffness()
             if body.muscle:
-                pull: Value = detached_column(actuation)
-                stiffness = stiffness + 2.0 * (pull.abs() if isinstance(pull, Tensor) else abs(pull))
+                stiffness = stiffness + 2.0 * pull
             rate = stiffness * detached_column(body.volume) / detached_column(body.mass)
         except RuntimeError as error:
             raise ValueError(f"values of bodies[{k}] must have shapes that go together: {error}") from error

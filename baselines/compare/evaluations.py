@@ -10,14 +10,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare import paper
-from baselines.registry import load
+from baselines.registry import load, reference_policy
 from cfp.config import RunConfig
 from cfp.envs.disturbances import Case, make_cases
 from cfp.envs.make import choose_device, make_env
 from cfp.errors import CheckpointError
-from cfp.evaluation.rollout import Result, evaluate, judging_seed
+from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
 from cfp.files import parse_json, write_json
+from cfp.policy import Policy
 from cfp.robustness import report
 from cfp.sections import Particles
 
@@ -156,7 +158,11 @@ def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop
         ConfigError: The environment refuses an option.
     """
     record, task, deterministic = Record(folder), config.task, protocol.deterministic(config.task)
-    policy = load(folder / "policy.safetensors", choose_device(config.device))
+    policy: Policy
+    if config.algo in REFERENCE_POLICIES:
+        policy = reference_policy(config)
+    else:
+        policy = load(folder / "policy.safetensors", choose_device(config.device))
     config = evaluation_config(config, protocol.tier)
 
     def play(seed: int, count: int) -> Entry:
@@ -169,7 +175,7 @@ def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop
 
     for key, (first, count) in zip(protocol.batch_keys(task), protocol.batches(), strict=True):
         check_stop()
-        record.add(key, partial(play, judging_seed(config) + first, count))
+        record.add(key, partial(play, evaluation_seed(config) + first, count))
     if "layout" in policy.description:
         record.add(protocol.key(task, "own layout"), partial(play, policy.description["layout"], 1))
     for case in protocol.cases()[1:]:

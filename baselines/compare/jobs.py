@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from baselines.common.reference_policies import FloorConfig
+from baselines.common.reference_policies import ReferenceConfig
 from baselines.compare.evaluations import Protocol, read_record
 from baselines.compare.plan import Plan
-from baselines.registry import ALGORITHMS, ALIASES, configure, find
+from baselines.registry import ALGORITHMS, ALIASES, configure, sees
 from cfp.config import EVALUATION_SEED, RunConfig, to_json
 from cfp.errors import ConfigError
-from cfp.experiment.run import holds_run, read_config
+from cfp.experiment.folder import holds_run, read_config
 from cfp.from_dict import flatten
 from cfp.sections import TASK_OPTIONS
 from cfp.weights import is_of_another_task, is_same_task, read_policy
@@ -52,7 +52,7 @@ class Job:
     @property
     def observes(self) -> str:
         """What the policy observes: image, state, simulator or nothing."""
-        return str(getattr(self.config, "sees", find(self.config.algo).sees))
+        return str(getattr(self.config, "sees", sees(self.config.algo)))
 
     @property
     def untrained(self) -> bool:
@@ -77,7 +77,7 @@ class Job:
 
 def is_reference(config: RunConfig) -> bool:
     """Whether options are those of a reference policy, which learns nothing."""
-    return isinstance(config, FloorConfig)
+    return isinstance(config, ReferenceConfig)
 
 
 def make_jobs(

@@ -18,14 +18,16 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
+from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare.evaluations import Protocol, evaluate_run
 from baselines.compare.jobs import Job, check_folder, read_sessions
-from baselines.registry import configure, open_run
+from baselines.registry import configure, find
 from cfp.config import to_json
 from cfp.envs.make import choose_device
 from cfp.experiment.process import Stopped, StopSignals, keep_memory, peak_memory
+from cfp.experiment.run import Run
 from cfp.experiment.run_lock import Claimed, claim
-from cfp.files import write_json, write_text
+from cfp.files import read_json, write_json, write_text
 
 Outcome = Literal["finished", "failed", "busy", "stopped"]
 """How a run ended; busy: another process holds its folder."""
@@ -89,25 +91,34 @@ def _train_and_evaluate(job: Job, signals: StopSignals, own_process: bool) -> No
 
 def train(job: Job, signals: StopSignals, own_process: bool = True) -> None:
     """Train to the end, and record the cost of this session in ``sessions.json``; a killed process leaves no record."""
+    if job.config.algo in REFERENCE_POLICIES:
+        write_json(job.folder / "config.json", to_json(job.config))
+        write_json(job.folder / "sessions.json", {"finished": job.config.ends()[-1], "sessions": []})
+        return
     earlier = read_sessions(job.folder)["sessions"]
-    session = open_run(job.config, job.folder, True, signals)
+    session = Run(find(job.config.algo), job.config, job.folder, True, signals)
     first_step, start, finished = session.step, time.perf_counter(), False
     try:
         session.train()
         finished = True
     finally:
-        record = {
+        record: dict[str, Any] = {
             "from": first_step,
             "to": session.step,
             "seconds": time.perf_counter() - start,
-            "evaluation_seconds": session.judging,
-            "teacher": dict(zip(("steps", "seconds"), session.teaching, strict=True)),
+            "evaluation_seconds": session.evaluation_seconds,
+            "teacher": {"steps": 0, "seconds": 0.0},
             "memory": peak_memory() if own_process else None,
             "device": choose_device(job.config.device),
             "host": socket.gethostname(),
             "process": os.getpid(),
             "finished": finished,
         }
+        cost = job.folder / "teacher" / "cost.json"
+        if cost.exists() and not any(record["teacher"]["steps"] for record in earlier):
+            teacher = read_json(cost)
+            record["teacher"] = {"steps": teacher["steps"], "seconds": teacher["seconds"]}
+            record["evaluation_seconds"] += teacher["evaluation_seconds"]
         end = job.config.ends()[-1] if finished else False
         write_json(job.folder / "sessions.json", {"finished": end, "sessions": [*earlier, record]})
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -17,7 +17,7 @@ from torch import Tensor
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import monitored
-from cfp.evaluation.rollout import Policy
+from cfp.policy import Policy
 from dittogym import make_spec
 from dittogym.action import bicubic
 from dittogym.geometry import Obstacle, floor
@@ -68,7 +68,7 @@ def reason_without_effect(case: Case, spec: TaskSpec, sees_image: bool = True) -
     floors = [item for item in spec.obstacles if item.name == FLOOR]
     if not floors:
         return f"{spec.name} has no obstacle named {FLOOR!r}"
-    present = {rule.friction for item in floors for rule in item.rules}
+    present = {rule.friction for item in floors for rule in item.velocity_rules}
     if not present:
         return f"the floor of {spec.name} has no rules"
     return f"the floor of {spec.name} has this friction" if present == {case.friction} else ""
@@ -96,12 +96,7 @@ def disturbed_env(
 
 
 def _with_friction(spec: TaskSpec, friction: float) -> tuple[Obstacle, ...]:
-    return tuple(
-        replace(item, rules=tuple(replace(rule, friction=friction) for rule in item.rules))
-        if item.name == FLOOR
-        else item
-        for item in spec.obstacles
-    )
+    return tuple(item.with_friction(friction) if item.name == FLOOR else item for item in spec.obstacles)
 
 
 def drop(values: Tensor, mask: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from torch import Tensor
 import dittogym.env
 from cfp.errors import NonFiniteError
 from dittogym import TorchEnv
+from dittogym.autoreset import autoreset_step
 from torchmpm import tree
 
 
@@ -93,21 +94,15 @@ class TorchVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         """Step with these actions; returns observation, reward (B,) float32, done (B,) bool, and infos."""
         assert self._actions is not None, "step_async must be called first"
-        observation, reward, terminated, truncated, info = self.torch_env.step(self._actions)
+        step = autoreset_step(self.torch_env, self._actions)
         self._actions = None
-        done = terminated | truncated
-        if "finite" in info:
-            done = done | ~info["finite"]
-        infos = self._split_info(info)
-        images = _to_numpy(observation)
-        timed_out = truncated.cpu().numpy()
-        for index in np.flatnonzero(done.cpu().numpy()):
-            infos[index]["terminal_observation"] = images[index]
-            infos[index]["TimeLimit.truncated"] = bool(timed_out[index])
-        if bool(done.any()):
-            observation, _ = self.torch_env.reset(options={"reset_mask": done})
-            images = _to_numpy(observation)
-        return images, _to_numpy(reward.float()), _to_numpy(done), infos
+        infos, done = self._split_info(step.info), _to_numpy(step.done)
+        if done.any():
+            finals, timed_out = _to_numpy(step.final_observation), _to_numpy(step.truncated)
+            for index in np.flatnonzero(done):
+                infos[index]["terminal_observation"] = finals[index]
+                infos[index]["TimeLimit.truncated"] = bool(timed_out[index])
+        return _to_numpy(step.observation), _to_numpy(step.reward.float()), done, infos
 
     def _split_info(self, info: dict[str, Any]) -> list[dict[str, Any]]:
         """Turn one dictionary of tensors with leading B into B dictionaries of numbers."""

@@ -60,8 +60,8 @@ def frame(model: Model, state: EnvState, index: int, actuation: Tensor | None, s
     if spec.target is not None:
         canvas.target(spec.target, state.centre[index].detach().cpu().double().numpy())
     for obstacle in spec.obstacles:
-        for box in obstacle.shown:
-            canvas.box(box, filled=bool(obstacle.drawn) or box.ground)
+        for box in obstacle.boxes:
+            canvas.box(box, filled=bool(obstacle.observed_boxes) or box.ground)
     x = particles.x[0].cpu().double().numpy()
     counts = [body.count for body in model.solver.bodies]
     kinds = [ROBOT, *(GROUND_BODY if isinstance(body.material, Snow) else OBJECT for body in spec.objects)]

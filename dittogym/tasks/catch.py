@@ -19,10 +19,11 @@ HAND = 1201 / 20000
 #: Distance from which the costs of cube to goal and hand to cube no longer grow, m.
 CAP = 0.5
 
-# Drawn blocks do not touch: a seam of one pixel is left between them, as in the reference.
+# Observed blocks do not touch: a seam of one pixel is left between them, as in the reference.
 RIGHT_BLOCK = Obstacle(
     "right block",
-    (
+    (nodes(1, 34, 37, 45), nodes(26, 34, 27, 37), nodes(16, 34, 20, 27)),
+    rules=(
         VelocityRule("+x", (1, 2), (37, 45)),
         VelocityRule("+x", (26, 27), (27, 37)),
         VelocityRule("+x", (16, 17), (20, 27)),
@@ -30,12 +31,12 @@ RIGHT_BLOCK = Obstacle(
         VelocityRule("-y", (17, 25), (27, 27)),
         VelocityRule("+y", (2, 25), (37, 37)),
     ),
-    drawn=(nodes(1, 32, 37, 45), nodes(26, 32, 27, 37), nodes(16, 32, 20, 27)),
-    shown=(nodes(1, 34, 37, 45), nodes(26, 34, 27, 37), nodes(16, 34, 20, 27)),
+    observed=(nodes(1, 32, 37, 45), nodes(26, 32, 27, 37), nodes(16, 32, 20, 27)),
 )
 LEFT_BLOCK = Obstacle(
     "left block",
-    (
+    (nodes(-34, -11, 37, 45), nodes(-34, -16, 27, 37), nodes(-34, -26, 20, 27)),
+    rules=(
         VelocityRule("-x", (-12, -11), (37, 45)),
         VelocityRule("-x", (-17, -16), (27, 37)),
         VelocityRule("-x", (-27, -26), (20, 27)),
@@ -43,8 +44,7 @@ LEFT_BLOCK = Obstacle(
         VelocityRule("+y", (-15, -12), (37, 37)),
         VelocityRule("+y", (-25, -17), (27, 27)),
     ),
-    drawn=(nodes(-32, -11, 37, 45), nodes(-32, -16, 27, 37), nodes(-32, -26, 20, 27)),
-    shown=(nodes(-34, -11, 37, 45), nodes(-34, -16, 27, 37), nodes(-34, -26, 20, 27)),
+    observed=(nodes(-32, -11, 37, 45), nodes(-32, -16, 27, 37), nodes(-32, -26, 20, 27)),
 )
 
 

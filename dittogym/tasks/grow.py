@@ -22,25 +22,24 @@ TIP = 2000 / 19600
 
 RIGHT_BEAM = Obstacle(
     "right beam",
-    (
+    (nodes(15, 32, 38, 41),),
+    rules=(
         VelocityRule("+x", (15, 16), (38, 41)),
         VelocityRule("-x", (30, 31), (38, 41)),
         VelocityRule("-y", (15, 32), (41, 41)),
         VelocityRule("+y", (15, 32), (38, 38)),
     ),
-    drawn=(nodes(15, 31, 38, 41),),
-    shown=(nodes(15, 32, 38, 41),),
+    observed=(nodes(15, 31, 38, 41),),
 )
 LEFT_BEAM = Obstacle(
     "left beam",
-    (
+    (nodes(-30, 2, 54, 57),),
+    rules=(
         VelocityRule("+x", (-30, -29), (54, 57)),
         VelocityRule("-x", (1, 2), (54, 57)),
         VelocityRule("-y", (-30, 2), (56, 57)),
         VelocityRule("+y", (-30, 2), (54, 54)),
     ),
-    drawn=(nodes(-30, 2, 54, 57),),
-    shown=(nodes(-30, 2, 54, 57),),
 )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dittogym.bodies.shapes import Lattice
-from dittogym.geometry import NODES, Box, Obstacle, ceiling, floor, nodes
+from dittogym.geometry import Obstacle, ceiling, floor, nodes
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.tasks.run import Forward
 from dittogym.window import Window
@@ -16,14 +16,13 @@ GOAL = 0.5
 def stair(k: int) -> Obstacle:
     """Column k of six, each one node lower than the one on its left."""
     left, right, top = 30 + 3 * k, 33 + 3 * k, 26 - k
-    box = Box(left / NODES, right / NODES, top=top / NODES, closed=True)
     rules = (
         VelocityRule("+x", (left, right - 1), (None, top)),
         VelocityRule("-x", (left + 1, right), (None, top)),
         # Without friction, and before the floor: inside the columns the floor does not stick.
         VelocityRule("-y", (left, right), (None, top)),
     )
-    return Obstacle(f"stair {k}", rules, drawn=(box,), shown=(nodes(left, right, top=top),))
+    return Obstacle(f"stair {k}", (nodes(left, right, top=top, closed=True),), rules=rules)
 
 
 def obstacle() -> TaskSpec:

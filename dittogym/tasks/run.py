@@ -17,15 +17,16 @@ GOAL = 1.70
 #: The episode ends when the robot's centre gets behind this, m.
 REAR_LIMIT = -0.2
 
-# Invisible to the robot: nothing in the observation tells of it.
+# The observation does not show it.
 HANGING_BLOCK = Obstacle(
     "hanging block",
-    (
+    (nodes(32, 47, 59),),
+    rules=(
         VelocityRule("+x", (32, 34), (61, None)),
         VelocityRule("-x", (46, 47), (61, None)),
         VelocityRule("+y", (33, 46), (59, 60)),
     ),
-    shown=(nodes(32, 47, 59),),
+    observed=(),
 )
 
 

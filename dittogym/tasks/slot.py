@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dittogym.bodies.shapes import Disc, Rectangle
 from dittogym.contract import Memory, Moment, Outcome
-from dittogym.geometry import NODES, Box, Obstacle, ceiling, floor, nodes
+from dittogym.geometry import Obstacle, ceiling, floor, nodes
 from dittogym.rewards import distance, signed_quadratic
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.window import Window
@@ -32,39 +32,36 @@ VARIANTS = {"registered": (500.0, 85.0, 40.0), "published": (650.0, 90.0, 45.0)}
 
 BLOCK = Obstacle(
     "hanging block",
-    (
+    (nodes(32, 45, 36),),
+    rules=(
         VelocityRule("+x", (32, 34), (36, None)),
         VelocityRule("-x", (44, 45), (36, None)),
         VelocityRule("+y", (32, 45), (35, 36)),
     ),
-    drawn=(nodes(32, 45, 36),),
-    shown=(nodes(32, 45, 36),),
 )
 SHELF = Obstacle(
     "shelf",
-    (
+    (nodes(45, 70, 38, 40, closed=True),),
+    rules=(
         VelocityRule("+x", (45, 46), (40, 40)),
         VelocityRule("-x", (69, 70), (40, 40)),
         VelocityRule("-y", (45, 70), (40, 40), friction=math.inf),
         VelocityRule("+y", (45, 70), (40, 40)),
     ),
-    drawn=(Box(45 / NODES, 70 / NODES, 38 / NODES, 40 / NODES, closed=True),),
-    shown=(nodes(45, 70, 38, 40),),
 )
 POST = Obstacle(
     "post",
-    (
+    (nodes(81, 85, top=40, closed=True),),
+    rules=(
         VelocityRule("+x", (81, 82), (None, 39)),
         VelocityRule("-x", (84, 85), (None, 39)),
         VelocityRule("-y", (82, 85), (40, 40), friction=math.inf),
     ),
-    drawn=(Box(81 / NODES, 85 / NODES, top=40 / NODES, closed=True),),
-    shown=(nodes(81, 85, top=40),),
 )
 # Moves with the robot: a wall behind it and one ahead.
 FRAME = Obstacle(
     "frame",
-    tuple(
+    rules=tuple(
         rule for end in ((0, 0), (127, 127)) for rule in (*fixed(i=end, frame="window"), *fixed(j=end, frame="window"))
     ),
 )

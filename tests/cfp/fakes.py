@@ -68,7 +68,7 @@ class FakeEnv:
             "is_success": height > 0.4,
             "reward_terms": {"near": reward - 1, "alive": reward * 0 + 1},
         }
-        return self._observe(), reward, height > self.end_above, self.env_state.steps >= self.horizon, info
+        return self._observe(), reward, (height > self.end_above) | ~finite, self.env_state.steps >= self.horizon, info
 
     def render(self, index=0):
         return np.full((512, 512, 3), index, np.uint8)

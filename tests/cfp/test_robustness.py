@@ -18,7 +18,7 @@ from cfp.envs.disturbances import Case, Disturbed, disturbed_env, make_cases, re
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from cfp.evaluate import open_policy, open_run
-from cfp.evaluation.rollout import Result, ZeroPolicy, evaluate, student
+from cfp.evaluation.evaluate import Result, ZeroPolicy, evaluate, student
 from cfp.files import write_json
 from cfp.presets import preset
 from cfp.train import PROGRAM
@@ -112,7 +112,7 @@ def test_constants_reach_the_physics_of_every_task(task):
     assert physics["gravity"].tolist() == [[2 * value for value in spec.gravity]] * 2
     env = disturbed_env(config, 8, 2, Case("ice", friction=0.25), 3)
     floors = [item for item in env.unwrapped.torch_env.spec.obstacles if item.name == "floor"]
-    assert [rule.friction for item in floors for rule in item.rules] == [0.25]
+    assert [rule.friction for item in floors for rule in item.velocity_rules] == [0.25]
     others = [item for item in spec.obstacles if item.name != "floor"]
     assert [item for item in env.unwrapped.torch_env.spec.obstacles if item.name != "floor"] == others
 
@@ -217,7 +217,7 @@ def test_chosen_cases_that_change_nothing_are_refused(folder):
 
 
 def test_floor_counts_with_all_its_rules():
-    run, (slippery,) = make_spec("run"), floor(0.0).rules
+    run, (slippery,) = make_spec("run"), floor(0.0).velocity_rules
     rough = replace(slippery, friction=0.5)
     for rules, reason in (
         ((), "the floor of run has no rules"),

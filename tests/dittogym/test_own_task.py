@@ -414,9 +414,9 @@ def test_numbers_that_would_fail_late_are_refused(changes: dict, error: type, me
 
 def test_obstacles_and_windows_check_their_parts() -> None:
     with pytest.raises(TypeError, match="rules must be a sequence of VelocityRule, got VelocityRule"):
-        Obstacle("ledge", VelocityRule("-y"))
-    with pytest.raises(TypeError, match=r"drawn\[0\] must be a Box, got tuple"):
-        Obstacle("ledge", (), drawn=((0.0, 1.0),))
+        Obstacle("ledge", rules=VelocityRule("-y"))
+    with pytest.raises(TypeError, match=r"observed\[0\] must be a Box, got tuple"):
+        Obstacle("ledge", rules=(), observed=((0.0, 1.0),))
     with pytest.raises(ValueError, match="left must be finite, got nan"):
         Window(left=math.nan)
 

@@ -114,7 +114,7 @@ def test_velocity_rules_are_the_published_ones(task: str) -> None:
     generator = torch.Generator().manual_seed(0)
     com = torch.cat((torch.tensor([0.09]), torch.empty(39).uniform_(-1.5, 3.0, generator=generator)))
     origins = spec.window.origin(torch.stack((com, com), 1))
-    rules = tuple(rule for obstacle in spec.obstacles for rule in obstacle.rules)
+    rules = tuple(rule for obstacle in spec.obstacles for rule in obstacle.velocity_rules)
     for origin in origins:
         velocity = torch.randn(2, 128, 128, generator=generator)
         padded = torch.nn.functional.pad(velocity, [PAD] * 4).flatten(1)[:, None]
@@ -128,7 +128,8 @@ def drawn_pixels(task: str, origin_x: float) -> torch.Tensor:
     origin = torch.tensor([[origin_x, 0.0]], dtype=torch.float64)
 
     def quarter(row: int, column: int) -> torch.Tensor:
-        drawn = obs.draw_boxes(dittogym.make_spec(task).drawn, origin, torch.tensor([[row]]), torch.tensor([[column]]))
+        corner = torch.tensor([[row]]), torch.tensor([[column]])
+        drawn = obs.draw_boxes(dittogym.make_spec(task).observed_boxes, origin, *corner)
         return torch.zeros(512, 512, dtype=torch.bool) if drawn is None else drawn.mask[0]
 
     return torch.cat([torch.cat([quarter(row, column) for column in (0, 512)], 1) for row in (0, 512)], 0)

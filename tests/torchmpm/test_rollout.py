@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from peak_memory import PeakMemory
 from scenes import lively, normal, robot
 from torch import Tensor
 
 from torchmpm import Body, Elastic, ParticleState, estimate_memory, repeated, trajectory
 from torchmpm.backends import compiler_found
-from torchmpm.memory import PeakMemory
 
 NATIVE = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
 
