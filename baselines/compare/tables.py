@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from baselines.common.reference_policies import Zero
 from baselines.compare import paper
 from baselines.compare.results import Group, RunResult
 from baselines.compare.stats import align_curves, first_step_at, interquartile_mean, score_interval, wilson_interval
@@ -159,7 +158,7 @@ def efficiency_table(groups: Sequence[Group], tier: Particles) -> Table:
         groups: All groups; those of ``zero`` are the resting robots.
         tier: Particles of the final evaluation; only curves with the same particles can be compared with it.
     """
-    rest = {group.task: group.iqm for group in groups if group.job.config.algo == Zero.name and group.scores}
+    rest = {group.task: group.iqm for group in groups if group.job.config.algo == "zero" and group.scores}
     trained = [group for group in groups if group.curves and not group.job.untrained]
     best: dict[tuple[str, str], float] = {}
     for group in trained:
