@@ -168,7 +168,7 @@ OTHERS = [
         main=baselines.robustness.main,
     ),
     comparing("unknown tasks", "--tasks swim", "task must be catch"),
-    comparing("unknown algorithms", "--algos alchemy", "algo: got 'alchemy', allowed cfp"),
+    comparing("unknown algorithms", "--algos alchemy", "algo must be one of cfp"),
     comparing("a seed twice", "--seeds 1 1", "seeds must be one or more different values, got 1 1"),
     comparing("without seeds", "--seeds", "seeds must be one or more different values, got none"),
     comparing("seed -1", "--seeds -1", "seeds must be between 0 and 8999, got -1"),
