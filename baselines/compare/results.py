@@ -98,6 +98,11 @@ class Group:
         return [run.evaluation for run in self.runs if run.evaluation is not None]
 
     @property
+    def own_layouts(self) -> list[float]:
+        """Returns on the only layout that policies were made for."""
+        return [each.own_layout for each in self.evaluations if each.own_layout is not None]
+
+    @property
     def scores(self) -> list[float]:
         """Mean returns of the runs that have been evaluated."""
         return [run.score for run in self.runs if run.score is not None]
@@ -132,6 +137,11 @@ class Group:
     def teacher_seconds(self) -> float:
         """Mean wall time of the training of the runs' teachers."""
         return float(np.mean([cost.teacher_seconds for cost in self.costs])) if self.costs else 0.0
+
+    @property
+    def evaluation_seconds(self) -> float:
+        """Mean wall time of the evaluations during training."""
+        return sum(cost.evaluation_seconds for cost in self.costs) / len(self.costs)
 
     @property
     def curves(self) -> list[Curve]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -20,11 +20,13 @@ class Column:
         key: Key of its values in the rows, and its name in the CSV file.
         title: Heading; an empty one restricts the column to the CSV file.
         format: Format specification of numbers; columns without one hold text.
+        value: From what a row is about to its value, for `make_row`.
     """
 
     key: str
     title: str = ""
     format: str = ""
+    value: Callable[[Any], Any] | None = None
 
     def text(self, row: Row) -> str:
         """The value of a row, for readers."""
@@ -37,6 +39,11 @@ class Column:
 def columns(format: str = "", /, **titles: str) -> tuple[Column, ...]:
     """Several columns of one format, as ``key="title"``."""
     return tuple(Column(key, title, format) for key, title in titles.items())
+
+
+def make_row(columns: Sequence[Column], subject: Any) -> dict[str, Any]:
+    """The values of all columns that have a ``value`` function."""
+    return {column.key: column.value(subject) for column in columns if column.value is not None}
 
 
 @dataclass(frozen=True)
