@@ -49,13 +49,8 @@ class Cost:
 class RunResult:
     """A run of the comparison with all that is known of it.
 
-    Attributes:
-        job: The run.
-        state: See `Job.state`; ``unevaluated`` if training has ended but the final evaluation is not complete.
-        error: Why it failed.
-        curve: Mean returns of the evaluations during training.
-        cost: None if no session has ended in order.
-        evaluation: None if there is none.
+    ``state`` is that of `Job.state`, or ``unevaluated`` if training has ended but the final evaluation is not complete;
+    ``error`` tells why it failed; ``curve`` holds the mean returns of the evaluations during training.
     """
 
     job: Job
@@ -73,14 +68,7 @@ class RunResult:
 
 @dataclass(frozen=True)
 class Group:
-    """The runs of one algorithm on one task, one per seed.
-
-    Attributes:
-        task: Name of the task.
-        observes: What the policies observe.
-        label: Name of the algorithm in the report.
-        runs: All runs, finished or not.
-    """
+    """The runs of one algorithm on one task, one per seed, finished or not."""
 
     task: str
     observes: str
@@ -130,8 +118,8 @@ class Group:
     @property
     def speed(self) -> float | None:
         """Environment steps per second of training, over all sessions; None without any."""
-        seconds = sum(cost.seconds for cost in self.costs)
-        return sum(cost.steps for cost in self.costs) / seconds if self.costs else None
+        costs = self.costs
+        return sum(cost.steps for cost in costs) / sum(cost.seconds for cost in costs) if costs else None
 
     @property
     def teacher_seconds(self) -> float:

@@ -14,13 +14,13 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Column:
-    """A column.
+    """A column of a table.
 
     Attributes:
         key: Key of its values in the rows, and its name in the CSV file.
         title: Heading; an empty one restricts the column to the CSV file.
         format: Format specification of numbers; columns without one hold text.
-        value: From what a row is about to its value, for `make_row`.
+        value: From the subject of a row to its value, for `make_row`.
     """
 
     key: str
@@ -48,14 +48,9 @@ def make_row(columns: Sequence[Column], subject: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of plain values; None, or a missing key, is a value that does not exist.
+    """Rows of plain values by the key of their column; None, or a missing key, is a value that does not exist.
 
-    Attributes:
-        name: Name of the CSV file, without its suffix.
-        title: Heading.
-        description: What the table shows.
-        columns: All columns.
-        rows: Values by the key of their column.
+    ``name`` is that of the CSV file, without its suffix; ``title`` and ``description`` are for readers.
     """
 
     name: str
