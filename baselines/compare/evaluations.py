@@ -19,7 +19,6 @@ from cfp.envs.make import choose_device, make_env
 from cfp.errors import CheckpointError
 from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
 from cfp.files import parse_json, write_json
-from cfp.policy import Policy
 from cfp.robustness import report
 from cfp.sections import Particles
 
@@ -97,15 +96,18 @@ class Record:
     """The entries in ``final_evaluation.json`` of a run folder that belong to the policy that is there now.
 
     Args:
+        config: Options of the run.
         folder: The run folder.
 
     Raises:
-        CheckpointError: There is no policy, or the record is damaged.
+        CheckpointError: The record is damaged.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / RECORD
-        self.policy = hashlib.sha256((folder / "policy.safetensors").read_bytes()).hexdigest()
+    def __init__(self, config: RunConfig, folder: Path) -> None:
+        self.path, policy = folder / RECORD, folder / "policy.safetensors"
+        self.policy = config.algo  # of a reference policy
+        if config.algo not in REFERENCE_POLICIES and policy.exists():
+            self.policy = hashlib.sha256(policy.read_bytes()).hexdigest()
         record = read_record(self.path, policy=str, entries=dict) if self.path.exists() else {}
         self.entries: dict[str, Any] = record["entries"] if record.get("policy") == self.policy else {}
 
@@ -157,8 +159,7 @@ def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop
         CheckpointError: There is no policy, or it is damaged.
         ConfigError: The environment refuses an option.
     """
-    record, task, deterministic = Record(folder), config.task, protocol.deterministic(config.task)
-    policy: Policy
+    record, task, deterministic = Record(config, folder), config.task, protocol.deterministic(config.task)
     if config.algo in REFERENCE_POLICIES:
         policy = reference_policy(config)
     else:
@@ -184,15 +185,14 @@ def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop
             record.add(key, partial(play_disturbed, first, count, case))
 
 
-def read_evaluation(task: str, folder: Path, protocol: Protocol) -> FinalEvaluation | None:
-    """What has been found so far; None without a policy or a whole batch of episodes.
+def read_evaluation(config: RunConfig, folder: Path, protocol: Protocol) -> FinalEvaluation | None:
+    """What has been found so far; None without a whole batch of episodes.
 
     Raises:
         CheckpointError: The record is damaged.
     """
-    if not (folder / "policy.safetensors").exists():
-        return None
-    entries, cases, batches = Record(folder).entries, protocol.cases(), len(protocol.batches())
+    task = config.task
+    entries, cases, batches = Record(config, folder).entries, protocol.cases(), len(protocol.batches())
 
     def find(case: Case | None = None) -> list[Entry | None]:
         return [entries[key] for key in protocol.batch_keys(task, case) if key in entries]

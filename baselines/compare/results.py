@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from baselines.compare.evaluations import FinalEvaluation, read_evaluation
+from baselines.compare.evaluations import FinalEvaluation, read_evaluation, read_record
 from baselines.compare.jobs import Job, read_sessions
 from baselines.compare.stats import Curve, interquartile_mean, score_interval
 from cfp.errors import CheckpointError
@@ -144,7 +145,7 @@ def read_result(job: Job) -> RunResult:
     Raises:
         CheckpointError: A file in it is damaged.
     """
-    evaluation, state, error = read_evaluation(job.config.task, job.folder, job.protocol), job.state, ""
+    evaluation, state, error = read_evaluation(job.config, job.folder, job.protocol), job.state, ""
     if state == "finished" and (evaluation is None or not evaluation.complete):
         state = "unevaluated"
     if (job.folder / "error.txt").exists():
@@ -177,14 +178,16 @@ def _read_cost(folder: Path) -> Cost | None:
         if not steps:
             return None
         evaluation = sum(session["evaluation_seconds"] for session in sessions)
-        teacher = sum(session["teacher"]["seconds"] for session in sessions)
+        teacher: dict[str, Any] = {"steps": 0, "seconds": 0.0, "evaluation_seconds": 0.0}
+        if (folder / "teacher" / "cost.json").exists():
+            teacher = read_record(folder / "teacher" / "cost.json")
         return Cost(
             last_step=sessions[-1]["to"],
             steps=steps,
-            seconds=max(sum(session["seconds"] for session in sessions) - evaluation - teacher, 1e-9),
-            evaluation_seconds=evaluation,
-            teacher_seconds=teacher,
-            teacher_steps=sum(session["teacher"]["steps"] for session in sessions),
+            seconds=max(sum(session["seconds"] for session in sessions) - evaluation - teacher["seconds"], 1e-9),
+            evaluation_seconds=evaluation + teacher["evaluation_seconds"],
+            teacher_seconds=teacher["seconds"] - teacher["evaluation_seconds"],
+            teacher_steps=teacher["steps"],
             memory=max((session["memory"] for session in sessions if session["memory"]), default=None),
             device="/".join(sorted({session["device"] for session in sessions})),
         )

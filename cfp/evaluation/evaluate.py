@@ -146,8 +146,8 @@ def evaluate(
     """Run episodes without learning.
 
     Neither the environments of a training run nor torch's generator are touched. The same seed gives the same episodes
-    with any number of threads; element i of the batch starts from layout ``seed + i``; with reference parity, whose resets show what was before,
-    only in environments that have just been made.
+    with any number of threads; element i of the batch starts from layout ``seed + i``. With reference parity, whose
+    resets show what was before, this holds only in environments that have just been made.
 
     Args:
         name: Of the policy, for the result.

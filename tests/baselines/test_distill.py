@@ -378,9 +378,9 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch, caps
 @pytest.mark.parametrize(
     ("task", "kind", "target", "message"),
     [
-        ("shapematch", "gradient", "T", "teacher: got a policy for the target T, allowed star"),
-        ("kick", "gradient", None, "teacher: got a policy for kick, allowed run"),
-        ("run", "gradient", "T", "teacher: its target or the one wanted cannot be read"),
+        ("shapematch", "gradient", "T", "teacher must be a policy for the target star, got T"),
+        ("kick", "gradient", None, "teacher must be a policy for run, got one for kick"),
+        ("run", "gradient", "T", "teacher: cannot compare its target"),
         (None, "", None, "allowed mpc, shac, gradient, catch, grow, run, shapematch"),
     ],
 )

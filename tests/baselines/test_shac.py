@@ -306,7 +306,7 @@ def test_actor_on_the_image_begins_with_a_policy_of_any_algorithm(tmp_path):
     torch.manual_seed(0)
     spread = torch.stack([algorithm.policy(images).atanh() for _ in range(30)]).std(0).mean()
     assert spread == pytest.approx(0.105, rel=0.05)  # not that of the policy, which nothing would change any more
-    with pytest.raises(ConfigError, match="start_from: got a policy for run, allowed kick"):
+    with pytest.raises(ConfigError, match="start_from must be a policy for kick, got one for run"):
         Shac.start(replace(warm, task="kick"))
     with pytest.raises(ConfigError, match="start_from: got a policy, allowed with sees 'image'"):
         replace(warm, sees="state").check()
