@@ -11,9 +11,10 @@ from typing import Literal
 
 import tyro
 
+from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare.evaluations import Noise, Protocol, Robustness
 from baselines.compare.executor import Executor, Resources, execute
-from baselines.compare.jobs import Job, check_folder, is_reference, make_jobs
+from baselines.compare.jobs import Job, check_folder, make_jobs
 from baselines.compare.local import InProcessExecutor, LocalExecutor
 from baselines.compare.plan import Plan
 from baselines.compare.ray import RayExecutor
@@ -108,7 +109,7 @@ class Command:
         """How the policy of a run is evaluated: SLOT has more episodes."""
         if config.task != "slot":
             return self.protocol
-        runs = 1 if is_reference(config) else len(self.seeds)
+        runs = 1 if config.algo in REFERENCE_POLICIES else len(self.seeds)
         return replace(self.protocol, episodes=max(self.episodes, -(-self.slot_episodes // runs)))
 
     def make_executor(self, signals: StopSignals) -> Executor:
@@ -192,7 +193,8 @@ def _report(command: Command, jobs: Sequence[Job]) -> list[RunResult]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry point; returns the exit code."""
-    description = f"Algorithms: {', '.join(ALGORITHMS)}.\n\n{inspect.getdoc(Command)}"
+    names = f"Algorithms: {', '.join(ALGORITHMS)}. Reference policies: {', '.join(REFERENCE_POLICIES)}."
+    description = f"{names}\n\n{inspect.getdoc(Command)}"
     program = program_name("baselines.compare", arguments)
     return run_command(lambda: compare(tyro.cli(Command, prog=program, description=description, args=arguments)))
 

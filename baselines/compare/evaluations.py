@@ -10,13 +10,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare import paper
-from baselines.registry import load
+from baselines.registry import load, reference_policy
 from cfp.config import RunConfig
 from cfp.envs.disturbances import Case, make_cases
 from cfp.envs.make import choose_device, make_env
 from cfp.errors import CheckpointError
-from cfp.evaluation.rollout import Result, evaluate, judging_seed
+from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
 from cfp.files import parse_json, write_json
 from cfp.robustness import report
 from cfp.sections import Particles
@@ -95,15 +96,18 @@ class Record:
     """The entries in ``final_evaluation.json`` of a run folder that belong to the policy that is there now.
 
     Args:
+        config: Options of the run.
         folder: The run folder.
 
     Raises:
-        CheckpointError: There is no policy, or the record is damaged.
+        CheckpointError: The record is damaged.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / RECORD
-        self.policy = hashlib.sha256((folder / "policy.safetensors").read_bytes()).hexdigest()
+    def __init__(self, config: RunConfig, folder: Path) -> None:
+        self.path, policy = folder / RECORD, folder / "policy.safetensors"
+        self.policy = config.algo  # of a reference policy
+        if config.algo not in REFERENCE_POLICIES and policy.exists():
+            self.policy = hashlib.sha256(policy.read_bytes()).hexdigest()
         record = read_record(self.path, policy=str, entries=dict) if self.path.exists() else {}
         self.entries: dict[str, Any] = record["entries"] if record.get("policy") == self.policy else {}
 
@@ -155,8 +159,11 @@ def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop
         CheckpointError: There is no policy, or it is damaged.
         ConfigError: The environment refuses an option.
     """
-    record, task, deterministic = Record(folder), config.task, protocol.deterministic(config.task)
-    policy = load(folder / "policy.safetensors", choose_device(config.device))
+    record, task, deterministic = Record(config, folder), config.task, protocol.deterministic(config.task)
+    if config.algo in REFERENCE_POLICIES:
+        policy = reference_policy(config)
+    else:
+        policy = load(folder / "policy.safetensors", choose_device(config.device))
     config = evaluation_config(config, protocol.tier)
 
     def play(seed: int, count: int) -> Entry:
@@ -169,7 +176,7 @@ def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop
 
     for key, (first, count) in zip(protocol.batch_keys(task), protocol.batches(), strict=True):
         check_stop()
-        record.add(key, partial(play, judging_seed(config) + first, count))
+        record.add(key, partial(play, evaluation_seed(config) + first, count))
     if "layout" in policy.description:
         record.add(protocol.key(task, "own layout"), partial(play, policy.description["layout"], 1))
     for case in protocol.cases()[1:]:
@@ -178,15 +185,14 @@ def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop
             record.add(key, partial(play_disturbed, first, count, case))
 
 
-def read_evaluation(task: str, folder: Path, protocol: Protocol) -> FinalEvaluation | None:
-    """What has been found so far; None without a policy or a whole batch of episodes.
+def read_evaluation(config: RunConfig, folder: Path, protocol: Protocol) -> FinalEvaluation | None:
+    """What has been found so far; None without a whole batch of episodes.
 
     Raises:
         CheckpointError: The record is damaged.
     """
-    if not (folder / "policy.safetensors").exists():
-        return None
-    entries, cases, batches = Record(folder).entries, protocol.cases(), len(protocol.batches())
+    task = config.task
+    entries, cases, batches = Record(config, folder).entries, protocol.cases(), len(protocol.batches())
 
     def find(case: Case | None = None) -> list[Entry | None]:
         return [entries[key] for key in protocol.batch_keys(task, case) if key in entries]

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from baselines.common.reference_policies import FloorConfig
-from baselines.compare.evaluations import Protocol, read_record
+from baselines.common.reference_policies import REFERENCE_POLICIES
+from baselines.compare.evaluations import RECORD, Protocol, read_record
 from baselines.compare.plan import Plan
-from baselines.registry import ALGORITHMS, ALIASES, configure, find
+from baselines.registry import ALGORITHMS, ALIASES, configure, sees
 from cfp.config import EVALUATION_SEED, RunConfig, to_json
 from cfp.errors import ConfigError
-from cfp.experiment.run import holds_run, read_config
+from cfp.experiment.folder import holds_run, read_config
 from cfp.from_dict import flatten
 from cfp.sections import TASK_OPTIONS
 from cfp.weights import is_of_another_task, is_same_task, read_policy
@@ -52,16 +52,18 @@ class Job:
     @property
     def observes(self) -> str:
         """What the policy observes: image, state, simulator or nothing."""
-        return str(getattr(self.config, "sees", find(self.config.algo).sees))
+        return str(getattr(self.config, "sees", sees(self.config.algo)))
 
     @property
     def untrained(self) -> bool:
         """Whether it evaluates a reference policy, which learns nothing and does not depend on the seed."""
-        return is_reference(self.config)
+        return self.config.algo in REFERENCE_POLICIES
 
     @property
     def trained(self) -> bool:
-        """Whether training has ended, here or by ``python -m baselines.train``."""
+        """Whether training has ended, here or by ``python -m baselines.train``, if there is any."""
+        if self.untrained:
+            return (self.folder / RECORD).exists()
         finished = read_sessions(self.folder)["finished"]
         return finished in (True, self.config.ends()[-1]) or (self.folder / "results.json").exists()
 
@@ -73,11 +75,6 @@ class Job:
         if (self.folder / "error.txt").exists():
             return "failed"
         return "begun" if holds_run(self.folder) else "missing"
-
-
-def is_reference(config: RunConfig) -> bool:
-    """Whether options are those of a reference policy, which learns nothing."""
-    return isinstance(config, FloorConfig)
 
 
 def make_jobs(
@@ -138,7 +135,7 @@ def resolve(plan: Plan, label: str, task: str, preset: str, seed: int, steps: in
     """
     values = plan.options(label, task)
     variant_of = values.pop("algo", label)
-    algo = label if label in {*ALGORITHMS, *ALIASES} else variant_of
+    algo = label if label in {*ALGORITHMS, *ALIASES, *REFERENCE_POLICIES} else variant_of
     algo = plan.own_options(label, task).get("algo", algo)
     start: dict[str, Any] = {"algo": algo, "task": task, "preset": preset}
     base = configure(start)

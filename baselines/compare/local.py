@@ -12,7 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from baselines.compare.executor import Executor, Resources
 from baselines.compare.jobs import Job
-from baselines.compare.worker import EXIT_CODES, Outcome, encode, run
+from baselines.compare.worker import EXIT_CODES, Outcome, carry_out, encode
 from cfp.experiment.process import StopSignals
 from cfp.files import write_text
 
@@ -51,7 +51,7 @@ class InProcessExecutor(Executor):
         """Carry out a run, see `Executor.submit`."""
         future: Future[Outcome] = Future()
         stopped = self.signals.number
-        future.set_result("stopped" if stopped else run(job, self.signals, self.lock_timeout, own_process=False))
+        future.set_result("stopped" if stopped else carry_out(job, self.signals, self.lock_timeout, own_process=False))
         return future
 
     def stop(self) -> None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from baselines.compare.evaluations import FinalEvaluation, read_evaluation
+from baselines.compare.evaluations import FinalEvaluation, read_evaluation, read_record
 from baselines.compare.jobs import Job, read_sessions
 from baselines.compare.stats import Curve, interquartile_mean, score_interval
 from cfp.errors import CheckpointError
@@ -48,13 +49,8 @@ class Cost:
 class RunResult:
     """A run of the comparison with all that is known of it.
 
-    Attributes:
-        job: The run.
-        state: See `Job.state`; ``unevaluated`` if training has ended but the final evaluation is not complete.
-        error: Why it failed.
-        curve: Mean returns of the evaluations during training.
-        cost: None if no session has ended in order.
-        evaluation: None if there is none.
+    ``state`` is that of `Job.state`, or ``unevaluated`` if training has ended but the final evaluation is not complete;
+    ``error`` tells why it failed; ``curve`` holds the mean returns of the evaluations during training.
     """
 
     job: Job
@@ -72,14 +68,7 @@ class RunResult:
 
 @dataclass(frozen=True)
 class Group:
-    """The runs of one algorithm on one task, one per seed.
-
-    Attributes:
-        task: Name of the task.
-        observes: What the policies observe.
-        label: Name of the algorithm in the report.
-        runs: All runs, finished or not.
-    """
+    """The runs of one algorithm on one task, one per seed, finished or not."""
 
     task: str
     observes: str
@@ -95,6 +84,11 @@ class Group:
     def evaluations(self) -> list[FinalEvaluation]:
         """Final evaluations of the runs that have one."""
         return [run.evaluation for run in self.runs if run.evaluation is not None]
+
+    @property
+    def own_layouts(self) -> list[float]:
+        """Returns on the only layout that policies were made for."""
+        return [each.own_layout for each in self.evaluations if each.own_layout is not None]
 
     @property
     def scores(self) -> list[float]:
@@ -124,13 +118,18 @@ class Group:
     @property
     def speed(self) -> float | None:
         """Environment steps per second of training, over all sessions; None without any."""
-        seconds = sum(cost.seconds for cost in self.costs)
-        return sum(cost.steps for cost in self.costs) / seconds if self.costs else None
+        costs = self.costs
+        return sum(cost.steps for cost in costs) / sum(cost.seconds for cost in costs) if costs else None
 
     @property
     def teacher_seconds(self) -> float:
         """Mean wall time of the training of the runs' teachers."""
         return float(np.mean([cost.teacher_seconds for cost in self.costs])) if self.costs else 0.0
+
+    @property
+    def evaluation_seconds(self) -> float:
+        """Mean wall time of the evaluations during training."""
+        return sum(cost.evaluation_seconds for cost in self.costs) / len(self.costs)
 
     @property
     def curves(self) -> list[Curve]:
@@ -144,7 +143,7 @@ def read_result(job: Job) -> RunResult:
     Raises:
         CheckpointError: A file in it is damaged.
     """
-    evaluation, state, error = read_evaluation(job.config.task, job.folder, job.protocol), job.state, ""
+    evaluation, state, error = read_evaluation(job.config, job.folder, job.protocol), job.state, ""
     if state == "finished" and (evaluation is None or not evaluation.complete):
         state = "unevaluated"
     if (job.folder / "error.txt").exists():
@@ -177,14 +176,16 @@ def _read_cost(folder: Path) -> Cost | None:
         if not steps:
             return None
         evaluation = sum(session["evaluation_seconds"] for session in sessions)
-        teacher = sum(session["teacher"]["seconds"] for session in sessions)
+        teacher: dict[str, Any] = {"steps": 0, "seconds": 0.0, "evaluation_seconds": 0.0}
+        if (folder / "teacher" / "cost.json").exists():
+            teacher = read_record(folder / "teacher" / "cost.json")
         return Cost(
             last_step=sessions[-1]["to"],
             steps=steps,
-            seconds=max(sum(session["seconds"] for session in sessions) - evaluation - teacher, 1e-9),
-            evaluation_seconds=evaluation,
-            teacher_seconds=teacher,
-            teacher_steps=sum(session["teacher"]["steps"] for session in sessions),
+            seconds=max(sum(session["seconds"] for session in sessions) - evaluation - teacher["seconds"], 1e-9),
+            evaluation_seconds=evaluation + teacher["evaluation_seconds"],
+            teacher_seconds=teacher["seconds"] - teacher["evaluation_seconds"],
+            teacher_steps=teacher["steps"],
             memory=max((session["memory"] for session in sessions if session["memory"]), default=None),
             device="/".join(sorted({session["device"] for session in sessions})),
         )

@@ -20,10 +20,11 @@ from typing import Any, Literal
 
 from baselines.compare.evaluations import Protocol, evaluate_run
 from baselines.compare.jobs import Job, check_folder, read_sessions
-from baselines.registry import configure, open_run
+from baselines.registry import configure, find
 from cfp.config import to_json
 from cfp.envs.make import choose_device
 from cfp.experiment.process import Stopped, StopSignals, keep_memory, peak_memory
+from cfp.experiment.run import Run
 from cfp.experiment.run_lock import Claimed, claim
 from cfp.files import write_json, write_text
 
@@ -47,7 +48,7 @@ def decode(line: str) -> tuple[Job, float]:
     return job, values["lock_timeout"]
 
 
-def run(job: Job, signals: StopSignals, lock_timeout: float, *, own_process: bool = True) -> Outcome:
+def carry_out(job: Job, signals: StopSignals, lock_timeout: float, *, own_process: bool = True) -> Outcome:
     """Do what is left of a run; an error is written to ``error.txt`` in its folder.
 
     Args:
@@ -82,7 +83,9 @@ def _train_and_evaluate(job: Job, signals: StopSignals, own_process: bool) -> No
             raise Stopped(signals.number)
 
     check_folder(job)
-    if not job.trained:
+    if job.untrained and not job.trained:
+        write_json(job.folder / "config.json", to_json(job.config))
+    elif not job.trained:
         train(job, signals, own_process)
     evaluate_run(job.config, job.folder, job.protocol, check_stop)
 
@@ -90,18 +93,17 @@ def _train_and_evaluate(job: Job, signals: StopSignals, own_process: bool) -> No
 def train(job: Job, signals: StopSignals, own_process: bool = True) -> None:
     """Train to the end, and record the cost of this session in ``sessions.json``; a killed process leaves no record."""
     earlier = read_sessions(job.folder)["sessions"]
-    session = open_run(job.config, job.folder, True, signals)
-    first_step, start, finished = session.step, time.perf_counter(), False
+    run = Run(find(job.config.algo), job.config, job.folder, True, signals)
+    first_step, start, finished = run.step, time.perf_counter(), False
     try:
-        session.train()
+        run.train()
         finished = True
     finally:
         record = {
             "from": first_step,
-            "to": session.step,
+            "to": run.step,
             "seconds": time.perf_counter() - start,
-            "evaluation_seconds": session.judging,
-            "teacher": dict(zip(("steps", "seconds"), session.teaching, strict=True)),
+            "evaluation_seconds": run.evaluation_seconds,
             "memory": peak_memory() if own_process else None,
             "device": choose_device(job.config.device),
             "host": socket.gethostname(),
@@ -124,7 +126,7 @@ def main() -> int:
     threading.Thread(target=_stop_with_parent, daemon=True).start()
     keep_memory()
     with StopSignals() as signals:
-        return EXIT_CODES[run(job, signals, lock_timeout)]
+        return EXIT_CODES[carry_out(job, signals, lock_timeout)]
 
 
 if __name__ == "__main__":

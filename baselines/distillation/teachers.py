@@ -13,7 +13,8 @@ from torch import Tensor
 
 from baselines.common.open_loop import OpenLoop
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
-from cfp.evaluation.rollout import Policy, SeesState
+from baselines.registry import load
+from cfp.policy import Policy, SeesState
 from cfp.sections import EnvironmentConfig
 from cfp.weights import check_trained_for, read_policy
 from dittogym import TorchEnv, make_spec
@@ -152,8 +153,6 @@ def read_teacher(path: str | Path, task: str, environment: EnvironmentConfig) ->
         ConfigError: It was trained for something else, or cannot be asked about other states than its own.
         CheckpointError: There is no such policy, or it is damaged.
     """
-    from baselines.registry import load  # the registry knows all algorithms, that which is taught included
-
     check_trained_for("teacher", read_policy(path)[1], task, environment)
     return load(path)
 

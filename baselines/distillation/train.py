@@ -5,29 +5,39 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import nn
 
 import cfp
-from baselines.common.algorithm import SEEDED, Algorithm, Callback, Sees, grid_size
 from baselines.common.episodes import Episodes
+from baselines.common.grid import grid_size
+from baselines.distillation.config import DistillConfig
 from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entries
+from baselines.distillation.teacher_training import (
+    TRAINED,
+    copy_teacher,
+    teacher_path,
+    train_teacher,
+    warn_of_recorded_teacher,
+)
 from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
 from baselines.planning.gradient import GradientPlannerConfig
 from baselines.shac.networks import fix_std
 from cfp.agent.actor import build_actor
 from cfp.agent.actor_policy import ActorPolicy
-from cfp.config import LadderConfig, RunConfig, check_training_layouts
-from cfp.envs.make import make_torch_env
+from cfp.config import RunConfig
+from cfp.envs.make import choose_device, make_torch_env
 from cfp.errors import NonFiniteError
-from cfp.sections import EnvironmentConfig, Particles
-from cfp.validation import check_at_least, check_fraction, check_positive
+from cfp.experiment.algorithm import Algorithm, Position, Scalars, Sees
+from cfp.experiment.folder import policy_path
+from cfp.experiment.process import StopSignals
+from cfp.sections import EnvironmentConfig
 from cfp.weights import KIND, load, save_policy
 from dittogym import make_spec
 
@@ -45,72 +55,7 @@ METRICS: dict[str, str] = {
     "train/terminated": "those that ended before their time",
     "train/nonfinite": "simulations that were not finite and were reset",
 }
-"""Every scalar that `Distill.learn` logs, and what it means."""
-
-
-@dataclass(frozen=True)
-class DistillConfig(LadderConfig):
-    """A distillation; num_envs robots move side by side. Levels are listed coarsest first.
-
-    The environment options say how the result is judged; train_particles, where it is taught.
-    """
-
-    algo: str = "distill"
-    """Which algorithm."""
-    teacher: str = "shac"
-    """mpc (plans from every state), shac or gradient (trained first), or a policy: a run folder, policy.safetensors."""
-    train_particles: Particles = "lite"
-    """Particles of the simulations that are taught in."""
-    rollout_steps: int = 64
-    """Control steps between two lessons."""
-    updates: int = 48
-    """Gradient steps in a lesson."""
-    batch_size: int = 256
-    """Labels in a gradient step."""
-    student_noise: bool = True
-    """The student moves with the noise of its policy."""
-    student_learning_rate: float = 1e-3
-    """Adam's step size at the beginning of each level; it falls to a tenth."""
-    max_grad_norm: float = 1.0
-    """Largest norm of the gradient."""
-    beta_decay: float = 0.7
-    """Factor by which the share of legs that the teacher leads falls from round to round; it begins at 1."""
-    switch_every: int = 8
-    """Control steps after which it is drawn anew who leads a robot."""
-    dropout: float = 0.0
-    """Share of entries that become 0 in half of the images that the student sees and of the actions that it takes, so
-    that it learns to do without them."""
-    capacity: int = 100_000
-    """Labels that are kept; an image takes 12 KiB, an action on the smaller grid of teacher and student 8 R R bytes."""
-    max_episode_steps: int = 400
-    """Control steps after which an episode is cut; the first ones are cut at staggered ages."""
-    num_layouts: int = 64
-    """Particle layouts that are gone through."""
-    planner: GradientPlannerConfig = field(default_factory=GradientPlannerConfig)
-    planner_grid: int | Literal["coarse", "fine"] = "coarse"
-    """Action grid of the teacher mpc."""
-
-    def ineffective(self) -> dict[str, str]:
-        """What concerns plans; layouts are counted from the seed."""
-        plans = {} if self.teacher == "mpc" else dict.fromkeys(("planner.", "planner_grid"), "teacher mpc")
-        return super().ineffective() | plans | SEEDED
-
-    def check(self) -> None:
-        """Check what the types cannot, see `LadderConfig.check`."""
-        super().check()
-        check_at_least(
-            1,
-            rollout_steps=self.rollout_steps,
-            updates=self.updates,
-            batch_size=self.batch_size,
-            switch_every=self.switch_every,
-            capacity=self.capacity,
-            max_episode_steps=self.max_episode_steps,
-            num_layouts=self.num_layouts,
-        )
-        check_training_layouts("num_layouts", self.num_layouts * len(self.resolutions), self.environment.num_envs)
-        check_positive(student_learning_rate=self.student_learning_rate, max_grad_norm=self.max_grad_norm)
-        check_fraction(beta_decay=self.beta_decay, dropout=self.dropout)
+"""Every scalar that `Distill.update` logs, and what it means."""
 
 
 class Distill(Algorithm):
@@ -121,21 +66,20 @@ class Distill(Algorithm):
 
     Args:
         config: The run's options.
-        level: Index of the level.
+        stage: Which level, 1 is the coarsest.
         start: Policy of the levels before, which are frozen.
         teacher: File of the teacher's policy, if it is not the one that the options name.
     """
 
-    name: ClassVar[str] = "distill"
     sees: ClassVar[Sees] = "image"
 
     def __init__(
-        self, config: DistillConfig, level: int = 0, start: ActorPolicy | None = None, teacher: Path | None = None
+        self, config: DistillConfig, stage: int = 1, start: ActorPolicy | None = None, teacher: Path | None = None
     ) -> None:
-        self.config, self.level = config, level
+        self.config, self.stage = config, stage
         own = replace(config, environment=config.environment.for_training(config.train_particles))
         self.env = make_torch_env(own, make_spec(config.task).patch)
-        self.spec = config.actor_spec(level)
+        self.spec = config.actor_spec(stage - 1)
         with self._luck():
             self.actor = build_actor(self.spec)
         fix_std(self.actor)
@@ -145,7 +89,7 @@ class Distill(Algorithm):
         learning = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
         self.adam = torch.optim.Adam(learning, config.student_learning_rate)
         episodes = Episodes(
-            self.env, config.seed + level * config.num_layouts, config.max_episode_steps, config.num_layouts
+            self.env, config.seed + (stage - 1) * config.num_layouts, config.max_episode_steps, config.num_layouts
         )
         grid = self.spec.resolutions[-1]
         self.collector = Collector(
@@ -188,11 +132,43 @@ class Distill(Algorithm):
             planner_grid=16 if silhouette else "coarse",
         )
 
+    @classmethod
+    def initialize(cls, config: DistillConfig, folder: Path) -> Position:
+        """Copy the teacher into the folder, if it is a policy."""
+        copy_teacher(config, folder)
+        return Position()
+
+    @classmethod
+    def prepare(cls, config: DistillConfig, folder: Path, signals: StopSignals | None) -> None:
+        """Train the teacher, if only its algorithm is named."""
+        train_teacher(config, folder, signals)
+
+    @classmethod
+    def create(cls, config: DistillConfig, stage: int, folder: Path, resumed: bool = False) -> Distill:
+        """The student at the beginning of a stage."""
+        start = load(policy_path(folder, stage - 1), choose_device(config.device)) if stage > 1 else None
+        algorithm = cls(config, stage, start, None if config.teacher == "mpc" else teacher_path(folder))
+        algorithm.starts_trained = stage > 1
+        return algorithm
+
+    @classmethod
+    def warnings(cls, config: DistillConfig, folder: Path, first_stage: int) -> list[str]:
+        """A teacher that may know one start only."""
+        return warn_of_recorded_teacher(config, folder)
+
+    @classmethod
+    def not_estimated(cls, config: DistillConfig) -> list[str]:
+        """The teacher's own training."""
+        if config.teacher not in TRAINED:
+            return []
+        options = f"--algo {config.teacher} --task {config.task}"
+        return [f"the teacher's training, which comes first (python -m baselines.train {options} --dry-run)"]
+
     @contextmanager
     def _luck(self) -> Iterator[None]:
         """Torch's generator, seeded for what happens next and put back afterwards."""
         with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
-            source = np.random.SeedSequence((self.config.seed, self.level, self.num_timesteps))
+            source = np.random.SeedSequence((self.config.seed, self.stage - 1, self.num_timesteps))
             torch.manual_seed(int(source.generate_state(1)[0]))
             yield
 
@@ -216,19 +192,16 @@ class Distill(Algorithm):
         """What has been learned so far; it looks at images only, whatever ``env`` is. Built once, not in every step."""
         return self.policy
 
-    def learn(self, total_timesteps: int, callback: Callback) -> Distill:
-        """Do as many rounds as cover the steps.
+    def update(self) -> Scalars:
+        """Do one round: collect labels, and learn from all that are kept.
 
         Raises:
             NonFiniteError: The loss is not finite.
         """
-        end = self.num_timesteps + total_timesteps
-        while self.num_timesteps < end:
-            with self._luck():
-                scalars = self._round()
-            self.num_timesteps += self.period
-            callback(scalars)
-        return self
+        with self._luck():
+            scalars = self._round()
+        self.num_timesteps += self.period
+        return scalars
 
     def _round(self) -> dict[str, float | None]:
         config, share = self.config, self.config.beta_decay**self.rounds
@@ -261,7 +234,7 @@ class Distill(Algorithm):
 
     def _rate(self) -> float:
         bounds = (0, *self.config.ends())
-        done = self.num_timesteps / (bounds[self.level + 1] - bounds[self.level])
+        done = self.num_timesteps / (bounds[self.stage] - bounds[self.stage - 1])
         return self.config.student_learning_rate * (1.0 - (1.0 - FINAL_RATE) * min(done, 1.0))
 
     def _loss(self, observations: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
@@ -284,10 +257,10 @@ class Distill(Algorithm):
         self.adam.step()
         return value
 
-    def save(self, path: Path, description: dict[str, Any]) -> None:
+    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the policy, as one of CFP."""
         save_policy(
-            path, self.actor, description | {"kind": KIND, "network": asdict(self.spec), "trained_by": self.name}
+            path, self.actor, description | {"kind": KIND, "network": asdict(self.spec), "trained_by": self.config.algo}
         )
 
     @classmethod
@@ -309,5 +282,4 @@ class Distill(Algorithm):
         """Undo `state_dict`."""
         for name in ("actor", "adam", "dataset", "collector"):
             getattr(self, name).load_state_dict(state[name])
-        self.dataset.rounds = [self._kept(labels) for labels in self.dataset.rounds]  # checkpoints from before differ
         self.rounds = state["rounds"]

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 import cfp
-from baselines.common.algorithm import Algorithm, Callback, GridConfig, Sees
 from baselines.common.episodes import Episodes
+from baselines.common.grid import GridConfig
 from baselines.shac.features import StateFeatures
 from baselines.shac.networks import ImageActor, StateActor, StatePolicy, fix_std, image_critic, state_critic
 from baselines.shac.reward import RewardConfig
@@ -21,7 +21,8 @@ from cfp.agent.actor_policy import ActorPolicy
 from cfp.config import RunConfig, check_training_layouts
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
-from cfp.evaluation.rollout import Policy
+from cfp.experiment.algorithm import Algorithm, Scalars, Sees
+from cfp.policy import Policy
 from cfp.sections import Particles, ReportConfig
 from cfp.validation import check_at_least, check_fraction, check_positive
 from cfp.weights import KIND, load, policy_for, read_policy, save_policy
@@ -46,7 +47,7 @@ METRICS: dict[str, str] = {
     "train/dropped": "gradients of single actions that were not finite and were left out",
     "train/skipped": "updates without a finite gradient, not made",
 }
-"""Every scalar that `Shac.learn` logs, and what it means."""
+"""Every scalar that `Shac.update` logs, and what it means."""
 
 
 @dataclass(frozen=True)
@@ -131,13 +132,12 @@ class Shac(Algorithm):
     simulation; the critic learns TD(lambda) targets from the same window.
     """
 
-    name: ClassVar[str] = "shac"
     sees: ClassVar[Sees] = "state"
 
-    def __init__(self, config: ShacConfig, level: int = 0, start: Policy | None = None) -> None:
+    def __init__(self, config: ShacConfig, stage: int = 1, start: Policy | None = None) -> None:
         self.config = config
         own = replace(config, environment=config.environment.for_training(config.train_particles))
-        self.env = make_torch_env(own, config.resolution(level))
+        self.env = make_torch_env(own, config.resolution(stage - 1))
         self.features = StateFeatures(config.deformation, config.clock, config.displacement)
         with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             torch.manual_seed(config.seed)
@@ -192,7 +192,7 @@ class Shac(Algorithm):
         )
 
     @classmethod
-    def start(cls, config: ShacConfig) -> ActorPolicy | None:
+    def initial_policy(cls, config: ShacConfig) -> ActorPolicy | None:
         """The policy that the actor begins with, if the options name one."""
         if config.start_from is None:
             return None
@@ -229,24 +229,17 @@ class Shac(Algorithm):
         policy = self.policy
         return policy.attached(env) if isinstance(policy, StatePolicy) else policy
 
-    def learn(self, total_timesteps: int, callback: Callback) -> Shac:
-        """Do as many windows as cover the steps.
+    def row(self) -> Scalars:
+        """Scalars of the last update, and of the episodes that have ended since the last row."""
+        self.rollout.episodes.recent_returns = []
+        return self.scalars
+
+    def update(self) -> Scalars:
+        """Play one window, and learn from it.
 
         Raises:
             NonFiniteError: Ten updates in a row had no finite gradient, or actions are not finite.
         """
-        end = self.num_timesteps + total_timesteps
-        while self.num_timesteps < end:
-            scalars = self._iterate()
-            self.num_timesteps += self.config.window * self.env.num_envs
-            callback(scalars)
-        return self
-
-    def written(self) -> None:
-        """The next row tells of the episodes that end from here on."""
-        self.rollout.episodes.recent_returns = []
-
-    def _iterate(self) -> dict[str, float | None]:
         rate = self.config.learning_rate * (1.0 - (1.0 - FINAL_RATE) * min(self.num_timesteps / self.config.steps, 1.0))
         for adam in (self.actor_adam, self.critic_adam):
             adam.param_groups[0]["lr"] = rate
@@ -256,7 +249,8 @@ class Shac(Algorithm):
         with torch.no_grad():
             for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
                 slow.lerp_(fast, self.config.tau)
-        scalars = self.rollout.episodes.scalars() | {
+        self.num_timesteps += self.config.window * self.env.num_envs
+        return self.rollout.episodes.scalars() | {
             "train/reward": float(window.rewards.detach().mean()) / self.config.reward.scale,
             "train/true_reward": window.true_reward,
             "train/value": float(window.next_values.detach().mean()),
@@ -265,7 +259,6 @@ class Shac(Algorithm):
             "train/learning_rate": rate,
             "train/skipped": float(self.skipped),
         }
-        return scalars
 
     def _improve_actor(self, window: Window) -> float | None:
         """One step of Adam; returns the gradient's norm, None if it was not finite and the step not made."""
@@ -298,7 +291,7 @@ class Shac(Algorithm):
             self.critic_adam.step()
         return float(loss.detach())
 
-    def save(self, path: Path, description: dict[str, Any]) -> None:
+    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the policy; one that sees the image becomes a policy of CFP."""
         description = {**description, "sees": self.config.sees}
         policy = self._policy(description)
@@ -306,7 +299,9 @@ class Shac(Algorithm):
             policy.save(path)
         else:
             network = {"resolutions": [policy.resolution]}
-            save_policy(path, policy.actor, description | {"kind": KIND, "network": network, "trained_by": self.name})
+            save_policy(
+                path, policy.actor, description | {"kind": KIND, "network": network, "trained_by": self.config.algo}
+            )
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu") -> StatePolicy | ActorPolicy:

@@ -11,7 +11,7 @@ from baselines.compare import evaluations
 from baselines.compare.__main__ import main
 from baselines.compare.evaluations import Protocol, Record, evaluation_config
 from baselines.compare.jobs import Job
-from baselines.compare.worker import run
+from baselines.compare.worker import carry_out
 from baselines.registry import configure, load
 from cfp.envs.disturbances import make_cases
 from cfp.errors import CheckpointError
@@ -85,7 +85,7 @@ def test_damaged_notes_are_named(tmp_path, capsys, content):
     (folder / "policy.safetensors").touch()
     (folder / "final_evaluation.json").write_text(content)
     with pytest.raises(CheckpointError, match=r"final_evaluation\.json: cannot be read \("):
-        Record(folder)
+        Record(configure({"algo": "mpc"}), folder)
 
 
 def test_options_that_change_no_result_may_differ(finished):
@@ -188,9 +188,23 @@ def test_all_policies_are_evaluated_with_the_same_noise(finished, monkeypatch):
 
 def test_evaluations_with_other_noise_do_not_count(finished):
     folder = finished / "runs" / "mpc-shapematch-quick-0"
+    config = configure(json.loads((folder / "config.json").read_text()))
     for noise, found in (("without", True), ("paper", True), ("with", False)):
         protocol = Protocol(2, 100, "none", noise)
-        assert (evaluations.read_evaluation("shapematch", folder, protocol) is not None) == found
+        assert (evaluations.read_evaluation(config, folder, protocol) is not None) == found
+
+
+def test_reference_policies_are_evaluated_without_training(tmp_path):
+    out = tmp_path / "out"
+    assert compare(out, "--algos", "zero", "random", "--seeds", "3", "4") == 0
+    folders = {name: out / "runs" / f"{name}-shapematch-quick-3" for name in ("zero", "random")}
+    assert sorted((out / "runs").iterdir()) == sorted(folders.values())
+    assert {path.name for path in folders["zero"].iterdir()} == {"config.json", "final_evaluation.json"}
+    found = {name: json.loads((folder / "final_evaluation.json").read_text()) for name, folder in folders.items()}
+    assert found["zero"]["policy"] == "zero" and found["zero"]["entries"] != found["random"]["entries"]
+    before = contents(out)
+    assert compare(out, "--algos", "zero", "random", "--seeds", "3", "4") == 0
+    assert contents(out) == before
 
 
 @pytest.mark.slow
@@ -220,5 +234,5 @@ def test_folder_in_use_is_left_alone(finished):
     before = (folder / "final_evaluation.json").read_bytes()
     config = configure(json.loads((folder / "config.json").read_text()))
     with claim(folder):
-        assert run(Job("mpc", config, folder, Protocol(9, 100, "none")), StopSignals(), 0.0) == "busy"
+        assert carry_out(Job("mpc", config, folder, Protocol(9, 100, "none")), StopSignals(), 0.0) == "busy"
     assert (folder / "final_evaluation.json").read_bytes() == before

@@ -14,7 +14,7 @@ from baselines.compare.plan import Plan
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ("--algos alchemy", "algo: got 'alchemy', allowed cfp"),
+        ("--algos alchemy", "algo must be one of cfp"),
         ("--tasks swim --algos mpc", "task must be catch"),
         ("--algos mpc mpc", "algos must be one or more different values, got mpc mpc"),
         ("--seeds 9500 --algos mpc", "seeds must be between 0 and 8999, got 9500"),

@@ -15,12 +15,12 @@ from baselines.modular.kmeans import update
 from baselines.modular.networks import ModularActor, ModularCritics
 from baselines.modular.nodes import Nodes, pack, unpack, visible_positions
 from baselines.modular.policy import SegmentPolicy
-from baselines.modular.train import ModularConfig, ModularRun, preset
+from baselines.modular.train import ModularConfig, preset
+from baselines.registry import find
 from cfp.agent.losses import Losses
 from cfp.envs.disturbances import Case
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import CheckpointError, ConfigError
-from cfp.experiment.process import StopSignals
 from cfp.robustness import report
 from cfp.sections import EnvironmentConfig, ReportConfig
 from cfp.weights import origin
@@ -84,7 +84,7 @@ def test_networks_have_the_documented_sizes(kind, actor, critics):
 
 
 def config(algo, **changes):
-    base = baselines.ALGORITHMS[algo].preset("run", "quick")
+    base = find(algo).preset("run", "quick")
     return replace(
         base,
         device="cpu",
@@ -98,8 +98,7 @@ def config(algo, **changes):
 
 
 def model_of(algo, folder):
-    with StopSignals() as signals:
-        return ModularRun(config(algo), folder, False, signals).make_model(0)
+    return find(algo).create(config(algo), 1, folder).model
 
 
 @pytest.mark.parametrize("algo", ["gnn-16", "transformer-16"])
@@ -193,10 +192,10 @@ def test_policy_must_be_shown_its_own_kind_of_task(tmp_path):
 
 @pytest.mark.parametrize("algo", ["gnn-16", "gnn-64", "transformer-16", "transformer-64"])
 def test_presets_learn_as_the_first_stage_does(algo):
-    assert baselines.ALGORITHMS[algo].sees == "state"
+    assert find(algo).sees == "state"
     for task in cfp.presets.TASKS:
         for name in ("quick", "paper"):
-            mine, ladder = baselines.ALGORITHMS[algo].preset(task, name), cfp.preset(task, name)
+            mine, ladder = find(algo).preset(task, name), cfp.preset(task, name)
             mine.check()
             assert (mine.learning, mine.environment, mine.steps) == (ladder.learning, ladder.environment, ladder.steps)
             assert (mine.alpha, mine.random_steps) == (ladder.alpha[0], ladder.random_steps[0])

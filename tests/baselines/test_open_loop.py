@@ -46,7 +46,7 @@ def test_file_holds_what_was_saved(policy, tmp_path):
 def test_file_without_actions_is_refused(tmp_path):
     wrong = OpenLoop(torch.zeros(1, 2, 4, 4), origin(configure({}), "cfp", 0, 0))
     wrong.save(tmp_path / "policy.safetensors")
-    with pytest.raises(CheckpointError, match="weights and description do not fit"):
+    with pytest.raises(CheckpointError, match="weights and description do not match"):
         baselines.load(tmp_path)  # says that it is an actor
 
 

@@ -85,7 +85,11 @@ def test_description_stands_beside_and_inside_the_weights(saved):
 def test_default_of_a_task_may_be_named_or_not(task, option, one, other, same):
     for given, wanted in ((one, other), (other, one)):
         description = {"task": task, "environment": {option: given}}
-        with nullcontext() if same else pytest.raises(ConfigError, match=f"got a policy for the {option} {given}"):
+        with (
+            nullcontext()
+            if same
+            else pytest.raises(ConfigError, match=f"must be a policy for the {option} {wanted}, got {given}")
+        ):
             check_trained_for("start_from", description, task, EnvironmentConfig(**{option: wanted}))
 
 
