@@ -79,7 +79,9 @@ TRAIN = [
     training("a target that is not there", "--target none.png", "target must be 'star'", "no such file: 'none.png'"),
     training("a variant of another task", "--variant published", "task 'shapematch' has no option 'variant'"),
     training("a policy that is not there", "--start-from none", "none.safetensors: there is no policy"),
-    training("a policy of another task", "--start-from run", "start_from: got a policy for run, allowed shapematch"),
+    training(
+        "a policy of another task", "--start-from run", "start_from must be a policy for shapematch, got one for run"
+    ),
     training("an algorithm of baselines", "--algo shac", "algo must be 'cfp', got 'shac'; python -m baselines.train"),
     training("robots on judging layouts", "--num-envs 10001", "num_envs must be at most 10000, got 10001"),
     Case(
@@ -138,7 +140,9 @@ OTHERS = [
     distilling("plans of no planner", "--iterations 9", "iterations requires teacher mpc"),
     learning("zero", "a grid of none", "--grid 0", "resolution must be 'coarse', 'fine' or 1 to 64, got 0"),
     distilling("an unknown teacher", "--teacher socrates", "teacher: got 'socrates'", "mpc, shac, gradient"),
-    distilling("a teacher of another task", "--teacher run", "teacher: got a policy for run, allowed shapematch"),
+    distilling(
+        "a teacher of another task", "--teacher run", "teacher must be a policy for shapematch, got one for run"
+    ),
     distilling("a decay of 2", "--beta-decay 2", "beta_decay must be between 0 and 1, got 2.0"),
     learning(
         "shac",
@@ -150,7 +154,7 @@ OTHERS = [
     distilling("no labels", "--capacity 0", "capacity must be at least 1, got 0"),
     evaluating("nothing", "", "policy: got None and the folder None, allowed is one of the two"),
     evaluating("a folder that is not there", "{folder}/none", "none: there is no run (no config.json)"),
-    evaluating("an unknown policy", "--policy alchemy", "none of that name is shipped (catch, grow, run, "),
+    evaluating("an unknown policy", "--policy alchemy", "no shipped one has that name (catch, grow, run, "),
     evaluating("no episodes", "--policy run --episodes 0", "episodes must be at least 1, got 0"),
     evaluating("with seed -1", "--policy run --seed -1", "seed must be between 0 and"),
     evaluating("with noise maybe", "--policy run --noise maybe", "'maybe'", "--noise", "without"),
