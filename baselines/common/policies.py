@@ -21,7 +21,7 @@ class StateBasedPolicy(ABC):
     """A policy that acts on the state of the environment given to `attached`; the image is not looked at.
 
     Args:
-        description: What it is and where it comes from, see `cfp.weights.origin`.
+        description: What it is and where it comes from, see `cfp.weights.describe_run`.
     """
 
     sees_image = False

@@ -20,7 +20,6 @@ from baselines.common.grid import grid_size
 from baselines.distillation.config import DistillConfig
 from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entries
 from baselines.distillation.teacher_training import (
-    TRAINED,
     copy_teacher,
     teacher_path,
     train_teacher,
@@ -96,7 +95,6 @@ class Distill(Algorithm):
             self.env, self._teacher(own, teacher), episodes, config.switch_every, config.dropout, grid
         )
         self.dataset, self.rounds = Dataset(config.capacity), 0
-        self.period = config.rollout_steps * self.env.num_envs
 
     @staticmethod
     def preset(task: str, name: str) -> DistillConfig:
@@ -139,7 +137,7 @@ class Distill(Algorithm):
         return Position()
 
     @classmethod
-    def prepare(cls, config: DistillConfig, folder: Path, signals: StopSignals | None) -> None:
+    def prepare(cls, config: DistillConfig, folder: Path, signals: StopSignals) -> None:
         """Train the teacher, if only its algorithm is named."""
         train_teacher(config, folder, signals)
 
@@ -155,14 +153,6 @@ class Distill(Algorithm):
     def warnings(cls, config: DistillConfig, folder: Path, first_stage: int) -> list[str]:
         """A teacher that may know one start only."""
         return warn_of_recorded_teacher(config, folder)
-
-    @classmethod
-    def not_estimated(cls, config: DistillConfig) -> list[str]:
-        """The teacher's own training."""
-        if config.teacher not in TRAINED:
-            return []
-        options = f"--algo {config.teacher} --task {config.task}"
-        return [f"the teacher's training, which comes first (python -m baselines.train {options} --dry-run)"]
 
     @contextmanager
     def _luck(self) -> Iterator[None]:
@@ -200,7 +190,7 @@ class Distill(Algorithm):
         """
         with self._luck():
             scalars = self._round()
-        self.num_timesteps += self.period
+        self.num_timesteps += self.config.rollout_steps * self.env.num_envs
         return scalars
 
     def _round(self) -> dict[str, float | None]:
