@@ -6,13 +6,14 @@ import sys
 from collections.abc import Sequence
 
 from baselines.train import PROGRAM
-from cfp.experiment import cli as command
+from cfp.experiment import training
+from cfp.experiment.cli import program_name
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
     words = ["--algo", "distill", *(sys.argv[1:] if arguments is None else arguments)]
-    return command.main(PROGRAM, words, command.program_name("baselines.distill", arguments))
+    return training.main(PROGRAM, words, program_name("baselines.distill", arguments))
 
 
 if __name__ == "__main__":

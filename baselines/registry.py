@@ -1,60 +1,61 @@
-"""All algorithms by name."""
+"""All algorithms and reference policies by name; their modules are imported when they are used."""
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import cfp
-from baselines.common import single_level as ladder
-from baselines.common.algorithm import Entry
-from baselines.common.reference_policies import Random, Scripted, Zero
-from baselines.distillation.run import DistillRun
-from baselines.distillation.train import Distill
-from baselines.modular import train as modular
-from baselines.planning.mpc import CEM, MPC
-from baselines.shac.train import Shac
-from baselines.trajectory.optimise import Gradient
+from baselines.common.reference_policies import REFERENCE_POLICIES, ReferenceConfig, reference_preset
 from cfp.config import RunConfig
 from cfp.errors import ConfigError
-from cfp.evaluation.rollout import Policy
-from cfp.experiment.cfp_run import Runner
-from cfp.experiment.process import StopSignals
-from cfp.experiment.run import Run
+from cfp.experiment.algorithm import Algorithm, Sees
 from cfp.from_dict import update_from_dict
+from cfp.policy import Policy
 from cfp.weights import read_policy
 
-ALGORITHMS: dict[str, Entry] = {
-    "cfp": Entry("image", cfp.preset, Runner, cfp.load),
-    "coarse": ladder.entry("coarse"),
-    "fine": ladder.entry("fine"),
-    "gnn-16": modular.entry("gnn-16"),
-    "gnn-64": modular.entry("gnn-64"),
-    "transformer-16": modular.entry("transformer-16"),
-    "transformer-64": modular.entry("transformer-64"),
-    "distill": Entry(Distill.sees, Distill.preset, DistillRun, Distill.load),
-    "gradient": Gradient.entry(),
-    "mpc": MPC.entry(),
-    "cem": CEM.entry(),
-    "shac": Shac.entry(),
-    "zero": Zero.entry(),
-    "random": Random.entry(),
-    "scripted": Scripted.entry(),
+ALGORITHMS: dict[str, str] = {
+    "cfp": "cfp.experiment.coarse_to_fine:CoarseToFine",
+    "coarse": "baselines.common.single_level:Coarse",
+    "fine": "baselines.common.single_level:Fine",
+    "gnn-16": "baselines.modular.train:GNN16",
+    "gnn-64": "baselines.modular.train:GNN64",
+    "transformer-16": "baselines.modular.train:Transformer16",
+    "transformer-64": "baselines.modular.train:Transformer64",
+    "distill": "baselines.distillation.train:Distill",
+    "gradient": "baselines.trajectory.optimise:Gradient",
+    "mpc": "baselines.planning.mpc:MPC",
+    "cem": "baselines.planning.mpc:CEM",
+    "shac": "baselines.shac.train:Shac",
 }
+"""``"module:Class"`` of each algorithm, a subclass of `cfp.experiment.algorithm.Algorithm`."""
+
 ALIASES = {name.replace("-", ""): name for name in ALGORITHMS if "-" in name}
 """Other spellings: gnn16 for gnn-16."""
 
 
-def find(name: str) -> Entry:
-    """An algorithm.
+def find(name: str) -> type[Algorithm]:
+    """The class of an algorithm.
 
     Raises:
         ConfigError: There is none of that name.
     """
+    if name in REFERENCE_POLICIES:
+        raise ConfigError(
+            f"algo: {name!r} is a reference policy, which is not trained; evaluate it with: "
+            f"python -m baselines.compare --algos {name}"
+        )
     name = ALIASES.get(name, name) if isinstance(name, str) else name
     if not isinstance(name, str) or name not in ALGORITHMS:
-        raise ConfigError(f"algo: got {name!r}, allowed {', '.join(ALGORITHMS)}")
-    return ALGORITHMS[name]
+        raise ConfigError(f"algo must be one of {', '.join(ALGORITHMS)}, got {name!r}")
+    module, _, attribute = ALGORITHMS[name].partition(":")
+    algorithm: type[Algorithm] = getattr(import_module(module), attribute)
+    return algorithm
+
+
+def sees(name: str) -> Sees:
+    """What the policies of an algorithm, or a reference policy, look at."""
+    return "nothing" if name in REFERENCE_POLICIES else find(name).sees
 
 
 def configure(values: dict[str, Any]) -> RunConfig:
@@ -63,18 +64,22 @@ def configure(values: dict[str, Any]) -> RunConfig:
     Raises:
         ConfigError: An unknown name or a value of the wrong type.
     """
-    entry = find(values.get("algo", "cfp"))
-    if values.get("algo") in ALIASES:
-        values = {**values, "algo": ALIASES[values["algo"]]}
-    config: RunConfig = update_from_dict(
-        entry.preset(values.get("task", "shapematch"), values.get("preset", "quick")), values
+    algo, task, preset = (
+        values.get(name, default) for name, default in (("algo", "cfp"), ("task", "shapematch"), ("preset", "quick"))
     )
+    if isinstance(algo, str) and algo in ALIASES:
+        algo = ALIASES[algo]
+        values = {**values, "algo": algo}
+    reference = isinstance(algo, str) and algo in REFERENCE_POLICIES
+    base = reference_preset(algo, task, preset) if reference else find(algo).preset(task, preset)
+    config: RunConfig = update_from_dict(base, values)
     return config
 
 
-def open_run(config: RunConfig, folder: Path, resume: bool, signals: StopSignals) -> Run:
-    """Open a run of any algorithm, see `cfp.experiment.run.Run`."""
-    return find(config.algo).open(config, folder, resume, signals)
+def reference_policy(config: RunConfig) -> Policy:
+    """The reference policy that the options of `configure` name."""
+    assert isinstance(config, ReferenceConfig)
+    return REFERENCE_POLICIES[config.algo](config)
 
 
 def load(path: str | Path, device: str = "cpu") -> Policy:
@@ -85,8 +90,8 @@ def load(path: str | Path, device: str = "cpu") -> Policy:
         device: Where its tensors go.
 
     Returns:
-        A policy with stable-baselines3's ``predict``. Some remember, and want the second result back as ``state``.
-        Its ``description`` tells task and origin.
+        A policy with stable-baselines3's ``predict``. Some have a memory, and expect the second result back as
+        ``state``. Its ``description`` tells task and origin.
 
     Raises:
         CheckpointError: No such file, a damaged one, or one that is not such a policy.

@@ -5,21 +5,21 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from baselines.registry import ALGORITHMS, configure, load, open_run
-from cfp.experiment import cli as command
+from baselines.registry import ALGORITHMS, configure, find, load
+from cfp.experiment import training
 
-PROGRAM = command.Program(
+PROGRAM = training.Program(
     "baselines",
     f"Train an algorithm (--algo {'|'.join(ALGORITHMS)}) on a DittoGym task; name it to see its options here.",
     configure,
-    open_run,
+    find,
     load,
 )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
-    return command.main(PROGRAM, arguments)
+    return training.main(PROGRAM, arguments)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from baselines.train import PROGRAM
 from cfp.envs.disturbances import Case, Disturbed
 from cfp.envs.vec_env import monitored
 from cfp.evaluate import open_policy
-from cfp.evaluation.rollout import evaluate, judging_seed
+from cfp.evaluation.evaluate import evaluate, evaluation_seed
 from dittogym import TorchEnv, make_spec
 
 BATCH = 20
@@ -44,7 +44,7 @@ def main() -> None:
             dtype=own.dtype,
             action_layout=own.action_indexing,
         )
-        seed = judging_seed(config) + done
+        seed = evaluation_seed(config) + done
         result = evaluate(
             "", policy, Disturbed(monitored(env), case, seed, policy.description["resolution"]), count,
             deterministic=policy.deterministic_by_default, seed=seed,

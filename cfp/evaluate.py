@@ -16,10 +16,14 @@ from cfp import train
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
 from cfp.errors import CheckpointError, ConfigError
-from cfp.evaluation.rollout import Noise, Policy, compare, format_table, to_rows
-from cfp.experiment.cli import Program, program_name, run_command
-from cfp.experiment.run import make_video, read_config, stage_files
+from cfp.evaluation.evaluate import Noise, compare
+from cfp.evaluation.tables import format_table, to_rows
+from cfp.experiment.cli import program_name, run_command
+from cfp.experiment.folder import policy_files, read_config
+from cfp.experiment.run import make_video
+from cfp.experiment.training import Program
 from cfp.from_dict import update_from_dict
+from cfp.policy import Policy
 from cfp.presets import from_json
 from cfp.sections import Particles
 from cfp.validation import check_at_least
@@ -101,7 +105,7 @@ def open_run(
     if seed is not None:
         config = replace(config, seed=seed)
         config.check()
-    files = stage_files(folder, len(config.ends()))
+    files = policy_files(folder, len(config.ends()))
     if not files:
         raise CheckpointError(f"{folder}: no policy has been written yet")
     loaded = choose_device(device)
@@ -147,7 +151,7 @@ def run(program: Program, command: Command) -> str:
     config, policies = command.open(program)
     results = compare(config, policies, command.episodes, command.noise)
     if command.video is not None:
-        make_video(config, list(policies.values())[-1], command.video, aside=command.json)
+        make_video(config, list(policies.values())[-1], command.video, to_stderr=command.json)
     return json.dumps(to_rows(results), indent=2) if command.json else format_table(config, results)
 
 

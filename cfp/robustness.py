@@ -17,10 +17,11 @@ from cfp.config import RunConfig
 from cfp.envs.disturbances import Case, Decides, disturbed_env, idle, make_cases
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection, judge
+from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
 from cfp.evaluation.plots import write_figure
-from cfp.evaluation.rollout import Policy, Result, evaluate, judging_seed
-from cfp.experiment.cli import Program
+from cfp.experiment.training import Program
 from cfp.files import write_json, write_text
+from cfp.policy import Policy
 from cfp.presets import from_json
 from cfp.tables import csv_text
 from cfp.validation import check_at_least
@@ -106,7 +107,7 @@ def report(config: RunConfig, policy: Policy, cases: Sequence[Case], episodes: i
         cases: The unperturbed one first.
         episodes: Of each case.
     """
-    spec, seed = make_spec(config.task, **config.environment.task_options()), judging_seed(config)
+    spec, seed = make_spec(config.task, **config.environment.task_options()), evaluation_seed(config)
     grid, results = 0 if isinstance(policy, Decides) else policy.description.get("resolution", policy.resolution), []
     for case in cases:
         if idle(case, spec, policy.sees_image):

@@ -5,23 +5,23 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from cfp.experiment import cli as command
-from cfp.experiment.cfp_run import Runner
+from cfp.experiment import training
+from cfp.experiment.coarse_to_fine import CoarseToFine
 from cfp.presets import from_json
 from cfp.weights import load
 
-PROGRAM = command.Program(
+PROGRAM = training.Program(
     "cfp",
     "Train the coarse-to-fine policy on a DittoGym task: all levels of the ladder, one after the other.",
     from_json,
-    Runner,
+    lambda _: CoarseToFine,
     load,
 )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
-    return command.main(PROGRAM, arguments)
+    return training.main(PROGRAM, arguments)
 
 
 if __name__ == "__main__":

@@ -282,7 +282,7 @@ def is_same_task(task: str, option: str, one: str | None, other: str | None) -> 
 
     Args:
         task: Its name.
-        option: One of `cfp.groups.TASK_OPTIONS`.
+        option: One of `cfp.sections.TASK_OPTIONS`.
         one: A value.
         other: Another.
 

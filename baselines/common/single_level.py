@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from typing import Literal
 
 import cfp
-from baselines.common.algorithm import Entry
 from cfp.config import Config
 from cfp.errors import ConfigError
-from cfp.experiment.cfp_run import Runner
+from cfp.experiment.coarse_to_fine import CoarseToFine
 from dittogym.tasks import task_name
 
 
@@ -31,7 +29,7 @@ class LevelConfig(Config):
         super().check()
 
 
-def preset(algo: Literal["coarse", "fine"], task: str, name: str) -> LevelConfig:
+def single_level_preset(algo: Literal["coarse", "fine"], task: str, name: str) -> LevelConfig:
     """The first stage of `cfp.preset`, for all its steps, on the task's coarse or fine action grid.
 
     Args:
@@ -56,6 +54,19 @@ def preset(algo: Literal["coarse", "fine"], task: str, name: str) -> LevelConfig
     return LevelConfig(**{option.name: getattr(level, option.name) for option in fields(level)})
 
 
-def entry(algo: Literal["coarse", "fine"]) -> Entry:
-    """For the registry."""
-    return Entry("image", partial(preset, algo), Runner, cfp.load)
+class Coarse(CoarseToFine):
+    """The first stage of CFP, for all its steps."""
+
+    @staticmethod
+    def preset(task: str, name: str) -> LevelConfig:
+        """Default options for a task, see `single_level_preset`."""
+        return single_level_preset("coarse", task, name)
+
+
+class Fine(CoarseToFine):
+    """CFP's finest grid from scratch, without a coarse policy."""
+
+    @staticmethod
+    def preset(task: str, name: str) -> LevelConfig:
+        """Default options for a task, see `single_level_preset`."""
+        return single_level_preset("fine", task, name)

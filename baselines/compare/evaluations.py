@@ -9,13 +9,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare.plan import judged, read_notes
-from baselines.registry import load
+from baselines.registry import load, reference_policy
 from cfp.config import RunConfig
 from cfp.envs.disturbances import Case, make_cases
 from cfp.envs.make import choose_device, make_env
-from cfp.evaluation.rollout import Policy, Result, evaluate, judging_seed
+from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
 from cfp.files import write_json
+from cfp.policy import Policy
 from cfp.robustness import report
 from cfp.sections import Particles
 from cfp.weights import policy_file
@@ -123,10 +125,14 @@ def judge(config: RunConfig, folder: Path, judging: Judging, stop: Callable[[], 
         ConfigError: The environment refuses an option.
     """
     record, own = Record(folder), judged(config, judging.tier)
-    policy = load(folder / "policy.safetensors", choose_device(config.device))
+    policy: Policy
+    if config.algo in REFERENCE_POLICIES:
+        policy = reference_policy(config)
+    else:
+        policy = load(folder / "policy.safetensors", choose_device(config.device))
 
     def part(first: int, count: int) -> dict[str, Any]:
-        return _entry(_evaluate(own, policy, judging_seed(own) + first, count))
+        return _entry(_evaluate(own, policy, evaluation_seed(own) + first, count))
 
     def disturbed(first: int, count: int, case: Case) -> list[dict[str, Any]]:
         return [_entry(result) for result in report(replace(own, seed=own.seed + first), policy, [case], count)]

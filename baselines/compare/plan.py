@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from baselines.common.reference_policies import FloorConfig
-from baselines.registry import ALGORITHMS, ALIASES, configure, find
+from baselines.common.reference_policies import ReferenceConfig
+from baselines.registry import ALGORITHMS, ALIASES, configure, sees
 from cfp.config import EVALUATION_SEED, RunConfig, to_json
 from cfp.errors import CheckpointError, ConfigError
-from cfp.experiment.run import holds_run, read_config
+from cfp.experiment.folder import holds_run, read_config
 from cfp.files import parse_json, read_json
 from cfp.from_dict import flatten
 from cfp.sections import TASK_OPTIONS
@@ -49,12 +49,12 @@ class Job:
     @property
     def sees(self) -> str:
         """What its policy looks at."""
-        return str(getattr(self.config, "sees", find(self.config.algo).sees))
+        return str(getattr(self.config, "sees", sees(self.config.algo)))
 
     @property
     def untrained(self) -> bool:
         """Whether nothing is learned, so that the seed changes nothing: layouts and noise of judging are the same."""
-        return isinstance(self.config, FloorConfig)
+        return isinstance(self.config, ReferenceConfig)
 
     @property
     def finished(self) -> bool:

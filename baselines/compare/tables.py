@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from baselines.common.reference_policies import Zero
 from baselines.compare import paper
 from baselines.compare.results import Found, Group
 from baselines.compare.stats import common_curve, first_reach, interquartile_mean, interval, wilson
@@ -159,7 +158,7 @@ def efficiency_table(groups: Sequence[Group], tier: Particles) -> Table:
         groups: All; that of ``zero`` is the resting robot.
         tier: Particles that it was judged with, and with which other curves can be compared.
     """
-    rest = {group.task: iqm(group.scores) for group in groups if group.algo == Zero.name and group.scores}
+    rest = {group.task: iqm(group.scores) for group in groups if group.algo == "zero" and group.scores}
     shown = [group for group in groups if group.curves and not group.untrained]
     best: dict[tuple[str, str], float] = {}
     for group in shown:

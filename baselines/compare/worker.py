@@ -17,14 +17,16 @@ import traceback
 from pathlib import Path
 from typing import Any
 
+from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare.evaluations import Judging, judge
 from baselines.compare.plan import Job, check_there, read_sessions
-from baselines.registry import configure, open_run
+from baselines.registry import configure, find
 from cfp.config import RunConfig, to_json
 from cfp.envs.make import choose_device
 from cfp.experiment.process import Stopped, StopSignals, keep_memory, peak_memory
+from cfp.experiment.run import Run
 from cfp.experiment.run_lock import Claimed, claim
-from cfp.files import write_json, write_text
+from cfp.files import read_json, write_json, write_text
 
 FINISHED, FAILED, BUSY = 0, 1, 3
 """Exit codes; stopped is 128 and the number of the signal."""
@@ -93,16 +95,30 @@ def _train_and_judge(job: Job, judging: Judging, signals: StopSignals, alone: bo
 
 def _train(config: RunConfig, folder: Path, signals: StopSignals, alone: bool) -> None:
     """Train to the end, and note in ``sessions.json`` what it took; a process that is killed leaves no note."""
-    there = read_sessions(folder)
-    run = open_run(config, folder, True, signals)
+    if config.algo in REFERENCE_POLICIES:
+        config.check()
+        write_json(folder / "config.json", to_json(config))
+        write_json(folder / "sessions.json", {"finished": config.ends()[-1], "sessions": []})
+        return
+    there, cost = read_sessions(folder), folder / "teacher" / "cost.json"
+    run = Run(find(config.algo), config, folder, True, signals)
     begun, start, whole = run.step, time.perf_counter(), False
     try:
         run.train()
         whole = True
     finally:
         seconds = time.perf_counter() - start
-        session = {"from": begun, "to": run.step, "seconds": seconds, "judging": run.judging, "memory": None}
-        session["teacher"] = dict(zip(("steps", "seconds"), run.teaching, strict=True))
+        session: dict[str, Any] = {
+            "from": begun,
+            "to": run.step,
+            "seconds": seconds,
+            "judging": run.evaluation_seconds,
+            "memory": None,
+        }
+        if cost.exists() and not any("teacher" in earlier for earlier in there["sessions"]):
+            teacher = read_json(cost)
+            session["teacher"] = {"steps": teacher["steps"], "seconds": teacher["seconds"]}
+            session["judging"] += teacher["evaluation_seconds"]
         session |= {"memory": peak_memory() if alone else None, "device": choose_device(config.device)}
         session |= {"host": socket.gethostname(), "process": os.getpid(), "finished": whole}
         finished = config.ends()[-1] if whole else False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, cast, get_args
 
@@ -13,7 +12,6 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecMonitor
 
 import cfp
-from baselines.common.algorithm import Entry
 from baselines.common.policies import StateBasedPolicy
 from baselines.modular.env import SegmentedEnv
 from baselines.modular.networks import Kind, ModularActor, ModularCritics
@@ -24,12 +22,12 @@ from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
 from cfp.agent.policies import NetworkPolicy
 from cfp.agent.sac import CFP
 from cfp.config import RunConfig
-from cfp.envs.make import choose_device, make_torch_env
+from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
-from cfp.experiment.cfp_run import SACRun
+from cfp.experiment.algorithm import Sees
+from cfp.experiment.coarse_to_fine import SACAlgorithm
 from cfp.validation import check_at_least
-from cfp.weights import origin
 from dittogym import make_spec
 
 
@@ -116,11 +114,6 @@ def preset(algo: str, task: str, name: str) -> ModularConfig:
     )
 
 
-def entry(algo: str) -> Entry:
-    """For the registry."""
-    return Entry("state", partial(preset, algo), ModularRun, SegmentPolicy.load)
-
-
 class ModularPolicy(NetworkPolicy):
     """Actor and critics over segments, for `cfp.agent.sac.CFP`.
 
@@ -162,34 +155,65 @@ class ModularSAC(CFP):
     ) -> tuple[np.ndarray, np.ndarray]:
         return actions, stored
 
-    def attached(self, env: Any) -> StateBasedPolicy:
-        """The present policy, looking at an environment."""
-        assert isinstance(self.policy, ModularPolicy)
-        actor = cast(ModularActor, self.networks()[0])
-        count = cast(spaces.Box, self.action_space).shape[0]
-        return SegmentPolicy(actor, Nodes(count, self.policy.kind == "gnn")).attached(env)
 
+class Modular(SACAlgorithm):
+    """A modular policy, trained by soft actor-critic; a subclass says which."""
 
-class ModularRun(SACRun):
-    """Trains a modular policy in its folder, see `cfp.experiment.run.Run`."""
-
+    algo: ClassVar[str]
+    sees: ClassVar[Sees] = "state"
     config: ModularConfig
     model_type = ModularSAC
 
-    def make_model(self, level: int) -> CFP:
+    @classmethod
+    def preset(cls, task: str, name: str) -> ModularConfig:
+        """Default options for a task, see `preset`."""
+        return preset(cls.algo, task, name)
+
+    @classmethod
+    def create(cls, config: ModularConfig, stage: int, folder: Path, resumed: bool = False) -> Modular:
         """Networks, replay memory and environment."""
-        env = SegmentedEnv(make_torch_env(self.config, self.config.resolution(level)), self.config.nodes)
-        networks = {"kind": self.config.kind, "features": self.config.nodes.num_features(env.env.spec)}
-        return self.build(
-            VecMonitor(TorchVecEnv(env, env.spaces)), ModularPolicy, networks, self.hyperparameters(level)
-        )
+        env = SegmentedEnv(make_torch_env(config, config.resolution(stage - 1)), config.nodes)
+        networks = {"kind": config.kind, "features": config.nodes.num_features(env.env.spec)}
+        monitor = VecMonitor(TorchVecEnv(env, env.spaces))
+        model = cls.make_model(config, monitor, ModularPolicy, networks, cls.hyperparameters(config, stage, folder))
+        return cls(config, stage, model)
 
-    def keep(self, model: CFP, level: int, step: int) -> None:
-        """Write the actor as ``policy.safetensors``."""
-        actor = cast(ModularActor, model.networks()[0])
-        description = origin(self.config, self.config.algo, level, step)
-        SegmentPolicy(actor, self.config.nodes, description).save(self.folder / "policy.safetensors")
+    def attached(self, env: Any) -> StateBasedPolicy:
+        """The present policy, looking at an environment."""
+        return self._policy({}).attached(env)
 
-    def load(self, path: Path) -> SegmentPolicy:
-        """Load a policy of the run."""
-        return SegmentPolicy.load(path, choose_device(self.config.device))
+    def _policy(self, description: dict[str, Any]) -> SegmentPolicy:
+        return SegmentPolicy(cast(ModularActor, self.model.networks()[0]), self.config.nodes, description)
+
+    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
+        """Write the actor."""
+        self._policy(description).save(path)
+
+    @classmethod
+    def load(cls, path: Path, device: str = "cpu") -> SegmentPolicy:
+        """Load a policy."""
+        return SegmentPolicy.load(path, device)
+
+
+class GNN16(Modular):
+    """A graph network over 16 segments."""
+
+    algo = "gnn-16"
+
+
+class GNN64(Modular):
+    """A graph network over 64 segments."""
+
+    algo = "gnn-64"
+
+
+class Transformer16(Modular):
+    """A Transformer over 16 segments."""
+
+    algo = "transformer-16"
+
+
+class Transformer64(Modular):
+    """A Transformer over 64 segments."""
+
+    algo = "transformer-64"

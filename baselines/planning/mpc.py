@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import cfp
-from baselines.common.algorithm import Algorithm, Callback, GridConfig, Sees
+from baselines.common.grid import GridConfig
 from baselines.common.open_loop import OpenLoop
 from baselines.planning.base import Planner, PlannerConfig
 from baselines.planning.cem import CEMPlanner, CEMPlannerConfig
@@ -18,6 +18,7 @@ from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.planning.surrogate import Surrogate
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
+from cfp.experiment.algorithm import Algorithm, Scalars, Sees
 from cfp.sections import EnvironmentConfig, Particles, ReportConfig
 from dittogym import make_spec
 
@@ -101,16 +102,15 @@ def episode_preset(task: str, name: str) -> dict[str, Any]:
 class MPC(Algorithm):
     """Model predictive control by gradients, see `GradientPlanner`.
 
-    There is nothing to learn: `learn` carries out planned steps of a single episode, and the policy is the record of
+    There is nothing to learn: `update` carries out a planned step of a single episode, and the policy is the record of
     its actions. On the layout of its seed the record repeats the episode; other layouts have to be planned for
     themselves.
     """
 
-    name: ClassVar[str] = "mpc"
     sees: ClassVar[Sees] = "simulator"
     planner_type: ClassVar[type[Planner[Any]]] = GradientPlanner
 
-    def __init__(self, config: PlannedConfig, level: int = 0, start: Any = None) -> None:
+    def __init__(self, config: PlannedConfig, stage: int = 1, start: Any = None) -> None:
         self.config = config
         self.env = make_torch_env(config, config.resolution(0), 1)
         self.env.reset(seed=config.seed)
@@ -145,25 +145,25 @@ class MPC(Algorithm):
         """The record so far."""
         return OpenLoop(self.actions)
 
-    def learn(self, total_timesteps: int, callback: Callback) -> MPC:
-        """Carry out some more steps, fewer if the episode ends."""
-        end = self.num_timesteps + total_timesteps
-        while self.num_timesteps < end and not self.is_done:
-            if self.surrogate and self.planner.needs_plan:
-                self.surrogate.sync(self.env.env_state)
-            action = self.planner.act().float()  # as the record keeps it, so that it repeats the episode exactly
-            self._carry_out(action)
-            self.actions = torch.cat((self.actions, action.cpu()))
-            self.num_timesteps += 1
-            callback(
-                {
-                    "train/return": self.total_reward,
-                    "train/reward": self.reward,
-                    "train/plans": float(self.planner.num_plans),
-                    "train/failed": float(self.planner.num_failed),
-                }
-            )
-        return self
+    @property
+    def finished(self) -> bool:
+        """Whether the episode is over."""
+        return self.is_done
+
+    def update(self) -> Scalars:
+        """Carry out one more step."""
+        if self.surrogate and self.planner.needs_plan:
+            self.surrogate.sync(self.env.env_state)
+        action = self.planner.act().float()  # as the record keeps it, so that it repeats the episode exactly
+        self._carry_out(action)
+        self.actions = torch.cat((self.actions, action.cpu()))
+        self.num_timesteps += 1
+        return {
+            "train/return": self.total_reward,
+            "train/reward": self.reward,
+            "train/plans": float(self.planner.num_plans),
+            "train/failed": float(self.planner.num_failed),
+        }
 
     @torch.no_grad()
     def _carry_out(self, action: Tensor) -> None:
@@ -172,7 +172,7 @@ class MPC(Algorithm):
         self.total_reward += self.reward
         self.is_done = bool(terminated)
 
-    def save(self, path: Path, description: dict[str, Any]) -> None:
+    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the record, with its layout."""
         OpenLoop(self.actions, description | {"layout": self.config.seed}).save(path)
 
@@ -196,7 +196,6 @@ class MPC(Algorithm):
 class CEM(MPC):
     """Model predictive control by the cross-entropy method, see `CEMPlanner`; otherwise the same as `MPC`."""
 
-    name: ClassVar[str] = "cem"
     planner_type: ClassVar[type[Planner[Any]]] = CEMPlanner
 
     @staticmethod

@@ -12,12 +12,13 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 import cfp
-from baselines.common.algorithm import Algorithm, Callback, Grid, GridConfig, Sees, grid_size
+from baselines.common.grid import Grid, GridConfig, grid_size
 from baselines.common.open_loop import OpenLoop
 from baselines.trajectory.objective import make_objective
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
+from cfp.experiment.algorithm import Algorithm, Scalars, Sees
 from cfp.sections import EnvironmentConfig, Particles, ReportConfig
 from cfp.validation import check_at_least, check_positive
 from dittogym import make_spec
@@ -41,7 +42,7 @@ METRICS: dict[str, str] = {
     "train/learning_rate": "Adam's step size in the next iteration",
     "train/failed": "iterations of this stage that were undone",
 }
-"""Every scalar that `Gradient.learn` logs, and what it means."""
+"""Every scalar that `Gradient.update` logs, and what it means."""
 
 
 @dataclass(frozen=True)
@@ -130,14 +131,13 @@ class Gradient(Algorithm):
     forgotten, and the learning rate falls for good.
     """
 
-    name: ClassVar[str] = "gradient"
     sees: ClassVar[Sees] = "nothing"
 
-    def __init__(self, config: GradientConfig, level: int = 0, start: OpenLoop | None = None) -> None:
-        self.config, self.level = config, level
-        environment = config.environment if level else config.environment.for_training(config.train_particles)
+    def __init__(self, config: GradientConfig, stage: int = 1, start: OpenLoop | None = None) -> None:
+        self.config, self.stage, polishes = config, stage, stage > 1
+        environment = config.environment if polishes else config.environment.for_training(config.train_particles)
         own = replace(config, environment=environment)
-        self.env = make_torch_env(own, config.resolution(level), 1 if level else None)
+        self.env = make_torch_env(own, config.resolution(stage - 1), 1 if polishes else None)
         self.env.reset(seed=config.seed)
         self.beginning = self.env.save()  # with reference parity, another reset would keep where the last episode ended
         self.horizon = self.env.spec.horizon
@@ -145,9 +145,9 @@ class Gradient(Algorithm):
         if start is not None:
             self.theta += _theta(start.actions, self.env.action_resolution).to(self.theta)
         self.theta.requires_grad_()
-        self.rate = config.polish_learning_rate if level else config.learning_rate
+        self.rate = config.polish_learning_rate if polishes else config.learning_rate
         self.adam = torch.optim.Adam([self.theta], self.rate, BETAS)
-        self.objective = make_objective(self.env, config.blur[-1:] if level else config.blur)
+        self.objective = make_objective(self.env, config.blur[-1:] if polishes else config.blur)
         self.usual = torch.zeros(self.horizon, device=self.env.device)
         self.slower, self.failed, self.failed_in_a_row = 1.0, 0, 0
         self.best_loss, self.best_size, self.best, self.phase = math.inf, 0.0, self.theta.detach().clone(), 0
@@ -180,25 +180,17 @@ class Gradient(Algorithm):
         """The present actions."""
         return OpenLoop(self.theta.tanh())
 
-    def learn(self, total_timesteps: int, callback: Callback) -> Gradient:
-        """Do as many iterations as cover the steps.
+    def _progress(self) -> float:
+        """How much of the stage is done, 0 to 1; a stage after one that ended early is longer, and stays at 1."""
+        bounds = (0, *self.config.ends())
+        return min(self.num_timesteps / (bounds[self.stage] - bounds[self.stage - 1]), 1.0)
+
+    def update(self) -> Scalars:
+        """Do one iteration.
 
         Raises:
             NonFiniteError: Ten iterations in a row failed.
         """
-        end = self.num_timesteps + total_timesteps
-        while self.num_timesteps < end:
-            scalars = self._iterate()
-            self.num_timesteps += self.horizon * self.env.num_envs
-            callback(scalars)
-        return self
-
-    def _progress(self) -> float:
-        """How much of the stage is done, 0 to 1; a stage after one that ended early is longer, and stays at 1."""
-        bounds = (0, *self.config.ends())
-        return min(self.num_timesteps / (bounds[self.level + 1] - bounds[self.level]), 1.0)
-
-    def _iterate(self) -> dict[str, float | None]:
         progress = self._progress()
         cosine = 0.5 * (1.0 + math.cos(math.pi * progress))
         rate = self.slower * self.rate * (FINAL_RATE + (1.0 - FINAL_RATE) * cosine)
@@ -219,6 +211,7 @@ class Gradient(Algorithm):
             self.failed_in_a_row = 0
         else:
             self._undo()
+        self.num_timesteps += self.horizon * self.env.num_envs
         return scalars | {"train/failed": float(self.failed)}
 
     def _episode(self, progress: float) -> Episode:
@@ -276,9 +269,9 @@ class Gradient(Algorithm):
         for state in self.adam.state.values():
             state["exp_avg"].zero_()
 
-    def save(self, path: Path, description: dict[str, Any]) -> None:
+    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the actions; a polished policy names its layout."""
-        own = {"layout": self.config.seed} if self.level else {}
+        own = {"layout": self.config.seed} if self.stage > 1 else {}
         OpenLoop(self.policy.actions, description | own).save(path)
 
     @classmethod
@@ -305,7 +298,7 @@ class Gradient(Algorithm):
         self.adam.load_state_dict(state["adam"])
         self.usual = state["usual"].to(self.theta)
         self.best_loss, self.phase, self.slower, self.failed, self.failed_in_a_row = state["counts"]
-        self.best_size = state.get("best_size", abs(self.best_loss))  # what it was in checkpoints from before
+        self.best_size = state["best_size"]
 
 
 def _theta(actions: Tensor, resolution: int) -> Tensor:

@@ -17,7 +17,7 @@ from torch import Tensor
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import monitored
-from cfp.evaluation.rollout import Policy
+from cfp.policy import Policy
 from dittogym import make_spec
 from dittogym.action import bicubic
 from dittogym.geometry import Obstacle, floor

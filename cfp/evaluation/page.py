@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path
 
 from cfp.config import RunConfig, to_json
-from cfp.evaluation.rollout import Result
+from cfp.evaluation.evaluate import Result
 from cfp.files import write_text
 
 STYLE = """

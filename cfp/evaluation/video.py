@@ -17,7 +17,8 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.envs.make import make_env
 from cfp.envs.vec_env import TorchVecEnv
-from cfp.evaluation.rollout import Policy, attached
+from cfp.evaluation.evaluate import attached
+from cfp.policy import Policy
 
 FRAMES_PER_SECOND = 10
 MISSING = "no video: it needs imageio with ffmpeg; install them with: pip install 'torchmpm[video]'"

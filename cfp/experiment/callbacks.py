@@ -1,62 +1,328 @@
-"""What happens between two rollouts of stable-baselines3's loop."""
+"""What happens between two updates of a stage: rows in the logs, evaluations, films, checkpoints, stopping.
+
+Each callback acts at the start of a rollout, when every step taken has been stored and learned from, and once more at
+the end of the stage.
+"""
 
 from __future__ import annotations
 
-import numpy as np
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
 from stable_baselines3.common.callbacks import BaseCallback
+from tqdm import tqdm
 
-from cfp.agent.sac import CFP
-from cfp.experiment.books import Books
+from cfp.config import RunConfig
+from cfp.envs.make import make_env
+from cfp.evaluation.evaluate import evaluate
+from cfp.evaluation.video import film_episode, write_video
+from cfp.experiment.algorithm import Algorithm, Position
+from cfp.experiment.checkpoint import Checkpoint
+from cfp.experiment.folder import policy_path
+from cfp.experiment.loggers import Tracker
+from cfp.experiment.process import Stopped, StopSignals
+from cfp.tables import Table
+from cfp.weights import origin
 
-ROLLOUT_METRICS: dict[str, str] = {
-    "rollout/return": "mean undiscounted return of the last training episodes (with action noise)",
-    "rollout/length": "their mean length in environment steps",
-    "rollout/success": "share of successes among them, where the task defines success",
-    "rollout/episodes": "episodes finished in this stage",
+LOG_METRICS: dict[str, str] = {
+    "stage": "stage in training, 1 is the first",
+    "time/steps_per_second": "environment steps per second of wall time since the last point (TensorBoard only)",
 }
-"""Scalars logged beside `cfp.agent.sac.METRICS` and `cfp.experiment.books.BOOK_METRICS`."""
+"""Scalars that every algorithm logs beside its own."""
 
 
-class StageCallback(BaseCallback):
-    """Keeps the books of one level.
+class StageFinished(Exception):
+    """A stage ends before its last step because its evaluations no longer improve; its checkpoint is written."""
 
-    Everything happens at the start of a rollout, when each step taken has been stored and learned from.
 
-    Args:
-        books: Of the level.
-        offset: Environment steps of the levels before it.
+@dataclass
+class Stage:
+    """A stage in training.
+
+    Attributes:
+        config: Options of the run.
+        folder: Of the run.
+        position: Number of the stage, and environment steps that the stages before it took.
+        algorithm: Is trained.
     """
 
-    def __init__(self, books: Books, offset: int) -> None:
-        super().__init__()
-        self.books, self.offset = books, offset
+    config: RunConfig
+    folder: Path
+    position: Position
+    algorithm: Algorithm
+
+    @property
+    def number(self) -> int:
+        """1 is the first."""
+        return self.position.stage
 
     @property
     def step(self) -> int:
         """Environment steps since the beginning of the run."""
-        return self.offset + self.model.num_timesteps
+        return self.position.offset + self.algorithm.num_timesteps
 
-    def _on_training_start(self) -> None:
-        self.books.open(self.step)
+    @property
+    def steps_left(self) -> int:
+        """Environment steps until the end of the stage."""
+        return max(0, self.config.ends()[self.number - 1] - self.step)
+
+    def save_policy(self) -> None:
+        """Write the present policy as ``policy.safetensors``."""
+        description = origin(self.config, self.config.algo, self.number - 1, self.step)
+        self.algorithm.save_policy(policy_path(self.folder), description)
+
+
+class StageCallback(BaseCallback):
+    """Acts every so many environment steps of the run.
+
+    Args:
+        stage: In training.
+        every: Environment steps; 0: never.
+    """
+
+    def __init__(self, stage: Stage, every: int) -> None:
+        super().__init__()
+        self.stage, self.every = stage, every
+        self._last = stage.step
+
+    def act(self) -> None:
+        """Do what has come due."""
+        raise NotImplementedError
+
+    def is_due(self) -> bool:
+        """Whether the steps since the last call have passed a multiple of `every`."""
+        last, self._last = self._last, self.stage.step
+        return self.every > 0 and self._last // self.every > last // self.every
 
     def _on_step(self) -> bool:
-        self.books.advance(self.training_env.num_envs)
         return True
 
     def _on_rollout_start(self) -> None:
-        self.books.turn(self.step, self._scalars)
+        if self.is_due():
+            self.act()
 
     def _on_training_end(self) -> None:
-        self.books.close(self.step, self._scalars)
+        self._on_rollout_start()
 
-    def _scalars(self) -> dict[str, float | None]:
-        assert isinstance(self.model, CFP)
-        scalars = {"rollout/return": self._recent("r"), "rollout/length": self._recent("l")}
-        scalars["rollout/episodes"] = self.model._episode_num
-        if self.model.ep_success_buffer:
-            scalars["rollout/success"] = float(np.mean(self.model.ep_success_buffer))
-        return scalars
 
-    def _recent(self, key: str) -> float | None:
-        episodes = self.model.ep_info_buffer
-        return float(np.mean([float(episode[key]) for episode in episodes])) if episodes else None
+class ProgressBarCallback(BaseCallback):
+    """Shows on the standard error how far the run has come.
+
+    Args:
+        stage: In training.
+    """
+
+    def __init__(self, stage: Stage) -> None:
+        super().__init__()
+        self.stage, self.values = stage, dict[str, str]()
+        self.bar = tqdm(disable=True)
+
+    def _on_training_start(self) -> None:
+        self.bar = tqdm(
+            total=self.stage.config.ends()[-1],
+            initial=self.stage.step,
+            desc=f"stage {self.stage.number}",
+            unit="step",
+            mininterval=0.1 if sys.stderr.isatty() else 15.0,  # a log file needs fewer lines than a terminal
+        )
+
+    def _on_step(self) -> bool:
+        self.bar.update(self.stage.step - self.bar.n)
+        return True
+
+    def show(self, **values: float) -> None:
+        """Show values beside the bar."""
+        self.values |= {name: f"{value:.1f}" for name, value in values.items()}
+        self.bar.set_postfix(self.values)
+
+    def close(self) -> None:
+        """End the line of the bar, so that what is printed next begins a new one."""
+        self.bar.close()
+
+
+class LogCallback(StageCallback):
+    """Writes rows to the logger of the algorithm: ``progress.csv``, TensorBoard, and Weights & Biases if asked for.
+
+    Args:
+        stage: In training.
+        bar: Shows the return of training episodes.
+    """
+
+    def __init__(self, stage: Stage, bar: ProgressBarCallback) -> None:
+        super().__init__(stage, stage.config.report.log_every)
+        self.bar = bar
+        self._logged, self._clock = stage.step, time.perf_counter()
+
+    def _on_training_start(self) -> None:
+        self._clock = time.perf_counter()
+
+    def act(self) -> None:
+        """Write a row."""
+        now, step, logger = time.perf_counter(), self.stage.step, self.stage.algorithm.logger
+        speed = (step - self._logged) / max(now - self._clock, 1e-9)
+        self._logged, self._clock = step, now
+        scalars = self.stage.algorithm.row()
+        logger.record("stage", self.stage.number)
+        for name, value in scalars.items():
+            logger.record(name, value)
+        logger.record("time/steps_per_second", speed, exclude="csv")
+        logger.dump(step)
+        if (value := scalars.get("rollout/return")) is not None:
+            self.bar.show(**{"return": value})
+
+    def _on_training_end(self) -> None:
+        if self._logged < self.stage.step:
+            self.act()
+
+
+class EvaluationCallback(StageCallback):
+    """Evaluates the policy and keeps the best one of the stage as ``policy.safetensors``.
+
+    A stage that begins with a trained policy is evaluated before its first step: it must do better than that.
+
+    Args:
+        stage: In training.
+        table: Gets a row for each evaluation.
+        tracker: Gets its scalars and images.
+        bar: Shows its mean return.
+
+    Attributes:
+        means: Mean returns of the stage's evaluations so far, those of earlier sessions included.
+        evaluated: Step of the run at which the last of them was made, 0 for none.
+        seconds: Wall time that evaluations have taken in this session.
+    """
+
+    def __init__(self, stage: Stage, table: Table, tracker: Tracker, bar: ProgressBarCallback) -> None:
+        super().__init__(stage, stage.config.report.eval_every)
+        self.table, self.tracker, self.bar = table, tracker, bar
+        rows = [row for row in table.rows if int(row["stage"]) == stage.number]
+        self.means = [float(row["mean"]) for row in rows]
+        self.evaluated, self.seconds = int(rows[-1]["step"]) if rows else 0, 0.0
+
+    @property
+    def is_missing(self) -> bool:
+        """Whether the policy of the present step, the last of the stage, has not been evaluated."""
+        return self.every > 0 and self.evaluated < self.stage.step
+
+    @property
+    def has_plateaued(self) -> bool:
+        """Whether the best evaluation is as many evaluations ago as the run is patient."""
+        patience, means = self.stage.config.report.patience, self.means
+        return bool(patience and means) and len(means) - 1 - means.index(max(means)) >= patience
+
+    def act(self) -> None:
+        """Evaluate the policy on layouts that are not trained on."""
+        start, stage, config = time.perf_counter(), self.stage, self.stage.config
+        seed, episodes = config.evaluation(stage.number - 1)
+        deterministic = config.report.eval_deterministic
+        env = make_env(config, config.action_size(stage.number - 1), episodes)
+        result = evaluate("", stage.algorithm, env, episodes, deterministic=deterministic, seed=seed)
+        row: dict[str, Any] = {"step": stage.step, "stage": stage.number, "episodes": episodes}
+        row |= {"mean": result.mean, "std": result.std}
+        row |= {"lowest": min(result.returns), "highest": max(result.returns), "success": result.success}
+        if result.mean > max(self.means, default=-float("inf")):
+            stage.save_policy()  # before the row: a crash between the two repeats the evaluation
+        self.means.append(result.mean)
+        self.evaluated = stage.step
+        self.table.add(row)
+        self.seconds += time.perf_counter() - start
+        scalars = {"eval/return": result.mean, "eval/std": result.std, "eval/success": result.success}
+        self.tracker.show(stage.step, {**scalars, **stage.algorithm.images()})
+        self.bar.show(evaluated=result.mean)
+
+    def _on_training_start(self) -> None:
+        if self.stage.algorithm.starts_trained and self.every and not self.means:
+            self.act()
+
+    def _on_training_end(self) -> None:
+        if self.is_missing:
+            self.act()
+
+
+class FilmCallback(StageCallback):
+    """Films one episode on the first layout of the evaluations, into ``videos/``.
+
+    Args:
+        stage: In training.
+        tracker: Gets the film.
+    """
+
+    def __init__(self, stage: Stage, tracker: Tracker) -> None:
+        super().__init__(stage, stage.config.report.video_every)
+        self.tracker = tracker
+
+    def act(self) -> None:
+        """Film the present policy."""
+        stage, config = self.stage, self.stage.config
+        path = stage.folder / "videos" / f"step{stage.step:09d}.mp4"
+        size, (seed, _) = config.action_size(stage.number - 1), config.evaluation(stage.number - 1)
+        write_video(path, film_episode(config, stage.algorithm, size, config.report.eval_deterministic, seed))
+        self.tracker.film(stage.step, path)
+
+
+class CheckpointCallback(StageCallback):
+    """Writes a checkpoint: at intervals, after each evaluation, and before the run is stopped.
+
+    Without evaluations the newest policy is written along with it.
+
+    Args:
+        stage: In training.
+        checkpoint: Where.
+        evaluation: Comes before this callback.
+        signals: Whether the user wants to stop.
+    """
+
+    def __init__(
+        self, stage: Stage, checkpoint: Checkpoint, evaluation: EvaluationCallback, signals: StopSignals
+    ) -> None:
+        super().__init__(stage, stage.config.report.checkpoint_every)
+        self.checkpoint, self.evaluation, self.signals = checkpoint, evaluation, signals
+        self._saved = stage.step
+
+    def act(self) -> None:
+        """Write a checkpoint."""
+        if not self.evaluation.means:
+            self.stage.save_policy()
+        self.checkpoint.save(self.stage.algorithm, self.stage.config, self.stage.position)
+        self._saved = self.stage.step
+
+    def _on_rollout_start(self) -> None:
+        just_evaluated = self.evaluation.evaluated == self.stage.step > self._last
+        if self.is_due() or just_evaluated or self.signals.number:
+            self.act()
+
+    def _on_training_end(self) -> None:
+        if self._saved < self.stage.step:
+            self.act()
+
+
+class StopCallback(StageCallback):
+    """Stops the run when the user wants to, and the stage when its evaluations no longer improve.
+
+    Args:
+        stage: In training.
+        evaluation: Knows whether they do.
+        signals: Whether the user wants to stop.
+    """
+
+    def __init__(self, stage: Stage, evaluation: EvaluationCallback, signals: StopSignals) -> None:
+        super().__init__(stage, 0)
+        self.evaluation, self.signals = evaluation, signals
+
+    def _on_rollout_start(self) -> None:
+        """Stop if need be; the checkpoint is written.
+
+        Raises:
+            Stopped: The user wants to stop.
+            StageFinished: The evaluations no longer improve.
+        """
+        self._on_training_end()
+        if self.evaluation.has_plateaued:
+            raise StageFinished
+
+    def _on_training_end(self) -> None:
+        if self.signals.number:
+            raise Stopped(self.signals.number)

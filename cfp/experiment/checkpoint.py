@@ -1,154 +1,128 @@
-"""Everything a run of CFP needs to go on after a stop or a crash: the state file and the replay chunks it names."""
+"""Everything a run needs to continue after a stop or a crash: the state file and the replay chunks it names."""
 
 from __future__ import annotations
 
 import json
-from collections import deque
+import pickle
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from stable_baselines3.common.vec_env import VecMonitor
 
-from cfp.agent.replay import ReplayArchive, ReplayRing
-from cfp.agent.sac import CFP
-from cfp.config import RunConfig
-from cfp.envs.vec_env import TorchVecEnv
-from cfp.experiment.state_file import Position, StateFile
+from cfp.agent.replay import ReplayArchive
+from cfp.config import RunConfig, to_json
+from cfp.errors import CheckpointError, ConfigError
+from cfp.experiment.algorithm import Algorithm, Position
+from cfp.files import parse_json, write_atomically
+from cfp.from_dict import flatten
+
+VERSION = 2
 
 
-class Checkpoint(StateFile):
-    """The ``checkpoint`` folder of a run of CFP.
+class Checkpoint:
+    """The ``checkpoint`` folder of a run.
 
-    The state file names its replay chunks, which are immutable: a crash at any moment leaves the previous checkpoint
-    whole.
+    The state file is replaced in one move, and names its replay chunks, which are immutable: a crash at any moment
+    leaves the previous checkpoint whole. Reading runs no code from the file.
 
     Args:
         folder: ``RUN/checkpoint``.
     """
 
     def __init__(self, folder: Path) -> None:
-        super().__init__(folder)
+        self.path = folder / "state.pt"
         self.archive = ReplayArchive(folder / "replay", 0)
 
-    def save(self, model: CFP, config: RunConfig, position: Position) -> None:
-        """Write networks, optimisers, statistics, counters, random generators and new replay rows.
+    def exists(self) -> bool:
+        """Whether a whole checkpoint is there."""
+        return self.path.exists()
+
+    def save(self, algorithm: Algorithm, config: RunConfig, position: Position) -> None:
+        """Replace the checkpoint.
 
         Args:
-            model: Between two rollouts, so that every step taken is stored.
+            algorithm: Between two updates, so that every step taken is stored.
             config: The run's options, compared at resume.
-            position: Where in the ladder the run stands.
+            position: Where the run stands.
         """
-        if position.level != self.archive.level:
-            self.archive = ReplayArchive(self.archive.folder, position.level)
-        assert model.replay_buffer is not None
-        rows = model.num_timesteps // model.n_envs
-        chunks = self.archive.save(model.replay_buffer, rows)
-        self.write(config, position, {"rows": rows, "chunks": chunks, "model": model_state(model)})
+        state = {
+            "version": VERSION,
+            "config": json.dumps(to_json(config)),
+            "stage": position.stage,
+            "offset": position.offset,
+            "num_timesteps": algorithm.num_timesteps,
+            "algorithm": algorithm.state_dict(),
+        }
+        if (buffer := algorithm.replay_buffer) is not None:
+            if position.stage != self.archive.level + 1:
+                self.archive = ReplayArchive(self.archive.folder, position.stage - 1)
+            rows = algorithm.num_timesteps // buffer.n_envs
+            state |= {"rows": rows, "chunks": self.archive.save(buffer, rows)}
+        packed = BytesIO()  # when it writes into a file, torch reports a full disk as a fault of its own
+        torch.save(state, packed)
+        write_atomically(self.path, lambda file: file.write(packed.getbuffer()))
         self.archive.prune()
 
-    def restore(self, model: CFP, state: dict[str, Any]) -> None:
-        """Put a state into a freshly made model of the same configuration.
+    def read(self) -> dict[str, Any]:
+        """Read the state.
 
         Raises:
-            CheckpointError: The state does not fit the model, or a replay chunk is missing or damaged.
+            CheckpointError: It is missing, damaged, or of another version.
         """
-        assert model.replay_buffer is not None
-        self.archive = ReplayArchive(self.archive.folder, state["level"])
         try:
-            self.archive.load(model.replay_buffer, state["rows"], state["chunks"])
-            restore_model(model, state["model"])
+            state = torch.load(self.path, map_location="cpu", weights_only=True)
+        except FileNotFoundError as error:
+            raise CheckpointError(f"{self.path}: there is no checkpoint") from error
+        except (OSError, RuntimeError, ValueError, KeyError, EOFError, pickle.UnpicklingError) as error:
+            raise CheckpointError(
+                f"{self.path}: the checkpoint is damaged ({type(error).__name__}) and cannot be resumed; "
+                "the policy.safetensors of the run may still be whole"
+            ) from error
+        if not isinstance(state, dict) or state.get("version") != VERSION:
+            found = state.get("version") if isinstance(state, dict) else type(state).__name__
+            raise CheckpointError(f"{self.path}: got checkpoint version {found}, allowed {VERSION}")
+        try:
+            parse_json(state["config"])
+            if min(state["stage"] - 1, state["offset"], state["num_timesteps"]) < 0:
+                raise ValueError("a count is negative")
+        except (KeyError, TypeError, ValueError) as error:
+            raise self.does_not_fit(error) from error
+        return state
+
+    def restore(self, algorithm: Algorithm, state: dict[str, Any]) -> None:
+        """Put a state into an algorithm that has just been created with the same options.
+
+        Raises:
+            CheckpointError: The state does not fit the algorithm, or a replay chunk is missing or damaged.
+        """
+        try:
+            if algorithm.replay_buffer is not None:
+                self.archive = ReplayArchive(self.archive.folder, state["stage"] - 1)
+                self.archive.load(algorithm.replay_buffer, state["rows"], state["chunks"])
+            algorithm.load_state_dict(state["algorithm"])
+            algorithm.num_timesteps = state["num_timesteps"]
         except (KeyError, RuntimeError, ValueError, TypeError) as error:
-            raise self.misfit(error) from error
+            raise self.does_not_fit(error) from error
+
+    def does_not_fit(self, error: Exception) -> CheckpointError:
+        """The error for a state that cannot be put into an algorithm."""
+        reason = f"{type(error).__name__}: {error}"
+        return CheckpointError(f"{self.path}: the checkpoint does not fit this program ({reason})")
 
 
-def model_state(model: CFP) -> dict[str, Any]:
-    """All that `CFP` learns and counts, as tensors and plain values."""
-    (actor, critic, _), values = model.networks(), model.logger.name_to_value  # of the row that comes next
-    return {
-        "policy": model.policy.state_dict(),
-        "actor_optimizer": actor.optimizer.state_dict(),
-        "critic_optimizer": critic.optimizer.state_dict(),
-        "reward_statistics": model.reward_statistics.state_dict(),
-        "num_timesteps": model.num_timesteps,
-        "episodes": model._episode_num,
-        "updates": model._n_updates,
-        "recent": [{key: float(value) for key, value in info.items()} for info in model.ep_info_buffer or ()],
-        "successes": [bool(success) for success in model.ep_success_buffer or ()],
-        "means": {name: (values[name], count) for name, count in model.logger.name_to_count.items()},
-        "environment": environment_state(model),
-        "random": random_state(model),
-    }
+def check_same(stored: dict[str, Any], given: RunConfig) -> None:
+    """Compare the options of a checkpoint with those of the command that wants to resume it.
 
-
-def restore_model(model: CFP, state: dict[str, Any]) -> None:
-    """Undo `model_state`."""
-    actor, critic, _ = model.networks()
-    model.policy.load_state_dict(state["policy"])
-    actor.optimizer.load_state_dict(state["actor_optimizer"])
-    critic.optimizer.load_state_dict(state["critic_optimizer"])
-    model.reward_statistics.load_state_dict(state["reward_statistics"])
-    model.num_timesteps = state["num_timesteps"]
-    model._episode_num = state["episodes"]
-    model._n_updates = state["updates"]
-    model.ep_info_buffer = deque(state["recent"], maxlen=model._stats_window_size)
-    model.ep_success_buffer = deque(state["successes"], maxlen=model._stats_window_size)
-    for name, (mean, count) in state.get("means", {}).items():  # checkpoints from before have none
-        model.logger.record_mean(name, mean)
-        model.logger.name_to_count[name] = count
-    restore_environment(model, state["environment"])
-    restore_random(model, state["random"])
-
-
-def environment_state(model: CFP) -> dict[str, Any]:
-    """The episodes in progress: the matter, the sums of their rewards, and what the policy sees next."""
-    monitor, env = _environments(model)
-    return {
-        "episodes": env.state_dict(),
-        "generators": env.torch_env.generators,
-        "returns": torch.from_numpy(monitor.episode_returns.copy()),
-        "lengths": torch.from_numpy(monitor.episode_lengths.copy()),
-        "observation": torch.from_numpy(np.array(model._last_obs)),
-    }
-
-
-def restore_environment(model: CFP, state: dict[str, Any]) -> None:
-    """Undo `environment_state`; the environment is reset first, so that later episodes start as they would have."""
-    monitor, env = _environments(model)
-    monitor.reset()
-    env.load_state_dict(state["episodes"])
-    env.torch_env.generators = state.get("generators", {})
-    monitor.episode_returns = state["returns"].numpy().copy()
-    monitor.episode_lengths = state["lengths"].numpy().copy()
-    model._last_obs = state["observation"].numpy().copy()
-
-
-def _environments(model: CFP) -> tuple[VecMonitor, TorchVecEnv]:
-    monitor = model.get_env()
-    assert isinstance(monitor, VecMonitor)
-    assert isinstance(monitor.venv, TorchVecEnv)
-    return monitor, monitor.venv
-
-
-def random_state(model: CFP) -> dict[str, Any]:
-    """States of every generator that training draws from: torch's, the replay memory's, the action space's."""
-    assert isinstance(model.replay_buffer, ReplayRing)
-    state: dict[str, Any] = {
-        "torch": torch.get_rng_state(),
-        "replay": json.dumps(model.replay_buffer.generator.bit_generator.state),
-        "actions": json.dumps(model.action_space.np_random.bit_generator.state),
-    }
-    if model.device.type == "cuda":
-        state["cuda"] = torch.cuda.get_rng_state(model.device)
-    return state
-
-
-def restore_random(model: CFP, state: dict[str, Any]) -> None:
-    """Undo `random_state`."""
-    assert isinstance(model.replay_buffer, ReplayRing)
-    torch.set_rng_state(state["torch"])
-    model.replay_buffer.generator.bit_generator.state = json.loads(state["replay"])
-    model.action_space.np_random.bit_generator.state = json.loads(state["actions"])
-    if "cuda" in state and model.device.type == "cuda":
-        torch.cuda.set_rng_state(state["cuda"], model.device)
+    Raises:
+        ConfigError: Naming the first option that differs and may not, with both values.
+    """
+    old, new = flatten(stored), flatten(json.loads(json.dumps(to_json(given))))
+    for name in {**old, **new}:
+        if name.startswith(given.changeable) or old.get(name) == new.get(name):
+            continue
+        allowed = ", ".join(option.rstrip(".") for option in given.changeable)
+        raise ConfigError(
+            f"{name.split('.')[-1]}: the run was started with {old.get(name)!r}, got {new.get(name)!r}; "
+            f"a resumed run may change only: {allowed}"
+        )

@@ -3,106 +3,99 @@
 from __future__ import annotations
 
 import tempfile
-import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from cfp.config import RunConfig
-from cfp.envs.make import make_env
-from cfp.evaluation.rollout import ZeroPolicy, attached
+from cfp.envs.make import choose_device, make_env
+from cfp.evaluation.evaluate import ZeroPolicy, attached
 from cfp.evaluation.video import available
+from cfp.experiment.algorithm import Algorithm, Cost, Position, mean_seconds
+from cfp.experiment.callbacks import Stage
+from cfp.experiment.checkpoint import Checkpoint
+from cfp.experiment.folder import copy_policy, policy_path
 from cfp.experiment.process import StopSignals, peak_memory
-from cfp.experiment.state_file import Position, StateFile
+from cfp.experiment.run import Run
+from cfp.policy import Policy
 from dittogym import make_spec
 
-if TYPE_CHECKING:
-    from cfp.experiment.cli import Program
-    from cfp.experiment.run import Run
-
-REPEATS = 3
 COLUMNS = {"stage": 5, "action": 7, "steps": 11, "steps/s": 8, "training": 11, "evaluations": 11, "replay": 8}
 """Of the table, and their widths."""
 
 
-@dataclass(frozen=True)
-class Cost:
-    """What one stage costs.
-
-    Attributes:
-        learning: Seconds of one environment step of one robot, its share of the updates included.
-        held: Bytes that the stage will hold beyond what it holds as it begins (a replay memory).
-    """
-
-    learning: float
-    held: int = 0
-
-
-def seconds(action: Callable[[], object], repeats: int = REPEATS) -> float:
-    """Mean duration of an action after a first, untimed time."""
-    action()
-    start = time.perf_counter()
-    for _ in range(repeats):
-        action()
-    return (time.perf_counter() - start) / repeats
-
-
-def estimate(program: Program, config: RunConfig, begun: Path | None = None) -> str:
+def estimate(algorithm: type[Algorithm], config: RunConfig, resumed: Path | None = None) -> str:
     """Time and memory of a run as a table; no folder of the user's is touched.
 
     Args:
-        program: Knows how to open it.
+        algorithm: Its class.
         config: Its options.
-        begun: Folder of the run if it goes on: then only what its checkpoint leaves is counted.
+        resumed: Folder of the run if it is going to be resumed: then only what its checkpoint leaves is counted.
 
     Raises:
         ConfigError: An option is wrong.
         CheckpointError: The checkpoint is damaged.
     """
     quiet = replace(config, report=replace(config.report, video=False, video_every=0, wandb="off"))
-    bounds, report, rows, total = (0, *config.ends()), config.report, [_row(COLUMNS)], 0.0
-    with tempfile.TemporaryDirectory() as folder:
-        run = program.run(quiet, Path(folder) / "run", False, StopSignals())
-        costs, first = run.measure_all(), run.position.level
-        lines = [f"not counted: {other}" for other in run.unmeasured()]
-        done = bounds[first]
-        if begun is not None and (checkpoint := StateFile(begun / "checkpoint")).exists():
-            state = checkpoint.load()
-            run.position, lines = Position(state["level"], state["offset"]), []
-            done = state["offset"] + state["model"]["num_timesteps"]
-            rows.insert(0, f"{begun} is at step {done:,} of {bounds[-1]:,}; what is left of it:")
-        for level, cost in enumerate(costs, first):
-            if level < run.position.level:
+    ends, rows, total = config.ends(), [_row(COLUMNS)], 0.0
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) / "run"
+        run = Run(algorithm, quiet, folder, False, StopSignals())
+        first, costs = run.position.stage, _measure(run)
+        lines = [f"not counted: {other}" for other in algorithm.not_estimated(config)]
+        done, present = (0, *ends)[first - 1], first
+        if resumed is not None and (checkpoint := Checkpoint(resumed / "checkpoint")).exists():
+            state, lines = checkpoint.read(), []
+            done, present = state["offset"] + state["num_timesteps"], state["stage"]
+            rows.insert(0, f"{resumed} is at step {done:,} of {ends[-1]:,}; what is left of it:")
+        for stage, (cost, starts_trained) in enumerate(costs, first):
+            if stage < present:
                 continue
-            start, end = max(bounds[level], done), max(bounds[level + 1], done)
-            policy, size = run.load(run.folder / f"stage{level + 1}.safetensors"), config.action_size(level)
-            judged = partial(_episodes, config, policy, size)
-            count = 0
-            if report.eval_every and end > start:
-                fresh = start == bounds[level] and run.begins_trained(level)
-                count = -(-end // report.eval_every) - start // report.eval_every + fresh
-            films = end // report.video_every - start // report.video_every if report.video_every else 0
-            training = (end - start) * cost.learning
-            judging = count * judged(config.evaluation(level)[1]) if count else 0.0
-            filming = films * judged(1, film=True) if films and available() else 0.0
-            total += training + judging + filming
-            grid = config.resolution(level)
-            speed = f"{1 / cost.learning:.1f}"
-            spent = _duration(training), _duration(judging + filming)
-            rows.append(_row((f"{level + 1}", f"{grid}x{grid}", f"{end - start:,}", speed, *spent, _size(cost.held))))
+            begin, end = ((0, *ends)[stage - 1 + later] for later in (0, 1))
+            start, end = max(begin, done), max(end, done)
+            training = (end - start) * cost.seconds_per_step
+            policy = algorithm.load(policy_path(folder, stage), choose_device(config.device))
+            reporting = _reporting(config, policy, stage, (start, end), starts_trained and start == begin)
+            total += training + reporting
+            grid = config.resolution(stage - 1)
+            speed, times = f"{1 / cost.seconds_per_step:.1f}", (_duration(training), _duration(reporting))
+            rows.append(_row((f"{stage}", f"{grid}x{grid}", f"{end - start:,}", speed, *times, _size(cost.memory))))
         ending = _ending(run, config)
-        lines += run.remarks()
-    memory, held = peak_memory(), max(cost.held for cost in costs)
+        lines += algorithm.warnings(config, folder, present)
+    memory, held = peak_memory(), max(cost.memory for cost, _ in costs)
     rows.append(
         f"time: about {_duration(total + ending)}, {_duration(ending)} of it for what follows the training; "
-        f"of {report.eval_episodes} episodes to an evaluation that none ends early"
+        f"of {config.report.eval_episodes} episodes to an evaluation that none ends early"
     )
     rows.append("memory: " + (f"about {_size(memory + held)}" if memory else f"{_size(held)} and the program itself"))
     return "\n".join([*rows, *lines])
+
+
+def _measure(run: Run) -> list[tuple[Cost, bool]]:
+    """Cost of each stage, over the untrained policy of the one before, and whether it starts with a trained policy."""
+    costs = []
+    run.algorithm.prepare(run.config, run.folder, None)
+    for stage in range(run.position.stage, run.stages + 1):
+        algorithm = run.algorithm.create(run.config, stage, run.folder)
+        present = Stage(run.config, run.folder, Position(stage), algorithm)
+        present.save_policy()
+        copy_policy(policy_path(run.folder), policy_path(run.folder, stage))
+        costs.append((algorithm.measure(), algorithm.starts_trained))
+    run.logger.close()
+    return costs
+
+
+def _reporting(config: RunConfig, policy: Policy, stage: int, steps: tuple[int, int], evaluated_first: bool) -> float:
+    """Seconds of the evaluations and films of a stage between two steps."""
+    report, size, (start, end) = config.report, config.action_size(stage - 1), steps
+    count = -(-end // report.eval_every) - start // report.eval_every if report.eval_every and end > start else 0
+    count += bool(count and evaluated_first)
+    films = end // report.video_every - start // report.video_every if report.video_every and available() else 0
+    evaluating = count * _episodes(config, policy, size, config.evaluation(stage - 1)[1]) if count else 0.0
+    return evaluating + (films * _episodes(config, policy, size, 1, film=True) if films else 0.0)
 
 
 def _ending(run: Run, config: RunConfig) -> float:
@@ -131,7 +124,7 @@ def _episodes(config: RunConfig, policy: PolicyPredictor, size: int, count: int,
         if film:
             env.get_images()
 
-    return seconds(step) * make_spec(config.task).horizon
+    return mean_seconds(step) * make_spec(config.task).horizon
 
 
 def _row(cells: Iterable[str]) -> str:

@@ -5,20 +5,18 @@ from collections.abc import Callable
 
 import pytest
 
-from cfp.experiment.books import Books
+from cfp.experiment.callbacks import StopCallback
 
 
 @pytest.fixture
 def stop_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Press Ctrl-C when a training comes to a step."""
-    turn = Books.turn
+    on_step, steps = StopCallback._on_step, []
 
-    def press(at: int) -> None:
-        def interrupt(books, step, scalars):
-            if step == at:
-                signal.raise_signal(signal.SIGINT)
-            turn(books, step, scalars)
+    def interrupt(callback: StopCallback) -> bool:
+        if callback.stage.step in steps:
+            signal.raise_signal(signal.SIGINT)
+        return on_step(callback)
 
-        monkeypatch.setattr(Books, "turn", interrupt)
-
-    return press
+    monkeypatch.setattr(StopCallback, "_on_step", interrupt)
+    return steps.append

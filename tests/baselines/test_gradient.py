@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from updates import EachUpdate
 
 from baselines import Gradient, OpenLoop
 from baselines.registry import configure
@@ -59,7 +60,7 @@ def test_descent_improves_the_true_return():
         Gradient(make(substeps=30, train_particles=500, learning_rate=0.2, blur=(1.0,), iterations=6)),
         [],
     )
-    algorithm.learn(6 * 30, lambda scalars: returns.append(scalars["train/return"]))
+    algorithm.learn(6 * 30, EachUpdate(lambda scalars: returns.append(scalars["train/return"])))
     assert len(returns) == 6 and algorithm.num_timesteps == 180
     assert returns[-1] > returns[0] + 40
     assert algorithm.policy.actions.abs().max() < 1
@@ -154,18 +155,18 @@ def test_unusual_gradients_are_clipped():
 @pytest.mark.parametrize("loss", [float("nan"), float("inf"), 1e3])
 def test_iteration_that_breaks_the_robot_is_undone(monkeypatch, loss):
     algorithm = Gradient(make(substeps=1, blur=(1.0,)))
-    algorithm.learn(30, lambda _: None)
+    algorithm.learn(30)
     good = algorithm._episode
     fail = lambda progress: Episode(loss, loss, 0.0, torch.zeros_like(algorithm.theta))  # noqa: E731
     monkeypatch.setattr(algorithm, "_episode", fail)
-    scalars = algorithm._iterate()
+    scalars = algorithm.update()
     assert not algorithm.theta.any() and scalars["train/failed"] == 1  # back to the start, the best so far
     monkeypatch.setattr(algorithm, "_episode", good)
-    assert algorithm._iterate()["train/learning_rate"] == pytest.approx(0.7 * scalars["train/learning_rate"])
+    assert algorithm.update()["train/learning_rate"] == pytest.approx(0.7 * scalars["train/learning_rate"])
     assert algorithm.theta.any() and algorithm.failed_in_a_row == 0
     monkeypatch.setattr(algorithm, "_episode", fail)
     with pytest.raises(NonFiniteError, match="10 iterations in a row"):
-        algorithm.learn(30 * 20, lambda _: None)
+        algorithm.learn(30 * 20)
 
 
 @pytest.mark.parametrize(
@@ -175,34 +176,34 @@ def test_better_losses_below_zero_are_kept(monkeypatch, sequence, size):
     algorithm, losses = Gradient(make("run", substeps=1)), iter(sequence)
     found = lambda progress: Episode(next(losses), size, 0.0, torch.ones_like(algorithm.theta))  # noqa: E731
     monkeypatch.setattr(algorithm, "_episode", found)
-    assert [algorithm._iterate()["train/failed"] for _ in range(4)] == [0, 0, 0, 0]
+    assert [algorithm.update()["train/failed"] for _ in range(4)] == [0, 0, 0, 0]
     resumed = Gradient(algorithm.config)
     resumed.load_state_dict(algorithm.state_dict())
     monkeypatch.setattr(resumed, "_episode", found)
-    assert resumed._iterate()["train/failed"] == 1 and resumed.best_loss == min(sequence)
+    assert resumed.update()["train/failed"] == 1 and resumed.best_loss == min(sequence)
 
 
-@pytest.mark.parametrize(("task", "level", "phases"), [("shapematch", 0, 4), ("shapematch", 1, 1), ("run", 0, 1)])
-def test_only_another_blur_begins_anew(task, level, phases):
-    algorithm = Gradient(make(task, polish=1, substeps=1), level)
+@pytest.mark.parametrize(("task", "stage", "phases"), [("shapematch", 1, 4), ("shapematch", 2, 1), ("run", 1, 1)])
+def test_only_another_blur_begins_anew(task, stage, phases):
+    algorithm = Gradient(make(task, polish=1, substeps=1), stage)
     assert len({algorithm.objective.phase(progress / 8) for progress in range(9)}) == phases
 
 
 def test_schedule_of_a_stage_that_gets_the_steps_of_an_earlier_one_does_not_rise_again(monkeypatch):
-    algorithm = Gradient(make(polish=2, polish_grid=4, substeps=1), 1)
+    algorithm = Gradient(make(polish=2, polish_grid=4, substeps=1), 2)
     found = Episode(1.0, 1.0, 0.0, torch.zeros_like(algorithm.theta))
     monkeypatch.setattr(algorithm, "_episode", lambda progress: found)
     rates = []
-    algorithm.learn(4 * 30, lambda scalars: rates.append(scalars["train/learning_rate"]))
+    algorithm.learn(4 * 30, EachUpdate(lambda scalars: rates.append(scalars["train/learning_rate"])))
     assert rates == pytest.approx([0.05, 0.0275, 0.005, 0.005])
 
 
 def test_polish_starts_from_the_actions_of_the_first_stage():
     actions = 0.5 * torch.rand(30, 2, 4, 4, generator=torch.Generator().manual_seed(0)) - 0.25
-    algorithm = Gradient(make(polish=1, polish_grid=4, particles=200), 1, OpenLoop(actions))
+    algorithm = Gradient(make(polish=1, polish_grid=4, particles=200), 2, OpenLoop(actions))
     assert torch.allclose(algorithm.policy.actions, actions, atol=1e-6)
     assert algorithm.env.num_particles == 200
-    finer = Gradient(make(polish=1, polish_grid=8, particles=200), 1, OpenLoop(actions)).policy.actions
+    finer = Gradient(make(polish=1, polish_grid=8, particles=200), 2, OpenLoop(actions)).policy.actions
     assert finer.shape == (30, 2, 8, 8)
     assert torch.allclose(finer.mean((2, 3)), actions.mean((2, 3)), atol=0.05)
 
@@ -210,7 +211,7 @@ def test_polish_starts_from_the_actions_of_the_first_stage():
 def test_only_polish_takes_place_where_the_result_is_judged():
     environment = EnvironmentConfig(1, 300, 4, parity="reference")
     first, polish = (
-        Gradient(make("run", environment=environment, train_particles=200, polish=1), level) for level in (0, 1)
+        Gradient(make("run", environment=environment, train_particles=200, polish=1), stage) for stage in (1, 2)
     )
     assert first.env.num_particles == 200 and max(first.env.model.shares) > 1 and not first.env.model.pixels
     assert polish.env.num_particles == 300 and max(polish.env.model.shares) == 1 and polish.env.model.pixels

@@ -14,7 +14,7 @@ import pytest
 from test_programs import COMMON, TINY, run
 
 import baselines
-from cfp.experiment.state_file import StateFile
+from cfp.experiment.checkpoint import Checkpoint
 from cfp.tables import read_table
 
 KILLS = int(os.environ.get("KILLS", "3"))
@@ -44,8 +44,8 @@ def check_whole(folder):
         json.loads(path.read_text())
     for path in folder.glob("*.safetensors"):
         baselines.load(path)
-    if (state := StateFile(folder / "checkpoint")).exists():
-        state.load()
+    if (checkpoint := Checkpoint(folder / "checkpoint")).exists():
+        checkpoint.read()
     return [row["step"] for row in read_table(folder / "evaluations.csv")]
 
 

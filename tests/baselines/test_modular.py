@@ -15,12 +15,12 @@ from baselines.modular.kmeans import update
 from baselines.modular.networks import ModularActor, ModularCritics
 from baselines.modular.nodes import Nodes, pack, unpack, visible_positions
 from baselines.modular.policy import SegmentPolicy
-from baselines.modular.train import ModularConfig, ModularRun, preset
+from baselines.modular.train import ModularConfig, preset
+from baselines.registry import find
 from cfp.agent.losses import Losses
 from cfp.envs.disturbances import Case
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import CheckpointError, ConfigError
-from cfp.experiment.process import StopSignals
 from cfp.robustness import report
 from cfp.sections import EnvironmentConfig, ReportConfig
 from cfp.weights import origin
@@ -98,8 +98,7 @@ def config(algo, **changes):
 
 
 def model_of(algo, folder):
-    with StopSignals() as signals:
-        return ModularRun(config(algo), folder, False, signals).make_model(0)
+    return find(algo).create(config(algo), 1, folder).model
 
 
 @pytest.mark.parametrize("algo", ["gnn-16", "transformer-16"])

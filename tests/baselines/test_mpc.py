@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from updates import EachUpdate
 
 from baselines import MPC, GradientPlannerConfig, OpenLoop, train
 from baselines.planning.mpc import MPCConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
-from cfp.experiment.process import StopSignals
-from cfp.experiment.run import holds_run
+from cfp.experiment.folder import holds_run
 from cfp.sections import EnvironmentConfig
 from cfp.tables import read_table
 
@@ -41,7 +41,7 @@ def test_record_repeats_the_episode(tmp_path) -> None:
 def test_record_repeats_the_episode_exactly_in_double_precision() -> None:
     config = replace(CONFIG, environment=replace(ENVIRONMENT, dtype="float64"))
     model = MPC(config)
-    model.learn(4, lambda scalars: None)
+    model.learn(4)
     env, memory = make_torch_env(config, 4, 1), None
     seen, _ = env.reset(seed=0)
     for _ in range(4):
@@ -68,10 +68,10 @@ def test_learning_stops_with_the_episode() -> None:
         if len(seen) == 3:
             mpc.env.state.x[..., 0] -= 1.0
 
-    mpc.learn(10, behind_the_limit)
+    mpc.learn(10, EachUpdate(behind_the_limit))
     assert mpc.is_done and mpc.num_timesteps == 4 == len(mpc.actions) == len(seen)
     assert seen[-1]["train/return"] == mpc.total_reward and seen[-1]["train/plans"] == 4
-    mpc.learn(5, behind_the_limit)
+    mpc.learn(5, EachUpdate(behind_the_limit))
     assert len(seen) == 4
 
 
@@ -79,7 +79,7 @@ def test_surrogate_is_synced_only_where_a_plan_is_made(monkeypatch) -> None:
     mpc, synced = MPC(replace(CONFIG, train_particles=60)), []
     sync = mpc.surrogate.sync
     monkeypatch.setattr(mpc.surrogate, "sync", lambda state: synced.append(int(state.steps)) or sync(state))
-    mpc.learn(5, lambda scalars: None)
+    mpc.learn(5)
     assert synced == [0, 2, 4]  # a plan is carried out for two steps
 
 
@@ -95,11 +95,11 @@ def test_layout_of_the_reference_is_kept() -> None:
 
 def test_state_goes_on_the_same() -> None:
     first, second = MPC(CONFIG), MPC(CONFIG)
-    first.learn(3, lambda scalars: None)
+    first.learn(3)
     second.load_state_dict(first.state_dict())
     second.num_timesteps = first.num_timesteps
     for mpc in (first, second):
-        mpc.learn(4, lambda scalars: None)
+        mpc.learn(4)
     assert torch.equal(first.actions, second.actions) and first.total_reward == second.total_reward
 
 
@@ -116,10 +116,8 @@ def test_bad_options_are_named(change: dict, named: str) -> None:
         replace(CONFIG, **change).check()
 
 
-def test_estimate_covers_a_whole_plan(tmp_path) -> None:
+def test_estimate_covers_a_whole_plan() -> None:
     """Only the first step of a commitment plans: timed alone it would make a run look several times longer."""
-    with StopSignals() as signals:
-        run = MPC.entry().open(CONFIG, tmp_path / "run", False, signals)
-        model = run.make_model(0)
-        assert run.measure(model).learning > 0
+    model = MPC(CONFIG)
+    assert model.measure().seconds_per_step > 0
     assert model.num_timesteps == CONFIG.planner.commit == 2

@@ -11,11 +11,12 @@ import cfp.evaluate
 import cfp.robustness
 import dittogym
 from baselines import evaluate, robustness, train
+from baselines.registry import sees
 from cfp.agent.actor import build_actor
 from cfp.errors import ConfigError
-from cfp.evaluation.rollout import SeesState
-from cfp.experiment.books import Books
-from cfp.experiment.cli import parse
+from cfp.experiment.callbacks import EvaluationCallback
+from cfp.experiment.training import parse
+from cfp.policy import SeesState
 from cfp.tables import read_table
 from cfp.weights import describe, save_policy
 
@@ -72,9 +73,6 @@ TINY = {
     "gnn-64": (MODULAR, 44, ["stage 1"]),
     "transformer-16": (MODULAR, 44, ["stage 1"]),
     "transformer-64": (MODULAR, 44, ["stage 1"]),
-    "zero": ("--grid 8", 1, ["stage 1"]),
-    "random": ("--grid 8", 1, ["stage 1"]),
-    "scripted": ("--grid 8", 1, ["stage 1"]),
 }
 PATCHES = {algo: 64 for algo in TINY if "-" in algo}
 """Action grids that are not 8."""
@@ -138,9 +136,9 @@ def test_folder_is_evaluated_whatever_trained_it(finished, capsys):
     assert json.loads(capsys.readouterr().out) == json.loads((folder / "results.json").read_text())
     assert cfp.evaluate.main([str(folder), "--episodes", "1", "--device", "cpu"]) == (0 if algo == "cfp" else 2)
     if algo != "cfp":
-        assert "python -m baselines.evaluate takes others" in capsys.readouterr().err
+        assert "python -m baselines.evaluate runs other algorithms" in capsys.readouterr().err
         assert cfp.robustness.main([str(folder), "--episodes", "1", "--device", "cpu"]) == 2
-        assert "python -m baselines.robustness takes others" in capsys.readouterr().err
+        assert "python -m baselines.robustness runs other algorithms" in capsys.readouterr().err
 
 
 def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monkeypatch, capsys, stop_at):
@@ -168,10 +166,14 @@ def test_stop_in_the_last_step_leaves_a_whole_stage(tmp_path, stop_at):
 
 
 def test_last_evaluation_that_a_crash_prevented_is_made_up_for(tmp_path, monkeypatch):
-    def crash(*_):
-        raise RuntimeError("killed")
+    act = EvaluationCallback.act
 
-    monkeypatch.setattr(Books, "close", crash)
+    def crash(callback):
+        if callback.stage.step == 30:
+            raise RuntimeError("killed")
+        act(callback)
+
+    monkeypatch.setattr(EvaluationCallback, "act", crash)
     with pytest.raises(RuntimeError, match="killed"):
         run("mpc", tmp_path)
     monkeypatch.undo()
@@ -180,11 +182,11 @@ def test_last_evaluation_that_a_crash_prevented_is_made_up_for(tmp_path, monkeyp
     assert len(baselines.load(tmp_path).actions) == json.loads((tmp_path / "policy.json").read_text())["steps"]
 
 
-def test_algorithm_is_told_which_scalars_become_a_row(tmp_path, monkeypatch):
-    told = []
-    monkeypatch.setattr(baselines.Shac, "written", lambda model: told.append(model.num_timesteps))
+def test_algorithm_is_asked_for_its_scalars_when_a_row_is_written(tmp_path, monkeypatch):
+    asked, row = [], baselines.Shac.row
+    monkeypatch.setattr(baselines.Shac, "row", lambda model: asked.append(model.num_timesteps) or row(model))
     assert run("shac", tmp_path) == 0
-    assert told == [24, 48, 72, 96] == [int(row["step"]) for row in read_table(tmp_path / "progress.csv")]
+    assert asked == [24, 48, 72, 96] == [int(row["step"]) for row in read_table(tmp_path / "progress.csv")]
 
 
 def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, monkeypatch, stop_at):
@@ -203,7 +205,7 @@ def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, mon
     assert baselines.load(tmp_path / "run").description["steps"] == int(best["step"])
 
 
-@pytest.mark.parametrize("algo", ["shac", "distill", "gradient", "zero", "random", "scripted"])
+@pytest.mark.parametrize("algo", ["shac", "distill", "gradient"])
 def test_new_particles_are_refused_where_the_seed_says_them(algo):
     with pytest.raises(ConfigError, match="resample requires soft actor-critic"):
         parse(train.PROGRAM, ["--algo", algo, "--resample"])
@@ -222,8 +224,14 @@ def test_polish_is_judged_on_the_layout_it_is_made_for(finished):
 
 
 def test_what_acts_without_looking_is_said_to_see_nothing():
-    blind = {name for name, entry in baselines.ALGORITHMS.items() if entry.sees == "nothing"}
-    assert blind == {"gradient", "zero", "random", "scripted"}
+    names = (*baselines.ALGORITHMS, "zero", "random", "scripted")
+    assert {name for name in names if sees(name) == "nothing"} == {"gradient", "zero", "random", "scripted"}
+
+
+@pytest.mark.parametrize("algo", ["zero", "random", "scripted"])
+def test_reference_policy_is_not_trained_and_the_error_says_how_to_evaluate_it(algo, capsys):
+    assert train.main(["--algo", algo]) == 2
+    assert f"python -m baselines.compare --algos {algo}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("given, name", [("gnn16", "gnn-16"), ("transformer64", "transformer-64"), ("cfp", "cfp")])
@@ -234,7 +242,7 @@ def test_algorithm_with_a_count_has_two_spellings(given, name):
 
 def test_wrong_algorithm_is_named(tmp_path, capsys):
     assert train.main(["--algo", "alchemy", "--out", str(tmp_path / "a")]) == 2
-    assert f"algo: got 'alchemy', allowed {', '.join(baselines.ALGORITHMS)}" in capsys.readouterr().err
+    assert f"algo must be one of {', '.join(baselines.ALGORITHMS)}, got 'alchemy'" in capsys.readouterr().err
     assert cfp.train.main(["--algo", "gradient", "--out", str(tmp_path / "a")]) == 2
     assert "algo must be 'cfp', got 'gradient'; python -m baselines.train" in capsys.readouterr().err
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from updates import EachUpdate
 
 import baselines
 import cfp
@@ -21,7 +22,7 @@ from cfp.agent.spec import ActorSpec
 from cfp.config import to_json
 from cfp.envs.make import make_env
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
-from cfp.evaluation.rollout import attached, evaluate
+from cfp.evaluation.evaluate import attached, evaluate
 from cfp.evaluation.video import film
 from cfp.sections import EnvironmentConfig
 from cfp.weights import describe, origin, save_policy
@@ -75,7 +76,7 @@ def test_training_makes_the_robot_run():
     )
     algorithm, rows = Shac(config), []
     before = speed(algorithm)
-    algorithm.learn(config.steps, rows.append)
+    algorithm.learn(config.steps, EachUpdate(rows.append))
     assert len(rows) == 15 and algorithm.num_timesteps == 480
     assert set(rows[0]) == set(METRICS)
     early, late = (np.mean([row["train/reward"] for row in part]) for part in (rows[:5], rows[-5:]))
@@ -127,13 +128,12 @@ def collect(algorithm):
 def test_resumed_training_is_the_same_to_the_last_bit(sees):
     config = make(sees=sees, max_episode_steps=6)
     whole, first, second = Shac(config), Shac(config), Shac(config)
-    ignore = lambda _: None  # noqa: E731
-    whole.learn(48, ignore)
-    first.learn(24, ignore)
+    whole.learn(48)
+    first.learn(24)
     second.load_state_dict(first.state_dict())
     second.num_timesteps = first.num_timesteps
     rows = []
-    second.learn(24, rows.append)
+    second.learn(24, EachUpdate(rows.append))
     assert torch.equal(parameters(whole), parameters(second))
     assert torch.equal(whole.env.state.x, second.env.state.x)
     assert rows[-1]["train/episodes"] == whole.rollout.episodes.counts["episodes"] > 0
@@ -141,7 +141,7 @@ def test_resumed_training_is_the_same_to_the_last_bit(sees):
 
 def test_simulation_that_is_not_finite_is_reset_and_counted(monkeypatch):
     algorithm = Shac(make(num_envs=3))
-    algorithm.learn(12, lambda _: None)
+    algorithm.learn(12)
     env, calls, step = algorithm.env, [], algorithm.env.step
 
     def spoil_the_second(action, *, soft):
@@ -154,7 +154,7 @@ def test_simulation_that_is_not_finite_is_reset_and_counted(monkeypatch):
 
     monkeypatch.setattr(env, "step", spoil_the_second)
     before, rows = parameters(algorithm), []
-    algorithm.learn(12, rows.append)
+    algorithm.learn(12, EachUpdate(rows.append))
     assert rows[0]["train/nonfinite"] == rows[0]["train/terminated"] == 1 and rows[0]["train/skipped"] == 0
     assert rows[0]["train/dropped"] == 0  # the environment keeps its neighbours' gradients clean
     assert env.state.x.isfinite().all()
@@ -173,7 +173,7 @@ def test_gradients_of_single_actions_that_are_not_finite_are_left_out_and_counte
 
     monkeypatch.setattr(algorithm.env, "step", slope_without_end)
     before, rows = parameters(algorithm), []
-    algorithm.learn(12, rows.append)
+    algorithm.learn(12, EachUpdate(rows.append))
     assert rows[0]["train/dropped"] == 4 and rows[0]["train/skipped"] == 0
     after = parameters(algorithm)
     assert after.isfinite().all() and not torch.equal(before, after)
@@ -185,7 +185,7 @@ def test_updates_without_a_finite_gradient_end_the_training(monkeypatch):
     weight = next(algorithm.actor.parameters())
     monkeypatch.setattr(shac_train, "actor_loss", lambda window, gamma: weight.sum() * float("nan"))
     with pytest.raises(NonFiniteError, match="10 updates in a row"):
-        algorithm.learn(8 * 20, rows.append)
+        algorithm.learn(8 * 20, EachUpdate(rows.append))
     assert rows[-1]["train/skipped"] == 9 and torch.equal(before, parameters(algorithm))
 
 
@@ -194,7 +194,7 @@ def test_actor_that_has_diverged_does_not_act():
     with torch.no_grad():
         next(algorithm.actor.parameters()).fill_(torch.nan)
     with pytest.raises(NonFiniteError, match="the actor's actions became NaN"):
-        algorithm.learn(8, lambda scalars: None)
+        algorithm.learn(8)
 
 
 def test_episodes_are_cut_at_staggered_ages_and_change_layouts():
@@ -229,17 +229,17 @@ def test_restart_of_a_neighbour_leaves_the_particles_that_were_close(monkeypatch
 
 def test_return_is_that_of_all_episodes_since_the_last_row():
     algorithm, rows = Shac(make(max_episode_steps=4)), []  # a window is as long as an episode
-    algorithm.learn(8, rows.append)
+    algorithm.learn(8, EachUpdate(rows.append))
     first = list(algorithm.rollout.episodes.recent_returns)
     again = Shac(algorithm.config)
     again.load_state_dict(algorithm.state_dict())
     for each in (algorithm, again):
-        each.learn(8, rows.append)
+        each.learn(8, EachUpdate(rows.append))
         ended = each.rollout.episodes.recent_returns
         assert len(ended) > len(first) > 0 and ended[: len(first)] == first
         assert rows[-1]["rollout/return"] == np.mean(ended)
-    algorithm.written()
-    algorithm.learn(8, rows.append)
+    algorithm.row()
+    algorithm.learn(8, EachUpdate(rows.append))
     assert len(algorithm.rollout.episodes.recent_returns) < len(ended)
 
 
@@ -266,9 +266,9 @@ def test_targets_are_those_of_td_lambda():
 @pytest.mark.parametrize("sees", ["state", "image"])
 def test_policy_goes_through_its_file(sees, tmp_path):
     algorithm = Shac(make("shapematch", sees=sees, grid=8))
-    algorithm.learn(8, lambda _: None)
+    algorithm.learn(8)
     path = tmp_path / "policy.safetensors"
-    algorithm.save(path, origin(algorithm.config, "shac", 0, 8))
+    algorithm.save_policy(path, origin(algorithm.config, "shac", 0, 8))
     policy = baselines.load(path)
     assert policy.description["sees"] == sees and policy.resolution == 8
     env = make_env(algorithm.config, 8, 2)
@@ -283,7 +283,7 @@ def test_policy_goes_through_its_file(sees, tmp_path):
 def test_policy_of_the_image_is_one_of_cfp(tmp_path):
     algorithm = Shac(make(sees="image"))
     path = tmp_path / "policy.safetensors"
-    algorithm.save(path, origin(algorithm.config, "shac", 0, 0))
+    algorithm.save_policy(path, origin(algorithm.config, "shac", 0, 0))
     policy = cfp.load(path)
     torch.manual_seed(0)
     images = torch.randint(0, 256, (40, 3, 64, 64), dtype=torch.uint8)
@@ -322,7 +322,7 @@ def test_policy_of_the_state_says_what_it_needs(tmp_path):
     with pytest.raises(ValueError, match="got 'kick'"):
         policy.attached(kick)
     path = tmp_path / "policy.safetensors"
-    algorithm.save(path, origin(algorithm.config, "shac", 0, 0))
+    algorithm.save_policy(path, origin(algorithm.config, "shac", 0, 0))
     path.write_bytes(path.read_bytes().replace(b"inputs", b"outputs"[:6]))
     with pytest.raises(CheckpointError):
         StatePolicy.load(path)
@@ -332,5 +332,5 @@ def test_policy_of_the_state_says_what_it_needs(tmp_path):
 def test_every_task_has_a_gradient(task):
     algorithm = Shac(make(task, substeps=20, grid=4, window=2))
     rows = []
-    algorithm.learn(4, rows.append)
+    algorithm.learn(4, EachUpdate(rows.append))
     assert rows[0]["train/gradient_norm"] > 0 and rows[0]["train/dropped"] == 0

@@ -65,12 +65,12 @@ def test_takes_over_constants_of_particles() -> None:
 def test_plans_in_it_are_carried_out_in_the_other() -> None:
     config = MPCConfig(task="grow", device="cpu", grid=4, environment=ENVIRONMENT, planner=PLANNER, train_particles=80)
     first, second = MPC(config), MPC(config)
-    first.learn(5, lambda scalars: None)
+    first.learn(5)
     assert first.env.num_particles == 600 and first.planner.env.num_particles == 80
     second.load_state_dict(first.state_dict())
     second.num_timesteps = 5
     for mpc in (first, second):
-        mpc.learn(2, lambda scalars: None)
+        mpc.learn(2)
     assert torch.equal(first.actions, second.actions) and bool(first.actions.any())
 
 

@@ -11,23 +11,24 @@ from cfp.agent.policies import CFPPolicy
 from cfp.agent.sac import CFP
 from cfp.envs.vec_env import monitored
 from cfp.errors import CheckpointError
-from cfp.experiment.checkpoint import Checkpoint, model_state
-from cfp.experiment.state_file import Position
+from cfp.experiment.algorithm import Position
+from cfp.experiment.checkpoint import Checkpoint
+from cfp.experiment.coarse_to_fine import CoarseToFine
 from cfp.presets import preset
 
 CONFIG = replace(preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,))
 
 
-def make_model(level=1):
+def make(stage=2):
     # The ring (20 rows) wraps around, and 7 does not divide anything: episodes are in progress at every checkpoint.
-    env = monitored(FakeEnv(num_envs=2, resolution=CONFIG.action_size(level), horizon=7))
-    spec = CONFIG.actor_spec(level)
+    env = monitored(FakeEnv(num_envs=2, resolution=CONFIG.action_size(stage - 1), horizon=7))
+    spec = CONFIG.actor_spec(stage - 1)
     hyperparameters = Hyperparameters(
         buffer_size=40, batch_size=4, update_start=6, random_steps=10, precision="bfloat16", gate_penalty=0.1
     )
     model = CFP(CFPPolicy, env, hyperparameters, policy_kwargs={"spec": spec}, seed=3, device="cpu")
     model.set_logger(Logger(None, []))
-    return model
+    return CoarseToFine(CONFIG, stage, model)
 
 
 class Hook(BaseCallback):
@@ -64,30 +65,30 @@ def assert_same(first, second, path="state"):
 def test_resumed_training_equals_uninterrupted_training_to_the_last_bit(tmp_path, stop):
     checkpoint = Checkpoint(tmp_path)
 
-    def save(model):
-        if model.num_timesteps == stop:
-            checkpoint.save(model, CONFIG, Position(1, 100))
+    def save(_):
+        if algorithm.num_timesteps == stop:
+            checkpoint.save(algorithm, CONFIG, Position(2, 100))
 
-    model = make_model()
-    model.learn(70, Hook(save))
-    resumed = make_model()
+    algorithm = make()
+    algorithm.learn(70, Hook(save))
+    resumed = make()
     torch.rand(5)  # generators are somewhere else
-    state = Checkpoint(tmp_path).load()
-    assert (state["level"], state["offset"]) == (1, 100)
+    state = Checkpoint(tmp_path).read()
+    assert (state["stage"], state["offset"]) == (2, 100)
     Checkpoint(tmp_path).restore(resumed, state)
     assert resumed.num_timesteps == stop
-    resumed.learn(70 - stop, reset_num_timesteps=False)
-    assert_same(model_state(resumed), model_state(model))
-    batch, again = model.replay_buffer.sample(4), resumed.replay_buffer.sample(4)
+    resumed.learn(70 - stop)
+    assert_same(resumed.state_dict(), algorithm.state_dict())
+    batch, again = algorithm.replay_buffer.sample(4), resumed.replay_buffer.sample(4)
     assert all(torch.equal(*pair) for pair in zip(batch[:5], again[:5], strict=True))
 
 
-@pytest.mark.parametrize("writer", ["cfp.experiment.state_file.write_atomically", "cfp.agent.replay.write_atomically"])
+@pytest.mark.parametrize("writer", ["cfp.experiment.checkpoint.write_atomically", "cfp.agent.replay.write_atomically"])
 def test_checkpoint_survives_a_crash_while_the_next_is_written(tmp_path, monkeypatch, writer):
-    checkpoint, model = Checkpoint(tmp_path), make_model()
-    model.learn(20)
-    checkpoint.save(model, CONFIG, Position(1))
-    model.learn(30, reset_num_timesteps=False)
+    checkpoint, algorithm = Checkpoint(tmp_path), make()
+    algorithm.learn(20)
+    checkpoint.save(algorithm, CONFIG, Position(2))
+    algorithm.learn(30)
 
     def crash(path, write):
         path.with_name(path.name + ".part").write_bytes(b"half a file")
@@ -95,32 +96,32 @@ def test_checkpoint_survives_a_crash_while_the_next_is_written(tmp_path, monkeyp
 
     monkeypatch.setattr(writer, crash)
     with pytest.raises(OSError, match="No space"):
-        checkpoint.save(model, CONFIG, Position(1))
+        checkpoint.save(algorithm, CONFIG, Position(2))
     monkeypatch.undo()
-    other = make_model()
-    Checkpoint(tmp_path).restore(other, Checkpoint(tmp_path).load())
+    other = make()
+    Checkpoint(tmp_path).restore(other, Checkpoint(tmp_path).read())
     assert other.num_timesteps == 20
     assert other.replay_buffer.size() == 10
 
 
 def test_next_level_replaces_the_replay_of_the_last(tmp_path):
-    checkpoint, coarse, fine = Checkpoint(tmp_path), make_model(0), make_model(1)
+    checkpoint, coarse, fine = Checkpoint(tmp_path), make(1), make(2)
     coarse.learn(12)
-    checkpoint.save(coarse, CONFIG, Position(0))
+    checkpoint.save(coarse, CONFIG, Position(1))
     fine.learn(8)
-    checkpoint.save(fine, CONFIG, Position(1, 12))
+    checkpoint.save(fine, CONFIG, Position(2, 12))
     assert [path.name for path in (tmp_path / "replay").iterdir()] == ["level2-000000000-000000004.npz"]
-    state = Checkpoint(tmp_path).load()
-    other = make_model(1)
+    state = Checkpoint(tmp_path).read()
+    other = make(2)
     Checkpoint(tmp_path).restore(other, state)
     assert other.replay_buffer.size() == 4
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut", "flipped", "pickle", "version"])
 def test_damaged_state_is_refused_with_its_name(tmp_path, damage):
-    checkpoint, model = Checkpoint(tmp_path), make_model()
-    model.learn(8)
-    checkpoint.save(model, CONFIG, Position(1))
+    checkpoint, algorithm = Checkpoint(tmp_path), make()
+    algorithm.learn(8)
+    checkpoint.save(algorithm, CONFIG, Position(2))
     path = tmp_path / "state.pt"
     content = bytearray(path.read_bytes())
     if damage == "missing":
@@ -132,16 +133,16 @@ def test_damaged_state_is_refused_with_its_name(tmp_path, damage):
             content[index] ^= 0x55
         path.write_bytes(content)
     elif damage == "pickle":
-        torch.save({"version": 1, "model": Position()}, path)  # a class of ours: refused, not imported
+        torch.save({"version": 2, "model": Position()}, path)  # a class of ours: refused, not imported
     else:
         torch.save({"version": 99}, path)
     with pytest.raises(CheckpointError, match=r"state\.pt"):
-        Checkpoint(tmp_path).load()
+        Checkpoint(tmp_path).read()
 
 
 def test_state_of_another_network_is_refused(tmp_path):
-    checkpoint, model = Checkpoint(tmp_path), make_model(1)
-    model.learn(8)
-    checkpoint.save(model, CONFIG, Position(1))
+    checkpoint, algorithm = Checkpoint(tmp_path), make(2)
+    algorithm.learn(8)
+    checkpoint.save(algorithm, CONFIG, Position(2))
     with pytest.raises(CheckpointError, match="does not fit"):
-        checkpoint.restore(make_model(0), checkpoint.load())
+        checkpoint.restore(make(1), checkpoint.read())

@@ -8,8 +8,8 @@ import dittogym
 from cfp.config import to_json
 from cfp.envs.make import make_env
 from cfp.errors import ConfigError
-from cfp.experiment.cli import parse
-from cfp.experiment.state_file import check_same
+from cfp.experiment.checkpoint import check_same
+from cfp.experiment.training import parse
 from cfp.from_dict import update_from_dict
 from cfp.presets import TASKS, from_json, preset
 from cfp.train import PROGRAM

@@ -11,7 +11,7 @@ from test_train import run
 
 import cfp
 from cfp import evaluate
-from cfp.experiment.callbacks import StageCallback
+from cfp.experiment.callbacks import StopCallback
 from cfp.weights import read_policy, write_policy
 
 SHORT = "--steps 80 --handover 40 --eval-every 40 --log-every 10".split()
@@ -70,15 +70,15 @@ def small_disk(tmp_path):
 def test_full_disk_is_an_error_and_the_last_checkpoint_still_good(
     finished, request, monkeypatch, capsys, place, full, message
 ):
-    folder, on_step = request.getfixturevalue(place) / "run", StageCallback._on_step
+    folder, on_step = request.getfixturevalue(place) / "run", StopCallback._on_step
     with ExitStack() as stack:
 
         def fill(callback):
-            if callback.step == 50:
+            if callback.stage.step == 50:
                 stack.enter_context(full(folder))
             return on_step(callback)
 
-        monkeypatch.setattr(StageCallback, "_on_step", fill)
+        monkeypatch.setattr(StopCallback, "_on_step", fill)
         assert run(folder, *SHORT) == 1
     monkeypatch.undo()
     error = capsys.readouterr().err.strip().splitlines()[-1]

@@ -8,9 +8,11 @@ import torch
 from test_train import run
 
 from cfp import train
-from cfp.experiment.cfp_run import Runner
-from cfp.experiment.cli import parse
+from cfp.evaluation.evaluate import evaluate
+from cfp.experiment.coarse_to_fine import CoarseToFine
 from cfp.experiment.process import StopSignals
+from cfp.experiment.run import Run
+from cfp.experiment.training import parse
 from cfp.tables import read_table
 from cfp.train import PROGRAM
 
@@ -21,13 +23,12 @@ MEANS = [1.0, 3.0, 2.0, 2.5, 9.0, 1.0, 5.0, 4.0, 3.0, 2.0]
 def scripted(monkeypatch):
     """Evaluations that return given means, whatever the policy."""
     left = list(MEANS)
-    evaluate = __import__("cfp.experiment.run", fromlist=["evaluate"]).evaluate
 
     def pretend(name, *arguments, **options):
         result = evaluate(name, *arguments, **options)
         return replace(result, returns=(left.pop(0),) * 2) if name == "" else result
 
-    monkeypatch.setattr("cfp.experiment.run.evaluate", pretend)
+    monkeypatch.setattr("cfp.experiment.callbacks.evaluate", pretend)
 
 
 def test_plateau_hands_over_and_ends_the_run(scripted, tmp_path, capsys):
@@ -128,9 +129,11 @@ def test_ladder_of_three_levels_in_one_command(tmp_path):
 def test_critics_of_a_level_begin_with_those_before_if_asked_to(tmp_path, monkeypatch, warm):
     options = "--particles 100 --substeps 1 --num-envs 2 --resolutions 4 8 --device cpu --backend eager".split()
     config = parse(PROGRAM, [*options, "--warm-critic" if warm else "--no-warm-critic"]).run
-    runner, seen = Runner(config, tmp_path / "run", False, StopSignals()), []
+    config = replace(config, report=replace(config.report, eval_every=0))
+    seen = []
 
-    def learn(model, steps, books):
+    def learn(algorithm, steps, callbacks):
+        model = algorithm.model
         seen.append({key: value.clone() for key, value in model.policy.critic.state_dict().items()})
         assert (model.reward_statistics.mean.item() == 7) == (warm and len(seen) == 2)
         with torch.no_grad():
@@ -138,10 +141,10 @@ def test_critics_of_a_level_begin_with_those_before_if_asked_to(tmp_path, monkey
                 for parameter in network.parameters():
                     parameter.fill_(0.125)
         model.reward_statistics.mean.fill_(7)
-        runner.keep(model, len(seen) - 1, 0)
+        callbacks.callbacks[0].stage.save_policy()
 
-    monkeypatch.setattr(runner, "learn", learn)
-    runner.train()
+    monkeypatch.setattr(CoarseToFine, "learn", learn)
+    Run(CoarseToFine, config, tmp_path / "run", False, StopSignals()).train()
     kept = all((value == 0.125).all() for key, value in seen[1].items() if value.requires_grad or "patches" not in key)
     assert kept == warm
 

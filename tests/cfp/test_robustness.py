@@ -18,7 +18,7 @@ from cfp.envs.disturbances import Case, Disturbed, disturbed_env, idle, make_cas
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from cfp.evaluate import open_policy, open_run
-from cfp.evaluation.rollout import Result, ZeroPolicy, evaluate, student
+from cfp.evaluation.evaluate import Result, ZeroPolicy, evaluate, student
 from cfp.files import write_json
 from cfp.presets import preset
 from cfp.train import PROGRAM

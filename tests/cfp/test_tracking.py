@@ -17,10 +17,10 @@ from cfp.agent.actor import build_actor
 from cfp.agent.sac import METRICS
 from cfp.agent.spec import ActorSpec
 from cfp.evaluation.pictures import PICTURES, muscles, policy_pictures
-from cfp.experiment.books import BOOK_METRICS
-from cfp.experiment.callbacks import ROLLOUT_METRICS
+from cfp.experiment.callbacks import LOG_METRICS
+from cfp.experiment.coarse_to_fine import ROLLOUT_METRICS
+from cfp.experiment.folder import EVALUATION_COLUMNS
 from cfp.experiment.loggers import EVALUATION_METRICS
-from cfp.experiment.run import EVALUATION_COLUMNS
 from cfp.tables import read_table
 
 SHORT = "--steps 110 --handover 70 --eval-every 70 --log-every 10".split()  # an episode ends in the first stage
@@ -41,7 +41,7 @@ def events(folder):
 
 
 def test_everything_written_is_explained_and_everything_explained_is_written(finished):
-    rows, wall_clock = METRICS | BOOK_METRICS | ROLLOUT_METRICS, {"time/steps_per_second"}
+    rows, wall_clock = METRICS | LOG_METRICS | ROLLOUT_METRICS, {"time/steps_per_second"}
     columns = set(read_table(finished / "progress.csv")[0])
     assert columns - {"step"} == set(rows) - wall_clock
     read = events(finished)
@@ -54,9 +54,10 @@ def test_everything_written_is_explained_and_everything_explained_is_written(fin
 def test_page_shows_every_table_of_names(package):
     shown = set(" ".join(re.findall(r"\{names-table\} (.*)", PAGE)).split())
     written = set()
-    for path in (Path(__file__).parents[2] / package).glob("*.py"):
+    root = Path(__file__).parents[2]
+    for path in (root / package).rglob("*.py"):
         for name in re.findall(r"^([A-Z_]*(?:METRICS|PICTURES|COLUMNS)): dict\[str, str\]", path.read_text(), re.M):
-            written.add(f"{package}.{path.stem}.{name}")
+            written.add(".".join((*path.relative_to(root).with_suffix("").parts, name)))
     assert written and written == {path for path in shown if path.startswith(f"{package}.")}
     for path in written:
         module, _, name = path.rpartition(".")

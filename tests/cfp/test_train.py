@@ -24,10 +24,10 @@ from cfp.agent.spec import ActorSpec
 from cfp.envs.vec_env import monitored
 from cfp.evaluation import plots as plot
 from cfp.evaluation import video
-from cfp.evaluation.rollout import compare
-from cfp.experiment.callbacks import StageCallback
-from cfp.experiment.cfp_run import Runner
+from cfp.evaluation.evaluate import compare
+from cfp.experiment.callbacks import StopCallback
 from cfp.experiment.cli import program_name
+from cfp.experiment.run import Run
 from cfp.presets import preset
 from cfp.sections import EnvironmentConfig
 from cfp.tables import read_table
@@ -85,7 +85,7 @@ def test_interrupt_that_is_not_held_back_is_one_line(tmp_path, monkeypatch, caps
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Runner, place, interrupt)
+    monkeypatch.setattr(Run, place, interrupt)
     assert run(tmp_path / "a", "--steps", "20", "--handover", "10") == 130
     assert capsys.readouterr().err.splitlines()[-1] == "stopped at once"
 
@@ -97,14 +97,11 @@ def test_policies_are_judged_on_the_device_that_was_chosen(finished, monkeypatch
         seen.append(device)
         return cfp.load(path, "cpu")
 
-    for module in ("experiment.cfp_run", "evaluate"):
-        monkeypatch.setattr(f"cfp.{module}.choose_device", lambda name: f"the one that {name} means")
+    monkeypatch.setattr("cfp.evaluate.choose_device", lambda name: f"the one that {name} means")
     program = replace(train.PROGRAM, load=load)
     evaluate.open_run(program, finished, "cuda")
     evaluate.open_policy(program, "run", "cuda", None)
-    monkeypatch.setattr("cfp.experiment.cfp_run.load", load)
-    Runner.load(SimpleNamespace(config=preset("run")), finished)
-    assert seen == [*["the one that cuda means"] * 3, "the one that auto means"]
+    assert seen == ["the one that cuda means"] * 3
 
 
 def test_one_seed_gives_one_table(finished, tmp_path):
@@ -117,14 +114,14 @@ def test_one_seed_gives_one_table(finished, tmp_path):
 
 @pytest.mark.parametrize(("stop", "number"), [(44, signal.SIGINT), (70, signal.SIGTERM), (110, signal.SIGINT)])
 def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monkeypatch, capsys, stop, number):
-    folder, on_step = tmp_path / "stopped", StageCallback._on_step
+    folder, on_step = tmp_path / "stopped", StopCallback._on_step
 
     def interrupt(callback):
-        if callback.step == stop:
+        if callback.stage.step == stop:
             signal.raise_signal(number)
         return on_step(callback)
 
-    monkeypatch.setattr(StageCallback, "_on_step", interrupt)
+    monkeypatch.setattr(StopCallback, "_on_step", interrupt)
     assert run(folder) == 128 + number
     assert "--resume" in capsys.readouterr().out
     monkeypatch.undo()
@@ -140,12 +137,12 @@ def test_killed_run_repeats_what_no_checkpoint_holds(finished, tmp_path, monkeyp
         pass
 
     def die(callback):
-        if callback.step == 98:
+        if callback.stage.step == 98:
             raise Killed
         return True
 
     folder = tmp_path / "killed"
-    monkeypatch.setattr(StageCallback, "_on_step", die)
+    monkeypatch.setattr(StopCallback, "_on_step", die)
     with pytest.raises(Killed):
         run(folder)
     monkeypatch.undo()
@@ -160,14 +157,14 @@ def test_layouts_that_are_drawn_anew_go_on_as_if_nothing_had_happened(tmp_path, 
         "--resample --resolutions 4 --handover --random-steps 10 --steps 128 --eval-every 0 --eval-episodes 1".split()
     )
     assert run(tmp_path / "whole", *options) == 0
-    on_step = StageCallback._on_step
+    on_step = StopCallback._on_step
 
     def interrupt(callback):
-        if callback.step == 80:  # in the second episode; the third begins at 120
+        if callback.stage.step == 80:  # in the second episode; the third begins at 120
             signal.raise_signal(signal.SIGINT)
         return on_step(callback)
 
-    monkeypatch.setattr(StageCallback, "_on_step", interrupt)
+    monkeypatch.setattr(StopCallback, "_on_step", interrupt)
     assert run(tmp_path / "stopped", *options) == 128 + signal.SIGINT
     monkeypatch.undo()
     assert run(tmp_path / "stopped", *options, "--resume") == 0
@@ -210,13 +207,13 @@ def test_finished_run_can_be_prolonged(tmp_path):
 def test_results_do_not_outlive_the_steps_they_are_of(tmp_path, monkeypatch):
     assert run(tmp_path / "a", "--steps", "40", "--handover", "20") == 0
     assert (tmp_path / "a" / "results.json").exists()
-    on_step = StageCallback._on_step
+    on_step = StopCallback._on_step
 
     def stop(callback):
         signal.raise_signal(signal.SIGTERM)
         return on_step(callback)
 
-    monkeypatch.setattr(StageCallback, "_on_step", stop)
+    monkeypatch.setattr(StopCallback, "_on_step", stop)
     assert train.main(["--out", str(tmp_path / "a"), "--resume", "--steps", "60"]) == 128 + signal.SIGTERM
     assert not (tmp_path / "a" / "results.json").exists()
 
@@ -247,7 +244,7 @@ def test_damaged_checkpoint_is_an_error_that_names_it(tmp_path, capsys):
         (["--preset", "slow"], "preset must be quick or paper for shapematch, got 'slow'"),
         (["--particles", "0"], "particles"),
         (["--target", "no/such.png"], "target"),
-        (["--num-envs", "0"], "num_envs: got 0"),
+        (["--num-envs", "0"], "num_envs must be at least 1, got 0"),
         (["--device", "abacus"], "device: got 'abacus'"),
         (["--config", "no/such.json"], "config: no/such.json cannot be read"),
         (["--backend", "slide-rule"], "backend"),

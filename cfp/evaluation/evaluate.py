@@ -1,14 +1,15 @@
-"""Returns of a policy on environments of its own, and the untrained policies it is compared with."""
+"""Evaluating policies: their returns on environments used for nothing else, beside those of untrained policies."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import numpy as np
 import torch
+from scipy import stats
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
@@ -16,37 +17,10 @@ from stable_baselines3.common.vec_env import VecEnv
 from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.envs.make import make_env
 from cfp.envs.vec_env import TorchVecEnv
+from cfp.policy import Policy, SeesState
 
 Noise = Literal["default", "with", "without", "both"]
 """With action noise or without; default: as the run that trained a policy evaluates it."""
-
-
-class Policy(PolicyPredictor, Protocol):
-    """A trained policy of any kind, as it comes from its file."""
-
-    @property
-    def sees_image(self) -> bool:
-        """Whether it looks at the pixels of the observation."""
-
-    @property
-    def resolution(self) -> int:
-        """Rows and columns of its actions."""
-
-    @property
-    def deterministic_by_default(self) -> bool:
-        """Whether the run that trained it evaluates it without noise."""
-
-    @property
-    def description(self) -> dict[str, Any]:
-        """What it is and comes from; ``layout`` is the seed of the one particle layout it was made for, if so."""
-
-
-@runtime_checkable
-class SeesState(Protocol):
-    """A policy that looks at the state of the simulation beside or instead of the image."""
-
-    def attached(self, env: Any) -> PolicyPredictor:
-        """The same policy, looking at a `dittogym.TorchEnv`."""
 
 
 def attached(policy: PolicyPredictor, env: VecEnv) -> PolicyPredictor:
@@ -89,22 +63,11 @@ class Result:
         count = len(self.returns)
         if count < 2:
             return None
-        return student(count - 1) * float(np.std(self.returns, ddof=1)) / math.sqrt(count)
+        return float(stats.t.ppf(0.975, count - 1) * np.std(self.returns, ddof=1) / math.sqrt(count))
 
 
-def student(degrees: int, level: float = 0.95) -> float:
-    """The t within which a share ``level`` of Student's distribution lies on both sides of 0.
-
-    With ``t = sqrt(degrees) tan(angle)`` the density in the angle is proportional to ``cos(angle)^(degrees - 1)``.
-    """
-    angle = np.linspace(0.0, np.pi / 2, 20_001)
-    density = np.cos(angle) ** (degrees - 1)
-    share = np.concatenate([[0.0], np.cumsum(density[1:] + density[:-1])])
-    return float(math.sqrt(degrees) * np.tan(np.interp(level, share / share[-1], angle)))
-
-
-def judging_seed(config: RunConfig) -> int:
-    """Of layouts that neither trained a policy nor chose the best one."""
+def evaluation_seed(config: RunConfig) -> int:
+    """Seed of the layouts of final evaluations, on which no policy was trained or chosen."""
     return config.seed + 2 * EVALUATION_SEED
 
 
@@ -210,7 +173,7 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, no
         noise: Whether trained policies act with their noise; ``"both"`` gives each a row with and one without.
     """
     coarsest = config.resolution(0)
-    seed = judging_seed(config)
+    seed = evaluation_seed(config)
     untrained = {"zero action": ZeroPolicy(coarsest), "random action": RandomPolicy(coarsest, config.seed)}
 
     def judged(name: str, policy: Policy | ZeroPolicy | RandomPolicy, deterministic: bool) -> Result:
@@ -228,35 +191,3 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, no
             alone, own = make_env(config, trained.resolution, 1), trained.description["layout"]
             results.append(evaluate("  own layout", trained, alone, 1, deterministic=deterministic, seed=own))
     return results
-
-
-def to_rows(results: list[Result]) -> list[dict[str, Any]]:
-    """Results as JSON values."""
-    return [
-        {
-            "policy": result.name,
-            "action": f"{result.resolution}x{result.resolution}",
-            "episodes": len(result.returns),
-            "mean": round(result.mean, 3),
-            "std": round(result.std, 3),
-            "interval": None if result.interval is None else round(result.interval, 3),
-            "returns": [round(value, 3) for value in result.returns],
-            "success": result.success,
-        }
-        for result in results
-    ]
-
-
-def format_table(config: RunConfig, results: list[Result]) -> str:
-    """Results as a plain text table: mean return, its 95 % confidence interval, and the spread of the episodes."""
-    counts = {len(result.returns) for result in results}
-    title = f"{config.task}, return over {'/'.join(map(str, sorted(counts)))} episodes"
-    lines = [title, f"{'policy':<16}{'action':>8}{'mean':>10}{'± 95 %':>9}{'± std':>9}{'lowest':>10}{'highest':>10}"]
-    for result in results:
-        grid = f"{result.resolution}x{result.resolution}"
-        interval = "–" if result.interval is None else f"{result.interval:.1f}"
-        spread = f"{result.mean:>10.1f}{interval:>9}{result.std:>9.1f}"
-        spread += f"{min(result.returns):>10.1f}{max(result.returns):>10.1f}"
-        success = "" if result.success is None else f"   success {result.success:.0%}"
-        lines.append(f"{result.name:<16}{grid:>8}{spread}{success}")
-    return "\n".join(lines)

@@ -1,0 +1,37 @@
+"""Options of algorithms that act on one grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from cfp.config import RunConfig
+from dittogym import make_spec
+
+SEEDED = {"environment.resample": "soft actor-critic (cfp, coarse, fine, gnn-*, transformer-*)"}
+"""What `RunConfig.ineffective` says where every episode begins on a layout that is counted from the seed."""
+
+Grid = int | Literal["coarse", "fine"]
+"""Action grid R: coarse, fine (the task's), or a number."""
+
+
+def grid_size(task: str, grid: Grid) -> int:
+    """Rows and columns of an action grid in a task."""
+    spec = make_spec(task)
+    return {"coarse": spec.coarse, "fine": spec.fine}[grid] if isinstance(grid, str) else grid
+
+
+@dataclass(frozen=True)
+class GridConfig(RunConfig):
+    """Options of a run on one action grid."""
+
+    grid: Grid = "coarse"
+    """Action grid R: coarse, fine (the task's), or a number."""
+
+    def resolution(self, level: int) -> int:
+        """Action grid R."""
+        return grid_size(self.task, self.grid)
+
+    def ineffective(self) -> dict[str, str]:
+        """Layouts are counted from the seed."""
+        return super().ineffective() | SEEDED

@@ -1,0 +1,267 @@
+"""What an algorithm offers to be trained, stopped, resumed, evaluated and compared like any other."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal, cast
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.type_aliases import PolicyPredictor
+
+from cfp.config import RunConfig
+from cfp.envs.make import choose_device
+from cfp.experiment.folder import policy_path
+from cfp.experiment.process import StopSignals
+from cfp.policy import Policy
+
+Sees = Literal["image", "state", "simulator", "nothing"]
+"""What a policy may look at: the observation; the full state; the simulator, to plan with; nothing."""
+
+Scalars = Mapping[str, float | None]
+"""Values to log by name; None for those that do not exist yet."""
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where a run stands.
+
+    Attributes:
+        stage: The stage in training, 1 is the first.
+        offset: Environment steps that the stages before it took.
+    """
+
+    stage: int = 1
+    offset: int = 0
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one stage costs.
+
+    Attributes:
+        seconds_per_step: Seconds of one environment step of one robot, its share of the updates included.
+        memory: Bytes that the stage will hold beyond what it holds as it begins (a replay memory).
+    """
+
+    seconds_per_step: float
+    memory: int = 0
+
+
+class Algorithm(ABC):
+    """Trains a policy through one stage of a run; method names are those of stable-baselines3.
+
+    The class methods concern the whole run; an object is one stage. A subclass implements `update`, one turn of the
+    training loop, or `learn`, the whole loop.
+
+    Args:
+        config: Options of the run.
+        stage: Which stage, 1 is the first.
+        start: Policy of the stage before; in the first stage `initial_policy`.
+
+    Attributes:
+        sees: What its policies look at; their training may use more.
+        num_timesteps: Environment steps taken in this stage.
+        period: Environment steps after which the work of learning repeats, for estimates of time.
+        starts_trained: Whether the stage begins with a trained policy, which is then evaluated before the first step.
+        replay_buffer: Transitions to keep in checkpoints.
+        logger: Receives scalars.
+        scalars: Those of the last update.
+    """
+
+    sees: ClassVar[Sees] = "image"
+    num_timesteps: int = 0
+    period: int = 1
+    starts_trained: bool = False
+    replay_buffer: ReplayBuffer | None = None
+    logger: Logger
+    scalars: Scalars = {}
+
+    @abstractmethod
+    def __init__(self, config: Any, stage: int = 1, start: Any = None) -> None: ...
+
+    @staticmethod
+    @abstractmethod
+    def preset(task: str, name: str) -> RunConfig:
+        """Default options for a task.
+
+        Args:
+            task: Its name.
+            name: ``"quick"`` or ``"paper"``.
+
+        Raises:
+            ConfigError: No such task or preset.
+        """
+
+    @classmethod
+    def initialize(cls, config: Any, folder: Path) -> Position:
+        """Begin a new run: put what its first stage needs into the folder, and tell which stage that is.
+
+        Raises:
+            CFPError: An option names a policy that cannot be read or does not fit; nothing has been written.
+        """
+        cls.initial_policy(config)
+        return Position()
+
+    @classmethod  # noqa: B027  (most algorithms need nothing)
+    def prepare(cls, config: Any, folder: Path, signals: StopSignals | None) -> None:
+        """Do what must be done before the first stage, such as training a teacher.
+
+        Args:
+            config: Options of the run.
+            folder: Of the run.
+            signals: Whether the user wants to stop; None: an untrained stand-in will do, to estimate costs.
+        """
+
+    @classmethod
+    def create(cls, config: Any, stage: int, folder: Path, resumed: bool = False) -> Algorithm:
+        """The algorithm at the beginning of a stage; the policy of the stage before is in the folder.
+
+        Args:
+            config: Options of the run.
+            stage: Which stage.
+            folder: Of the run.
+            resumed: A checkpoint of this stage is going to be loaded.
+        """
+        if stage > 1:
+            start: Policy | None = cls.load(policy_path(folder, stage - 1), choose_device(config.device))
+        else:
+            start = None if resumed else cls.initial_policy(config)
+        algorithm = cls(config, stage, start)
+        algorithm.starts_trained = start is not None
+        return algorithm
+
+    @classmethod
+    def initial_policy(cls, config: Any) -> Policy | None:
+        """The trained policy that the first stage begins with, if the options name one.
+
+        Raises:
+            CFPError: It cannot be read or does not fit.
+        """
+        return None
+
+    @classmethod
+    def warnings(cls, config: Any, folder: Path, first_stage: int) -> list[str]:
+        """What the user may not expect of the stages from ``first_stage`` on, a line each."""
+        return []
+
+    @classmethod
+    def not_estimated(cls, config: Any) -> list[str]:
+        """Work that estimates of costs leave out, a line each."""
+        return []
+
+    @classmethod
+    @abstractmethod
+    def load(cls, path: Path, device: str = "cpu") -> Policy:
+        """Load the policy that `save_policy` wrote to ``path``, onto a device."""
+
+    def set_logger(self, logger: Logger) -> None:
+        """Set where scalars go."""
+        self.logger = logger
+
+    def warm_start(self, previous: Any) -> None:  # noqa: B027  (most algorithms hand over a policy only)
+        """Take from the algorithm of the stage before what a new one shall have besides its policy."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether the stage is over before its last step."""
+        return False
+
+    def learn(self, total_timesteps: int, callback: BaseCallback | None = None) -> Algorithm:
+        """Take some more environment steps and learn from them.
+
+        Args:
+            total_timesteps: How many at least.
+            callback: A rollout starts before each update, and a step ends after it; may raise to stop the training.
+        """
+        callback = callback or CallbackList([])
+        callback.init_callback(cast(BaseAlgorithm, self))
+        callback.on_training_start(locals(), globals())
+        end = self.num_timesteps + total_timesteps
+        while self.num_timesteps < end and not self.finished:
+            callback.on_rollout_start()
+            self.scalars = self.update()
+            callback.on_step()
+        callback.on_training_end()
+        return self
+
+    def update(self) -> Scalars:
+        """Take some environment steps, add them to `num_timesteps`, and learn from them.
+
+        Returns:
+            Scalars of this update.
+        """
+        raise NotImplementedError
+
+    def row(self) -> Scalars:
+        """Scalars for the next row of the logs, which is being written: those of the last update."""
+        return self.scalars
+
+    def images(self) -> dict[str, np.ndarray]:
+        """What to show at an evaluation, uint8 (H, W, 3) by name."""
+        return {}
+
+    @property
+    @abstractmethod
+    def policy(self) -> PolicyPredictor:
+        """What has been learned so far."""
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Choose actions.
+
+        Args:
+            observation: (B, 3, 64, 64) uint8.
+            state: What the last call returned, None at the beginning; arrays with a leading B.
+            episode_start: (B,) bool, which elements begin a new episode.
+            deterministic: Without noise.
+
+        Returns:
+            Actions (B, 2, R, R), and the policy's memory for the next step.
+        """
+        return self.policy.predict(observation, state, episode_start, deterministic)
+
+    @abstractmethod
+    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
+        """Write the policy, see `cfp.weights.write_policy`.
+
+        Args:
+            path: The ``.safetensors`` file.
+            description: What it is and comes from.
+        """
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """All that learning needs to continue, as tensors and plain values; without the replay memory."""
+
+    @abstractmethod
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from the ``state`` of `state_dict`, in an algorithm made with the same options."""
+
+    def measure(self) -> Cost:
+        """Time the work of one `period`; what has been learned is spoiled."""
+        start = time.perf_counter()
+        while self.num_timesteps < self.period and not self.finished:
+            self.update()
+        return Cost((time.perf_counter() - start) / max(1, self.num_timesteps))
+
+
+def mean_seconds(action: Callable[[], object], repeats: int = 3) -> float:
+    """Mean duration of an action, after a first time that is not measured."""
+    action()
+    start = time.perf_counter()
+    for _ in range(repeats):
+        action()
+    return (time.perf_counter() - start) / repeats

@@ -1,0 +1,260 @@
+"""Soft actor-critic as an algorithm of a run, and with it CFP: one level after another, each frozen under the next."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import VecMonitor
+
+from cfp.agent.hyperparameters import Hyperparameters
+from cfp.agent.policies import ActorPolicy, CFPPolicy, NetworkPolicy
+from cfp.agent.replay import FIELDS
+from cfp.agent.sac import CFP
+from cfp.config import Config, RunConfig
+from cfp.envs.make import choose_device, make_env
+from cfp.errors import ConfigError
+from cfp.evaluation.pictures import policy_pictures
+from cfp.experiment.algorithm import Algorithm, Cost, Position, Scalars, mean_seconds
+from cfp.experiment.folder import policy_path
+from cfp.experiment.sac_state import load_model_state_dict, model_state_dict
+from cfp.presets import preset
+from cfp.weights import KIND, fitting, load, policy_for, read_policy, save_policy, write_policy
+
+ROLLOUT_METRICS: dict[str, str] = {
+    "rollout/return": "mean undiscounted return of the last training episodes (with action noise)",
+    "rollout/length": "their mean length in environment steps",
+    "rollout/success": "share of successes among them, where the task defines success",
+    "rollout/episodes": "episodes finished in this stage",
+}
+"""Scalars logged beside `cfp.agent.sac.METRICS` and `cfp.experiment.callbacks.LOG_METRICS`."""
+
+
+class SACAlgorithm(Algorithm):
+    """Trains a `cfp.agent.sac.CFP` with whatever networks; a subclass makes it and knows its policies.
+
+    Args:
+        config: Options of the run.
+        stage: Which stage, 1 is the first.
+        model: As the stage begins.
+    """
+
+    model_type: type[CFP] = CFP
+
+    def __init__(self, config: Any, stage: int, model: CFP) -> None:
+        self.config, self.stage, self.model = config, stage, model
+        assert model.replay_buffer is not None
+        self.replay_buffer = model.replay_buffer
+        self.period = 1
+
+    @property
+    def num_timesteps(self) -> int:
+        """Environment steps taken in this stage."""
+        return self.model.num_timesteps
+
+    @num_timesteps.setter
+    def num_timesteps(self, value: int) -> None:
+        self.model.num_timesteps = value
+
+    @classmethod
+    def make_model(
+        cls,
+        config: RunConfig,
+        env: VecMonitor,
+        policy: type[NetworkPolicy],
+        networks: dict[str, Any],
+        hyperparameters: Hyperparameters,
+    ) -> CFP:
+        """Create the model of a stage.
+
+        Args:
+            config: Options of the run.
+            env: Environment to train in.
+            policy: Class of the networks.
+            networks: Options of the networks.
+            hyperparameters: Of the stage.
+        """
+        if hyperparameters.compile:
+            print("compiling the updates; the first time on a machine this takes minutes ...", flush=True)
+        model = cls.model_type(
+            policy,
+            env,
+            hyperparameters,
+            policy_kwargs=networks,
+            seed=config.seed,
+            device=choose_device(config.device),
+            stats_window_size=max(10, env.num_envs),
+        )
+        model.set_logger(Logger(None, []))
+        return model
+
+    @classmethod
+    def hyperparameters(cls, config: Any, stage: int, folder: Path) -> Hyperparameters:
+        """Hyperparameters of a stage."""
+        hyperparameters: Hyperparameters = config.hyperparameters(stage - 1)
+        return hyperparameters
+
+    @classmethod
+    def warnings(cls, config: Any, folder: Path, first_stage: int) -> list[str]:
+        """Stages that end before they act by their policy, or before they learn."""
+        lines, (starts, waits) = [], (config.learning.update_start, config.learning.actor_start)
+        for stage in range(first_stage, len(config.ends()) + 1):
+            steps, random = config.stage_steps(stage - 1), cls.hyperparameters(config, stage, folder).random_steps
+            if steps <= random:
+                lines.append(f"stage {stage}: all its {steps:,} steps are random (--random-steps {random})")
+            elif steps <= starts:
+                lines.append(f"stage {stage}: no update in its {steps:,} steps (--update-start {starts})")
+            elif steps < waits:
+                lines.append(f"stage {stage}: no actor update in its {steps:,} steps (--actor-start {waits})")
+        return lines
+
+    def set_logger(self, logger: Logger) -> None:
+        """Set where scalars go."""
+        self.logger = logger
+        self.model.set_logger(logger)
+
+    def learn(self, total_timesteps: int, callback: BaseCallback | None = None) -> SACAlgorithm:
+        """Train for some more environment steps in stable-baselines3's loop."""
+        self.model.learn(total_timesteps, callback, log_interval=1 << 62, reset_num_timesteps=False)
+        return self
+
+    def row(self) -> Scalars:
+        """Scalars of the last episodes; the model has logged its own."""
+        episodes, model = self.model.ep_info_buffer or (), self.model
+        scalars: dict[str, float | None] = {
+            f"rollout/{name}": float(np.mean([float(episode[key]) for episode in episodes])) if episodes else None
+            for name, key in (("return", "r"), ("length", "l"))
+        }
+        scalars["rollout/episodes"] = model._episode_num
+        if model.ep_success_buffer:
+            scalars["rollout/success"] = float(np.mean(model.ep_success_buffer))
+        return scalars
+
+    @property
+    def policy(self) -> NetworkPolicy:
+        """What has been learned so far."""
+        assert isinstance(self.model.policy, NetworkPolicy)
+        return self.model.policy
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that learning needs to continue."""
+        return model_state_dict(self.model)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Undo `state_dict`."""
+        load_model_state_dict(self.model, state)
+
+    def measure(self) -> Cost:
+        """Time a few steps and updates."""
+        model, env, buffer = self.model, self.model.get_env(), self.model.replay_buffer
+        assert env is not None and buffer is not None
+        observation, count = env.reset(), env.num_envs
+        assert isinstance(observation, np.ndarray)
+        model._last_obs = observation
+        _, stored = model._sample_action(0, None, count)
+        for _ in range(-(-model.batch_size // count)):
+            buffer.add(observation, observation, stored, np.zeros(count), np.zeros(count), [{}] * count)
+        acting = mean_seconds(lambda: env.step(model.predict(observation)[0]))
+        model.num_timesteps = model.hyperparameters.actor_start  # from here on an update is a whole one
+        updating = mean_seconds(lambda: model.train(1, model.batch_size)) * self.config.learning.gradient_steps
+        arrays = (getattr(buffer, name) for name in FIELDS)
+        return Cost((acting + updating) / count, sum(array.nbytes for array in arrays))
+
+
+class CoarseToFine(SACAlgorithm):
+    """The levels of the coarse-to-fine policy, each over the frozen policy of the coarser one (paper, Section 4.2)."""
+
+    config: Config
+
+    @staticmethod
+    def preset(task: str, name: str) -> Config:
+        """Default options for a task, see `cfp.preset`."""
+        return preset(task, name)
+
+    @classmethod
+    def initialize(cls, config: Config, folder: Path) -> Position:
+        """Take the first levels from a policy if the options say so; its steps count as those before its handover.
+
+        Raises:
+            ConfigError: It does not fit these levels.
+            CheckpointError: It is missing, damaged, or of another kind.
+        """
+        if config.start_from is None:
+            return Position()
+        policy, refine = policy_for(config, config.start_from), config.refine
+        levels, resolutions = len(policy.spec.resolutions), config.resolutions
+        if policy.spec.resolutions != resolutions[:levels] or (levels == len(resolutions) and not refine):
+            allowed = f"the first of {resolutions}" + ("" if refine else " but the last")
+            raise ConfigError(f"start_from: got a policy of levels {policy.spec.resolutions}, allowed {allowed}")
+        if levels > 1 and policy.spec != (allowed_spec := config.actor_spec(levels - 1)):
+            raise ConfigError(f"start_from: got networks {policy.spec}, allowed {allowed_spec}")
+        stage = levels if refine else levels + 1
+        copy = _start_path(folder) if refine else policy_path(folder, levels)
+        write_policy(copy, *read_policy(config.start_from))
+        return Position(stage, (0, *config.handover)[stage - 1])
+
+    @classmethod
+    def hyperparameters(cls, config: Config, stage: int, folder: Path) -> Hyperparameters:
+        """Hyperparameters of a stage; a policy that is refined does not act at random."""
+        own = super().hyperparameters(config, stage, folder)
+        return replace(own, random_steps=0) if _refines(config, folder, stage) else own
+
+    @classmethod
+    def create(cls, config: Config, stage: int, folder: Path, resumed: bool = False) -> CoarseToFine:
+        """Networks, replay memory and environment of a stage."""
+        env, spec = make_env(config, config.action_size(stage - 1)), config.actor_spec(stage - 1)
+        refines = _refines(config, folder, stage)
+        model = cls.make_model(config, env, CFPPolicy, {"spec": spec}, cls.hyperparameters(config, stage, folder))
+        actor = model.networks()[0]
+        if refines:
+            model.origin = load(_start_path(folder), str(model.device)).actor
+            actor.load_state_dict(model.origin.state_dict())
+        elif stage > 1:
+            path = policy_path(folder, stage - 1)
+            coarse = load(path, str(model.device)).actor
+            with fitting(path):
+                actor.get_submodule("coarse").load_state_dict(coarse.state_dict())
+        algorithm = cls(config, stage, model)
+        algorithm.starts_trained = stage > 1 or refines
+        return algorithm
+
+    @classmethod
+    def load(cls, path: Path, device: str = "cpu") -> ActorPolicy:
+        """Load a policy."""
+        return load(path, device)
+
+    def warm_start(self, previous: CoarseToFine) -> None:
+        """Warm critics: those of the level before, with the reward statistics in whose units their values are."""
+        if not self.config.learning.warm_critic:
+            return
+        for mine, theirs in zip(self.model.networks()[1:], previous.model.networks()[1:], strict=True):
+            mine.load_state_dict(theirs.state_dict())
+        self.model.reward_statistics.load_state_dict(previous.model.reward_statistics.state_dict())
+
+    def images(self) -> dict[str, np.ndarray]:
+        """What the actor does with the observation of the first robot."""
+        assert isinstance(self.model._last_obs, np.ndarray)
+        observation, _ = self.policy.obs_to_tensor(self.model._last_obs[:1])
+        assert isinstance(observation, torch.Tensor)
+        return policy_pictures(self.model.networks()[0], observation)
+
+    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
+        """Write the actor."""
+        network = asdict(self.config.actor_spec(self.stage - 1))
+        save_policy(path, self.model.networks()[0], description | {"kind": KIND, "network": network})
+
+
+def _start_path(folder: Path) -> Path:
+    """The run's own copy of the policy that it refines."""
+    return folder / "start.safetensors"
+
+
+def _refines(config: Config, folder: Path, stage: int) -> bool:
+    """Whether the actor of a stage begins as the one that is refined."""
+    start = _start_path(folder)
+    return config.refine and start.exists() and bool(read_policy(start)[1]["stage"] == stage)

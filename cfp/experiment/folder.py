@@ -1,0 +1,74 @@
+"""What lies where in the folder of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from cfp.config import RunConfig
+from cfp.errors import CheckpointError
+from cfp.files import copy_atomically, read_json
+from cfp.weights import read_policy
+
+EVALUATION_COLUMNS: dict[str, str] = {
+    "step": "environment steps of the run so far",
+    "stage": "stage in training, 1 is the first",
+    "episodes": "episodes of the evaluation, each on a layout of its own that is not trained on",
+    "mean": "mean of their undiscounted returns; a stage keeps the policy with the highest",
+    "std": "standard deviation of the returns",
+    "lowest": "lowest return",
+    "highest": "highest return",
+    "success": "share of successes, where the task defines success",
+}
+"""Columns of ``evaluations.csv``."""
+
+MARKS = ("config.json", "checkpoint", "progress.csv", "evaluations.csv", "policy.safetensors")
+"""Any of these in a folder means that it holds a run."""
+
+
+def holds_run(folder: Path) -> bool:
+    """Whether a folder holds a run, finished or not."""
+    return any((folder / name).exists() for name in MARKS)
+
+
+def read_config(folder: Path, configure: Callable[[dict[str, Any]], RunConfig]) -> RunConfig:
+    """Options of the run in a folder.
+
+    Args:
+        folder: Of the run.
+        configure: From JSON values to options.
+
+    Raises:
+        CheckpointError: There is no run, or its ``config.json`` cannot be read.
+    """
+    path = folder / "config.json"
+    try:
+        config = configure(read_json(path))
+        config.check()
+        return config
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{folder}: there is no run (no config.json)") from error
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path}: cannot be read ({error})") from error
+
+
+def policy_path(folder: Path, stage: int | None = None) -> Path:
+    """File of the policy in training (or trained last), or of a finished stage (from 1)."""
+    return folder / ("policy.safetensors" if stage is None else f"stage{stage}.safetensors")
+
+
+def policy_files(folder: Path, stages: int) -> dict[str, Path]:
+    """Policies of a run so far by name: those of finished stages, then the one in training or trained last."""
+    finished = {f"stage {stage}": policy_path(folder, stage) for stage in range(1, stages)}
+    files = {name: path for name, path in finished.items() if path.exists()}
+    newest = policy_path(folder)
+    if newest.exists():
+        files[f"stage {read_policy(newest)[1]['stage']}"] = newest
+    return files
+
+
+def copy_policy(source: Path, target: Path) -> None:
+    """Copy a ``.safetensors`` file and the ``.json`` beside it."""
+    for suffix in (".safetensors", ".json"):
+        copy_atomically(source.with_suffix(suffix), target.with_suffix(suffix))

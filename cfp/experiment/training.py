@@ -1,0 +1,172 @@
+"""The command line that trains: options from preset, file and command line."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from cfp.config import RunConfig, to_json
+from cfp.errors import ConfigError
+from cfp.experiment.algorithm import Algorithm
+from cfp.experiment.cli import program_name, run_command
+from cfp.experiment.estimate import estimate
+from cfp.experiment.folder import holds_run, read_config
+from cfp.experiment.process import Stopped, StopSignals
+from cfp.experiment.run import Run
+from cfp.experiment.run_lock import claim
+from cfp.files import read_json
+from cfp.from_dict import update_from_dict
+from cfp.policy import Policy
+
+
+@dataclass(frozen=True)
+class Program:
+    """What the command lines of a package are made of.
+
+    Attributes:
+        package: ``python -m PACKAGE.train``.
+        about: First words of the help.
+        configure: From JSON values to options; what the values leave out comes from the preset they name.
+        find: The algorithm of a name.
+        load: Loads a policy file onto a device.
+    """
+
+    package: str
+    about: str
+    configure: Callable[[dict[str, Any]], RunConfig]
+    find: Callable[[str], type[Algorithm]]
+    load: Callable[[Path, str], Policy]
+
+
+@dataclass(frozen=True)
+class Command:
+    """Defaults come from the preset of the task; a --config file goes over them, the command line over both.
+
+    Ctrl-C writes a checkpoint and stops; --resume goes on.
+    """
+
+    run: RunConfig
+    out: Path | None = None
+    """Folder of the run; in runs/, named by algorithm, task, preset and seed, if not given."""
+    resume: bool = False
+    """Go on with the run in the folder; an empty or missing folder starts afresh."""
+    config: Path | None = None
+    """JSON file with options, in the form of a run's config.json; it may hold only some of them."""
+    dry_run: bool = False
+    """Only print the options and an estimate of time and memory; write nothing."""
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """What must be known before the defaults are: the same options, read first."""
+
+    algo: str | None = None
+    task: str | None = None
+    preset: str | None = None
+    out: Path | None = None
+    resume: bool = False
+    config: Path | None = None
+
+
+def parse(program: Program, arguments: Sequence[str], started: str | None = None) -> Command:
+    """Read a command line.
+
+    Args:
+        program: Whose it is.
+        arguments: The words.
+        started: How the help calls the program; by its module if not given.
+
+    Raises:
+        ConfigError: An option is wrong.
+        SystemExit: ``--help``, or an option that does not exist or cannot be read (exit code 2).
+    """
+    choice, _ = tyro.cli(_Choice, args=list(arguments), return_unknown_args=True, add_help=False, console_outputs=False)
+    values = _values(choice)
+    preset = program.configure({name: values[name] for name in ("algo", "task", "preset") if name in values})
+    base = program.configure(values)
+
+    def read(defaults: RunConfig) -> Command:
+        command = tyro.cli(
+            Command,
+            prog=started or program_name(f"{program.package}.train", arguments),
+            description=f"{program.about}\n\n{inspect.getdoc(Command)}",
+            args=list(arguments),
+            default=Command(defaults),
+            config=(tyro.conf.OmitArgPrefixes,),
+        )
+        # The word may be another spelling of the name.
+        return command if choice.algo is None else replace(command, run=replace(command.run, algo=base.algo))
+
+    if choice.resume:
+        folder = choice.out or _default_folder(read(base).run)  # all that names a folder comes from these words
+        if (folder / "config.json").exists():
+            past = read_config(folder, program.configure)
+            # What a file says otherwise than the run is refused, not left out.
+            command = read(past if choice.config is None else update_from_dict(past, values))
+            command.run.check()
+            return replace(command, out=folder)
+    command = read(base)
+    run = command.run.with_derived(preset, values.keys() | _named(arguments))
+    run.check()
+    run.check_effect(preset)
+    return replace(command, run=run, out=command.out or _default_folder(run))
+
+
+def _named(arguments: Sequence[str]) -> set[str]:
+    """Options that words of a command line name."""
+    return {word[2:].partition("=")[0].replace("-", "_") for word in arguments if word.startswith("--")}
+
+
+def _values(choice: _Choice) -> dict[str, Any]:
+    """What a file and the choice on the command line say about the defaults."""
+    values: dict[str, Any] = {}
+    if choice.config is not None:
+        try:
+            values = read_json(choice.config)
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"config: {choice.config} cannot be read as JSON ({error})") from error
+    chosen = {"algo": choice.algo, "task": choice.task, "preset": choice.preset}
+    return values | {name: value for name, value in chosen.items() if value is not None}
+
+
+def _default_folder(config: RunConfig) -> Path:
+    return Path("runs") / config.name
+
+
+def main(program: Program, arguments: Sequence[str] | None = None, started: str | None = None) -> int:
+    """Do what a command line says; returns the exit code, see `parse`."""
+    words = sys.argv[1:] if arguments is None else arguments
+    return run_command(lambda: _train(program, words, started or program_name(f"{program.package}.train", arguments)))
+
+
+def _train(program: Program, arguments: Sequence[str], started: str) -> None:
+    """Train, evaluate, draw and film."""
+    command = parse(program, arguments, started)
+    folder, config = command.out, command.run
+    assert folder is not None
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"out: {folder} is a file, allowed is a folder")
+    if command.resume and not holds_run(folder):
+        print(f"{folder} holds no run yet: starting afresh")
+    if command.dry_run:
+        print(json.dumps(to_json(config), indent=2))
+        print(estimate(program.find(config.algo), config, folder if command.resume else None))
+        return
+    print(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed} -> {folder}")
+    with claim(folder):
+        with StopSignals() as signals:
+            run = Run(program.find(config.algo), config, folder, command.resume, signals)
+            if config.environment.backend == "compile":
+                print("compiling the physics; the first time on a machine this takes half a minute ...")
+            try:
+                run.train()
+            except Stopped as stopped:
+                raise Stopped(stopped.number, f"resume with: {started} --resume --out {folder}") from None
+        run.finish()

@@ -1,0 +1,35 @@
+"""What programs ask of a trained policy, whatever trained it."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, runtime_checkable
+
+from stable_baselines3.common.type_aliases import PolicyPredictor
+
+
+class Policy(PolicyPredictor, Protocol):
+    """A trained policy of any kind, as it comes from its file."""
+
+    @property
+    def sees_image(self) -> bool:
+        """Whether it looks at the pixels of the observation."""
+
+    @property
+    def resolution(self) -> int:
+        """Rows and columns of its actions."""
+
+    @property
+    def deterministic_by_default(self) -> bool:
+        """Whether the run that trained it evaluates it without noise."""
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """What it is and comes from; ``layout`` is the seed of the one particle layout it was made for, if any."""
+
+
+@runtime_checkable
+class SeesState(Protocol):
+    """A policy that looks at the state of the simulation beside or instead of the image."""
+
+    def attached(self, env: Any) -> PolicyPredictor:
+        """The same policy, looking at a `dittogym.TorchEnv`."""
