@@ -17,8 +17,8 @@ import baselines
 from baselines.train import main as train
 from cfp.config import EVALUATION_SEED
 from dittogym import TorchEnv
-from dittogym.targets import load_target
-from dittogym.tasks.shapematch import silhouette
+from dittogym.observation.image import silhouette
+from dittogym.tasks.targets import load_target
 
 LAYOUTS = 3
 #: Pixels that a drawn letter gets: a robot at rest has 355.

@@ -9,8 +9,7 @@ import torch
 from tiers import sine, zeros
 
 import dittogym
-from dittogym.observation.smooth import soft_silhouette
-from dittogym.tasks.shapematch import silhouette
+from dittogym.observation.image import silhouette, soft_silhouette
 
 STEPS = 30
 

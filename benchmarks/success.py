@@ -8,7 +8,7 @@ most of their time tells nothing.
 import argparse
 from dataclasses import replace
 
-from baselines.compare.stats import wilson
+from baselines.compare.stats import wilson_interval
 from baselines.train import PROGRAM
 from cfp.envs.disturbances import Case, Disturbed
 from cfp.envs.vec_env import monitored
@@ -52,7 +52,7 @@ def main() -> None:
         if result.success is None:
             parser.error(f"policy: got one of {config.task}, allowed of a task that defines success")
         done, successes = done + count, successes + round(result.success * count)
-        low, high = wilson(successes, done)
+        low, high = wilson_interval(successes, done)
         print(f"{successes} of {done} episodes, 95 % interval {low:.0%} to {high:.0%}", flush=True)
 
 

@@ -1,15 +1,21 @@
-"""The coarse-to-fine policy (CFP): soft actor-critic on action images whose resolution grows level by level."""
+"""The coarse-to-fine policy (CFP): soft actor-critic on action images of increasing resolution."""
 
-from cfp.agent.features import ImageFeatures
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.hyperparameters import Hyperparameters
-from cfp.agent.policies import ActorPolicy, CFPPolicy
-from cfp.agent.sac import CFP
 from cfp.agent.spec import ActorSpec
 from cfp.config import Config
-from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import CFPError, CheckpointError, ConfigError, NonFiniteError
 from cfp.presets import preset
 from cfp.weights import load
+
+if TYPE_CHECKING:
+    from cfp.agent.features import ImageFeatures
+    from cfp.agent.policies import CFPPolicy
+    from cfp.agent.sac import CFP
+    from cfp.envs.vec_env import TorchVecEnv
 
 __all__ = [
     "CFP",
@@ -27,3 +33,17 @@ __all__ = [
     "load",
     "preset",
 ]
+
+# Imported on first use: loading a policy needs neither stable-baselines3 nor TensorBoard, which it imports.
+_ON_FIRST_USE = {
+    "CFP": "cfp.agent.sac",
+    "CFPPolicy": "cfp.agent.policies",
+    "ImageFeatures": "cfp.agent.features",
+    "TorchVecEnv": "cfp.envs.vec_env",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _ON_FIRST_USE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_ON_FIRST_USE[name]), name)

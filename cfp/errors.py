@@ -1,16 +1,16 @@
-"""Errors that name a user's mistake or a run's failure in one line."""
+"""Errors that command lines report in one line, without a traceback."""
 
 
 class CFPError(Exception):
-    """Base of all errors that the command lines show without a traceback."""
+    """Base class of all errors of this package."""
 
 
 class ConfigError(CFPError, ValueError):
-    """An option is wrong: the message names it, what was given, and what is allowed."""
+    """An option is wrong; the message names the option, what is allowed, and what was given."""
 
 
 class CheckpointError(CFPError):
-    """A file of a run is missing, damaged, or belongs to another configuration."""
+    """A file of a run is missing, damaged, or of another configuration."""
 
 
 class NonFiniteError(CFPError, ArithmeticError):

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from cfp import train
 from cfp.config import RunConfig
-from cfp.envs.disturbances import Case, Decides, disturbed_env, idle, make_cases
+from cfp.envs.disturbances import Case, Decides, disturbed_env, make_cases, reason_without_effect
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection, judge
 from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
@@ -92,29 +92,35 @@ def check_words(cases: Sequence[Case], words: Sequence[str], spec: TaskSpec, pol
         ConfigError: No case with a word in its name changes anything; it says why.
     """
     for word in words:
-        reasons = {case.name: idle(case, spec, policy.sees_image) for case in cases[1:] if word in case.name}
+        reasons = {
+            case.name: reason_without_effect(case, spec, policy.sees_image) for case in cases[1:] if word in case.name
+        }
         if all(reasons.values()):
             told = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
             raise ConfigError(f"cases: got {word!r}, allowed words of cases that change something ({told})")
 
 
-def report(config: RunConfig, policy: Policy, cases: Sequence[Case], episodes: int) -> list[Result]:
+def report(
+    config: RunConfig, policy: Policy, cases: Sequence[Case], episodes: int, *, deterministic: bool | None = None
+) -> list[Result]:
     """Evaluate a policy in every case that changes something for it, on the same layouts with the same noise.
 
     Args:
         config: Options of the run that trained it.
-        policy: Acts as it is evaluated.
+        policy: The policy.
         cases: The unperturbed one first.
-        episodes: Of each case.
+        episodes: Episodes of each case.
+        deterministic: Act without noise; None: as the run that trained the policy evaluates it.
     """
+    if deterministic is None:
+        deterministic = policy.deterministic_by_default
     spec, seed = make_spec(config.task, **config.environment.task_options()), evaluation_seed(config)
     grid, results = 0 if isinstance(policy, Decides) else policy.description.get("resolution", policy.resolution), []
     for case in cases:
-        if idle(case, spec, policy.sees_image):
+        if reason_without_effect(case, spec, policy.sees_image):
             continue
         env = disturbed_env(config, policy.resolution, episodes, case, seed, grid)
         acting = policy.through(env.disturb) if isinstance(policy, Decides) else policy
-        deterministic = policy.deterministic_by_default
         results.append(evaluate(case.name, acting, env, episodes, deterministic=deterministic, seed=seed))
     return results
 

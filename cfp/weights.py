@@ -1,4 +1,4 @@
-"""Policies to share: ``*.safetensors`` with a ``*.json`` beside it, both readable without pickle."""
+"""Policy files: ``*.safetensors`` with a ``*.json`` beside it, both readable without pickle."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import dataclasses
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ import torch
 from torch import Tensor
 
 from cfp.agent.actor import Actor
-from cfp.agent.policies import ActorPolicy
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.spec import RESOLUTIONS, ActorSpec
 from cfp.config import LARGEST_SEED, Config, RunConfig
 from cfp.errors import CheckpointError, ConfigError
@@ -43,22 +42,22 @@ _DESCRIBED: dict[str, tuple[type, int | None, int]] = {
     "layout": (int, 0, LARGEST_SEED),
     "task_file": (str, None, 0),
 }
-"""What every description holds: type, least and largest value."""
+"""Type, smallest and largest value of the entries of a description."""
 _OPTIONAL = ("layout", "task_file")
-"""What some have not: they were not made for one layout; the task comes with the library."""
-REASON = 300
-"""Characters of an error of torch that are shown: it lists every layer."""
+"""Entries that only policies for a single initial position, or for custom tasks, have."""
+MAX_REASON = 300
+"""Characters shown of an error of torch, which lists every layer."""
 SHIPPED = Path(__file__).parent / "pretrained"
-"""Policies that come with the package, by name."""
+"""Folder of the policies that come with the package."""
 
 
-def origin(config: RunConfig, kind: str, level: int, steps: int) -> dict[str, Any]:
-    """What a policy of any kind is and comes from, as JSON values.
+def describe_run(config: RunConfig, kind: str, stage: int, steps: int) -> dict[str, Any]:
+    """Description of a policy of any kind, as JSON values.
 
     Args:
-        config: The run that trained it.
-        kind: Says who can load it.
-        level: Its stage, 0 is the first.
+        config: Options of the run that trained it.
+        kind: Algorithm that can load it.
+        stage: Index of its stage, counted from 0.
         steps: Environment steps of the run so far.
     """
     return {
@@ -66,8 +65,8 @@ def origin(config: RunConfig, kind: str, level: int, steps: int) -> dict[str, An
         "version": VERSION,
         "kind": kind,
         "task": config.task,
-        "resolution": config.resolution(level),
-        "stage": level + 1,
+        "resolution": config.resolution(stage),
+        "stage": stage + 1,
         "steps": steps,
         "seed": config.seed,
         "deterministic": config.report.eval_deterministic,
@@ -76,25 +75,25 @@ def origin(config: RunConfig, kind: str, level: int, steps: int) -> dict[str, An
 
 
 def is_of_another_task(description: Mapping[str, Any], task: str) -> bool:
-    """Whether a policy was trained when the file that a task of one's own comes from was another."""
+    """Whether the file of a custom task has changed since a policy was trained."""
     then, now = description.get("task_file"), fingerprint(task)
     return then is not None and now is not None and then != now
 
 
-def describe(config: Config, level: int, steps: int) -> dict[str, Any]:
-    """What an actor is and comes from, see `origin`."""
-    return origin(config, KIND, level, steps) | {"network": dataclasses.asdict(config.actor_spec(level))}
+def describe(config: Config, stage: int, steps: int) -> dict[str, Any]:
+    """Description of an actor, see `describe_run`."""
+    return describe_run(config, KIND, stage, steps) | {"network": dataclasses.asdict(config.actor_spec(stage))}
 
 
 def write_policy(path: Path, tensors: Mapping[str, Tensor], description: dict[str, Any]) -> None:
     """Write a policy of any kind.
 
-    The description goes into the weights file too, so that the two can never disagree; the JSON file is for reading.
+    The weights file contains the description too, so that the two cannot disagree; the JSON file is for readers.
 
     Args:
         path: The ``.safetensors`` file; the ``.json`` file gets the same name.
-        tensors: By name.
-        description: From `origin`, and what else its kind needs.
+        tensors: Weights by name.
+        description: From `describe_run`, with further entries that its kind needs.
     """
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     content = safetensors.torch.save(plain, {FORMAT: json.dumps(description)})
@@ -108,33 +107,36 @@ def shipped() -> list[str]:
 
 
 def policy_file(path: str | Path) -> Path:
-    """The ``.safetensors`` file that a path stands for.
+    """Resolve a path to a ``.safetensors`` file.
 
     Args:
-        path: A run folder, that file itself, the ``.json`` beside it, or, where nothing has that path, the name of a
-            policy that comes with the package.
+        path: A run folder, the file itself, the ``.json`` beside it, or, if no such path exists, the name of a policy
+            that comes with the package.
 
     Raises:
-        CheckpointError: There is none.
+        CheckpointError: There is no policy.
     """
     file = Path(path)
     if not file.exists() and str(path) in shipped():
         file = SHIPPED / str(path)
     file = file / "policy.safetensors" if file.is_dir() else file.with_suffix(".safetensors")
     if not file.exists():
-        raise CheckpointError(f"{file}: there is no policy, and none of that name is shipped ({', '.join(shipped())})")
+        raise CheckpointError(f"{file}: there is no policy, and no shipped one has that name ({', '.join(shipped())})")
     return file
 
 
 def read_policy(path: str | Path, device: str = "cpu") -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what `write_policy` wrote: tensors by name, and the description; nothing is unpickled.
+    """Read a policy that `write_policy` wrote; nothing is unpickled.
 
     Args:
-        path: A run folder, a ``.safetensors`` file, or the ``.json`` beside one.
-        device: Where the tensors go.
+        path: See `policy_file`.
+        device: Device of the tensors.
+
+    Returns:
+        Weights by name, and the description.
 
     Raises:
-        CheckpointError: No such file, a damaged one, or one that is not such a policy.
+        CheckpointError: The file is missing, damaged, or not a policy.
     """
     file = policy_file(path)
     try:
@@ -150,48 +152,47 @@ def read_policy(path: str | Path, device: str = "cpu") -> tuple[dict[str, Tensor
         raise CheckpointError(f"{file}: {error}") from error
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
-            raise CheckpointError(f"{file}: {name}: got weights that are NaN or infinite, allowed are finite ones")
+            raise CheckpointError(f"{file}: weights must be finite, got NaN or infinity in {name}")
     return tensors, description
 
 
 def _checked(description: Any) -> dict[str, Any]:
-    """The description of a policy, once all that every kind has is what it should be.
+    """Check the entries of a description that every kind of policy has.
 
     Raises:
-        ConfigError: It is not.
+        ConfigError: It is not a description, or an entry is wrong.
     """
     known = isinstance(description, dict) and description.get("format") == FORMAT
     if not known or description.get("version") != VERSION:
-        raise ConfigError(f"got a file without a {FORMAT} description of version {VERSION}")
-    description = {"kind": KIND, **description}  # files older than kinds are all of this one
+        raise ConfigError(f"the file must have a {FORMAT} description of version {VERSION}")
     for name, (kind, least, most) in _DESCRIBED.items():
         value: Any = description.get(name)
         if name in _OPTIONAL and value is None:
             continue
-        wrong = type(value) is not kind  # a truth value is no number here
+        wrong = type(value) is not kind  # isinstance would accept a bool for an int
         if wrong or (least is not None and not least <= value <= most):
-            allowed = type_name(kind) if least is None else f"{least} to {most}"
-            raise ConfigError(f"{name}: got {value!r}, allowed {allowed}")
+            allowed = type_name(kind) if least is None else f"between {least} and {most}"
+            raise ConfigError(f"{name} must be {allowed}, got {value!r}")
     update_from_dict(EnvironmentConfig(), description["environment"], "environment")
     return description
 
 
 @contextmanager
 def fitting(path: str | Path) -> Iterator[None]:
-    """Turn what goes wrong while a policy is built from its file into an error that names the file.
+    """Report errors while a policy is built from its file as errors that name the file.
 
     Raises:
-        CheckpointError: Tensors and description do not fit.
+        CheckpointError: Weights and description do not match.
     """
     try:
         yield
     except (KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
-        reason = " ".join(str(error).split())[:REASON] or type(error).__name__
-        raise CheckpointError(f"{policy_file(path)}: weights and description do not fit ({reason})") from error
+        reason = " ".join(str(error).split())[:MAX_REASON] or type(error).__name__
+        raise CheckpointError(f"{policy_file(path)}: weights and description do not match ({reason})") from error
 
 
 def save_policy(path: Path, actor: Actor, description: dict[str, Any]) -> None:
-    """Write an actor with its frozen levels, see `write_policy`.
+    """Write an actor with its frozen coarser stages.
 
     Args:
         path: The ``.safetensors`` file.
@@ -207,94 +208,92 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
     Args:
         path: A run folder, a ``.safetensors`` file, the ``.json`` beside one, or the name of a policy that comes with
             the package, such as ``"run"``.
-        device: Where its tensors go.
+        device: Device of its tensors.
 
     Returns:
-        A policy with stable-baselines3's ``predict(observation, deterministic=...)``, uint8 (3, 64, 64) or
-        (B, 3, 64, 64) in, float32 (2, A, A) or (B, 2, A, A) out. ``policy.resolution`` is A, for
-        ``gymnasium.make(..., resolution=...)``: the patch after several levels, see `ActorSpec`. Its ``description``
-        tells task and origin.
+        A policy with stable-baselines3's ``predict(observation, deterministic=...)``, which takes uint8 (3, 64, 64) or
+        (B, 3, 64, 64) and returns float32 (2, A, A) or (B, 2, A, A). ``policy.resolution`` is A, for
+        ``gymnasium.make(..., resolution=...)``, see `ActorSpec.action_size`. ``policy.description`` holds the task and
+        the options of its training.
 
     Raises:
-        CheckpointError: No such file, a damaged one, or one that is not such a policy.
+        CheckpointError: The file is missing, damaged, or not such a policy.
     """
     tensors, description = read_policy(path, device)
     if description["kind"] != KIND:
-        raise CheckpointError(f"{policy_file(path)}: got a policy of kind {description['kind']!r}, allowed {KIND!r}")
+        raise CheckpointError(f"{policy_file(path)}: kind must be {KIND!r}, got {description['kind']!r}")
     with fitting(path):
         spec = update_from_dict(ActorSpec(resolutions=RESOLUTIONS[:1]), description["network"], "network")
         policy = ActorPolicy(spec, description["deterministic"])
         policy.actor.load_state_dict(tensors)
     policy.description = description
     policy.to(device)
-    policy.set_training_mode(False)
+    policy.eval()
     return policy
 
 
 def policy_for(config: RunConfig, path: str) -> ActorPolicy:
-    """Load the policy that a run's option start_from names.
+    """Load the policy that a run starts from.
 
     Args:
         config: The run's options.
-        path: The option.
+        path: Its option ``start_from``.
 
     Raises:
-        ConfigError: The policy is for another task, target, physics or action layout.
+        ConfigError: The policy is for another task, target, physics or orientation of actions.
         CheckpointError: See `load`.
     """
     policy = load(path)
     check_trained_for("start_from", policy.description, config.task, config.environment)
-    environment: EnvironmentConfig = update_from_dict(EnvironmentConfig(), policy.description["environment"])
-    if (made := environment.action_indexing) != (asked := config.environment.action_indexing):
-        raise ConfigError(f"start_from: got a policy for action layout {made}, allowed {asked}")
+    environment = update_from_dict(EnvironmentConfig(), policy.description["environment"])
+    if (found := environment.action_indexing) != (expected := config.environment.action_indexing):
+        raise ConfigError(f"start_from must be a policy for action_layout {expected}, got {found}")
     return policy
 
 
 def check_trained_for(option: str, description: Mapping[str, Any], task: str, environment: EnvironmentConfig) -> None:
-    """Check that what a policy was trained for is what it shall go on with, or teach.
+    """Check that a policy was trained for a task and environment.
 
     Args:
-        option: Names the policy, for the message.
-        description: Of the policy.
-        task: What shall be done.
-        environment: Where.
+        option: Option that names the policy, for the message.
+        description: Description of the policy.
+        task: The task.
+        environment: The environment.
 
     Raises:
-        ConfigError: It was another task, target, or matter and time under an action.
+        ConfigError: It was trained for another task, target, material or number of substeps.
     """
-    if description["task"] != task:
-        raise ConfigError(f"{option}: got a policy for {description['task']}, allowed {task}")
-    theirs: EnvironmentConfig = update_from_dict(EnvironmentConfig(), description["environment"])
-    if theirs.substeps != environment.substeps:
-        raise ConfigError(f"{option}: got a policy for substeps {theirs.substeps}, allowed {environment.substeps}")
+    if (found := description["task"]) != task:
+        raise ConfigError(f"{option} must be a policy for {task}, got one for {found}")
+    own = update_from_dict(EnvironmentConfig(), description["environment"])
+    if own.substeps != environment.substeps:
+        raise ConfigError(f"{option} must be a policy for substeps {environment.substeps}, got {own.substeps}")
     for name in TASK_OPTIONS:
-        given, allowed = getattr(theirs, name), getattr(environment, name)
+        given, expected = getattr(own, name), getattr(environment, name)
         try:
-            same = is_same_task(task, name, given, allowed)
+            same = is_same_task(task, name, given, expected)
         except (ValueError, TypeError, OSError) as error:
-            raise ConfigError(f"{option}: its {name} or the one wanted cannot be read ({error})") from error
+            raise ConfigError(f"{option}: cannot compare its {name} {given} with {expected} ({error})") from error
         if not same:
-            raise ConfigError(f"{option}: got a policy for the {name} {given}, allowed {allowed}")
+            raise ConfigError(f"{option} must be a policy for the {name} {expected}, got {given}")
 
 
-def is_same_task(task: str, option: str, one: str | None, other: str | None) -> bool:
-    """Whether two values of an option make the same of a task; None is the task's default.
+def is_same_task(task: str, option: str, value: str | None, other: str | None) -> bool:
+    """Whether two values of an option result in the same task; None is the task's default.
 
     Args:
-        task: Its name.
+        task: Name of the task.
         option: One of `cfp.sections.TASK_OPTIONS`.
-        one: A value.
-        other: Another.
+        value: A value.
+        other: Another value.
 
     Raises:
         ValueError: The task refuses a value.
-        TypeError: It has no such option.
-        OSError: A picture cannot be read.
+        TypeError: The task has no such option.
+        OSError: An image cannot be read.
     """
-    if one == other:
+    if value == other:
         return True
-    given: list[dict[str, Any]] = [{} if value is None else {option: value} for value in (one, other)]
-    first, second = (make_spec(task, **options) for options in given)
-    if first.target is not None:  # such a task judges by a function made for the picture
-        second = replace(second, judge=first.judge)
+    options: list[dict[str, Any]] = [{} if each is None else {option: each} for each in (value, other)]
+    first, second = (make_spec(task, **each) for each in options)
     return first == second and np.array_equal(np.asarray(first.target), np.asarray(second.target))

@@ -9,32 +9,33 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-Layout = Literal["image", "grid"]
+#: How an action array is indexed: as the observation (row from the top, column), or as the grid (x, y).
+ActionIndexing = Literal["image", "grid"]
 
 
-def to_grid_layout(action: Tensor, layout: Layout) -> Tensor:
+def to_grid_indexing(action: Tensor, indexing: ActionIndexing) -> Tensor:
     """Bring an action (B, 2, R, R) to the index order (component, x rightwards, y upwards).
 
-    In the layout ``"image"`` the last indices are row from the top and column, as in the observation, so a pixel of the
-    action acts where the same pixel of the observation looks. The reference implementation indexes actions as
+    With the indexing ``"image"`` the last indices are row from the top and column, as in the observation, so a pixel of
+    the action acts where the same pixel of the observation looks. The reference implementation indexes actions as
     ``"grid"`` and observations as images, a quarter turn apart.
     """
-    return action.flip(-2).transpose(-1, -2) if layout == "image" else action
+    return action.flip(-2).transpose(-1, -2) if indexing == "image" else action
 
 
-def from_grid_layout(action: Tensor, layout: Layout) -> Tensor:
-    """Undo `to_grid_layout`: an action (..., R, R) indexed (x rightwards, y upwards) in a layout."""
-    return action.transpose(-1, -2).flip(-2) if layout == "image" else action
+def from_grid_indexing(action: Tensor, indexing: ActionIndexing) -> Tensor:
+    """Undo :func:`to_grid_indexing`, for an action (..., R, R) indexed (x rightwards, y upwards)."""
+    return action.transpose(-1, -2).flip(-2) if indexing == "image" else action
 
 
 def patch_field(action: Tensor, patch: int, max_actuation: float | Tensor) -> Tensor:
-    """Upsample an action in grid layout to the patch and scale it to muscle stress.
+    """Upsample an action to the patch and scale it to muscle stress.
 
     Bicubic interpolation (a = -0.75) with half-pixel centres; the result is clipped to the muscles' limit, because the
     interpolation overshoots.
 
     Args:
-        action: (B, 2, R, R), 1 is the full actuation.
+        action: (B, 2, R, R) in grid indexing, 1 is the full actuation.
         patch: Width P of the patch in nodes.
         max_actuation: Muscle stress limit, Pa; a number or (B,).
 
@@ -49,18 +50,18 @@ def patch_field(action: Tensor, patch: int, max_actuation: float | Tensor) -> Te
 def bicubic(image: Tensor, size: int, align_corners: bool = False) -> Tensor:
     """Bicubic interpolation (a = -0.75) of square images (..., R, R) to (..., size, size).
 
-    Written as two small matrix products, which are several times faster on a CPU than PyTorch's own, forward and
-    backward.
+    Computed as two small matrix products, which on a CPU are several times faster than
+    ``torch.nn.functional.interpolate``, forward and backward.
     """
     matrix = bicubic_matrix(image.shape[-1], size, align_corners, image.dtype, image.device)
-    with torch.autocast(image.device.type, enabled=False):  # makes what is executed, not only what a network reads
+    with torch.autocast(image.device.type, enabled=False):  # its result is executed, so precision matters
         return matrix @ image @ matrix.T
 
 
 @functools.lru_cache(maxsize=64)
 @torch.inference_mode(False)  # what is kept must serve gradients later
 def bicubic_matrix(before: int, after: int, align_corners: bool, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Matrix (after, before) of one-dimensional interpolation, read off PyTorch's own on unit vectors."""
+    """Matrix (after, before) of one-dimensional interpolation, from ``interpolate`` of unit vectors."""
     basis = torch.eye(before, dtype=torch.float64, device="cpu")[:, None, :, None].expand(-1, -1, -1, before)
     image = interpolate(basis, size=(after, before), mode="bicubic", align_corners=align_corners)
     return image[:, 0, :, 0].T.contiguous().to(device, dtype)
@@ -78,27 +79,27 @@ def patch_corner(centre: Tensor, patch: int, nodes: int) -> Tensor:
     return (nodes * centre.detach() - patch / 2).to(torch.int64).clamp(0, nodes - patch)
 
 
-def place(field: Tensor, centre: Tensor, nodes: int) -> Tensor:
-    """Put patches on the nodes of the window.
+def place(actuation: Tensor, centre: Tensor, nodes: int) -> Tensor:
+    """Put the actuation of patches on the nodes of the window.
 
     Args:
-        field: (B, 2, P, P) actuation on the patch.
+        actuation: (B, 2, P, P) on the patch, Pa.
         centre: (B, 2) where its centre belongs, in window coordinates, m (the window is 1 m wide).
         nodes: Nodes per axis of the window.
 
     Returns:
         (B, 2, nodes, nodes); zero off the patch, which is kept whole inside the window.
     """
-    batch, _, patch, _ = field.shape
+    batch, _, patch, _ = actuation.shape
     i, j = patch_corner(centre, patch, nodes).split(1, dim=1)
-    ids = i * nodes + j + _patch_ids(patch, nodes, field.device)
-    result = field.new_zeros(batch, 2, nodes * nodes)
-    return result.scatter(2, ids[:, None].expand(-1, 2, -1), field.flatten(2)).unflatten(2, (nodes, nodes))
+    ids = i * nodes + j + _patch_ids(patch, nodes, actuation.device)
+    result = actuation.new_zeros(batch, 2, nodes * nodes)
+    return result.scatter(2, ids[:, None].expand(-1, 2, -1), actuation.flatten(2)).unflatten(2, (nodes, nodes))
 
 
 @functools.lru_cache(maxsize=16)
 @torch.inference_mode(False)
 def _patch_ids(patch: int, nodes: int, device: torch.device) -> Tensor:
-    """Where a patch in the corner of the window has its nodes among all of them, (P P)."""
+    """Indices (P P) among all nodes of a patch in the corner of the window."""
     along = torch.arange(patch, device=device)
     return (along[:, None] * nodes + along).flatten()

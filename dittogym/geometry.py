@@ -1,10 +1,12 @@
-"""Obstacles: one list feeds physics (velocity rules), observation (drawn pixels) and picture (shown boxes)."""
+"""Obstacles: one list of boxes feeds physics (velocity rules), observation and picture."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
+from dittogym.observation.image import RASTER
 from torchmpm import VelocityRule, checks
 from torchmpm.boundary import Range
 
@@ -12,8 +14,8 @@ from torchmpm.boundary import Range
 NODES = 128
 #: Top of the floor in nodes; the surface lies between this node and the next.
 FLOOR_NODE = 19
-#: Ten fine pixels of the observation's raster, 1,024 to the metre.
-MARK = 10 / 1024
+#: Half the width of the mark of a goal: ten fine pixels of the observation's raster, m.
+MARK = 10 / RASTER
 
 
 @dataclass(frozen=True)
@@ -31,13 +33,20 @@ class Box:
 
     @property
     def ground(self) -> bool:
-        """Whether it is all that lies below some height."""
+        """Whether it holds everything below some height."""
         return (self.left, self.right, self.bottom) == (-math.inf, math.inf, -math.inf) and self.top < math.inf
 
 
-def nodes(left: float = -math.inf, right: float = math.inf, bottom: float = -math.inf, top: float = math.inf) -> Box:
+def nodes(
+    left: float = -math.inf,
+    right: float = math.inf,
+    bottom: float = -math.inf,
+    top: float = math.inf,
+    *,
+    closed: bool = False,
+) -> Box:
     """A box whose bounds are counted in nodes from the world's origin."""
-    return Box(left / NODES, right / NODES, bottom / NODES, top / NODES)
+    return Box(left / NODES, right / NODES, bottom / NODES, top / NODES, closed)
 
 
 def mark(point: tuple[float, float]) -> Box:
@@ -50,33 +59,78 @@ def mark(point: tuple[float, float]) -> Box:
 class Obstacle:
     """Something that does not move.
 
+    One list of boxes says where it is: matter cannot enter them, the robot sees them, and a person sees them in
+    :meth:`dittogym.TorchEnv.render`. Where matter or the robot meet something else, ``rules`` and ``observed`` say so.
+
     Attributes:
         name: For messages and docs.
-        rules: What it does to matter; of several rules for one direction on a node the first in the task's list counts.
-        drawn: What the robot sees of it: boxes whose pixels are set in the occupancy channel. Some obstacles of the
-            reference implementation are invisible to the robot; they have none.
-        shown: What a person sees of it in :meth:`dittogym.TorchEnv.render`.
+        boxes: Boxes with edges on nodes, at least 4 nodes wide and high.
+        friction: Coulomb coefficient of their faces; ``math.inf`` sticks.
+        rules: What it does to matter instead of what follows from the boxes; of several rules for one direction on a
+            node the first in the task's list counts.
+        observed: The boxes that the robot sees instead: their pixels are set in the occupancy channel. Some obstacles
+            of the reference implementation are invisible to the robot, ``()``.
 
     Raises:
+        ValueError: A box has edges between nodes, or is so thin that its faces would overlap.
         TypeError: A field is something else; a single rule or box needs its comma too, ``(rule,)``.
     """
 
     name: str
-    rules: tuple[VelocityRule, ...]
-    drawn: tuple[Box, ...] = ()
-    shown: tuple[Box, ...] = ()
+    boxes: tuple[Box, ...] = ()
+    friction: float = 0.0
+    rules: tuple[VelocityRule, ...] | None = None
+    observed: tuple[Box, ...] | None = None
 
     def __post_init__(self) -> None:
         checks.instance("name", self.name, str)
-        checks.instances("rules", self.rules, VelocityRule)
-        for name in ("drawn", "shown"):
-            checks.instances(name, getattr(self, name), Box)
+        checks.instances("boxes", self.boxes, Box)
+        if self.observed is not None:
+            checks.instances("observed", self.observed, Box)
+        checks.instances("rules", self.velocity_rules, VelocityRule)
+
+    @property
+    def velocity_rules(self) -> tuple[VelocityRule, ...]:
+        """What it does to matter."""
+        if self.rules is not None:
+            return self.rules
+        return tuple(rule for box in self.boxes for rule in _faces(box, self.friction))
+
+    @property
+    def observed_boxes(self) -> tuple[Box, ...]:
+        """What the robot sees of it."""
+        return self.boxes if self.observed is None else self.observed
+
+    def with_friction(self, friction: float) -> Obstacle:
+        """The same obstacle with another Coulomb coefficient on all its faces."""
+        rules = self.rules and tuple(replace(rule, friction=friction) for rule in self.rules)
+        return replace(self, friction=friction, rules=rules)
+
+
+def _faces(box: Box, friction: float) -> Iterator[VelocityRule]:
+    """One-sided faces, two nodes deep, on the sides of a box that are not open."""
+    ends = [None if math.isinf(edge) else edge * NODES for edge in (box.left, box.right, box.bottom, box.top)]
+    if any(end is not None and end != round(end) for end in ends):
+        raise ValueError(f"boxes must have edges at multiples of 1/{NODES} m unless rules are given, got {box}")
+    left, right, bottom, top = (None if end is None else round(end) for end in ends)
+    i, j = (left, right), (bottom, top)
+    for low, high in (i, j):
+        if low is not None and high is not None and high - low < 3:
+            raise ValueError(f"boxes must have at least 4 nodes in each direction unless rules are given, got {i}, {j}")
+    if left is not None:
+        yield VelocityRule("+x", (left, left + 1), j, friction=friction)
+    if right is not None:
+        yield VelocityRule("-x", (right - 1, right), j, friction=friction)
+    if bottom is not None:
+        yield VelocityRule("+y", i, (bottom, bottom + 1), friction=friction)
+    if top is not None:
+        yield VelocityRule("-y", i, (top - 1, top), friction=friction)
 
 
 def floor(friction: float = math.inf) -> Obstacle:
     """Ground up to node 19; sticky by default, as published (the reference's Coulomb branch never acts)."""
-    surface = (FLOOR_NODE + 1) / NODES
-    return Obstacle("floor", (VelocityRule("-y", j=(None, FLOOR_NODE), friction=friction),), shown=(Box(top=surface),))
+    rule = VelocityRule("-y", j=(None, FLOOR_NODE), friction=friction)
+    return Obstacle("floor", (nodes(top=FLOOR_NODE + 1),), rules=(rule,), observed=())
 
 
 def ceiling(node: int) -> Obstacle:
@@ -86,18 +140,19 @@ def ceiling(node: int) -> Obstacle:
         ValueError: The node is not a whole number.
     """
     checks.whole("node", node, 0)
-    return Obstacle("ceiling", (VelocityRule("+y", j=(node, None)),), shown=(Box(bottom=node / NODES),))
+    return Obstacle("ceiling", (nodes(bottom=node),), rules=(VelocityRule("+y", j=(node, None)),), observed=())
 
 
 def side_walls(top: int | None) -> Obstacle:
     """Invisible walls at both ends of a fixed window that reaches from -0.5 m to 0.5 m, up to this node."""
-    rules = (VelocityRule("+x", (32, 34), (None, top)), VelocityRule("-x", (-34, -32), (None, top)))
     height = math.inf if top is None else top
-    return Obstacle("side walls", rules, shown=(nodes(32, 34, top=height), nodes(-34, -32, top=height)))
+    boxes = (nodes(32, 34, top=height), nodes(-34, -32, top=height))
+    rules = (VelocityRule("+x", (32, 34), (None, top)), VelocityRule("-x", (-34, -32), (None, top)))
+    return Obstacle("side walls", boxes, rules=rules, observed=())
 
 
 def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True, friction: float = 0.0) -> Obstacle:
-    """A box of nodes that matter cannot enter: one-sided faces left, right, below and above.
+    """A box of nodes that matter cannot enter.
 
     Args:
         name: For messages and docs.
@@ -108,24 +163,14 @@ def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True, fric
             floor does.
 
     Raises:
-        ValueError: A range is none, the friction is negative, or the box is narrower than four nodes, so that its faces
-            would overlap.
+        ValueError: A range is not two node indices, the friction is negative, or the box is narrower than four nodes,
+            so that its faces would overlap.
     """
     for axis, given in (("i", i), ("j", j)):
         if not isinstance(given, tuple) or len(given) != 2 or not {type(end) for end in given} <= {int, type(None)}:
             raise ValueError(f"{axis} must be a range (low, high) of node indices, got {given!r}")
     if None in i:
         raise ValueError(f"i must have both ends, got {i!r}")
-    (left, right), (low, high) = i, j
-    if right - left < 3 or (low is not None and high is not None and high - low < 3):
-        raise ValueError(f"solid needs at least 4 nodes in each direction, got i={i}, j={j}")
-    rules = [
-        VelocityRule("+x", (left, left + 1), j, friction=friction),
-        VelocityRule("-x", (right - 1, right), j, friction=friction),
-    ]
-    if low is not None:
-        rules.append(VelocityRule("+y", i, (low, low + 1), friction=friction))
-    if high is not None:
-        rules.append(VelocityRule("-y", i, (high - 1, high), friction=friction))
-    box = nodes(left, right, -math.inf if low is None else low, math.inf if high is None else high)
-    return Obstacle(name, tuple(rules), (box,) if visible else (), (box,))
+    low, high = j
+    box = nodes(*i, -math.inf if low is None else low, math.inf if high is None else high)
+    return Obstacle(name, (box,), friction, observed=None if visible else ())

@@ -4,32 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numpy as np
 from torch import Tensor
 
 from dittogym.bodies.shapes import Shape
+from dittogym.contract import Memory, Moment, Outcome
 from dittogym.geometry import NODES, Box, Obstacle, mark
-from dittogym.observation.raster import SIZE
-from torchmpm import Material, ParticleState, checks
-
-#: Rewards per step of an element whose state is no longer finite; its episode ends.
-FAILURE_REWARD = -16.0
+from dittogym.observation.image import SIZE
+from dittogym.window import FIXED, Centre, Window
+from torchmpm import Material, checks
 
 
 @dataclass(frozen=True)
-class Body:
+class BodySpec:
     """Particles of one kind.
 
     Attributes:
         shape: Where they start.
         count: Particles at full size.
         mass: Mass of a particle at full size, kg.
-        material: Of an object; ``None``: elastic, with the robot's Lame parameters. The robot always is von Mises
-            matter with the constants of its task.
-        lite: Particles in the lite tier; ``None``: in proportion to the robot's.
-        moves_visibly: Whether the velocity channels of the observation show it; the occupancy channel always does.
+        material: ``None``: with the constants of the task, von Mises matter for the robot, elastic for an object.
+        lite: Particles in the lite tier; ``None``: 2,000 for the robot, in proportion to it for an object.
+        hidden_velocity: Whether the velocity channels of the observation leave it out; the occupancy channel always
+            shows it.
+
+    Raises:
+        ValueError: A number is out of range.
+        TypeError: The shape is not a :class:`dittogym.bodies.shapes.Shape`.
     """
 
     shape: Shape
@@ -37,136 +40,17 @@ class Body:
     mass: float = 2.0
     material: Material | None = None
     lite: int | None = None
-    moves_visibly: bool = True
+    hidden_velocity: bool = False
 
     def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            ValueError: There are no particles, or they weigh nothing.
-            TypeError: The shape is none.
-        """
         checks.instance("shape", self.shape, Shape)
         checks.whole("count", self.count, 1)
         checks.number("mass", self.mass, above=0.0)
+        if self.lite is not None:
+            checks.whole("lite", self.lite, 1)
 
 
-class Measurement(NamedTuple):
-    """Averages over bodies at one moment.
-
-    Attributes:
-        com: (B, 2) mean position of the robot's particles in the world, m.
-        velocity: (B, 2) mean velocity of the robot's particles, m/s.
-        split: (B,) spread of the robot, sqrt(Var x + Var y), m.
-        object_com: (B, 2) the same for the object; ``None`` in tasks without one.
-        object_velocity: (B, 2), m/s.
-    """
-
-    com: Tensor
-    velocity: Tensor
-    split: Tensor
-    object_com: Tensor | None = None
-    object_velocity: Tensor | None = None
-
-
-class Moment(NamedTuple):
-    """What a task's own terms may look at after a step.
-
-    Attributes:
-        particles: The state.
-        robot: Number of robot particles; they come first.
-        now: Averages after the step.
-        start: Averages right after the reset.
-        observation: (B, 3, 64, 64) uint8; floating point if ``soft``, from
-            :func:`dittogym.observation.smooth.soft_observation`.
-        memory: What the task remembers, tensors with a leading B.
-        soft: Whether smooth terms are wanted, for gradients; then nothing but the terms is used of the outcome.
-    """
-
-    particles: ParticleState
-    robot: int
-    now: Measurement
-    start: Measurement
-    observation: Tensor
-    memory: Mapping[str, Tensor]
-    soft: bool = False
-
-
-class Outcome(NamedTuple):
-    """A task's own judgement of a step.
-
-    Attributes:
-        terms: Named reward terms, (B,) each, already weighted; not ``split``, ``action``, ``alive`` or ``failure``,
-            which the engine adds.
-        terminated: (B,) bool, the task's own reasons to end; ``None`` for none.
-        success: (B,) bool; ``None`` where success is not defined.
-        info: Further quantities for ``info``, leading B.
-        memory: Replaces the memory, leading B; ``None`` keeps it.
-    """
-
-    terms: Mapping[str, Tensor]
-    terminated: Tensor | None = None
-    success: Tensor | None = None
-    info: Mapping[str, Tensor] = {}
-    memory: Mapping[str, Tensor] | None = None
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Weights of the reward terms.
-
-    Attributes:
-        location: Of the task's own terms of place.
-        velocity: Of its terms of speed.
-        split: Of the term of a torn robot, which all tasks share where they have a limit of the spread.
-        action: Of the size of the actuation field.
-        alive: Reward of every step.
-    """
-
-    location: float = 0.0
-    velocity: float = 0.0
-    split: float = 0.0
-    action: float = 0.0
-    alive: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            ValueError: One is none, or not finite.
-        """
-        for name, value in vars(self).items():
-            checks.number(name, value)
-
-
-@dataclass(frozen=True)
-class Window:
-    """Where the 1 m x 1 m simulated window lies in the world.
-
-    Attributes:
-        left: Its left end for a fixed window, m.
-        follow: For a moving window the distance of the robot's centre from its left end, m; then ``left`` is unused.
-    """
-
-    left: float = 0.0
-    follow: float | None = None
-
-    def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            ValueError: One is not finite.
-        """
-        checks.number("left", self.left)
-        if self.follow is not None:
-            checks.number("follow", self.follow)
-
-
-#: Centre (x, y) in window coordinates, m; ``None`` stands for the robot's centre.
-Centre = tuple[float | None, float | None]
-
-
-def nothing(moment: Moment) -> Mapping[str, Tensor]:
+def no_memory(moment: Moment, spec: TaskSpec) -> Memory:
     """The memory of a task that needs none."""
     return {}
 
@@ -183,9 +67,11 @@ class TaskSpec:
         lam: First Lame parameter, Pa.
         yield_stress: Of the robot, Pa.
         max_actuation: Muscle stress at action 1, Pa.
-        judge: The task's own reward terms, termination and success. Asked for soft terms it should return smooth ones,
-            see :class:`Moment` and the helpers in :mod:`dittogym.rewards`; a smooth reward needs nothing.
-        weights: Weights of the terms that all tasks share, and of the task's own.
+        reward_fn: The task's own reward terms, termination and success, from a :class:`dittogym.contract.Moment` and
+            this specification. A reward has a smooth form if it uses the operations of ``moment.ops``.
+        weights: Weights of the reward terms by name: one for each term of ``reward_fn``, and any of ``split`` (a torn
+            robot, where there is a ``split_limit``), ``action`` (norm of the actuation field) and ``alive`` (every
+            step).
         objects: Bodies beside the robot, at most one.
         gravity: (x, y), m/s^2.
         damping: Factor on node velocities in every substep.
@@ -197,29 +83,28 @@ class TaskSpec:
         goal: Point in the world that the observation marks by a square of 19 fine pixels, m; ``None`` for none.
         coarse, fine: Action resolutions.
         split_limit: Spread at which the episode ends, m; ``None`` for never.
-        remember: What to keep from the start of an episode, tensors with a leading B.
-        stale: Entries of the memory that a reset leaves as they are under ``parity="reference"``.
+        initial_memory: What to remember from the start of an episode, tensors with a leading B.
+        stale_memory: Entries of the memory that a reset leaves as they are under ``parity="reference"``.
         target: (64, 64) bool picture to match, centred on the robot, row 0 at the top; for pictures of the task.
 
     Raises:
         ValueError: A number is out of range, or there is more than one object.
-        TypeError: A body, an obstacle or a group of numbers is something else, or ``judge`` or ``remember`` cannot be
-            called.
+        TypeError: A body, an obstacle or a group of numbers is something else, or a function cannot be called.
     """
 
     name: str
     horizon: int
-    robot: Body
+    robot: BodySpec
     mu: float
     yield_stress: float
     max_actuation: float
-    judge: Callable[[Moment, Weights], Outcome]
-    weights: Weights
-    objects: tuple[Body, ...] = ()
+    reward_fn: RewardFunction
+    weights: Mapping[str, float]
+    objects: tuple[BodySpec, ...] = ()
     lam: float = 50.0
     gravity: tuple[float, float] = (0.0, 0.0)
     damping: float = 1.0
-    window: Window = Window()
+    window: Window = FIXED
     view: Centre = (None, None)
     reach: Centre = (None, None)
     patch: int = 64
@@ -228,42 +113,41 @@ class TaskSpec:
     coarse: int = 8
     fine: int = 16
     split_limit: float | None = None
-    remember: Callable[[Moment], Mapping[str, Tensor]] = nothing
-    stale: tuple[str, ...] = ()
+    initial_memory: MemoryFunction = no_memory
+    stale_memory: tuple[str, ...] = ()
     target: np.ndarray | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         """Check what would otherwise fail late or silently."""
         checks.instance("name", self.name, str)
-        checks.whole("horizon", self.horizon, 1)
-        checks.number("mu", self.mu, above=0.0)
-        for name in ("yield_stress", "max_actuation", "damping"):
-            checks.number(name, getattr(self, name), least=0.0)
-        checks.number("lam", self.lam)
-        if self.split_limit is not None:
-            checks.number("split_limit", self.split_limit, above=0.0)
-        for name in ("gravity", "goal", "view", "reach"):
-            self._check_point(name, optional=name == "goal", open_ended=name in ("view", "reach"))
-        checks.instance("weights", self.weights, Weights)
+        self._check_numbers()
+        self._check_weights()
         checks.instance("window", self.window, Window)
         checks.instances("obstacles", self.obstacles, Obstacle)
+        checks.instance("robot", self.robot, BodySpec)
+        checks.instances("objects", self.objects, BodySpec)
+        if len(self.objects) > 1:
+            raise ValueError(f"objects must be at most one body, got {len(self.objects)}")
         if self.target is not None and np.shape(self.target) != (SIZE, SIZE):
             raise ValueError(f"target must have shape {(SIZE, SIZE)}, got {np.shape(self.target)}")
+        for name in ("reward_fn", "initial_memory"):
+            if not callable(given := getattr(self, name)):
+                raise TypeError(f"{name} must be a function of a Moment and a TaskSpec, got {given!r}")
+        checks.instances("stale_memory", self.stale_memory, str)
+
+    def _check_numbers(self) -> None:
+        checks.whole("horizon", self.horizon, 1)
+        checks.number("mu", self.mu, above=0.0)
+        checks.number("lam", self.lam)
+        for name in ("yield_stress", "max_actuation", "damping"):
+            checks.number(name, getattr(self, name), least=0.0)
+        if self.split_limit is not None:
+            checks.number("split_limit", self.split_limit, above=0.0)
         checks.whole("patch", self.patch, 4, NODES)
         for name in ("coarse", "fine"):
             checks.whole(name, getattr(self, name), 1, self.patch)
-        checks.instance("robot", self.robot, Body)
-        for name in ("material", "lite"):
-            if (given := getattr(self.robot, name)) is not None:
-                raise ValueError(f"robot.{name} must be None, it follows from the task, got {given!r}")
-        checks.instances("objects", self.objects, Body)
-        if len(self.objects) > 1:
-            raise ValueError(f"objects must be at most one body, got {len(self.objects)}")
-        if not callable(self.judge):
-            raise TypeError(f"judge must be a function from Moment and Weights to Outcome, got {self.judge!r}")
-        if not callable(self.remember):
-            raise TypeError(f"remember must be a function from Moment to tensors by name, got {self.remember!r}")
-        checks.instances("stale", self.stale, str)
+        for name in ("gravity", "goal", "view", "reach"):
+            self._check_point(name, optional=name == "goal", open_ended=name in ("view", "reach"))
 
     def _check_point(self, name: str, *, optional: bool, open_ended: bool) -> None:
         given = getattr(self, name)
@@ -275,13 +159,32 @@ class TaskSpec:
             if value is not None or not open_ended:
                 checks.number(f"{name} {axis}", value)
 
+    def _check_weights(self) -> None:
+        checks.instance("weights", self.weights, Mapping)
+        for name, value in self.weights.items():
+            checks.number(f"weights[{name!r}]", value)
+
     @property
-    def bodies(self) -> tuple[Body, ...]:
+    def bodies(self) -> tuple[BodySpec, ...]:
         """Robot and objects in particle order."""
         return (self.robot, *self.objects)
 
+    def goal_like(self, x: Tensor) -> Tensor:
+        """The goal (2,) with the type and device of ``x``, m.
+
+        Raises:
+            ValueError: There is none.
+        """
+        if self.goal is None:
+            raise ValueError(f"goal of task {self.name!r} must be a point (x, y), got None")
+        return x.new_tensor(self.goal)
+
     @property
-    def drawn(self) -> tuple[Box, ...]:
+    def observed_boxes(self) -> tuple[Box, ...]:
         """What the robot sees of obstacles and goal."""
-        boxes = tuple(box for obstacle in self.obstacles for box in obstacle.drawn)
+        boxes = tuple(box for obstacle in self.obstacles for box in obstacle.observed_boxes)
         return boxes if self.goal is None else (*boxes, mark(self.goal))
+
+
+RewardFunction: TypeAlias = Callable[[Moment, TaskSpec], Outcome]
+MemoryFunction: TypeAlias = Callable[[Moment, TaskSpec], Memory]

@@ -3,70 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from numbers import Integral
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dittogym import core as dynamics
-from dittogym.action import Layout, to_grid_layout
-from dittogym.bodies.positions import Layouts, Particles, Seed, particle_counts
-from dittogym.core import EnvState
-from dittogym.observation.smooth import soft_observation
+from dittogym import core
+from dittogym.action import ActionIndexing, to_grid_indexing
+from dittogym.arguments import DTYPES, choice, find_device, find_mask, find_resolution, reset_options
+from dittogym.bodies.positions import InitialPositions, Particles, Seed, particle_counts
+from dittogym.contract import ENGINE_INFO, measure
+from dittogym.model import PARITIES, EnvState, ParityName, Snapshot, check_stability, make_model
+from dittogym.observation.image import SHAPE
 from dittogym.physics import Physics, merged, physics_values
 from dittogym.render.frame import frame
-from dittogym.rewards import measure
-from dittogym.spec import Measurement, TaskSpec
+from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
 from torchmpm import ParticleState, checks, tree
 from torchmpm.rollout import Segment, check_repetition
-
-Parity = Literal["clean", "reference"]
-_DTYPES = {"float32": torch.float32, "float64": torch.float64}
-_RESET_OPTIONS = ("physics", "positions", "reset_mask")
-
-
-@dataclass(frozen=True, eq=False)
-class Snapshot:
-    """A moment of an environment, see :meth:`dittogym.TorchEnv.save`.
-
-    Attributes:
-        task: Name of the task.
-        counts: Particles of each body.
-        shares: By body, the full-size particles that one particle stands for.
-        state: Everything that moves, leading B.
-        observation: (B, 3, 64, 64) uint8.
-    """
-
-    task: str
-    counts: tuple[int, ...]
-    shares: tuple[float, ...]
-    state: EnvState
-    observation: Tensor
-
-
-torch.serialization.add_safe_globals([Snapshot, EnvState, Measurement])  # tensors, numbers and a name
-
-
-def _device(device: str | torch.device) -> torch.device:
-    try:
-        found = torch.device(device)
-    except (TypeError, RuntimeError) as error:
-        raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}") from error
-    if found.type not in ("cpu", "cuda"):
-        raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
-    if found.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device must be available, got {device!r}, but torch finds no CUDA device")
-    if found.index is not None and found.index >= (count := max(1, torch.cuda.device_count())):
-        raise ValueError(f"device must be available, got {device!r}, but torch numbers its devices 0 to {count - 1}")
-    return found
-
-
-def _sum(terms: Mapping[str, Tensor]) -> Tensor:
-    return torch.stack(tuple(terms.values())).sum(0)
 
 
 class TorchEnv:
@@ -110,7 +66,7 @@ class TorchEnv:
         TypeError: The task has no such option.
     """
 
-    observation_shape = (3, 64, 64)
+    observation_shape = SHAPE
 
     def __init__(
         self,
@@ -123,54 +79,42 @@ class TorchEnv:
         dtype: str | torch.dtype = "float32",
         device: str | torch.device = "cpu",
         backend: str = "auto",
-        action_layout: Layout | None = None,
-        parity: Parity = "clean",
+        action_layout: ActionIndexing | None = None,
+        parity: ParityName = "clean",
         resample: bool = False,
         deterministic: bool = False,
         segment: Segment = "auto",
         **task_options: Any,
     ) -> None:
         self.spec = make_spec(task, **task_options)
-        dtype = str(dtype).removeprefix("torch.")
-        for name, value, allowed in (
-            ("dtype", dtype, tuple(_DTYPES)),
-            ("parity", parity, ("clean", "reference")),
-            ("action_layout", action_layout, ("image", "grid", None)),
-        ):
-            if value not in allowed:
-                raise ValueError(f"{name} must be one of {allowed}, got {value!r}")
+        self.num_envs, substeps = checks.whole("num_envs", num_envs, 1), checks.whole("substeps", substeps, 1)
+        check_repetition(substeps, segment)
         for name, flag in (("resample", resample), ("deterministic", deterministic)):
             checks.flag(name, flag)
-        num_envs, substeps = checks.whole("num_envs", num_envs, 1), checks.whole("substeps", substeps, 1)
-        check_repetition(substeps, segment)
-        self.num_envs, self.dtype, self.device = num_envs, _DTYPES[dtype], _device(device)
+        self.dtype, self.device = choice("dtype", str(dtype).removeprefix("torch."), DTYPES), find_device(device)
         if deterministic and (self.device.type != "cpu" or backend == "compile"):
             raise ValueError(
                 "deterministic=True needs device 'cpu' and a backend other than 'compile', "
                 f"got {device!r} and {backend!r}"
             )
-        self.action_resolution = self._resolution(resolution)
+        self.action_resolution = find_resolution(self.spec, resolution)
         self.action_shape = (2, self.action_resolution, self.action_resolution)
-        self._stale = parity == "reference"
-        self.action_layout: Layout = action_layout or ("grid" if self._stale else "image")
-        self._counts = counts = particle_counts(self.spec, particles)
-        self.model = dynamics.make_model(
-            self.spec, counts, substeps=substeps, backend=backend, unscaled=self._stale, segment=segment
+        self._parity = choice("parity", parity, PARITIES)
+        indexing = {"image": "image", "grid": "grid", None: self._parity.action_indexing}
+        self.action_layout: ActionIndexing = choice("action_layout", action_layout, indexing)
+        counts = particle_counts(self.spec, particles)
+        self.model = make_model(
+            self.spec, counts, substeps=substeps, backend=backend, parity=self._parity, segment=segment
         )
-        self._layouts = Layouts(self.spec, counts, num_envs, spread=not self.model.pixels, resample=resample)
-        self._like = torch.empty(num_envs, dtype=self.dtype, device=self.device)
+        random = self._parity.random_positions or counts == tuple(body.count for body in self.spec.bodies)
+        self._initial_positions = InitialPositions(self.spec, counts, self.num_envs, random=random, resample=resample)
+        self._like = torch.empty(self.num_envs, dtype=self.dtype, device=self.device)
         self.device = self._like.device  # with the number of what is the current device now
         self._physics: Physics = {}
         self._env_state: EnvState | None = None
         self._observation: Tensor | None = None
-        self._field: Tensor | None = None
-
-    def _resolution(self, resolution: str | int) -> int:
-        named = {"coarse": self.spec.coarse, "fine": self.spec.fine}
-        size: Any = named.get(resolution) if isinstance(resolution, str) else resolution
-        if isinstance(size, bool) or not isinstance(size, Integral) or not 1 <= int(size) <= self.spec.patch:
-            raise ValueError(f"resolution must be 'coarse', 'fine' or 1 to {self.spec.patch}, got {resolution!r}")
-        return int(size)
+        self._info: dict[str, Tensor] | None = None
+        self._actuation: Tensor | None = None
 
     @property
     def num_particles(self) -> int:
@@ -198,30 +142,37 @@ class TorchEnv:
         own = self.num_envs, self.num_particles, self.dtype, self.device
         if kind != own:
             raise ValueError(f"env_state must be of {own} (simulations, particles, dtype, device), got {kind}")
-        self._env_state, self._observation, self._field = value, None, None
+        self._env_state, self._actuation, self._observation, self._info = value, None, None, None
 
     @property
     def generators(self) -> dict[int, dict[str, Tensor]]:
-        """States of the elements' random generators, which ``resample`` draws from; an assignment brings them back.
+        """States of the elements' random generators, which ``resample`` draws from; assign them to restore them.
 
         By element: tensors ``key`` (624,) and ``pos`` () of the Mersenne Twister.
         """
-        return self._layouts.generators
+        return {element: sampler.generator for element, sampler in self._initial_positions.samplers.items()}
 
     @generators.setter
     def generators(self, states: Mapping[int, Mapping[str, Tensor]]) -> None:
-        self._layouts.generators = states
+        samplers = self._initial_positions.samplers
+        if missing := [element for element in states if element not in samplers]:
+            raise RuntimeError(f"call reset() first: elements {missing} have no random generator yet")
+        for element, state in states.items():
+            samplers[element].generator = state
 
     @property
     def state(self) -> ParticleState:
         """The particles of all simulations."""
         return self.env_state.particles
 
-    def _moment(self) -> tuple[EnvState, Tensor]:
-        state = self.env_state
-        if self._observation is None:  # the state was assigned
-            self._observation = dynamics.observe(self.model, state)
-        return state, self._observation
+    def _present(self) -> tuple[Tensor, dict[str, Tensor]]:
+        """Observation and measured info of the present state, computed anew where the state was assigned."""
+        if self._observation is None:
+            self._observation = core.observe(self.model, self.env_state)
+        if self._info is None:
+            now = measure(self.state, self.model.num_robot_particles)
+            self._info = tree.detach(core.measured_info(self.model, self.env_state, now))
+        return self._observation, self._info
 
     def detach(self, *, physics: bool = True) -> None:
         """Cut the autograd graph: gradients do not reach back beyond this moment.
@@ -230,20 +181,19 @@ class TorchEnv:
             physics: Also those in the constants that the last reset was given; without, a constant can be learned from
                 one stretch of an episode after the other.
         """
-        state = self.env_state.detach()
+        state = tree.detach(self.env_state)
         self._env_state = state if physics else replace(state, physics=self.env_state.physics)
 
     def save(self) -> Snapshot:
         """A copy of the present moment, to which :meth:`load` returns; keeps the autograd graph."""
-        state, observation = self._moment()
-        return Snapshot(
-            self.spec.name, self._counts, self.model.shares, tree.map(Tensor.clone, state), observation.clone()
-        )
+        state, observation = tree.map(Tensor.clone, (self.env_state, self._present()[0]))
+        counts, weight = self.model.camera.counts, self.model.particle_weight
+        return Snapshot(self.spec.name, counts, weight, state, observation)
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
-        """Go on from a saved moment, to the last bit as if nothing had happened since.
+        """Continue from a saved moment, to the last bit as if nothing had happened since.
 
-        The layout and the physics of the next reset, and a ``TimeLimit`` wrapper's count, are not part of it.
+        The positions and the physics of the next reset, and a ``TimeLimit`` wrapper's count, are not part of it.
 
         Args:
             snapshot: Of this environment or one like it; one of a single simulation goes into every element.
@@ -258,32 +208,31 @@ class TorchEnv:
         """
         if not isinstance(snapshot, Snapshot):
             raise TypeError(f"snapshot must be what save() returned, got {type(snapshot).__name__}")
-        chosen = self._mask(mask, "mask")
-        theirs = snapshot.state
-        size = len(theirs.steps)
-        kind = (snapshot.task, snapshot.counts, snapshot.shares, theirs.particles.dtype, theirs.particles.device)
-        own = (self.spec.name, self._counts, self.model.shares, self.dtype, self.device)
+        chosen = find_mask("mask", mask, self.num_envs, self.device)
+        theirs, size, counts = snapshot.state, len(snapshot.state.steps), self.model.camera.counts
+        kind, own = snapshot.kind, (self.spec.name, counts, self.model.particle_weight, self.dtype, self.device)
         if kind != own or size not in (1, self.num_envs):
             raise ValueError(
                 f"snapshot must hold 1 or {self.num_envs} simulations of {own}, got {size} of {kind} "
                 "(task, particles, what each stands for, dtype, device)"
             )
         index = torch.arange(self.num_envs, device=self.device) % size
-        state, observation = tree.map(lambda t: t[index], theirs), snapshot.observation[index]
+        state, observation = tree.map(lambda t: t[index], (theirs, snapshot.observation))
         if not bool(chosen.all()):
-            mine, seen = self._moment()
+            mine = self.env_state
             physics = merged(self.spec, mine.physics, state.physics, chosen, self._like)
-            state = replace(state, physics=physics).where(chosen, replace(mine, physics=physics))
-            observation = tree.where(chosen, observation, seen)
-        self._env_state, self._observation, self._field = state, observation.clone(), None
+            state, mine = (replace(each, physics=physics) for each in (state, mine))
+            state, observation = tree.where(chosen, (state, observation), (mine, self._present()[0]))
+        self.env_state = state
+        self._observation = observation.clone()
         return observation
 
     def reset(self, *, seed: Seed = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        """Start new episodes.
+        """Start new episodes. A reset that raises an error changes nothing.
 
         Args:
             seed: Seeds element i with ``seed + i``, or with ``seed[i]``, and draws its particles anew. Without it, or
-                where ``seed[i]`` is ``None``, the last layout is used again, unless ``resample`` was asked for.
+                where ``seed[i]`` is ``None``, the last positions are used again, unless ``resample`` was asked for.
             options: ``"positions"``: (N, 2) or (B, N, 2) world positions in m, robot first, used until the next seed,
                 with ``resample`` until the next reset;
                 ``"physics"``: constants of the matter, one value for all, one per element or one per particle, see
@@ -297,38 +246,50 @@ class TorchEnv:
             ValueError: An option is unknown, has the wrong shape, puts particles outside the window, or makes matter
                 too stiff for the substeps.
         """
-        if options is not None and not isinstance(options, Mapping):
-            raise ValueError(f"options must be a mapping that may hold {', '.join(_RESET_OPTIONS)}, got {options!r}")
-        options = dict(options or {})
-        for name in options:
-            if name not in _RESET_OPTIONS:
-                raise ValueError(f"options may hold {', '.join(_RESET_OPTIONS)}, got {name!r}")
-        mask = self._mask(options.get("reset_mask"), "reset_mask")
-        old, everyone = self._env_state, bool(mask.all())
-        if old is None and not everyone:
+        options = reset_options(options)
+        mask = find_mask("reset_mask", options.get("reset_mask"), self.num_envs, self.device)
+        if self._env_state is None and not bool(mask.all()):
             raise ValueError("reset_mask must reset all elements the first time")
-        physics = self._physics
-        if options.get("physics") is not None:
-            given = physics_values(options["physics"], self.num_envs, self.num_particles, self._like)
-            physics = merged(self.spec, physics, given, mask, self._like)
-            dynamics.check_stability(self.model, physics)
-        positions = self._layouts.draw(seed, mask.cpu().numpy(), options.get("positions"), self._like)
-        fresh, observation = dynamics.initial(self.model, positions, physics)
-        if old is not None and self._stale:
-            memory = {**fresh.memory, **{name: old.memory[name].detach() for name in self.spec.stale}}
-            fresh = replace(fresh, centre=old.centre.detach(), memory=memory)
-        if old is not None and not everyone:
-            kept = merged(self.spec, physics, old.physics, ~mask, self._like)
-            observation = tree.where(mask, observation, self._moment()[1])
-            fresh = replace(fresh, physics=kept).where(mask, replace(old, physics=kept))
-        # Gradients in these constants reach back to this reset only, not to those before it.
-        self._physics = {name: value.detach().clone() for name, value in physics.items()}
-        self._env_state, self._field = fresh, None
-        if self._observation is None or not self._stale:
-            self._observation = observation
-        now = measure(self.state, self.model.robot)
-        info = dynamics.averages(self.model, fresh, now)
-        return self._observation.clone(), {name: value.detach() for name, value in info.items()}
+        physics = self._next_physics(options.get("physics"), mask)
+        drawn = self._initial_positions.draw(seed, mask.cpu().numpy(), options.get("positions"), self._like)
+        assert drawn.positions is not None
+        index = mask.nonzero()[:, 0]
+        fresh, observation = core.reset(self.model, drawn.positions[index], tree.map(lambda t: t[index], physics))
+        info = tree.detach(core.measured_info(self.model, fresh, fresh.start))
+        if self._env_state is not None:
+            if self._parity.stale_reset:
+                fresh, observation = self._stale(fresh, observation, index)
+            if len(index) < self.num_envs:
+                fresh, observation, info = self._insert(index, fresh, observation, info)
+                fresh = replace(fresh, physics=merged(self.spec, self.env_state.physics, physics, mask, self._like))
+        # Gradients in positions and constants reach back to this reset only, not to the next that uses them.
+        self._initial_positions = replace(drawn, positions=drawn.positions.detach().clone())
+        self._physics = tree.map(lambda t: t.detach().clone(), physics)
+        self._env_state, self._actuation, self._observation, self._info = fresh, None, observation, info
+        return tree.map(Tensor.clone, (observation, info))
+
+    def _next_physics(self, given: Any, mask: Tensor) -> Physics:
+        """The constants of the next episodes, where elements outside ``mask`` keep those that wait for them."""
+        if given is None:
+            return self._physics
+        values = physics_values(given, self.num_envs, self.num_particles, self._like)
+        physics = merged(self.spec, self._physics, values, mask, self._like)
+        check_stability(self.model, physics)
+        return physics
+
+    def _stale(self, fresh: EnvState, observation: Tensor, index: Tensor) -> tuple[EnvState, Tensor]:
+        """What the reference implementation's reset leaves of the last episodes of the elements ``index``."""
+        old = self.env_state
+        memory = {name: old.memory[name][index].detach() for name in self.spec.stale_memory}
+        fresh = replace(fresh, centre=old.centre[index].detach(), memory={**fresh.memory, **memory})
+        return fresh, self._present()[0][index]
+
+    def _insert(self, index: Tensor, state: EnvState, *seen: Any) -> tuple[Any, ...]:
+        """The present state, observation and info of all elements, with others in place of the elements ``index``."""
+        present = (replace(self.env_state, physics={}), *self._present())
+        others = (replace(state, physics={}), *seen)
+        inserted: tuple[Any, ...] = tree.map(lambda whole, part: whole.index_copy(0, index, part), present, others)
+        return inserted
 
     def step(self, action: Tensor, *, soft: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Advance every simulation by one control step.
@@ -347,32 +308,29 @@ class TorchEnv:
         Raises:
             ValueError: The action has the wrong shape or type or is not finite.
         """
-        action = self._checked(action)
-        state, field = dynamics.transition(self.model, self.env_state, to_grid_layout(action, self.action_layout))
-        observation = dynamics.observe(self.model, state)
-        judged, outcome = dynamics.judge(self.model, state, field, observation)
-        # The image is kept as a copy: what is returned belongs to the caller.
-        self._env_state, self._observation, self._field = judged, observation.clone(), field.detach()
-        info: dict[str, Any] = {"reward_terms": dict(outcome.terms), **outcome.info}
-        if outcome.success is not None:
-            info["is_success"] = outcome.success
-        reward = _sum(outcome.terms)
+        action = to_grid_indexing(self._checked(action), self.action_layout)
+        result = core.step(self.model, self.env_state, action, soft=soft)
+        info: dict[str, Any] = {"reward_terms": dict(result.terms), **result.info}
+        if result.success is not None:
+            info["is_success"] = result.success
         if soft:
-            info["true_reward"], observation = reward, soft_observation(self.model, state)
-            terms = dynamics.judge(self.model, state, field, observation, soft=True)[1].terms
-            info["reward_terms"], reward = dict(terms), _sum(terms)
-        assert outcome.terminated is not None
-        return observation, reward, outcome.terminated, state.steps >= self.spec.horizon, info
+            info["true_reward"] = result.true_reward
+        # Copies: what is returned belongs to the caller.
+        self._observation = result.observation.clone()
+        self._info = {name: value.detach().clone() for name, value in result.info.items() if name in ENGINE_INFO}
+        self._env_state, self._actuation = result.state, result.actuation.detach()
+        observation = result.observation if result.soft_observation is None else result.soft_observation
+        return observation, result.reward, result.terminated, result.state.steps >= self.spec.horizon, info
 
     def soft_observation(self) -> Tensor:
         """The present image as a smooth function of the state.
 
-        See :func:`dittogym.observation.smooth.soft_observation`.
+        See :func:`dittogym.core.soft_observation`.
 
         Returns:
             (B, 3, 64, 64) in the units of the uint8 observation, with the autograd graph of the state.
         """
-        return soft_observation(self.model, self.env_state)
+        return core.soft_observation(self.model, self.env_state)
 
     def render(self, index: int = 0, *, muscles: bool = False, size: int = 512) -> np.ndarray:
         """Picture of one simulation in RGB.
@@ -385,21 +343,7 @@ class TorchEnv:
         Returns:
             (S, S, 3) uint8 for S = ``size``.
         """
-        field = self._field if muscles else None
-        return frame(self.model, self.env_state, index, field, size)
-
-    def _mask(self, given: Any, name: str) -> Tensor:
-        if given is None:
-            return torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        try:
-            mask = torch.as_tensor(given, device=self.device)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(f"{name} must be bool of shape ({self.num_envs},), got {given!r}") from error
-        if mask.dtype != torch.bool or mask.shape != (self.num_envs,):
-            raise ValueError(
-                f"{name} must be bool of shape ({self.num_envs},), got {mask.dtype} of shape {tuple(mask.shape)}"
-            )
-        return mask
+        return frame(self.model, self.env_state, index, self._actuation if muscles else None, size)
 
     def _checked(self, action: Tensor) -> Tensor:
         if not isinstance(action, Tensor) or not action.is_floating_point():

@@ -4,18 +4,62 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from torch import Tensor
 
 from dittogym.bodies.positions import Seed
 from dittogym.env import RENDER_FPS, RENDER_MODES, as_image, as_numpy, as_tensor, registered_horizon, spaces
+from dittogym.model import Snapshot
 from dittogym.spec import TaskSpec
-from dittogym.torch_env import Snapshot, TorchEnv
+from dittogym.torch_env import TorchEnv
 from torchmpm import ParticleState, checks
+
+
+class AutoresetStep(NamedTuple):
+    """A step of a batch with a leading B throughout.
+
+    Attributes:
+        observation: Of new episodes where ``done``.
+        final_observation: After the step, before any reset.
+        reward: (B,).
+        terminated: (B,) bool.
+        truncated: (B,) bool.
+        done: (B,) bool, elements whose episode ended and that were reset.
+        info: Of the step.
+        reset_info: Of all elements after the reset; ``None`` if no episode ended.
+    """
+
+    observation: Tensor
+    final_observation: Tensor
+    reward: Tensor
+    terminated: Tensor
+    truncated: Tensor
+    done: Tensor
+    info: dict[str, Any]
+    reset_info: dict[str, Any] | None
+
+
+def autoreset_step(env: Any, action: Tensor, max_episode_steps: float | None = None) -> AutoresetStep:
+    """Step all elements, and reset those whose episode has ended.
+
+    Args:
+        env: A :class:`dittogym.TorchEnv`, or another environment with its ``step`` and ``reset``.
+        action: (B, 2, R, R).
+        max_episode_steps: Steps after which an episode is truncated; ``None`` leaves it to the environment.
+    """
+    observation, reward, terminated, truncated, info = env.step(action)
+    if max_episode_steps is not None:
+        truncated = env.env_state.steps >= max_episode_steps
+    done, final_observation, reset_info = terminated | truncated, observation, None
+    if bool(done.any()):
+        final_observation = observation.clone()  # an environment may reuse its memory
+        observation, reset_info = env.reset(options={"reset_mask": done})
+    return AutoresetStep(observation, final_observation, reward, terminated, truncated, done, info, reset_info)
 
 
 class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -103,38 +147,39 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Returns:
             Observations (B, 3, 64, 64) uint8, rewards (B,) float64, terminated and truncated (B,) bool, ``info``.
         """
-        fresh = self._ended.copy()
         action = as_tensor(actions, self.torch_env)
-        if self.autoreset_mode is AutoresetMode.NEXT_STEP:  # whatever they hold
-            action = action.masked_fill(torch.as_tensor(fresh, device=action.device)[:, None, None, None], 0.0)
-        observation, reward, terminated, _, raw = self.torch_env.step(action)
-        info = as_numpy(raw)
-        rewards, ends = reward.double().cpu().numpy(), terminated.cpu().numpy()
-        limits = (self.torch_env.env_state.steps >= self._horizon).cpu().numpy()
-        observations = as_image(observation)
-        if self.autoreset_mode is AutoresetMode.DISABLED:
-            return observations, rewards, ends, limits, _with_masks(info, np.ones(self.num_envs, dtype=bool))
+        everyone = np.ones(self.num_envs, dtype=bool)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
-            self._ended = (ends | limits) & ~fresh
-            if fresh.any():
-                observations, start = self._restart(fresh)
-                rewards, ends, limits = rewards * ~fresh, ends & ~fresh, limits & ~fresh
-                return observations, rewards, ends, limits, _restarted(info, start, fresh)
-            return observations, rewards, ends, limits, _with_masks(info, ~fresh)
-        done = ends | limits
-        result = _with_masks(info, np.ones(self.num_envs, dtype=bool))
-        if done.any():
-            final = np.empty(self.num_envs, dtype=object)
-            for i in np.flatnonzero(done):
-                final[i] = observations[i]
-            last = {"final_obs": final, "_final_obs": done, "final_info": _with_masks(info, done), "_final_info": done}
-            observations, start = self._restart(done)
-            result = _restarted(info, start, done) | last
-        return observations, rewards, ends, limits, result
+            return self._step_then_reset_next(action)
+        if self.autoreset_mode is AutoresetMode.DISABLED:
+            observation, reward, terminated, _, info = self.torch_env.step(action)
+            limits = _array(self.torch_env.env_state.steps >= self._horizon)
+            rewards, ends = _array(reward.double()), _array(terminated)
+            return as_image(observation), rewards, ends, limits, _with_masks(as_numpy(info), everyone)
+        step = autoreset_step(self.torch_env, action, self._horizon)
+        rewards, ends, limits = _array(step.reward.double()), _array(step.terminated), _array(step.truncated)
+        images, info = as_image(step.observation), as_numpy(step.info)
+        if step.reset_info is None:
+            return images, rewards, ends, limits, _with_masks(info, everyone)
+        done, finals, final = _array(step.done), as_image(step.final_observation), np.empty(self.num_envs, dtype=object)
+        for i in np.flatnonzero(done):
+            final[i] = finals[i]
+        last = {"final_obs": final, "_final_obs": done, "final_info": _with_masks(info, done), "_final_info": done}
+        return images, rewards, ends, limits, _restarted(info, as_numpy(step.reset_info), done) | last
 
-    def _restart(self, mask: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
-        observation, info = self.torch_env.reset(options={"reset_mask": torch.as_tensor(mask)})
-        return as_image(observation), as_numpy(info)
+    def _step_then_reset_next(self, action: torch.Tensor) -> tuple[Any, ...]:
+        """A step in which elements that have ended before are reset instead; their actions do not count."""
+        fresh = self._ended.copy()
+        ended = torch.as_tensor(fresh, device=action.device)
+        action = action.masked_fill(ended[:, None, None, None], 0.0)  # whatever they hold
+        observation, reward, terminated, _, raw = self.torch_env.step(action)
+        limits = _array(self.torch_env.env_state.steps >= self._horizon) & ~fresh
+        rewards, ends, info = _array(reward.double()) * ~fresh, _array(terminated) & ~fresh, as_numpy(raw)
+        self._ended = ends | limits
+        if not fresh.any():
+            return as_image(observation), rewards, ends, limits, _with_masks(info, ~fresh)
+        observation, start = self.torch_env.reset(options={"reset_mask": ended})
+        return as_image(observation), rewards, ends, limits, _restarted(info, as_numpy(start), fresh)
 
     def save(self) -> Snapshot:
         """The present moment of all simulations; see :meth:`dittogym.TorchEnv.save`."""
@@ -163,8 +208,8 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return tuple(self.torch_env.render(i, muscles=self.render_muscles) for i in range(self.num_envs))
 
 
-def _array(mask: Any) -> np.ndarray:
-    return mask.cpu().numpy() if isinstance(mask, torch.Tensor) else np.asarray(mask)
+def _array(values: Any) -> np.ndarray:
+    return values.cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
 
 
 def _restarted(info: dict[str, Any], start: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:

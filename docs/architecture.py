@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import sys
 from dataclasses import dataclass
 from html import escape
@@ -44,8 +45,9 @@ class Package:
 
 
 def summary(file: Path) -> str:
-    """First line of a module's docstring."""
-    return (ast.get_docstring(ast.parse(file.read_text())) or "").partition("\n")[0]
+    """First line of a module's docstring, without the markup of references."""
+    line = (ast.get_docstring(ast.parse(file.read_text())) or "").partition("\n")[0]
+    return re.sub(r":\w+:`~?([^`]+)`", r"\1", line)
 
 
 def imported(file: Path) -> set[str]:

@@ -14,7 +14,7 @@ from PIL import Image
 import dittogym
 from dittogym.bodies.positions import particle_counts
 from dittogym.geometry import Obstacle
-from dittogym.spec import Body, TaskSpec
+from dittogym.spec import BodySpec, TaskSpec
 from torchmpm import Snow, VelocityRule
 
 DOCS = Path(__file__).resolve().parent
@@ -155,7 +155,7 @@ def numbers(spec: TaskSpec) -> list[tuple[str, str]]:
     return rows
 
 
-def matter(body: Body) -> str:
+def matter(body: BodySpec) -> str:
     """Material of an object."""
     return "soil" if isinstance(body.material, Snow) else "elastic"
 
@@ -168,8 +168,8 @@ def centre(place: tuple[float | None, float | None]) -> str:
 
 def row(obstacle: Obstacle) -> tuple[str, str, str]:
     """Name, visibility and velocity rules of an obstacle."""
-    rules = "<br>".join(dict.fromkeys(map(rule, obstacle.rules)))
-    return obstacle.name, "yes" if obstacle.drawn else "no", rules
+    rules = "<br>".join(dict.fromkeys(map(rule, obstacle.velocity_rules)))
+    return obstacle.name, "yes" if obstacle.observed_boxes else "no", rules
 
 
 def rule(rule: VelocityRule) -> str:

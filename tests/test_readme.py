@@ -1,4 +1,4 @@
-"""The examples of the README and of the docs run as they stand, and keep to the shapes that the annotations promise."""
+"""The code samples of the README and the documentation run, and pass the shape checks of the annotations."""
 
 import os
 import re
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Lets beartype check every annotation of the physics, shapes included, while what follows runs.
+#: Makes beartype check all annotations of the physics, including shapes, while the samples run.
 CHECKED = """
 from jaxtyping import install_import_hook
 with install_import_hook("torchmpm", "beartype.beartype"):
@@ -18,13 +18,13 @@ with install_import_hook("torchmpm", "beartype.beartype"):
 
 
 def examples(page: str) -> str:
-    """The Python blocks of a page, one after the other."""
+    """All Python blocks of a page, joined."""
     text = (ROOT / page).read_text()
     return "\n".join(re.findall(r"^```python\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE))
 
 
 def run(source: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run a program in a folder, and in a process of its own: the hook must be there before the first import."""
+    """Run a program in a folder, in a new process because the hook must precede the first import."""
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     return subprocess.run([sys.executable, "-c", source], cwd=folder, env=environment, capture_output=True, text=True)
 
@@ -60,7 +60,7 @@ PAGES = {
 
 
 SLOW = {"docs/own.md", "docs/concepts/planning.md", "docs/develop/adding.md"}
-"""Pages with programs that take up to a minute."""
+"""Pages whose samples take up to a minute."""
 
 
 @pytest.mark.parametrize("page", [pytest.param(p, marks=[pytest.mark.slow] * (p in SLOW)) for p in PAGES])

@@ -2,66 +2,21 @@
 
 from __future__ import annotations
 
-import gc
-import weakref
-from dataclasses import replace
-from functools import partial
-from typing import Any
-
 import torch
 from torch import Tensor
 
-# Tensors without memory and interception of operators have no public names; ``torch.utils.flop_counter`` and the
-# notes on extending torch use these. The public meta device cannot stand in: some operators behave otherwise on it.
-from torch._subclasses.fake_tensor import FakeTensorMode
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils.weak import WeakIdKeyDictionary
-
 from torchmpm import checks
 from torchmpm.native.cpu import call
-from torchmpm.rollout import SEGMENT, Segment, check_repetition, repeated
+from torchmpm.native.inputs import Inputs
+from torchmpm.rollout import SEGMENT, Segment, check_repetition
 from torchmpm.solver import Solver
 from torchmpm.state import ParticleState
-from torchmpm.substep import substep
+from torchmpm.substep import Planes, substep
 
 #: Component planes of a state.
 PLANES = 13
-
-
-class PeakMemory(TorchDispatchMode):
-    """Bytes alive among the storages that operators return while the mode is on.
-
-    Works on real tensors and on fake ones, which have sizes but no memory.
-
-    Attributes:
-        now: Bytes alive.
-        peak: The largest number so far.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._seen = WeakIdKeyDictionary()
-        self.now = self.peak = 0
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Run an operator and count what it returns."""
-        result = func(*args, **(kwargs or {}))
-        for tensor in result if isinstance(result, (tuple, list)) else (result,):
-            if isinstance(tensor, Tensor):
-                self._count(tensor.untyped_storage())
-        return result
-
-    def _count(self, storage: torch.UntypedStorage) -> None:
-        if storage in self._seen:
-            return
-        size = storage.nbytes()
-        self._seen[storage] = size
-        self.now += size
-        self.peak = max(self.peak, self.now)
-        weakref.finalize(storage, self._release, size)
-
-    def _release(self, size: int) -> None:
-        self.now -= size
+#: Largest temporary memory of an eager substep, in units of the graph that it leaves: on top of a graph, and without.
+WITH_GRAPH, WITHOUT_GRAPH = 0.4, 0.7
 
 
 def estimate_memory(
@@ -75,10 +30,10 @@ def estimate_memory(
 ) -> int:
     """Bytes that :meth:`torchmpm.Solver.step`, and a backward pass through it, will need beyond their inputs.
 
-    For the eager backend, the operators of two substeps and of their backward passes run on tensors without memory, and
-    the result is extrapolated. A compiled substep keeps less than an eager one, so there this is an upper bound. The
-    native backend reports the size of its scratch memory. The estimate is the largest number of bytes alive at once,
-    with gradients in state and actuation; what an allocator rounds up, or keeps for later, is not included.
+    For the eager backend, the graph of a substep is measured on tensors without memory, and the result is extrapolated.
+    A compiled substep keeps less than an eager one, so there this is an upper bound. The native backend reports the
+    size of its scratch memory. The estimate is the largest number of bytes alive at once, with gradients in state and
+    actuation; what an allocator rounds up, or keeps for later, is not included.
 
     Args:
         solver: The solver; its backend is the one that the step would use.
@@ -103,10 +58,10 @@ def estimate_memory(
         if state.device.type != "cpu":
             raise ValueError(f"state must be on the CPU for the memory of backend 'native', got {state.device}")
         return _native(solver, state, substeps, segment, env_steps, backward, share)
+    graph = _graph_bytes(solver, state)
     if not backward:
-        return _rehearsed(solver, state, 2, False)
-    kept, grown = _eager_parts(solver, state)
-    return _eager(state, kept, grown, substeps, segment) + (env_steps - 1) * _step_bytes(solver, state)
+        return int(WITHOUT_GRAPH * graph)
+    return _eager(state, graph, substeps, segment) + (env_steps - 1) * _step_bytes(solver, state)
 
 
 def segment_for(
@@ -139,9 +94,9 @@ def segment_for(
     if solver.runs_native(state):
         needs = {n: _native(solver, state, substeps, n, env_steps, True, share) for n in lengths}
     else:
-        kept, grown = _eager_parts(solver, state)
-        others = least - _eager(state, kept, grown, substeps, None)
-        needs = {n: others + _eager(state, kept, grown, substeps, n) for n in lengths}
+        graph = _graph_bytes(solver, state)
+        others = least - _eager(state, graph, substeps, None)
+        needs = {n: others + _eager(state, graph, substeps, n) for n in lengths}
     for length, need in needs.items():
         if need <= budget:
             return length
@@ -176,35 +131,34 @@ def _step_bytes(solver: Solver, state: ParticleState) -> int:
     return _state_bytes(state) + _field_bytes(solver, state)
 
 
-def _eager(state: ParticleState, kept: int, grown: int, substeps: int, segment: Segment) -> int:
+def _eager(state: ParticleState, graph: int, substeps: int, segment: Segment) -> int:
+    """Bytes of an eager step with its backward pass, from those that the graph of one substep takes."""
     segment = SEGMENT if segment == "auto" else segment
     if segment is None or segment >= substeps:
-        return kept + grown * substeps
-    return kept + grown * segment + _state_bytes(state) * -(-substeps // segment)
+        return int(graph * (substeps + WITH_GRAPH))
+    return int(graph * (segment + WITH_GRAPH)) + _state_bytes(state) * -(-substeps // segment)
 
 
-def _eager_parts(solver: Solver, state: ParticleState) -> tuple[int, int]:
-    """Bytes that do not depend on the number of substeps, and bytes that the graph of a further one takes."""
-    one, two = (_rehearsed(solver, state, times, True) for times in (1, 2))
-    return 2 * one - two, two - one
-
-
-def _rehearsed(solver: Solver, state: ParticleState, substeps: int, backward: bool) -> int:
-    """Peak bytes of some substeps without checkpoints, on tensors that have no memory."""
+def _graph_bytes(solver: Solver, state: ParticleState) -> int:
+    """Bytes that one further substep adds to the graph of a step."""
     batch, count, nodes = state.batch_size, state.num_particles, solver.grid.resolution
-    empty = state.x.new_empty
-    scene = solver.scene(state, empty(batch, 2, nodes, nodes).zero_())
-    assert scene.actuation is not None
-    gc.collect()  # a collection in between would let go of memory that is counted
-    with FakeTensorMode(allow_non_fake_inputs=True), torch.set_grad_enabled(backward):
-        planes = tuple(empty((batch, count), requires_grad=backward) for _ in range(PLANES))
-        field = empty(scene.actuation.shape, requires_grad=backward)
-        run = partial(substep, replace(scene, actuation=field))
-        with PeakMemory() as memory:
-            final = ParticleState.from_planes(repeated(run, planes, substeps))
-            if backward:
-                torch.autograd.backward([final.x, final.v, final.C, final.F], [final.x, final.v, final.C, final.F])
-    return memory.peak
+    stacked = torch.empty(PLANES, batch, count, dtype=state.dtype, device="meta")
+    field = torch.empty(batch, 2, nodes, nodes, dtype=state.dtype, device="meta")
+    scene = solver.scene(ParticleState.from_stack(stacked), field.requires_grad_())
+    planes: Planes = tuple(plane.requires_grad_() for plane in stacked.unbind())
+    kept: dict[int, torch.UntypedStorage] = {}
+
+    def keep(tensor: Tensor) -> Tensor:
+        storage = tensor.untyped_storage()
+        kept[id(storage)] = storage
+        return tensor
+
+    sizes = []
+    with torch.enable_grad(), torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+        for _ in range(2):
+            planes = substep(scene, planes)
+            sizes.append(sum(storage.nbytes() for storage in kept.values()))
+    return sizes[1] - sizes[0]
 
 
 def _occupied(solver: Solver, state: ParticleState | tuple[int, int, torch.dtype]) -> float:
@@ -252,10 +206,10 @@ def _scratch_bytes(solver: Solver, state: ParticleState, substeps: int, backward
     with torch.no_grad():
         values = solver.kernels.values(state.Jp)
     field, pair, planes = empty(batch, 2, nodes, nodes), empty(batch, 2), empty(PLANES, batch, count)
-    inputs = call.Inputs(planes, field, pair, pair, values, torch.empty(batch, 2, dtype=torch.int64))
+    inputs = Inputs(planes, field, pair, pair, values, torch.empty(batch, 2, dtype=torch.int64))
     outputs = {"result": planes}
     if backward:
-        outputs = dict.fromkeys(("result_bar", "planes_bar", "field_bar"), planes)
+        outputs = dict.fromkeys(("planes_bar", "field_bar"), planes)
         outputs |= dict.fromkeys(("origin_bar", "gravity_bar"), pair)
         if _differentiates_values(solver):
             outputs["values_bar"] = planes

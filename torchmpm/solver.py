@@ -10,18 +10,19 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchmpm import checks, stability
 from torchmpm.backends import BACKENDS, compiled, compiler_found, has_tangents, transforming, warn_eager
 from torchmpm.boundary import VelocityRule, faces
-from torchmpm.grid import Grid
+from torchmpm.grid import PAD, Grid
 from torchmpm.materials.base import Value
-from torchmpm.materials.body import Body
+from torchmpm.materials.body import Body, per_particle
 from torchmpm.native.cpu.library import NO_COMPILER
 from torchmpm.native.kernels import Kernels
 from torchmpm.rollout import Segment, check_repetition, repeated
 from torchmpm.state import ParticleState
-from torchmpm.substep import Planes, Scene, make_scene, substep
+from torchmpm.substep import Planes, Scene, substep
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +105,7 @@ class Solver:
 
         Args:
             bodies: Bodies of the same counts.
-            gravity: Acceleration, as in the constructor.
+            gravity: Acceleration, two numbers or a tensor of shape (2,) or (B, 2), m/s^2.
         """
         solver = object.__new__(type(self))
         for name, value in (self.__getstate__() | {"bodies": bodies, "gravity": gravity}).items():
@@ -209,7 +210,7 @@ class Solver:
 
         Args:
             state: The current state.
-            fields: What else the step depends on.
+            fields: Other tensors (B, ...) that the step depends on.
 
         Raises:
             ValueError: The backend is ``"native"``, or ``"compile"``, and cannot run this.
@@ -256,10 +257,23 @@ class Solver:
             actuation: (B, 2, G, G), Pa, or ``None``.
             origin: (B, 2), m, or ``None``.
         """
-        origin = self._check_arguments(state, actuation, origin)
+        origin, nodes = self._check_arguments(state, actuation, origin), self.grid.resolution
+        exists = pad(state.Jp.new_ones(nodes, nodes), [PAD] * 4).flatten()[None]
+        if actuation is not None:
+            actuation = pad(actuation, [PAD] * 4).flatten(2).transpose(0, 1).contiguous()
         gravity = torch.as_tensor(self.gravity, dtype=state.dtype, device=state.device)
-        masks = faces(self.rules, self.grid, origin)
-        return make_scene(self.grid, self.bodies, self.dt, gravity, self.damping, masks, actuation, origin, state.Jp)
+        return Scene(
+            grid=self.grid,
+            bodies=self.bodies,
+            dt=self.dt,
+            origin=origin,
+            mass=per_particle(self.bodies, "mass", state.Jp),
+            exists=exists,
+            gravity=(self.dt * gravity).reshape(-1, 2).T[..., None] * exists,
+            damping=self.damping,
+            faces=faces(self.rules, self.grid, origin),
+            actuation=actuation,
+        )
 
     def _check_arguments(self, state: ParticleState, actuation: Tensor | None, origin: Tensor | None) -> Tensor:
         """Check the arguments of a step; returns the origin (B, 2), m."""

@@ -26,12 +26,12 @@ def stable_dt(bodies: Sequence[Body], h: float, actuation: Value = 0.0) -> float
     Raises:
         ValueError: Shapes of a body's values do not go together, or they are not finite or have a wrong sign.
     """
-    rates = [0.0]
+    rates, pull = [0.0], torch.as_tensor(detached_column(actuation), dtype=torch.float64, device="cpu").abs()
     for k, body in enumerate(bodies):
         try:
             stiffness: Value = body.material.stiffness()
             if body.muscle:
-                stiffness = stiffness + 2.0 * torch.as_tensor(detached_column(actuation)).abs()
+                stiffness = stiffness + 2.0 * pull
             rate = stiffness * detached_column(body.volume) / detached_column(body.mass)
         except RuntimeError as error:
             raise ValueError(f"values of bodies[{k}] must have shapes that go together: {error}") from error

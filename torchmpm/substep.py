@@ -10,13 +10,12 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchmpm import transfer
 from torchmpm.boundary import Face, constrain
-from torchmpm.grid import PAD, Grid
+from torchmpm.grid import Grid
 from torchmpm.materials.base import broadcast_plane
-from torchmpm.materials.body import Body, per_particle, slices
+from torchmpm.materials.body import Body, slices
 from torchmpm.materials.linalg import Mat2, Sym2, matmul
 from torchmpm.materials.muscle import muscle_stress
 from torchmpm.spline import Stencil, stencil
@@ -73,47 +72,6 @@ class Scattered(NamedTuple):
     F: Mat2
     Jp: Tensor
     momentum: Tensor
-
-
-def make_scene(
-    grid: Grid,
-    bodies: tuple[Body, ...],
-    dt: float,
-    gravity: Tensor,
-    damping: float,
-    faces: tuple[Face, ...],
-    actuation: Tensor | None,
-    origin: Tensor,
-    like: Tensor,
-) -> Scene:
-    """Prepare what the substeps of one step share.
-
-    Args:
-        grid: The window.
-        bodies: The particles in their order.
-        dt: Duration of a substep, s.
-        gravity: (2,), (1, 2) or (B, 2) acceleration, m/s^2.
-        damping: Factor on node velocities in a substep.
-        faces: Velocity rules as masks.
-        actuation: (B, 2, G, G), Pa, or ``None``.
-        origin: (B, 2), m.
-        like: (B, N) a plane of the state.
-    """
-    exists = pad(like.new_ones(grid.resolution, grid.resolution), [PAD] * 4).flatten()[None]
-    if actuation is not None:
-        actuation = pad(actuation, [PAD] * 4).flatten(2).transpose(0, 1).contiguous()
-    return Scene(
-        grid=grid,
-        bodies=bodies,
-        dt=dt,
-        origin=origin,
-        mass=per_particle(bodies, "mass", like),
-        exists=exists,
-        gravity=(dt * gravity).reshape(-1, 2).T[..., None] * exists,
-        damping=damping,
-        faces=faces,
-        actuation=actuation,
-    )
 
 
 def substep(scene: Scene, planes: Planes) -> Planes:

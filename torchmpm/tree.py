@@ -70,7 +70,7 @@ def map(function: Callable[..., Any], tree: Tree, *others: Tree) -> Tree:
 
 
 def leaves(tree: Any) -> list[Tensor]:
-    """All tensors of a tree, in order."""
+    """All tensors (B, ...) of a tree, in order."""
     return [leaf for leaf in pytree.tree_leaves(tree) if isinstance(leaf, Tensor)]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cfp.agent.policies import ActorPolicy
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.spec import ActorSpec
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
@@ -23,7 +23,7 @@ class StateBasedPolicy(ABC):
     """A policy that acts on the state of the environment given to `attached`; the image is not looked at.
 
     Args:
-        description: What it is and where it comes from, see `cfp.weights.origin`.
+        description: What it is and where it comes from, see `cfp.weights.describe_run`.
     """
 
     sees_image = False

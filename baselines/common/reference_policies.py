@@ -16,7 +16,7 @@ from baselines.common.open_loop import OpenLoop
 from cfp.policy import Policy
 from cfp.sections import ReportConfig
 from dittogym import make_spec
-from dittogym.action import Layout, from_grid_layout
+from dittogym.action import ActionIndexing, from_grid_indexing
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ REFERENCE_POLICIES: dict[str, Callable[[ReferenceConfig], Policy]] = {
 }
 
 
-def wave(steps: int, size: int, layout: Layout) -> Tensor:
+def wave(steps: int, size: int, layout: ActionIndexing) -> Tensor:
     """The actions with which the reference figures of the tasks were recorded, (T, 2, R, R).
 
     In step t = 1, 2, ... the muscle of direction c in column x and row y of the action grid, counted to the right and
@@ -84,7 +84,7 @@ def wave(steps: int, size: int, layout: Layout) -> Tensor:
     """
     t, c, x, y = np.ogrid[1 : steps + 1, 0:2, 0:size, 0:size]
     drive = np.sin(0.3 * t + 0.7 * x + 1.1 * y + 2.0 * c)
-    return from_grid_layout(torch.from_numpy(drive.astype(np.float32)), layout)
+    return from_grid_indexing(torch.from_numpy(drive.astype(np.float32)), layout)
 
 
 class RandomActions:

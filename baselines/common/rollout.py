@@ -2,57 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 
-from dittogym import core as dynamics
-from dittogym.action import Layout, to_grid_layout
-from dittogym.core import EnvState, Model
-from dittogym.observation.smooth import soft_observation
+from dittogym import core
+from dittogym.action import ActionIndexing, to_grid_indexing
+from dittogym.core import StepResult
+from dittogym.model import EnvState, Model
 from torchmpm import trajectory, tree
 
-
-class Judgement(NamedTuple):
-    """What a control step was worth.
-
-    Attributes:
-        state: After the step, with the task's memory brought up to date.
-        reward: (B,) to differentiate.
-        true_reward: (B,) the task's own.
-        ended: (B,) bool, whether the episode ends.
-    """
-
-    state: EnvState
-    reward: Tensor
-    true_reward: Tensor
-    ended: Tensor
+#: From the task, a state and actions (B, 2, R, R) in grid indexing, such as :func:`dittogym.core.step`.
+StepFunction: TypeAlias = Callable[[Model, EnvState, Tensor], StepResult]
 
 
-#: From the task, the state after a transition and the actuation on the patch.
-Judge: TypeAlias = Callable[[Model, EnvState, Tensor], Judgement]
-
-
-def judge(model: Model, state: EnvState, field: Tensor) -> Judgement:
-    """The task's smooth reward beside its true one, see :meth:`dittogym.TorchEnv.step` with ``soft``."""
-    judged, outcome = dynamics.judge(model, state, field, dynamics.observe(model, state))
-    soft = dynamics.judge(model, state, field, soft_observation(model, state), soft=True)[1]
-    assert outcome.terminated is not None
-    return Judgement(judged, _sum(soft.terms), _sum(outcome.terms).detach(), outcome.terminated)
-
-
-def judge_true(model: Model, state: EnvState, field: Tensor) -> Judgement:
-    """The task's true reward alone, for searches without gradients."""
-    judged, outcome = dynamics.judge(model, state, field, dynamics.observe(model, state))
-    assert outcome.terminated is not None
-    total = _sum(outcome.terms)
-    return Judgement(judged, total, total, outcome.terminated)
-
-
-def _sum(terms: Mapping[str, Tensor]) -> Tensor:
-    return torch.stack(tuple(terms.values())).sum(0)
+def soft_step(model: Model, state: EnvState, action: Tensor) -> StepResult:
+    """A step with the task's smooth reward."""
+    return core.step(model, state, action, soft=True)
 
 
 class Rollout(NamedTuple):
@@ -75,9 +43,9 @@ def rollout(
     model: Model,
     start: EnvState,
     actions: Tensor,
-    judge: Judge = judge,
+    step: StepFunction = soft_step,
     *,
-    layout: Layout = "image",
+    layout: ActionIndexing = "image",
     checkpointed: bool = True,
 ) -> Rollout:
     """Drive simulations through some control steps.
@@ -86,27 +54,37 @@ def rollout(
         model: The task, such as ``TorchEnv.model``.
         start: Where the simulations start, B of them.
         actions: (T, B, 2, R, R), as :meth:`dittogym.TorchEnv.step` takes them.
-        judge: What a step is worth.
-        layout: Of the actions.
+        step: Advances the simulations; by default the reward is the smooth one.
+        layout: How the actions are indexed.
         checkpointed: Keep only the states between the steps and replay each step in the backward pass.
     """
 
-    def step(before: Judgement, action: Tensor) -> Judgement:
-        state, field = dynamics.transition(model, before.state, to_grid_layout(action, layout))
-        after, over = judge(model, state, field), before.ended
-        earned, true = (torch.where(over, 0.0, reward) for reward in (after.reward, after.true_reward))
-        return Judgement(after.state, earned, true, over | after.ended)
+    def advance(before: _Step, action: Tensor) -> _Step:
+        result = step(model, before.state, to_grid_indexing(action, layout))
+        reward, true_reward = (
+            torch.where(before.ended, 0.0, value) for value in (result.reward, result.true_reward.detach())
+        )
+        return _Step(result.state, reward, true_reward, before.ended | result.terminated)
 
-    nothing = actions.new_zeros(actions.shape[1])
-    last, steps = trajectory(
-        step,
-        Judgement(start, nothing, nothing, nothing.bool()),
+    zero = actions.new_zeros(actions.shape[1])
+    last, rewards = trajectory(
+        advance,
+        _Step(start, zero, zero, zero.bool()),
         actions,
-        observe=lambda judgement: (judgement.reward, judgement.true_reward),
+        observe=lambda after: (after.reward, after.true_reward),
         checkpointed=checkpointed,
     )
-    rewards, true_rewards = (torch.stack(values) for values in zip(*steps, strict=True))
-    return Rollout(last.state, rewards, true_rewards, last.ended)
+    smooth, true = (torch.stack(values) for values in zip(*rewards, strict=True))
+    return Rollout(last.state, smooth, true, last.ended)
+
+
+class _Step(NamedTuple):
+    """State, rewards (B,) of the last step, and whether the episode has ended, (B,)."""
+
+    state: EnvState
+    reward: Tensor
+    true_reward: Tensor
+    ended: Tensor
 
 
 def repeat(state: EnvState, copies: int) -> EnvState:

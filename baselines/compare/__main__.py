@@ -11,71 +11,79 @@ from typing import Literal
 
 import tyro
 
-from baselines.compare.evaluations import Judging
-from baselines.compare.local import Report, Resources, run_here, run_local
-from baselines.compare.plan import Job, Plan, check_there, make_jobs
+from baselines.common.reference_policies import REFERENCE_POLICIES
+from baselines.compare.evaluations import Noise, Protocol, Robustness
+from baselines.compare.executor import Executor, Resources, execute
+from baselines.compare.jobs import Job, check_folder, make_jobs
+from baselines.compare.local import InProcessExecutor, LocalExecutor
+from baselines.compare.plan import Plan
+from baselines.compare.ray import RayExecutor
 from baselines.compare.report import write_report
-from baselines.compare.results import Found, find_runs
-from baselines.compare.worker import describe
+from baselines.compare.results import RunResult, read_result
+from baselines.compare.worker import Outcome
 from baselines.registry import ALGORITHMS
-from cfp.config import Preset
+from cfp.config import Preset, RunConfig
 from cfp.errors import ConfigError
 from cfp.experiment.cli import program_name, run_command
-from cfp.experiment.process import StopSignals
+from cfp.experiment.process import Stopped, StopSignals
 from cfp.sections import Particles
+from cfp.validation import check_at_least
 
-PATIENCE, CLUSTER_PATIENCE = 30.0, 300.0
+LOCK_TIMEOUT, CLUSTER_LOCK_TIMEOUT = 30.0, 300.0
 """Seconds to wait for another process that holds a run folder; file servers take a while to give up a lost machine."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """Train what is missing, reuse what is there, go on with what was interrupted, judge all, and write a report.
+    """Train what is missing, reuse what is finished, resume what was interrupted, evaluate all, and write a report.
 
-    Ctrl-C stops all runs with a checkpoint; the same command goes on. Exit code 0: every run is finished and judged;
-    1: some are not, the report says why; 2: an option is wrong.
+    Ctrl-C stops all runs with a checkpoint; the same command resumes them. Exit code 0: every run is finished and
+    evaluated; 1: some are not, and the report says why; 2: an option is wrong.
     """
 
     tasks: tuple[str, ...] = ("shapematch",)
-    """Which tasks."""
+    """Tasks."""
     algos: tuple[str, ...] = ("zero", "cfp")
-    """Which algorithms, or variants that the plan names; zero is a resting robot, from which efficiency counts."""
+    """Algorithms, or variants that the plan names; zero is a resting robot, from which sample efficiency counts."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds of the runs; what learns nothing has one run, with the first."""
+    """Seeds of the runs; the reference policies zero, random and scripted have one run, with the first seed."""
     out: Path = Path("runs/compare")
     """Folder of the report, with the run folders in runs/."""
     plan: Path | None = None
     """JSON file with options of runs, under common, tasks and algos."""
     preset: Preset = "quick"
-    """Where the defaults of all runs come from."""
+    """Preset of all runs."""
     steps: int | None = None
-    """Environment steps of every algorithm with this option, unless the plan says otherwise."""
+    """Environment steps of every algorithm with this option, unless the plan gives it."""
     device: str = "auto"
     """cpu, cuda, or auto."""
     episodes: int = 10
     """Episodes of the final evaluation of each policy."""
     tier: Particles = "lite"
-    """Particles of the final evaluation, for all."""
+    """Particles of the final evaluation, for all policies."""
+    noise: Noise = "paper"
+    """Action noise of all policies in the final evaluation: with, without, or as in the paper, that is without in
+    SHAPE MATCH and with it in all other tasks."""
     slot_episodes: int = 100
-    """Least episodes in SLOT, of all seeds of an algorithm together, for the success rate."""
-    robustness: Literal["none", "paper", "all"] = "paper"
+    """Least number of episodes in SLOT, of all seeds of an algorithm together, for the success rate."""
+    robustness: Robustness = "paper"
     """Disturbed cases that are evaluated."""
     executor: Literal["local", "ray"] = "local"
     """Processes of this machine, or tasks of a Ray cluster."""
     workers: int = 1
-    """Local: runs at a time, each in a process; 0: all in this process."""
+    """Local: runs at a time, each in a process of its own; 0: one after the other in this process."""
     cpus_per_run: int | None = None
-    """Cores of a run; if not given, this machine's by the number of workers, or 1 on a cluster."""
+    """Cores of a run; if not given, an equal share of this machine's for each worker, or 1 on a cluster."""
     gpus_per_run: float = 0.0
-    """Ray: GPUs of a run; parts are allowed."""
+    """Ray: GPUs of a run, also a fraction of one."""
     retries: int = 2
-    """How often a run goes on again after its process or node was lost."""
+    """How many more times a run is started whose process or node was lost, over all causes together."""
     address: str | None = None
     """Ray: address of the cluster; if not given, RAY_ADDRESS, else one on this machine, new if there is none."""
     only: int | None = None
-    """Do only the run of this number, as --dry-run lists them, and write no report (array jobs)."""
+    """Carry out only the run of this number, as --dry-run lists them, and write no report (array jobs)."""
     report_only: bool = False
-    """Run nothing; write the report about what is there."""
+    """Carry out nothing; write the report about what is there."""
     dry_run: bool = False
     """Only list the runs and their states."""
 
@@ -85,110 +93,110 @@ class Command:
         Raises:
             ConfigError: Naming the option, what was given and what is allowed.
         """
-        least = {"episodes": 1, "slot_episodes": 1, "workers": 0, "gpus_per_run": 0, "retries": 0}
-        if self.cpus_per_run is not None:
-            least["cpus_per_run"] = 1
-        for name, value in least.items():
-            if getattr(self, name) < value:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed {value} or more")
+        check_at_least(1, episodes=self.episodes, slot_episodes=self.slot_episodes, cpus_per_run=self.cpus_per_run or 1)
+        check_at_least(0, workers=self.workers, gpus_per_run=self.gpus_per_run, retries=self.retries)
         if self.gpus_per_run and self.executor == "local":
-            raise ConfigError(f"gpus_per_run: got {self.gpus_per_run}, allowed with --executor ray only")
+            raise ConfigError(f"gpus_per_run must be 0 without --executor ray, got {self.gpus_per_run}")
         if self.only is not None and self.report_only:
-            raise ConfigError(f"only: got {self.only}, allowed without --report-only: a single run has no report")
+            raise ConfigError(f"only cannot be combined with --report-only, got {self.only}")
 
-    def judging(self, job: Job) -> Judging:
-        """How the policy of a run is judged."""
-        general = Judging(self.episodes, self.tier, self.robustness, job.config.environment.parity)
-        if job.config.task != "slot":
-            return general
-        for_each = -(-self.slot_episodes // (1 if job.untrained else len(self.seeds)))
-        return replace(general, episodes=max(self.episodes, for_each))
+    @property
+    def protocol(self) -> Protocol:
+        """How policies are evaluated."""
+        return Protocol(self.episodes, self.tier, self.robustness, self.noise)
+
+    def protocol_of(self, config: RunConfig) -> Protocol:
+        """How the policy of a run is evaluated: SLOT has more episodes."""
+        if config.task != "slot":
+            return self.protocol
+        runs = 1 if config.algo in REFERENCE_POLICIES else len(self.seeds)
+        return replace(self.protocol, episodes=max(self.episodes, -(-self.slot_episodes // runs)))
+
+    def make_executor(self, signals: StopSignals) -> Executor:
+        """What carries out the runs.
+
+        Raises:
+            ConfigError: Ray is not installed, or the cluster cannot be reached.
+        """
+        one_machine = self.executor == "local" and self.only is None
+        lock_timeout = LOCK_TIMEOUT if one_machine else CLUSTER_LOCK_TIMEOUT
+        resources = Resources(self.cpus_per_run, self.gpus_per_run, self.retries, lock_timeout)
+        if self.executor == "ray":
+            return RayExecutor(self.address, resources)
+        return LocalExecutor(self.workers, resources) if self.workers else InProcessExecutor(signals, resources)
 
 
 def compare(command: Command) -> int:
-    """Do what a command says; returns the exit code.
+    """Carry out a comparison; returns the exit code.
 
     Raises:
         CFPError: An option is wrong, or a run folder holds something else.
+        Stopped: A signal stopped the comparison; all runs have saved their work.
     """
     command.check()
+    plan = Plan.read(command.plan)
+    for part, names in plan.unused(command.tasks, command.algos).items():
+        print(f"plan: {part} {', '.join(names)} are not in this comparison")
     jobs = make_jobs(
-        Plan.read(command.plan),
+        plan,
         command.tasks,
         command.algos,
         command.seeds,
         command.out / "runs",
+        command.protocol_of,
         preset=command.preset,
         steps=command.steps,
         device=command.device,
     )
     for job in jobs:
-        check_there(job)
+        check_folder(job)
+    if command.only is not None and not 0 <= command.only < len(jobs):
+        raise ConfigError(f"only must be between 0 and {len(jobs) - 1}, got {command.only}")
     if command.dry_run:
         print("\n".join(f"{number:>4}  {job.name:<40} {job.state}" for number, job in enumerate(jobs)))
         return 0
-    chosen = jobs
-    if command.only is not None:
-        if not 0 <= command.only < len(jobs):
-            raise ConfigError(f"only: got {command.only}, allowed 0 to {len(jobs) - 1}")
-        chosen = [jobs[command.only]]
-    with StopSignals() as signals:
-        outcomes = {} if command.report_only else _carry_out(command, chosen, signals)
-    runs = [] if command.only is not None else _report(command, jobs)
-    if signals.number:
-        print("stopped; the same command goes on")
-        return 128 + signals.number
     if command.report_only:
-        return 0 if all(run.state == "finished" for run in runs) else 1
-    return 0 if set(outcomes.values()) == {"finished"} else 1
+        return 0 if all(run.state == "finished" for run in _report(command, jobs)) else 1
+    chosen = jobs if command.only is None else [jobs[command.only]]
+    with StopSignals() as signals:
+        outcomes = _carry_out(command, chosen, signals)
+    if command.only is None:
+        _report(command, jobs)
+    if signals.number:
+        raise Stopped(signals.number, "the same command resumes the comparison")
+    return 0 if set(outcomes) == {"finished"} else 1
 
 
-def _carry_out(command: Command, jobs: Sequence[Job], signals: StopSignals) -> dict[int, str]:
-    """Do all runs; returns how each ended."""
-    alone = command.executor == "local" and command.only is None  # else the same folder is seen by other machines
-    patience = PATIENCE if alone else CLUSTER_PATIENCE
-    works = [describe(job, command.judging(job), patience) for job in jobs]
-    resources = Resources(command.cpus_per_run, command.gpus_per_run, command.retries)
-    outcomes: dict[int, str] = {}
+def _carry_out(command: Command, jobs: Sequence[Job], signals: StopSignals) -> list[Outcome]:
+    """Carry out runs and print how each ended."""
+    outcomes: list[Outcome] = []
 
-    def told(index: int, how: str) -> None:
-        outcomes[index] = how
-        error = jobs[index].folder / "error.txt"
-        reason = f" ({error.read_text().strip()})" if how == "failed" and error.exists() else ""
-        print(f"[{len(outcomes)}/{len(jobs)}] {jobs[index].name}: {how}{reason}", flush=True)
+    def on_outcome(job: Job, outcome: Outcome) -> None:
+        outcomes.append(outcome)
+        error = job.folder / "error.txt"
+        reason = f" ({error.read_text().strip()})" if outcome == "failed" and error.exists() else ""
+        print(f"[{len(outcomes)}/{len(jobs)}] {job.name}: {outcome}{reason}", flush=True)
 
-    _execute(command, works, resources, signals, told)
+    execute(command.make_executor(signals), jobs, signals, on_outcome)
     return outcomes
 
 
-def _execute(
-    command: Command, works: list[dict[str, object]], resources: Resources, signals: StopSignals, told: Report
-) -> None:
-    if command.executor == "ray":
-        from baselines.compare.ray import run_ray
-
-        run_ray(works, command.address, resources, signals, told)
-    elif command.workers:
-        run_local(works, command.workers, resources, signals, told)
-    else:
-        run_here(works, signals, told)
-
-
-def _report(command: Command, jobs: Sequence[Job]) -> list[Found]:
-    about = (
+def _report(command: Command, jobs: Sequence[Job]) -> list[RunResult]:
+    description = (
         f"{', '.join(command.algos)} on {', '.join(command.tasks)}, preset {command.preset}, seeds "
         f"{', '.join(map(str, command.seeds))}."
     )
-    runs = find_runs(jobs, command.judging)
-    print(f"report: {write_report(command.out, runs, command.episodes, command.tier, about)}")
+    runs = [read_result(job) for job in jobs]
+    print(f"report: {write_report(command.out, runs, command.protocol, description)}")
     return runs
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line entry; returns the exit code."""
-    about = f"Algorithms: {', '.join(ALGORITHMS)}.\n\n{inspect.getdoc(Command)}"
-    started = program_name("baselines.compare", arguments)
-    return run_command(lambda: compare(tyro.cli(Command, prog=started, description=about, args=arguments)))
+    """Command line entry point; returns the exit code."""
+    names = f"Algorithms: {', '.join(ALGORITHMS)}. Reference policies: {', '.join(REFERENCE_POLICIES)}."
+    description = f"{names}\n\n{inspect.getdoc(Command)}"
+    program = program_name("baselines.compare", arguments)
+    return run_command(lambda: compare(tyro.cli(Command, prog=program, description=description, args=arguments)))
 
 
 if __name__ == "__main__":

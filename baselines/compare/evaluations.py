@@ -1,203 +1,225 @@
-"""Final evaluations of a run's policy, kept in ``judged.json`` of its folder so that none is made twice."""
+"""The final evaluation of a run's policy, recorded in its folder so that no episode is played twice."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from baselines.common.reference_policies import REFERENCE_POLICIES
-from baselines.compare.plan import judged, read_notes
+from baselines.compare import paper
 from baselines.registry import load, reference_policy
 from cfp.config import RunConfig
 from cfp.envs.disturbances import Case, make_cases
 from cfp.envs.make import choose_device, make_env
+from cfp.errors import CheckpointError
 from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
-from cfp.files import write_json
-from cfp.policy import Policy
+from cfp.files import parse_json, write_json
 from cfp.robustness import report
 from cfp.sections import Particles
-from cfp.weights import policy_file
 
-CHUNK = 10
+RECORD = "final_evaluation.json"
+BATCH = 10
 """Episodes side by side; what is kept when an evaluation is stopped, or more episodes are asked for."""
 PAPER_CASES = 3
-"""Of `make_cases`: unperturbed, action dropout, observation dropout, which the paper reports."""
+"""How many of `make_cases` the paper reports: unperturbed, action dropout, observation dropout."""
+
+Noise = Literal["paper", "with", "without"]
+Robustness = Literal["none", "paper", "all"]
+Entry = dict[str, Any]
+"""``returns`` of some episodes, and how many of them were ``successes`` (None if the task does not define success)."""
 
 
 @dataclass(frozen=True)
-class Judging:
-    """How policies are judged.
+class Protocol:
+    """How policies are evaluated; but for the episodes in SLOT the same for all policies of a comparison.
 
     Attributes:
-        episodes: For each policy, on the same layouts for all.
-        tier: Particles, see `cfp.config.EnvironmentConfig`.
-        robustness: Which disturbed cases: none, those of the paper, or all of `cfp.envs.disturbances.make_cases`.
-        parity: Of the run, which holds at full size only, see `cfp.config.EnvironmentConfig.for_evaluation`.
+        episodes: Number of episodes, on the same layouts for all policies.
+        tier: Particles, see `cfp.sections.EnvironmentConfig`.
+        robustness: Disturbed cases: none, those of the paper, or all of `cfp.envs.disturbances.make_cases`.
+        noise: Whether policies act with their action noise; ``paper``: except in the tasks in `paper.WITHOUT_NOISE`.
     """
 
     episodes: int
     tier: Particles = "lite"
-    robustness: Literal["none", "paper", "all"] = "paper"
-    parity: Literal["clean", "reference"] = "clean"
+    robustness: Robustness = "paper"
+    noise: Noise = "paper"
 
     def cases(self) -> list[Case]:
-        """Cases of the robustness table, the unperturbed one first: it is the evaluation on the common layouts."""
+        """Cases of the robustness table; the first one is unperturbed, the evaluation on the common layouts."""
         return [] if self.robustness == "none" else make_cases()[: PAPER_CASES if self.robustness == "paper" else None]
 
-    def chunks(self) -> list[tuple[int, int]]:
-        """First layout and number of layouts of each part of the evaluation."""
-        return [(first, min(CHUNK, self.episodes - first)) for first in range(0, self.episodes, CHUNK)]
+    def deterministic(self, task: str) -> bool:
+        """Whether policies act without noise in a task."""
+        return task in paper.WITHOUT_NOISE if self.noise == "paper" else self.noise == "without"
 
-    def key(self, what: str) -> str:
-        """Under which an entry is kept."""
-        mended = self.parity == "reference" and self.tier != "full"  # not what an earlier version has judged
-        return f"{what}, particles {self.tier}" + (", parity clean" if mended else "")
+    def batches(self) -> list[tuple[int, int]]:
+        """First layout and number of layouts of each batch of episodes."""
+        return [(first, min(BATCH, self.episodes - first)) for first in range(0, self.episodes, BATCH)]
 
-    def to_json(self) -> dict[str, Any]:
-        """For `from_json`."""
-        return asdict(self)
+    def key(self, task: str, layouts: str, case: Case | None = None) -> str:
+        """Key of an entry in the record; other particles or other noise make another entry."""
+        noise = "without" if self.deterministic(task) else "with"
+        return f"{f'{case.name}, ' if case else ''}{layouts}, particles {self.tier}, {noise} noise"
 
-    @classmethod
-    def from_json(cls, values: dict[str, Any]) -> Judging:
-        """Undo `to_json` after a way through JSON."""
-        tier = values["tier"]
-        return cls(**{**values, "tier": tuple(tier) if isinstance(tier, list) else tier})
+    def batch_keys(self, task: str, case: Case | None = None) -> list[str]:
+        """Keys of all batches of episodes, unperturbed or in a disturbed case."""
+        return [self.key(task, f"layouts {first} to {first + count - 1}", case) for first, count in self.batches()]
 
 
 @dataclass(frozen=True)
-class Judged:
-    """What the judging of a policy has found so far.
+class FinalEvaluation:
+    """What the evaluation of a policy has found so far.
 
     Attributes:
-        returns: One for each episode on the common layouts; fewer than asked for while judging goes on.
-        successes: How many of them were successful, None where the task does not define success.
-        own: Return on the one layout that the policy was made for, if it was.
-        cases: Mean return by case, the unperturbed one first; None where a case changes nothing for the policy or was
-            not tried on all layouts yet.
-        whole: Nothing is left to do.
+        returns: One per episode on the common layouts; fewer than asked for while the evaluation is incomplete.
+        successes: Number of successful episodes, None if the task does not define success.
+        own_layout: Return on the one layout that the policy was made for, if there is one.
+        cases: Mean return by case, the unperturbed one first; None if a case changes nothing for the policy, or has not
+            been tried on all layouts yet.
+        complete: Whether nothing is left to do.
     """
 
     returns: tuple[float, ...]
     successes: int | None
-    own: float | None
+    own_layout: float | None
     cases: dict[str, float | None]
-    whole: bool
+    complete: bool
 
 
 class Record:
-    """``judged.json`` of a run folder; what was found for another policy file counts no longer.
+    """The entries in ``final_evaluation.json`` of a run folder that belong to the policy that is there now.
 
     Args:
-        folder: Of the run.
+        config: Options of the run.
+        folder: The run folder.
 
     Raises:
-        CheckpointError: There is no policy, or the record is damaged.
+        CheckpointError: The record is damaged.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / "judged.json"
-        self.policy = hashlib.sha256(policy_file(folder).read_bytes()).hexdigest()
-        there = read_notes(self.path, entries=dict) if self.path.exists() else {}
-        self.entries: dict[str, Any] = there["entries"] if there.get("policy") == self.policy else {}
+    def __init__(self, config: RunConfig, folder: Path) -> None:
+        self.path, policy = folder / RECORD, folder / "policy.safetensors"
+        self.policy = config.algo  # of a reference policy
+        if config.algo not in REFERENCE_POLICIES and policy.exists():
+            self.policy = hashlib.sha256(policy.read_bytes()).hexdigest()
+        record = read_record(self.path, policy=str, entries=dict) if self.path.exists() else {}
+        self.entries: dict[str, Any] = record["entries"] if record.get("policy") == self.policy else {}
 
-    def once(self, key: str, make: Callable[[], Any]) -> None:
-        """Make and keep an entry that is not there."""
+    def add(self, key: str, make: Callable[[], Entry | None]) -> None:
+        """Make an entry that is missing, and write it; None where a case changes nothing for the policy."""
         if key not in self.entries:
             self.entries[key] = make()
             write_json(self.path, {"policy": self.policy, "entries": self.entries})
 
 
-def judge(config: RunConfig, folder: Path, judging: Judging, stop: Callable[[], None]) -> None:
-    """Make the evaluations that are missing.
+def read_record(path: Path, **types: type) -> dict[str, Any]:
+    """Read a JSON object that a comparison has written into a run folder.
 
     Args:
-        config: Of the run.
-        folder: Of the run.
-        judging: What is asked for.
-        stop: Called between two parts; raises to stop.
+        path: The file.
+        types: Names of values that it must hold, and their types.
+
+    Raises:
+        CheckpointError: The file cannot be read, or a value is missing or of another type.
+    """
+    try:
+        record: dict[str, Any] = parse_json(path.read_text())
+        for name, kind in types.items():
+            if not isinstance(record[name], kind):
+                raise ValueError(f"{name} must be of type {kind.__name__}, got {json.dumps(record[name])}")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(f"{path}: cannot be read ({type(error).__name__}: {error})") from error
+    return record
+
+
+def evaluation_config(config: RunConfig, tier: Particles) -> RunConfig:
+    """Options of the environment of a final evaluation: seed 0 for all runs, so that all play the same layouts.
+
+    The environment depends on ``tier`` and not on the particles of the run, so that it is the same for all runs.
+    """
+    return replace(config, seed=0, environment=config.environment.for_evaluation(tier))
+
+
+def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop: Callable[[], None]) -> None:
+    """Evaluate the policy of a run as far as that has not been done.
+
+    Args:
+        config: Options of the run.
+        folder: The run folder.
+        protocol: How to evaluate.
+        check_stop: Called between two batches of episodes; raises to stop.
 
     Raises:
         CheckpointError: There is no policy, or it is damaged.
         ConfigError: The environment refuses an option.
     """
-    record, own = Record(folder), judged(config, judging.tier)
-    policy: Policy
+    record, task, deterministic = Record(config, folder), config.task, protocol.deterministic(config.task)
     if config.algo in REFERENCE_POLICIES:
         policy = reference_policy(config)
     else:
         policy = load(folder / "policy.safetensors", choose_device(config.device))
+    config = evaluation_config(config, protocol.tier)
 
-    def part(first: int, count: int) -> dict[str, Any]:
-        return _entry(_evaluate(own, policy, evaluation_seed(own) + first, count))
+    def play(seed: int, count: int) -> Entry:
+        env = make_env(config, policy.resolution, count)
+        return _entry(evaluate("", policy, env, count, deterministic=deterministic, seed=seed))
 
-    def disturbed(first: int, count: int, case: Case) -> list[dict[str, Any]]:
-        return [_entry(result) for result in report(replace(own, seed=own.seed + first), policy, [case], count)]
+    def play_disturbed(first: int, count: int, case: Case) -> Entry | None:
+        results = report(replace(config, seed=first), policy, [case], count, deterministic=deterministic)
+        return _entry(results[0]) if results else None
 
-    for first, count in judging.chunks():
-        stop()
-        record.once(_layouts(judging, first, count), partial(part, first, count))
+    for key, (first, count) in zip(protocol.batch_keys(task), protocol.batches(), strict=True):
+        check_stop()
+        record.add(key, partial(play, evaluation_seed(config) + first, count))
     if "layout" in policy.description:
-        layout = policy.description["layout"]
-        record.once(judging.key("own layout"), lambda: _entry(_evaluate(own, policy, layout, 1)))
-    for case in judging.cases()[1:]:
-        for first, count in judging.chunks():
-            stop()
-            record.once(_layouts(judging, first, count, case), partial(disturbed, first, count, case))
+        record.add(protocol.key(task, "own layout"), partial(play, policy.description["layout"], 1))
+    for case in protocol.cases()[1:]:
+        for key, (first, count) in zip(protocol.batch_keys(task, case), protocol.batches(), strict=True):
+            check_stop()
+            record.add(key, partial(play_disturbed, first, count, case))
 
 
-def read(folder: Path, judging: Judging) -> Judged | None:
-    """What has been found so far; None without a policy or a whole part of its evaluation.
+def read_evaluation(config: RunConfig, folder: Path, protocol: Protocol) -> FinalEvaluation | None:
+    """What has been found so far; None without a whole batch of episodes.
 
     Raises:
         CheckpointError: The record is damaged.
     """
-    if not (folder / "policy.safetensors").exists():
-        return None
-    entries = Record(folder).entries
-    keys = [_layouts(judging, first, count) for first, count in judging.chunks()]
-    parts = [entries[key] for key in keys if key in entries]
+    task = config.task
+    entries, cases, batches = Record(config, folder).entries, protocol.cases(), len(protocol.batches())
+
+    def find(case: Case | None = None) -> list[Entry | None]:
+        return [entries[key] for key in protocol.batch_keys(task, case) if key in entries]
+
+    parts = [part for part in find() if part is not None]
     if not parts:
         return None
-    returns = [value for part in parts for value in part["returns"]]
-    successes = [part["successes"] for part in parts]
-    own, cases = entries.get(judging.key("own layout")), judging.cases()
-    found = {
-        case.name: [entries.get(_layouts(judging, first, count, case)) for first, count in judging.chunks()]
-        for case in cases[1:]
-    }
-    means: dict[str, float | None] = {case.name: _mean(returns) for case in cases[:1]}
-    return Judged(
-        tuple(returns),
-        None if None in successes else sum(successes),
-        None if own is None else own["returns"][0],
-        means | {name: _mean_of(results) for name, results in found.items()},
-        len(parts) == len(keys) and not any(None in results for results in found.values()),
+    returns, successes = _returns(parts), [part["successes"] for part in parts]
+    own, disturbed = entries.get(protocol.key(task, "own layout")), {case.name: find(case) for case in cases[1:]}
+    means = {name: _mean(_returns(found)) if len(found) == batches else None for name, found in disturbed.items()}
+    return FinalEvaluation(
+        returns=tuple(returns),
+        successes=None if None in successes else sum(successes),
+        own_layout=own and own["returns"][0],
+        cases={case.name: _mean(returns) for case in cases[:1]} | means,
+        complete=len(parts) == batches and all(len(found) == batches for found in disturbed.values()),
     )
 
 
-def _layouts(judging: Judging, first: int, count: int, case: Case | None = None) -> str:
-    layouts = f"layouts {first} to {first + count - 1}"
-    return judging.key(layouts if case is None else f"{case.name}, {layouts}")
-
-
-def _evaluate(config: RunConfig, policy: Policy, seed: int, count: int) -> Result:
-    env = make_env(config, policy.resolution, count)
-    return evaluate("", policy, env, count, deterministic=policy.deterministic_by_default, seed=seed)
-
-
-def _entry(result: Result) -> dict[str, Any]:
+def _entry(result: Result) -> Entry:
     successes = None if result.success is None else round(result.success * len(result.returns))
     return {"returns": list(result.returns), "successes": successes}
 
 
-def _mean_of(parts: list[list[dict[str, Any]] | None]) -> float | None:
-    """Mean return of a case; None where it changes nothing, or a part of it is missing."""
-    return _mean([value for part in parts if part for value in part[0]["returns"]]) if all(parts) else None
+def _returns(parts: list[Entry] | list[Entry | None]) -> list[float]:
+    return [value for part in parts if part is not None for value in part["returns"]]
 
 
-def _mean(values: list[float]) -> float:
-    return sum(values) / len(values)
+def _mean(values: list[float]) -> float | None:
+    return sum(values) / len(values) if values else None

@@ -1,153 +1,166 @@
-"""Where runs are carried out: processes of this machine. `baselines.compare.ray` has those of a cluster."""
+"""Executors of this machine: one run after the other in this process, or several in processes of their own."""
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 
-from baselines.compare.worker import BUSY, FINISHED, work
+from baselines.compare.executor import Executor, Resources
+from baselines.compare.jobs import Job
+from baselines.compare.worker import EXIT_CODES, Outcome, carry_out, encode
 from cfp.experiment.process import StopSignals
 from cfp.files import write_text
 
-MODULE = (sys.executable, "-m", "baselines.compare.worker")
+WORKER = (sys.executable, "-m", "baselines.compare.worker")
 POLL = 0.2
 """Seconds between two looks at a process."""
 
 
-@dataclass(frozen=True)
-class Resources:
-    """What a run gets.
-
-    Attributes:
-        cpus: Cores; None: this machine's shared out among the workers, one on a cluster.
-        gpus: GPUs, also parts of one; on a cluster only.
-        retries: How often a run is begun again whose process or machine was lost.
-    """
-
-    cpus: int | None = None
-    gpus: float = 0.0
-    retries: int = 2
-
-
-def outcome(code: int) -> str:
-    """Finished, failed, busy or stopped."""
-    return {FINISHED: "finished", BUSY: "busy"}.get(code, "failed" if 0 < code <= 128 else "stopped")
-
-
-def run_process(values: dict[str, Any], threads: int, retries: int, stopped: Callable[[], int]) -> str:
-    """Carry out work in a process of its own; its output goes to ``log.txt`` in the run folder.
-
-    The process is in a session of its own: Ctrl-C reaches this one only, which asks it to stop, once.
+class ProcessKilled(Exception):
+    """The process of a run was killed by a signal.
 
     Args:
-        values: From `baselines.compare.worker.describe`.
-        threads: Of its numerical libraries.
-        retries: How often it is begun again when something kills it.
-        stopped: How urgently the user wants to stop: 0 not, 1 with a checkpoint, 2 at once.
-
-    Returns:
-        See `outcome`.
+        number: The signal.
     """
-    folder = Path(values["folder"])
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+    def __str__(self) -> str:
+        return f"killed by {signal.Signals(self.number).name}; see log.txt"
+
+
+class InProcessExecutor(Executor):
+    """Carries out each run in this process when it is submitted.
+
+    Args:
+        signals: Whether the user wants to stop.
+        resources: What a run gets.
+    """
+
+    def __init__(self, signals: StopSignals, resources: Resources) -> None:
+        self.signals, self.lock_timeout = signals, resources.lock_timeout
+
+    def submit(self, job: Job) -> Future[Outcome]:
+        """Carry out a run, see `Executor.submit`."""
+        future: Future[Outcome] = Future()
+        stopped = self.signals.number
+        future.set_result("stopped" if stopped else carry_out(job, self.signals, self.lock_timeout, own_process=False))
+        return future
+
+    def stop(self) -> None:
+        """Runs look at the signals themselves."""
+
+    def shutdown(self, kill: bool) -> None:
+        """Nothing is in progress."""
+
+
+class LocalExecutor(Executor):
+    """Carries out runs in processes of this machine.
+
+    Args:
+        workers: Number of processes at a time.
+        resources: What a run gets.
+    """
+
+    def __init__(self, workers: int, resources: Resources) -> None:
+        self.threads = resources.cpus or max(1, (os.cpu_count() or 1) // workers)
+        self.resources = resources
+        self._pool = ThreadPoolExecutor(workers)
+        self._stop, self._kill = threading.Event(), threading.Event()
+
+    def submit(self, job: Job) -> Future[Outcome]:
+        """Queue a run, see `Executor.submit`."""
+        return self._pool.submit(self._run, job)
+
+    def stop(self) -> None:
+        """Ask the processes to stop with a checkpoint."""
+        self._stop.set()
+
+    def shutdown(self, kill: bool) -> None:
+        """Wait for the processes; ``kill`` ends them at once."""
+        if kill:
+            self._stop.set()
+            self._kill.set()
+        self._pool.shutdown()
+
+    def _run(self, job: Job) -> Outcome:
+        for attempt in range(1 + self.resources.retries):
+            if self._stop.is_set():
+                return "stopped"
+            try:
+                return run_process(job, self.threads, self.resources.lock_timeout, self._urgency)
+            except ProcessKilled as error:
+                reason = f"{error} ({attempt + 1} times)"
+        write_text(job.folder / "error.txt", reason + "\n")
+        return "failed"
+
+    def _urgency(self) -> int:
+        return self._stop.is_set() + self._kill.is_set()
+
+
+def run_process(job: Job, threads: int, lock_timeout: float, urgency: Callable[[], int] = lambda: 0) -> Outcome:
+    """Carry out a run in a process of its own, whose output is appended to ``log.txt`` in the run folder.
+
+    The process is in a session of its own: Ctrl-C reaches this process only, which then asks it to stop, once.
+
+    Args:
+        job: The run.
+        threads: Number of threads of its numerical libraries.
+        lock_timeout: Seconds to wait for another process that holds the run folder.
+        urgency: Whether to stop the process: 0 not, 1 with a checkpoint, 2 at once.
+
+    Raises:
+        ProcessKilled: A signal that was not sent from here ended the process.
+    """
+    folder = job.folder
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "error.txt").unlink(missing_ok=True)
-    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
-    environment.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    for _ in range(1 + retries):
-        with open(folder / "log.txt", "ab") as log:
-            begun = log.tell()
-            process = subprocess.Popen(
-                MODULE, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment, start_new_session=True
-            )
-        assert process.stdin is not None
-        try:
-            process.stdin.write(json.dumps(values).encode() + b"\n")
-            process.stdin.flush()
-        except BrokenPipeError:
-            pass  # it has ended already, and its exit code says how
-        code = _wait(process, stopped)
-        if code >= 0 or stopped():
-            break
-    if code < 0 and not stopped():
-        reason = f"killed by {signal.Signals(-code).name}, {1 + retries} times; see log.txt"
-        write_text(folder / "error.txt", reason + "\n")
-        return "failed"
-    if outcome(code) == "failed" and not (folder / "error.txt").exists():  # it ended before or beside the run itself
+    environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, "OMP_NUM_THREADS": str(threads)}
+    with open(folder / "log.txt", "ab") as log:
+        log_start = log.tell()
+        process = subprocess.Popen(
+            WORKER, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment, start_new_session=True
+        )
+    assert process.stdin is not None
+    try:
+        process.stdin.write(encode(job, lock_timeout))
+        process.stdin.flush()
+    except BrokenPipeError:
+        pass  # the process has ended already; its exit code says how
+    code = _wait(process, urgency)
+    if code < 0 and not urgency():
+        raise ProcessKilled(-code)
+    outcome: Outcome = "stopped" if code < 0 else {code: name for name, code in EXIT_CODES.items()}.get(code, "failed")
+    if outcome == "failed" and not (folder / "error.txt").exists():  # it failed outside of the run itself
         with open(folder / "log.txt", "rb") as log:
-            log.seek(begun)
-            last = log.read().decode(errors="replace").strip().rpartition("\n")[2]
-        write_text(folder / "error.txt", f"{last or 'no word'} (exit code {code}; see log.txt)\n")
-    return outcome(code)
+            log.seek(log_start)
+            last_line = log.read().decode(errors="replace").strip().rpartition("\n")[2]
+        write_text(folder / "error.txt", f"{last_line or 'no output'} (exit code {code}; see log.txt)\n")
+    return outcome
 
 
-def _wait(process: subprocess.Popen[bytes], stopped: Callable[[], int]) -> int:
+def _wait(process: subprocess.Popen[bytes], urgency: Callable[[], int]) -> int:
+    """Wait for a process, pass on requests to stop, and return its exit code."""
     asked = 0
     try:
         while True:
             try:
                 return process.wait(POLL)
             except subprocess.TimeoutExpired:
-                if stopped() > asked:
-                    asked = stopped()
+                if urgency() > asked:
+                    asked = urgency()
                     process.send_signal(signal.SIGTERM if asked == 1 else signal.SIGKILL)
-    except BaseException:  # this process is stopped by force, or a task of a cluster is cancelled
+    except BaseException:  # this process is ended by force, or a task of a cluster is cancelled
         process.terminate()
         process.wait()
         raise
     finally:
         assert process.stdin is not None
         process.stdin.close()
-
-
-Report = Callable[[int, str], None]
-"""Called with the index of a run and how it ended."""
-
-
-def run_here(works: Sequence[dict[str, Any]], signals: StopSignals, told: Report) -> None:
-    """Carry out all work in this process, one after the other."""
-    for index, values in enumerate(works):
-        if signals.number:
-            told(index, "stopped")
-            continue
-        code = work(values, alone=False)
-        if code >= 128:
-            signals.number = code - 128
-        told(index, outcome(code))
-
-
-def run_local(
-    works: Sequence[dict[str, Any]], workers: int, resources: Resources, signals: StopSignals, told: Report
-) -> None:
-    """Carry out all work in processes of this machine.
-
-    Args:
-        works: From `baselines.compare.worker.describe`.
-        workers: Processes at a time.
-        resources: Of a run.
-        signals: Whether the user wants to stop.
-        told: Called as each ends.
-    """
-    threads = resources.cpus or max(1, (os.cpu_count() or 1) // workers)
-    forced = False
-
-    def one(values: dict[str, Any]) -> str:
-        if signals.number:
-            return "stopped"
-        return run_process(values, threads, resources.retries, lambda: 2 if forced else int(signals.number > 0))
-
-    with ThreadPoolExecutor(workers) as pool:
-        futures = {pool.submit(one, values): index for index, values in enumerate(works)}
-        try:
-            for future in as_completed(futures):
-                told(futures[future], future.result())
-        except BaseException:
-            forced = True
-            raise

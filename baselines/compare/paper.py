@@ -6,6 +6,11 @@ the steps, three seeds, training returns. A resting robot was measured in the re
 
 from __future__ import annotations
 
+from cfp.sections import Particles
+
+TIER: Particles = "full"
+"""Particles of the paper's figures."""
+
 COLUMNS = ("cfp", "coarse", "fine", "gnn-16", "gnn-64", "transformer-16", "transformer-64")
 """Names that the paper's methods have here, in the order of `CURVES`."""
 
@@ -71,6 +76,9 @@ REST: dict[str, float] = {
     "slot": 7000,
 }
 """Return of a robot that does not move (SHAPE MATCH: 12 to 30, by the particles)."""
+
+WITHOUT_NOISE = ("shapematch",)
+"""Tasks in which the paper evaluates policies without action noise; in all others they act with it."""
 
 
 def curve(algo: str, task: str) -> tuple[float, float] | None:

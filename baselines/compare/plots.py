@@ -1,152 +1,155 @@
-"""The pictures of a comparison."""
+"""The figures of a comparison. Colours tell algorithms apart, lines and markers what they observe."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from baselines.compare.results import Group
-from baselines.compare.stats import bootstrap, common_curve, interquartile_mean, interval
+from baselines.compare.stats import align_curves, bootstrap_interval, interquartile_mean
+from baselines.compare.table import Row
 
 COLOURS = (
     "#0173b2 #de8f05 #029e73 #d55e00 #cc78bc #ca9161 #56b4e9 #949494 #8c564b #bcbd22 #17becf #7f3c8d #e377c2 #1b5e20"
 ).split()
-LINES = {"image": "-", "state": "--", "simulator": ":", "nothing": (0, (1, 4))}
-MARKS = {"image": "o", "state": "s", "simulator": "^", "nothing": "v"}
-BAND_REPEATS = 2_000
-OTHER = "-.", "D"
-"""Line and mark of policies that see something else."""
+LINES: dict[str, Any] = {"image": "-", "state": "--", "simulator": ":", "nothing": (0, (1, 4))}
+MARKERS = {"image": "o", "state": "s", "simulator": "^", "nothing": "v"}
+BAND_RESAMPLES = 2_000
 
 
-def _colours(groups: Sequence[Group]) -> dict[str, str]:
-    labels = dict.fromkeys(group.label for group in groups)
-    return {label: COLOURS[i % len(COLOURS)] for i, label in enumerate(labels)}
+@dataclass(frozen=True)
+class Style:
+    """How the results of a group are drawn."""
+
+    colour: str
+    line: Any
+    marker: str
+
+
+def _styles(groups: Iterable[Group]) -> dict[tuple[str, str], Style]:
+    """Styles by algorithm and observation."""
+    groups = list(groups)
+    labels = list(dict.fromkeys(group.label for group in groups))
+    return {
+        (group.label, group.observes): Style(
+            COLOURS[labels.index(group.label) % len(COLOURS)], LINES[group.observes], MARKERS[group.observes]
+        )
+        for group in groups
+    }
 
 
 def _panels(tasks: Sequence[str], height: float, handles: list[Line2D]) -> tuple[Figure, dict[str, Axes]]:
-    """A figure with a panel of some height, inches, for each task, and a legend below."""
+    """A figure with a panel of some height in inches for each task, and a legend below."""
     columns = min(len(tasks), 3)
-    rows, across = math.ceil(len(tasks) / columns), max(3, 2 * columns)
-    size = (max(6.5, 4.6 * columns), height * rows + 0.3 * math.ceil(len(handles) / across) + 0.2)
+    rows, legend_columns = math.ceil(len(tasks) / columns), max(3, 2 * columns)
+    size = (max(6.5, 4.6 * columns), height * rows + 0.3 * math.ceil(len(handles) / legend_columns) + 0.2)
     figure = Figure(figsize=size, dpi=130, layout="constrained")
     panels = {task: figure.add_subplot(rows, columns, index + 1) for index, task in enumerate(tasks)}
     for task, axes in panels.items():
         axes.set_title(task)
         axes.grid(alpha=0.3)
-    figure.legend(handles=handles, loc="outside lower center", ncols=across, fontsize=8, frameon=False)
+    figure.legend(handles=handles, loc="outside lower center", ncols=legend_columns, fontsize=8, frameon=False)
     return figure, panels
 
 
-def _legend(groups: Sequence[Group]) -> list[Line2D]:
-    """Who sees what."""
-    colours, who = _colours(groups), {(group.label, group.sees): group for group in groups}.values()
+def _legend(styles: dict[tuple[str, str], Style]) -> list[Line2D]:
     return [
-        Line2D([], [], color=colours[g.label], linestyle=_line(g), marker=_mark(g), label=f"{g.label} (sees {g.sees})")
-        for g in who
+        Line2D([], [], color=style.colour, linestyle=style.line, marker=style.marker, label=_name(label, observes))
+        for (label, observes), style in styles.items()
     ]
 
 
-def _line(group: Group) -> Any:
-    return LINES.get(group.sees, OTHER[0])
+def _name(label: str, observes: str) -> str:
+    return f"{label} (observes {observes})"
 
 
-def _mark(group: Group) -> str:
-    return MARKS.get(group.sees, OTHER[1])
+def _bar_names(axes: Axes, names: Sequence[str]) -> None:
+    """Name horizontal bars or marks, from top to bottom."""
+    axes.set_yticks(range(len(names)), names, fontsize=8)
+    axes.set_ylim(len(names) - 0.5, -0.5)
 
 
-def curves(groups: Sequence[Group], *, minutes: bool = False) -> Figure:
-    """Evaluations while training: interquartile mean over seeds and its 95 % bootstrap band.
+def learning_curves(groups: Sequence[Group], *, minutes: bool = False) -> Figure:
+    """Evaluations during training: interquartile mean over seeds and its 95 % bootstrap band.
 
     Args:
-        groups: All.
-        minutes: Over the time of training at each group's mean speed, in place of environment steps; a teacher's comes
-            first.
+        groups: All groups.
+        minutes: Draw them over the time of training at each group's mean speed, that of a teacher first, instead of
+            environment steps.
     """
-    colours = _colours(groups)
+    styles = _styles(groups)
     shown = [group for group in groups if group.curves and (group.speed or not minutes)]
-    figure, panels = _panels(list(dict.fromkeys(group.task for group in shown)), 3.4, _legend(groups))
+    figure, panels = _panels(list(dict.fromkeys(group.task for group in shown)), 3.4, _legend(styles))
     for group in shown:
-        axes, (steps, values) = panels[group.task], common_curve(group.curves)
-        colour = colours[group.label]
-        mean = interquartile_mean(values)
+        axes, style = panels[group.task], styles[group.label, group.observes]
+        steps, values = align_curves(group.curves)
         if minutes and group.speed:
-            steps = (group.teaching + steps / group.speed) / 60
-        axes.plot(steps, mean, _mark(group), linestyle=_line(group), color=colour, markersize=3, linewidth=1.5)
-        band = bootstrap([values], repeats=BAND_REPEATS)
-        if band is not None:
-            axes.fill_between(steps, *band, color=colour, alpha=0.15, linewidth=0)
+            steps = (group.teacher_seconds + steps / group.speed) / 60
+        line = {"color": style.colour, "linestyle": style.line, "marker": style.marker}
+        axes.plot(steps, interquartile_mean(values), **line, markersize=3, linewidth=1.5)
+        if len(steps) and (band := bootstrap_interval([values], BAND_RESAMPLES)) is not None:
+            axes.fill_between(steps, *band, color=style.colour, alpha=0.15, linewidth=0)
     for axes in panels.values():
         axes.set(xlabel="minutes of training" if minutes else "environment steps", ylabel="return of an evaluation")
     return figure
 
 
-def returns(groups: Sequence[Group]) -> Figure:
-    """Final evaluation: each seed a pale mark, interquartile mean and interval; grouped by what is seen."""
-    colours = _colours(groups)
+def final_returns(groups: Sequence[Group]) -> Figure:
+    """Final evaluation: a pale mark for each seed, interquartile mean and interval; a line between observations."""
+    styles = _styles(groups)
     members: dict[str, list[Group]] = {}
     for group in groups:
         if group.scores:
             members.setdefault(group.task, []).append(group)
-    figure, panels = _panels(list(members), 1.2 + 0.3 * max(map(len, members.values())), _legend(groups))
+    figure, panels = _panels(list(members), 1.2 + 0.3 * max(map(len, members.values())), _legend(styles))
     for task, axes in panels.items():
         shown = members[task]
         for place, group in enumerate(shown):
-            _score(axes, group, place, colours[group.label])
-            if place and group.sees != shown[place - 1].sees:
+            style, (low, high) = styles[group.label, group.observes], group.interval
+            axes.plot(group.scores, [place] * len(group.scores), style.marker, color=style.colour, alpha=0.35)
+            if low is not None and high is not None:
+                axes.plot([low, high], [place, place], color=style.colour, linewidth=2.5)
+            mean = float(interquartile_mean(group.scores))
+            axes.plot(mean, place, style.marker, color=style.colour, markersize=8, markeredgecolor="black")
+            if place and group.observes != shown[place - 1].observes:
                 axes.axhline(place - 0.5, color="black", linewidth=1)
-        axes.set_yticks(range(len(shown)), [f"{group.label} ({group.sees})" for group in shown], fontsize=8)
-        axes.set_ylim(len(shown) - 0.5, -0.5)
+        _bar_names(axes, [f"{group.label} ({group.observes})" for group in shown])
         axes.set_xlabel("return")
     return figure
 
 
-def _score(axes: Axes, group: Group, place: int, colour: str) -> None:
-    scores, ends = group.scores, interval([group.scores])
-    axes.plot(scores, [place] * len(scores), _mark(group), color=colour, alpha=0.35)
-    if ends is not None:
-        axes.plot(ends, [place, place], color=colour, linewidth=2.5)
-    mean = float(interquartile_mean(np.array(scores)))
-    axes.plot(mean, place, _mark(group), color=colour, markersize=8, markeredgecolor="black")
-
-
-def robustness(groups: Sequence[Group], rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Ratio under each disturbance, a bar for each algorithm with the range of its seeds; the paper's as a line.
+def robustness_ratios(groups: Sequence[Group], rows: Sequence[Row]) -> Figure:
+    """Ratio in each disturbed case: a bar for each algorithm with the range of its seeds; the paper's as a line.
 
     Args:
-        groups: All, for their colours.
-        rows: Of the robustness table.
+        groups: All groups, for their colours.
+        rows: Rows of the robustness table.
     """
-    colours, rows = _colours(groups), [row for row in rows if row["ratio"] is not None]
-    who = list(dict.fromkeys(row["algo"] for row in rows))
-    cases = {task: list(dict.fromkeys(row["case"] for row in rows if row["task"] == task)) for task in _tasks(rows)}
-    sights = {row["algo"]: row["sees"] for row in rows}
-    handles = [Line2D([], [], color=colours[algo], linewidth=6, label=f"{algo} (sees {sights[algo]})") for algo in who]
-    handles.append(Line2D([], [], color="black", linewidth=2.5, label="the paper's CFP"))
-    most = max(map(len, cases.values()))
-    figure, panels = _panels(list(cases), 1.0 + most * max(0.4, 0.16 * len(who)), handles)
-    thick = 0.8 / len(who)
+    styles, rows = _styles(groups), [row for row in rows if row["ratio"] is not None]
+    names = list(dict.fromkeys((row["algo"], row["sees"]) for row in rows))
+    cases: dict[str, list[str]] = {}
     for row in rows:
-        axes = panels[row["task"]]
-        place = cases[row["task"]].index(row["case"]) + (who.index(row["algo"]) - (len(who) - 1) / 2) * thick
-        reach = [[row["ratio"] - row["low"]], [row["high"] - row["ratio"]]]
-        axes.barh(place, row["ratio"], thick, xerr=reach, color=colours[row["algo"]], error_kw={"linewidth": 1})
+        if row["case"] not in cases.setdefault(row["task"], []):
+            cases[row["task"]].append(row["case"])
+    handles = [Line2D([], [], color=styles[name].colour, linewidth=6, label=_name(*name)) for name in names]
+    handles.append(Line2D([], [], color="black", linewidth=2.5, label="the paper's CFP"))
+    figure, panels = _panels(list(cases), 1.0 + max(map(len, cases.values())) * max(0.4, 0.16 * len(names)), handles)
+    height = 0.8 / len(names)
+    for row in rows:
+        axes, name = panels[row["task"]], (row["algo"], row["sees"])
+        place = cases[row["task"]].index(row["case"]) + (names.index(name) - (len(names) - 1) / 2) * height
+        seeds = [[row["ratio"] - row["low"]], [row["high"] - row["ratio"]]]
+        axes.barh(place, row["ratio"], height, xerr=seeds, color=styles[name].colour, error_kw={"linewidth": 1})
         if row["paper"] is not None:
-            axes.plot([row["paper"]] * 2, [place - thick / 2, place + thick / 2], color="black", linewidth=2.5)
+            axes.plot([row["paper"]] * 2, [place - height / 2, place + height / 2], color="black", linewidth=2.5)
     for task, axes in panels.items():
         axes.axvline(1, color="black", linewidth=1, linestyle="--")
-        axes.set_yticks(
-            range(len(cases[task])), [case.replace(" dropout", "\ndropout") for case in cases[task]], fontsize=8
-        )
-        axes.set_ylim(len(cases[task]) - 0.5, -0.5)
+        _bar_names(axes, [case.replace(" dropout", "\ndropout") for case in cases[task]])
         axes.set_xlabel("ratio to the unperturbed return")
     return figure
-
-
-def _tasks(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    return list(dict.fromkeys(row["task"] for row in rows))

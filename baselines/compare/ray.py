@@ -1,78 +1,89 @@
-"""Runs of a comparison as tasks of a Ray cluster; Ray is imported only when this is asked for."""
+"""Executor of a Ray cluster; Ray is imported only when this executor is made."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from concurrent.futures import Future
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from baselines.compare.local import Report, Resources, run_process
+from baselines.compare.executor import Executor, Resources
+from baselines.compare.jobs import Job
+from baselines.compare.local import ProcessKilled, run_process
+from baselines.compare.worker import Outcome
 from cfp.errors import ConfigError
-from cfp.experiment.process import StopSignals
 from cfp.files import write_text
 
 
-def run_ray(
-    works: Sequence[dict[str, Any]], address: str | None, resources: Resources, signals: StopSignals, told: Report
-) -> None:
-    """Carry out all work as tasks of a Ray cluster.
+class RayExecutor(Executor):
+    """Carries out runs as tasks of a Ray cluster.
 
-    The run folders must be on a file system that all nodes share, and all nodes must have this package. What a lost
-    node was doing goes on from its last checkpoint on another one; its folder's lock keeps two from doing it at once.
+    The run folders must be on a file system that all nodes share, and all nodes must have this package. A run whose
+    node is lost continues on another one from its last checkpoint; the lock on its folder keeps two nodes from working
+    on it at once. Ray counts lost nodes and killed processes together, so that ``retries`` bounds their sum.
 
     Args:
-        works: From `baselines.compare.worker.describe`.
-        address: Of the cluster; None: what ``RAY_ADDRESS`` says, else the one last started on this machine, else a new
-            one.
-        resources: Of a run.
-        signals: Whether the user wants to stop.
-        told: Called as each ends.
+        address: Address of the cluster; None: what ``RAY_ADDRESS`` names, else the cluster last started on this
+            machine, else a new one.
+        resources: What a run gets.
 
     Raises:
         ConfigError: Ray is not installed, or the cluster cannot be reached.
     """
-    try:
-        import ray
-    except ImportError as error:
-        raise ConfigError(
-            "executor: got 'ray', which is not installed; pip install 'torchmpm[ray]', or --executor local"
-        ) from error
-    owned = not ray.is_initialized()
-    if owned:
+
+    def __init__(self, address: str | None, resources: Resources) -> None:
         try:
-            ray.init(address=address, log_to_driver=False, configure_logging=False)
-        except ConnectionError as error:
-            raise ConfigError(f"address: got {address!r}, where no Ray cluster answers ({error})") from error
-    cpus = resources.cpus or 1
-    task = ray.remote(_ray_task).options(
-        num_cpus=cpus, num_gpus=resources.gpus, max_retries=resources.retries, scheduling_strategy="SPREAD"
-    )
-    try:
-        waiting = {task.remote(values, cpus, resources.retries): index for index, values in enumerate(works)}
-        asked = False
-        while waiting:
-            done, _ = ray.wait(list(waiting), timeout=1.0)
-            if signals.number and not asked:
-                asked = True
-                for reference in waiting:
-                    ray.cancel(reference)
-            for reference in done:
-                index = waiting.pop(reference)
-                told(index, _result(ray, reference, Path(works[index]["folder"])))
-    finally:
-        if owned:
-            ray.shutdown()
+            import ray
+        except ImportError as error:
+            raise ConfigError(
+                "executor ray requires Ray, which is not installed: pip install 'torchmpm[ray]'"
+            ) from error
+        self._ray: Any = ray
+        self._owned = not ray.is_initialized()
+        if self._owned:
+            try:
+                ray.init(address=address, log_to_driver=False, configure_logging=False)
+            except ConnectionError as error:
+                raise ConfigError(f"address: no Ray cluster answers at {address!r} ({error})") from error
+        self._threads, self._lock_timeout = resources.cpus or 1, resources.lock_timeout
+        self._task = ray.remote(run_process).options(
+            num_cpus=self._threads,
+            num_gpus=resources.gpus,
+            max_retries=resources.retries,
+            retry_exceptions=[ProcessKilled],
+            scheduling_strategy="SPREAD",
+        )
+        self._references: list[Any] = []
 
+    def submit(self, job: Job) -> Future[Outcome]:
+        """Queue a run, see `Executor.submit`."""
+        reference, future = self._task.remote(job, self._threads, self._lock_timeout), Future[Outcome]()
+        self._references.append(reference)
+        reference.future().add_done_callback(partial(self._finish, future, job.folder))
+        return future
 
-def _ray_task(values: dict[str, Any], threads: int, retries: int) -> str:
-    return run_process(values, threads, retries, lambda: 0)
+    def stop(self) -> None:
+        """Cancel the tasks, which asks their runs to stop with a checkpoint."""
+        for reference in self._references:
+            self._ray.cancel(reference)
 
+    def shutdown(self, kill: bool) -> None:
+        """Disconnect from the cluster, which ends all tasks of this process."""
+        if self._owned:
+            self._ray.shutdown()
 
-def _result(ray: Any, reference: Any, folder: Path) -> str:
-    try:
-        return str(ray.get(reference))
-    except ray.exceptions.TaskCancelledError:
-        return "stopped"
-    except ray.exceptions.RayError as error:
-        write_text(folder / "error.txt", f"{type(error).__name__}: {' '.join(str(error).split())}\n")
-        return "failed"
+    def _finish(self, future: Future[Outcome], folder: Path, done: Future[Outcome]) -> None:
+        """Pass on the result of a task; an exception that a callback raised would be lost."""
+        try:
+            future.set_result(self._outcome(folder, done))
+        except BaseException as error:
+            future.set_exception(error)
+
+    def _outcome(self, folder: Path, done: Future[Outcome]) -> Outcome:
+        error = done.exception()
+        if isinstance(error, self._ray.exceptions.TaskCancelledError):
+            return "stopped"
+        if isinstance(error, ProcessKilled | self._ray.exceptions.RayError):
+            write_text(folder / "error.txt", f"{type(error).__name__}: {' '.join(str(error).split())}\n")
+            return "failed"
+        return done.result()

@@ -1,149 +1,157 @@
-"""The report of a comparison: tables as CSV, all of them in one Markdown file and one page, and pictures."""
+"""The report of a comparison: tables as CSV files, all of them in one Markdown file and one page, and figures."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from baselines.compare import plots as pictures
-from baselines.compare import tables
-from baselines.compare.results import Found, Group, group
+from baselines.compare import paper, plots, tables
+from baselines.compare.evaluations import Protocol
+from baselines.compare.results import Group, RunResult, group_results
 from baselines.compare.table import Table
 from cfp.evaluation.page import STYLE
 from cfp.evaluation.plots import write_figure
 from cfp.files import write_text
 from cfp.sections import Particles
 
-MORE_STYLE = """
+TABLE_STYLE = """
 body { max-width: 76rem; } .wide { overflow-x: auto; } table { font-size: 14px; } th { vertical-align: bottom; }
 th.text, td.text { text-align: left; } td { font-variant-numeric: tabular-nums; white-space: nowrap; }
 """
-PAPER: Particles = "full"
-"""Particles of the paper's figures."""
-Picture = tuple[str, str, str]
-"""File, title, words."""
 
 
-def write_report(folder: Path, runs: Sequence[Found], episodes: int, tier: Particles, about: str) -> Path:
-    """Write all files of the report; those of an earlier one are replaced.
+@dataclass(frozen=True)
+class Picture:
+    """A figure of the report, with the name of its file, a title, and a caption that explains it."""
+
+    file: str
+    title: str
+    caption: str
+    figure: Figure
+
+
+def write_report(folder: Path, runs: Sequence[RunResult], protocol: Protocol, description: str) -> Path:
+    """Write all files of the report, over those of an earlier one.
 
     Args:
         folder: Where they go: ``index.html``, ``report.md``, ``*.csv``, ``*.png``.
-        runs: Of the comparison.
-        episodes: Of a final evaluation, for the words.
-        tier: Particles of the final evaluations.
-        about: What was compared, for the head of the page.
+        runs: The runs of the comparison.
+        protocol: How policies were evaluated.
+        description: What was compared, for the head of the report.
 
     Returns:
         The path of the page.
     """
-    groups = group(runs)
-    whole = make_tables(runs, groups, episodes, tier)
-    for table in whole:
+    groups = group_results(runs)
+    complete = make_tables(runs, groups, protocol)
+    for table in complete:
         write_text(folder / f"{table.name}.csv", table.to_csv())
-    shown = {table.name: table for table in whole}
-    shown["runs"] = tables.unfinished(shown["runs"])
-    sketches = _draw(folder, groups, shown["robustness"])
-    about = f"{about} {_size(tier)} {_sights(groups)}"
-    write_text(folder / "report.md", _markdown(shown, sketches, about))
-    write_text(folder / "index.html", _page(shown, sketches, about))
+    shown = {table.name: table for table in complete if table.rows}
+    runs_table = complete[0]
+    unfinished = tables.unfinished(runs_table.rows)
+    shown["runs"] = Table("runs", runs_table.title, runs_table.description, runs_table.columns, unfinished)
+    pictures = _make_pictures(groups, shown.get("robustness"))
+    for picture in pictures.values():
+        write_figure(folder / picture.file, picture.figure)
+    head = f"{description} {_describe_protocol(protocol)} {_describe_observations(groups)}"
+    write_text(folder / "report.md", _markdown(shown, pictures, head))
+    write_text(folder / "index.html", _page(shown, pictures, head, [table.name for table in complete]))
     return folder / "index.html"
 
 
-def make_tables(runs: Sequence[Found], groups: Sequence[Group], episodes: int, tier: Particles) -> list[Table]:
+def make_tables(runs: Sequence[RunResult], groups: Sequence[Group], protocol: Protocol) -> list[Table]:
     """All tables, in the order of the report; those with the paper's returns have rows at its size only."""
-    alike = groups if tier == PAPER else []
+    comparable = groups if protocol.tier == paper.TIER else []
     return [
         tables.runs_table(runs),
-        tables.returns_table(groups, episodes),
-        tables.aggregate_table(alike),
-        tables.efficiency_table(groups, tier),
+        tables.returns_table(groups, protocol.episodes),
+        tables.aggregate_table(comparable),
+        tables.efficiency_table(groups, protocol.tier),
         tables.cost_table(groups),
         tables.success_table(groups),
         tables.robustness_table(groups),
-        tables.paper_table(alike),
+        tables.paper_table(comparable),
     ]
 
 
-def _size(tier: Particles) -> str:
-    """What was judged with how many particles, in words."""
-    words = f"Final evaluations with {tier} particles."
-    if tier != PAPER:
-        words += (
-            " None of them is set beside the paper's returns or scaled by them: those are of full size, and returns of "
-            "other sizes differ (--tier full judges the same policies there)."
+def _describe_protocol(protocol: Protocol) -> str:
+    rule = f"action noise as in the paper: none in {', '.join(paper.WITHOUT_NOISE)}, in all other tasks with it"
+    noise = {"paper": rule, "with": "action noise", "without": "no action noise"}[protocol.noise]
+    text = f"Final evaluations with {protocol.tier} particles and {noise}."
+    if protocol.tier != paper.TIER:
+        text += (
+            " They are not compared with the paper's returns, which are of full size: returns of other sizes differ "
+            "(--tier full evaluates the same policies there)."
         )
-    return words
+    return text
 
 
-def _sights(groups: Sequence[Group]) -> str:
-    """Who sees what, in words."""
-    sights = list(dict.fromkeys(each.sees for each in groups))
-    seen = [f"{sees}: {', '.join(dict.fromkeys(g.label for g in groups if g.sees == sees))}" for sees in sights]
-    return f"What policies see – {'; '.join(seen)}."
+def _describe_observations(groups: Sequence[Group]) -> str:
+    labels: dict[str, list[str]] = {}
+    for group in groups:
+        labels.setdefault(group.observes, []).append(group.label)
+    parts = (f"{observes}: {', '.join(dict.fromkeys(names))}" for observes, names in labels.items())
+    return f"What policies observe – {'; '.join(parts)}."
 
 
-def _draw(folder: Path, groups: Sequence[Group], robustness: Table) -> dict[str, Picture]:
-    """Write the pictures that there is something to show in; by the table that each stands above."""
-    made: dict[str, tuple[Figure, Picture]] = {}
-    if any(each.scores for each in groups):
-        words = "Interquartile mean over seeds with its 95 % bootstrap interval; pale marks are single seeds."
-        made["returns"] = pictures.returns(groups), ("returns.png", "Returns", words)
-    if any(each.curves for each in groups):
-        made["efficiency"] = pictures.curves(groups), ("curves.png", "Learning curves", _curve_words(groups))
-    if any(each.curves and each.speed for each in groups):
-        words = "The same over the time of training, without that of evaluations, at the mean speed over seeds."
-        made["cost"] = pictures.curves(groups, minutes=True), ("minutes.png", "Learning curves over time", words)
-    if any(row["ratio"] is not None for row in robustness.rows):
-        words = "Mean over seeds and their range; black: the paper's CFP."
-        made["robustness"] = pictures.robustness(groups, robustness.rows), ("robustness.png", "Robustness", words)
-    for figure, (name, _, _) in made.values():
-        write_figure(folder / name, figure)
-    return {key: picture for key, (_, picture) in made.items()}
+def _make_pictures(groups: Sequence[Group], robustness: Table | None) -> dict[str, Picture]:
+    """Figures that have something to show, by the table that each stands above."""
+    pictures: dict[str, Picture] = {}
+    if any(group.scores for group in groups):
+        caption = "Interquartile mean over seeds with its 95 % bootstrap interval; pale marks are single seeds."
+        pictures["returns"] = Picture("returns.png", "Returns", caption, plots.final_returns(groups))
+    if any(group.curves for group in groups):
+        figure = plots.learning_curves(groups)
+        pictures["efficiency"] = Picture("curves.png", "Learning curves", _curve_caption(groups), figure)
+    if any(group.curves and group.speed for group in groups):
+        caption = "The same over the time of training, without that of evaluations, at the mean speed over seeds."
+        figure = plots.learning_curves(groups, minutes=True)
+        pictures["cost"] = Picture("minutes.png", "Learning curves over time", caption, figure)
+    if robustness is not None and any(row["ratio"] is not None for row in robustness.rows):
+        caption = "Mean over seeds and their range; black: the paper's CFP."
+        figure = plots.robustness_ratios(groups, robustness.rows)
+        pictures["robustness"] = Picture("robustness.png", "Robustness", caption, figure)
+    return pictures
 
 
-def _curve_words(groups: Sequence[Group]) -> str:
-    """What the curves show; that evaluations were made with different particles, if so."""
-    words = (
-        "The runs' own evaluations while they trained: interquartile mean over seeds and its 95 % bootstrap band, on "
-        "steps where all seeds have values. The line says what is seen."
+def _curve_caption(groups: Sequence[Group]) -> str:
+    text = (
+        "The runs' own evaluations during training: interquartile mean over seeds and its 95 % bootstrap band, on "
+        "steps where all seeds have values. The style of a line tells what is observed."
     )
-    particles = {each.label: each.particles for each in groups}
+    particles: dict[str, Particles] = {group.label: group.particles for group in groups}
     if len(set(particles.values())) > 1:
         listed = ", ".join(f"{label} {value}" for label, value in particles.items())
-        words += f" Not the same particles for all: {listed}."
-    own = sorted({each.label for each in groups if each.runs[0].job.config.evaluation(0)[1] == 1})
-    if own:
-        words += f" On the one layout they are made for: {', '.join(own)}."
-    return words
+        text += f" The numbers of particles differ: {listed}."
+    if own := sorted({group.label for group in groups if group.job.config.evaluation(0)[1] == 1}):
+        text += f" On the one layout they are made for: {', '.join(own)}."
+    return text
 
 
-def _markdown(shown: dict[str, Table], sketches: dict[str, Picture], about: str) -> str:
-    parts = ["# Comparison", about]
+def _markdown(shown: dict[str, Table], pictures: dict[str, Picture], head: str) -> str:
+    parts = ["# Comparison", head]
     for name, table in shown.items():
-        if name in sketches:
-            file, title, words = sketches[name]
-            parts.append(f"![{title}]({file})\n\n{words}")
-        if table.rows or name == "runs":
-            parts.append(table.to_markdown().rstrip())
+        if picture := pictures.get(name):
+            parts.append(f"![{picture.title}]({picture.file})\n\n{picture.caption}")
+        parts.append(table.to_markdown().rstrip())
     return "\n\n".join(parts) + "\n"
 
 
-def _page(shown: dict[str, Table], sketches: dict[str, Picture], about: str) -> str:
+def _page(shown: dict[str, Table], pictures: dict[str, Picture], head: str, files: Sequence[str]) -> str:
     parts = [
         "<!doctype html>",
         '<html lang="en"><head><meta charset="utf-8"><title>Comparison</title>',
-        f"<style>{STYLE}{MORE_STYLE}</style></head><body><h1>Comparison</h1><p>{escape(about)}</p>",
+        f"<style>{STYLE}{TABLE_STYLE}</style></head><body><h1>Comparison</h1><p>{escape(head)}</p>",
     ]
     for name, table in shown.items():
-        if name in sketches:
-            file, title, words = sketches[name]
-            parts.append(f'<figure><img src="{file}" alt="{title}"><figcaption>{escape(words)}</figcaption></figure>')
-        if table.rows or name == "runs":
-            parts.append(table.to_html())
-    files = ", ".join(f'<a href="{name}.csv">{name}.csv</a>' for name in shown)
-    parts.append(f"<h2>Files</h2><p>The tables with all columns: {files}.</p></body></html>")
+        if picture := pictures.get(name):
+            image = f'<img src="{picture.file}" alt="{picture.title}">'
+            parts.append(f"<figure>{image}<figcaption>{escape(picture.caption)}</figcaption></figure>")
+        parts.append(table.to_html())
+    links = ", ".join(f'<a href="{name}.csv">{name}.csv</a>' for name in files)
+    parts.append(f"<h2>Files</h2><p>The tables with all columns: {links}.</p></body></html>")
     return "\n".join(parts) + "\n"

@@ -1,59 +1,56 @@
-"""What the run folders of a comparison say, read for the report."""
+"""The contents of the run folders of a comparison, read for the report."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from baselines.compare.evaluations import Judged, Judging, read
-from baselines.compare.plan import Job, read_sessions
+from baselines.compare.evaluations import FinalEvaluation, read_evaluation, read_record
+from baselines.compare.jobs import Job, read_sessions
+from baselines.compare.stats import Curve, interquartile_mean, score_interval
+from cfp.errors import CheckpointError
 from cfp.sections import Particles
 from cfp.tables import read_table
 
-Curve = tuple[np.ndarray, np.ndarray]
-"""Steps (N,) and values (N,)."""
+OBSERVATIONS = ("image", "state", "simulator", "nothing")
+"""What policies observe, in the order of tables."""
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What training took, of the sessions that ended in order.
+    """What training took, over the sessions that ended in order.
 
     Attributes:
-        reached: Environment steps of the run after the last of them.
+        last_step: Environment steps of the run at the end of the last session.
         steps: Environment steps in these sessions.
-        seconds: Wall time of them, without evaluations and without the training of a teacher.
-        judging: Seconds of evaluations between them, the teacher's included.
-        teaching: Seconds of the training of a teacher that came first, 0 for none.
-        taught: Environment steps of that.
+        seconds: Wall time, without evaluations and without the training of a teacher.
+        evaluation_seconds: Wall time of the evaluations in between, those of a teacher included.
+        teacher_seconds: Wall time of the training of a teacher that came first, 0 for none.
+        teacher_steps: Environment steps of that training.
         memory: Most bytes that a process held, None if not measured.
         device: Where it ran.
     """
 
-    reached: int
+    last_step: int
     steps: int
     seconds: float
-    judging: float
-    teaching: float
-    taught: int
+    evaluation_seconds: float
+    teacher_seconds: float
+    teacher_steps: int
     memory: int | None
     device: str
 
 
 @dataclass(frozen=True)
-class Found:
+class RunResult:
     """A run of the comparison with all that is known of it.
 
-    Attributes:
-        job: The run.
-        state: See `Job.state`; unjudged if it is finished but its final evaluation is not whole.
-        error: Why it failed.
-        curve: Evaluations while it trained.
-        cost: None if no session has ended in order.
-        judged: None if it has not been.
+    ``state`` is that of `Job.state`, or ``unevaluated`` if training has ended but the final evaluation is not complete;
+    ``error`` tells why it failed; ``curve`` holds the mean returns of the evaluations during training.
     """
 
     job: Job
@@ -61,138 +58,136 @@ class Found:
     error: str
     curve: Curve
     cost: Cost | None
-    judged: Judged | None
+    evaluation: FinalEvaluation | None
 
     @property
     def score(self) -> float | None:
-        """Mean return over the common layouts."""
-        return None if self.judged is None else float(np.mean(self.judged.returns))
+        """Mean return on the common layouts."""
+        return None if self.evaluation is None else float(np.mean(self.evaluation.returns))
 
 
 @dataclass(frozen=True)
 class Group:
-    """The runs of one algorithm on one task, one for each seed.
-
-    Attributes:
-        task: Name.
-        sees: What its policies look at.
-        label: Of the algorithm.
-        runs: All of them, finished or not.
-    """
+    """The runs of one algorithm on one task, one per seed, finished or not."""
 
     task: str
-    sees: str
+    observes: str
     label: str
-    runs: tuple[Found, ...]
+    runs: tuple[RunResult, ...]
+
+    @property
+    def job(self) -> Job:
+        """The first run, for what all of them have in common."""
+        return self.runs[0].job
+
+    @property
+    def evaluations(self) -> list[FinalEvaluation]:
+        """Final evaluations of the runs that have one."""
+        return [run.evaluation for run in self.runs if run.evaluation is not None]
+
+    @property
+    def own_layouts(self) -> list[float]:
+        """Returns on the only layout that policies were made for."""
+        return [each.own_layout for each in self.evaluations if each.own_layout is not None]
 
     @property
     def scores(self) -> list[float]:
-        """Mean returns of the runs that were judged."""
+        """Mean returns of the runs that have been evaluated."""
         return [run.score for run in self.runs if run.score is not None]
 
     @property
-    def algo(self) -> str:
-        """Which algorithm the label stands for."""
-        return self.runs[0].job.config.algo
+    def iqm(self) -> float | None:
+        """Interquartile mean of the scores."""
+        return float(interquartile_mean(self.scores)) if self.scores else None
 
     @property
-    def untrained(self) -> bool:
-        """Whether nothing is learned."""
-        return self.runs[0].job.untrained
+    def interval(self) -> tuple[float, float] | tuple[None, None]:
+        """95 % interval of the interquartile mean; None twice for fewer than two runs."""
+        return score_interval([self.scores])
 
     @property
     def particles(self) -> Particles:
-        """Of the evaluations while it trains."""
-        return self.runs[0].job.config.environment.particles
+        """Particles of the evaluations during training."""
+        return self.job.config.environment.particles
 
     @property
     def costs(self) -> list[Cost]:
-        """Of the runs of which a session has ended in order."""
+        """Costs of the runs of which a session has ended in order."""
         return [run.cost for run in self.runs if run.cost is not None]
 
     @property
     def speed(self) -> float | None:
-        """Environment steps per second of all these sessions together, without evaluations; None without any."""
+        """Environment steps per second of training, over all sessions; None without any."""
         costs = self.costs
         return sum(cost.steps for cost in costs) / sum(cost.seconds for cost in costs) if costs else None
 
     @property
-    def teaching(self) -> float:
-        """Mean seconds of the training of the runs' teachers."""
-        return float(np.mean([cost.teaching for cost in self.costs])) if self.costs else 0.0
+    def teacher_seconds(self) -> float:
+        """Mean wall time of the training of the runs' teachers."""
+        return float(np.mean([cost.teacher_seconds for cost in self.costs])) if self.costs else 0.0
+
+    @property
+    def evaluation_seconds(self) -> float:
+        """Mean wall time of the evaluations during training."""
+        return sum(cost.evaluation_seconds for cost in self.costs) / len(self.costs)
 
     @property
     def curves(self) -> list[Curve]:
-        """Of the runs that have one."""
+        """Curves of the runs that have one."""
         return [run.curve for run in self.runs if len(run.curve[0])]
 
 
-def find_runs(jobs: Iterable[Job], judging: Callable[[Job], Judging]) -> list[Found]:
-    """Read all run folders.
+def read_result(job: Job) -> RunResult:
+    """Read the folder of a run.
 
-    Args:
-        jobs: The comparison.
-        judging: How the policy of a run is judged.
+    Raises:
+        CheckpointError: A file in it is damaged.
     """
-    return [_find(job, judging(job)) for job in jobs]
+    evaluation, state, error = read_evaluation(job.config, job.folder, job.protocol), job.state, ""
+    if state == "finished" and (evaluation is None or not evaluation.complete):
+        state = "unevaluated"
+    if (job.folder / "error.txt").exists():
+        error = (job.folder / "error.txt").read_text().strip()
+    return RunResult(job, state, error, _read_curve(job.folder), _read_cost(job.folder), evaluation)
 
 
-def _find(job: Job, judging: Judging) -> Found:
-    error, judged, state = job.folder / "error.txt", read(job.folder, judging), job.state
-    if state == "finished" and (judged is None or not judged.whole):
-        state = "unjudged"
-    return Found(
-        job,
-        state,
-        error.read_text().strip() if error.exists() else "",
-        _curve(job.folder),
-        _cost(job.folder),
-        judged,
-    )
+def group_results(runs: Sequence[RunResult]) -> list[Group]:
+    """Group runs by task, observation and algorithm; tasks and algorithms keep their order."""
+    members: dict[tuple[str, str, str], list[RunResult]] = {}
+    for run in runs:
+        members.setdefault((run.job.config.task, run.job.observes, run.job.label), []).append(run)
+    tasks = list(dict.fromkeys(task for task, _, _ in members))
+    keys = sorted(members, key=lambda key: (tasks.index(key[0]), OBSERVATIONS.index(key[1])))
+    return [Group(*key, tuple(members[key])) for key in keys]
 
 
-def _curve(folder: Path) -> Curve:
-    """Of evaluations at the same step, at a handover, the last counts: what goes on from there."""
+def _read_curve(folder: Path) -> Curve:
+    """At a handover there are two evaluations at the same step; the later one counts, from which training continues."""
     rows = read_table(folder / "evaluations.csv", ("step", "mean"))
     values = {float(row["step"]): float(row["mean"]) for row in rows}
     steps = np.array(sorted(values))
     return steps, np.array([values[step] for step in steps])
 
 
-def _cost(folder: Path) -> Cost | None:
-    sessions: list[dict[str, Any]] = read_sessions(folder)["sessions"]
-    steps = sum(session["to"] - session["from"] for session in sessions)
-    if not steps:
-        return None
-    memories = [session["memory"] for session in sessions if session["memory"]]
-    judging = sum(session["judging"] for session in sessions)
-    teachers = [session["teacher"] for session in sessions if "teacher" in session]  # sessions from before have none
-    teaching = sum(teacher["seconds"] for teacher in teachers)
-    seconds = sum(session["seconds"] for session in sessions) - judging - teaching
-    return Cost(
-        sessions[-1]["to"],
-        steps,
-        max(seconds, 1e-9),
-        judging,
-        teaching,
-        sum(teacher["steps"] for teacher in teachers),
-        max(memories, default=None),
-        "/".join(sorted({session["device"] for session in sessions})),
-    )
-
-
-SIGHTS = ("image", "state", "simulator", "nothing")
-"""Order of groups in tables."""
-
-
-def group(runs: Sequence[Found]) -> list[Group]:
-    """Runs by task, what is seen, and algorithm; tasks and algorithms in the order of the comparison."""
-    together: dict[tuple[str, str, str], list[Found]] = {}
-    for run in runs:
-        together.setdefault((run.job.config.task, run.job.sees, run.job.label), []).append(run)
-    tasks = list(dict.fromkeys(task for task, _, _ in together))
-
-    def order(key: tuple[str, str, str]) -> tuple[int, int]:
-        return tasks.index(key[0]), SIGHTS.index(key[1]) if key[1] in SIGHTS else len(SIGHTS)
-
-    return [Group(*key, tuple(together[key])) for key in sorted(together, key=order)]
+def _read_cost(folder: Path) -> Cost | None:
+    sessions = read_sessions(folder)["sessions"]
+    try:
+        steps = sum(session["to"] - session["from"] for session in sessions)
+        if not steps:
+            return None
+        evaluation = sum(session["evaluation_seconds"] for session in sessions)
+        teacher: dict[str, Any] = {"steps": 0, "seconds": 0.0, "evaluation_seconds": 0.0}
+        if (folder / "teacher" / "cost.json").exists():
+            teacher = read_record(folder / "teacher" / "cost.json")
+        return Cost(
+            last_step=sessions[-1]["to"],
+            steps=steps,
+            seconds=max(sum(session["seconds"] for session in sessions) - evaluation - teacher["seconds"], 1e-9),
+            evaluation_seconds=evaluation + teacher["evaluation_seconds"],
+            teacher_seconds=teacher["seconds"] - teacher["evaluation_seconds"],
+            teacher_steps=teacher["steps"],
+            memory=max((session["memory"] for session in sessions if session["memory"]), default=None),
+            device="/".join(sorted({session["device"] for session in sessions})),
+        )
+    except (KeyError, TypeError) as error:
+        raise CheckpointError(f"{folder / 'sessions.json'}: cannot be read ({error})") from error

@@ -1,87 +1,98 @@
-"""A table that can be written as CSV, Markdown and HTML."""
+"""A table with declared columns, rendered as CSV, Markdown and HTML."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
 
 from cfp.tables import csv_text
 
+Row = Mapping[str, Any]
+
 
 @dataclass(frozen=True)
 class Column:
-    """A column.
+    """A column of a table.
 
     Attributes:
-        key: Of the rows; its name in the CSV file.
-        title: For readers.
-        form: How values are formatted, for `format`; text stays as it is.
+        key: Key of its values in the rows, and its name in the CSV file.
+        title: Heading; an empty one restricts the column to the CSV file.
+        format: Format specification of numbers; columns without one hold text.
+        value: From the subject of a row to its value, for `make_row`.
     """
 
     key: str
-    title: str
-    form: str = ""
+    title: str = ""
+    format: str = ""
+    value: Callable[[Any], Any] | None = None
+
+    def text(self, row: Row) -> str:
+        """The value of a row, for readers."""
+        value = row.get(self.key)
+        if value is None:
+            return "–"
+        return value if isinstance(value, str) else format(value, self.format)
+
+
+def columns(format: str = "", /, **titles: str) -> tuple[Column, ...]:
+    """Several columns of one format, as ``key="title"``."""
+    return tuple(Column(key, title, format) for key, title in titles.items())
+
+
+def make_row(columns: Sequence[Column], subject: Any) -> dict[str, Any]:
+    """The values of all columns that have a ``value`` function."""
+    return {column.key: column.value(subject) for column in columns if column.value is not None}
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows with plain values; None is a value that does not exist.
+    """Rows of plain values by the key of their column; None, or a missing key, is a value that does not exist.
 
-    Attributes:
-        name: Of the CSV file.
-        title: For readers.
-        about: What it shows, in a sentence or two.
-        columns: All of them; a title that is empty makes one for the CSV file only.
-        rows: By key of a column.
+    ``name`` is that of the CSV file, without its suffix; ``title`` and ``description`` are for readers.
     """
 
     name: str
     title: str
-    about: str
-    columns: tuple[Column, ...]
-    rows: Sequence[Mapping[str, Any]]
+    description: str
+    columns: Sequence[Column]
+    rows: Sequence[Row]
+
+    @property
+    def visible(self) -> list[Column]:
+        """Columns for readers."""
+        return [column for column in self.columns if column.title]
 
     def to_csv(self) -> str:
         """All columns, with raw values."""
         return csv_text(self.rows, [column.key for column in self.columns])
 
     def to_markdown(self) -> str:
-        """Heading, words and table."""
-        lines = [f"## {self.title}", "", self.about, ""]
+        """Heading, description and visible columns."""
+        lines = [f"## {self.title}", "", self.description, ""]
         if self.rows:
-            rules = ("---" if column.form == "" else "---:" for column in self._shown())
-            lines += [_line(column.title for column in self._shown()), _line(rules)]
-            lines += [_line(cell.replace("|", "\\|") for cell in row) for row in self._cells()]
+            lines.append(_markdown_line(column.title for column in self.visible))
+            lines.append(_markdown_line("---:" if column.format else "---" for column in self.visible))
+            for row in self.rows:
+                lines.append(_markdown_line(column.text(row).replace("|", "\\|") for column in self.visible))
         return "\n".join(lines) + "\n"
 
     def to_html(self) -> str:
-        """Heading, words and table."""
-        head = "".join(f"<th{_side(column)}>{escape(column.title)}</th>" for column in self._shown())
-        rows = [f"<tr>{head}</tr>"]
-        for row in self._cells():
-            cells = zip(self._shown(), row, strict=True)
-            rows.append("<tr>" + "".join(f"<td{_side(column)}>{escape(cell)}</td>" for column, cell in cells) + "</tr>")
-        table = f"<div class='wide'><table>{''.join(rows)}</table></div>" if self.rows else ""
-        return f"<h2>{escape(self.title)}</h2>\n<p>{escape(self.about)}</p>\n{table}"
-
-    def _shown(self) -> list[Column]:
-        return [column for column in self.columns if column.title]
-
-    def _cells(self) -> list[list[str]]:
-        return [[_show(row.get(column.key), column.form) for column in self._shown()] for row in self.rows]
+        """Heading, description and visible columns."""
+        head = f"<h2>{escape(self.title)}</h2>\n<p>{escape(self.description)}</p>\n"
+        if not self.rows:
+            return head
+        rows = ["".join(_html_cell("th", column, column.title) for column in self.visible)]
+        rows += ["".join(_html_cell("td", column, column.text(row)) for column in self.visible) for row in self.rows]
+        body = "".join(f"<tr>{row}</tr>" for row in rows)
+        return f"{head}<div class='wide'><table>{body}</table></div>"
 
 
-def _show(value: Any, form: str) -> str:
-    if value is None:
-        return "–"
-    return value if isinstance(value, str) else format(value, form)
+def _html_cell(tag: str, column: Column, text: str) -> str:
+    alignment = "" if column.format else ' class="text"'
+    return f"<{tag}{alignment}>{escape(text)}</{tag}>"
 
 
-def _side(column: Column) -> str:
-    return ' class="text"' if column.form == "" else ""
-
-
-def _line(cells: Any) -> str:
+def _markdown_line(cells: Iterable[str]) -> str:
     return "| " + " | ".join(cells) + " |"

@@ -1,7 +1,7 @@
-"""One run of a comparison in a process of its own: trained to its end, then judged.
+"""Carries out one run of a comparison: trains it to its end, then evaluates its policy.
 
-The process is given its work as a line of JSON on its standard input, which its parent holds open: when that ends, the
-parent is gone, and the run stops with a checkpoint as if it had been asked to.
+As a program, the process reads its job as one line of JSON from the standard input, which its parent keeps open. When
+the standard input ends, the parent is gone, and the run stops with a checkpoint as if a signal had asked it to.
 """
 
 from __future__ import annotations
@@ -14,115 +14,104 @@ import sys
 import threading
 import time
 import traceback
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from baselines.common.reference_policies import REFERENCE_POLICIES
-from baselines.compare.evaluations import Judging, judge
-from baselines.compare.plan import Job, check_there, read_sessions
+from baselines.compare.evaluations import Protocol, evaluate_run
+from baselines.compare.jobs import Job, check_folder, read_sessions
 from baselines.registry import configure, find
-from cfp.config import RunConfig, to_json
+from cfp.config import to_json
 from cfp.envs.make import choose_device
 from cfp.experiment.process import Stopped, StopSignals, keep_memory, peak_memory
 from cfp.experiment.run import Run
-from cfp.experiment.run_lock import Claimed, claim
-from cfp.files import read_json, write_json, write_text
+from cfp.experiment.run_lock import FolderInUse, run_lock
+from cfp.files import write_json, write_text
 
-FINISHED, FAILED, BUSY = 0, 1, 3
-"""Exit codes; stopped is 128 and the number of the signal."""
+Outcome = Literal["finished", "failed", "busy", "stopped"]
+"""How a run ended; busy: another process holds its folder."""
+EXIT_CODES: dict[Outcome, int] = {"finished": 0, "failed": 1, "busy": 3, "stopped": 4}
 
 
-def describe(job: Job, judging: Judging, patience: float) -> dict[str, Any]:
-    """The work as JSON values.
+def encode(job: Job, lock_timeout: float) -> bytes:
+    """A job as one line of JSON, see `decode`."""
+    values = {"label": job.label, "config": to_json(job.config), "folder": str(job.folder)}
+    return json.dumps(values | {"protocol": asdict(job.protocol), "lock_timeout": lock_timeout}).encode() + b"\n"
+
+
+def decode(line: str) -> tuple[Job, float]:
+    """Inverse of `encode`."""
+    values: dict[str, Any] = json.loads(line)
+    protocol, tier = values["protocol"], values["protocol"]["tier"]
+    protocol["tier"] = tuple(tier) if isinstance(tier, list) else tier
+    job = Job(values["label"], configure(values["config"]), Path(values["folder"]), Protocol(**protocol))
+    return job, values["lock_timeout"]
+
+
+def carry_out(job: Job, signals: StopSignals, lock_timeout: float, *, own_process: bool = True) -> Outcome:
+    """Do what is left of a run; an error is written to ``error.txt`` in its folder.
 
     Args:
         job: The run.
-        judging: How it is judged.
-        patience: Seconds to wait for another process that holds the folder.
+        signals: Whether the user wants to stop.
+        lock_timeout: Seconds to wait for another process that holds the folder.
+        own_process: Whether this process does nothing else, so that its memory is that of the run.
     """
-    return {
-        "label": job.label,
-        "folder": str(job.folder),
-        "config": to_json(job.config),
-        "judging": judging.to_json(),
-        "patience": patience,
-    }
-
-
-def work(values: dict[str, Any], alone: bool = True) -> int:
-    """Do the work of `describe` as far as it is not done; returns the exit code.
-
-    What goes wrong is written to ``error.txt`` in the run folder.
-
-    Args:
-        values: From `describe`.
-        alone: The process does nothing else, so that its memory is the run's.
-    """
-    job = Job(values["label"], configure(values["config"]), Path(values["folder"]))
     try:
-        with claim(job.folder, values["patience"]), StopSignals() as signals:
+        with run_lock(job.folder, lock_timeout):
             (job.folder / "error.txt").unlink(missing_ok=True)
             try:
-                _train_and_judge(job, Judging.from_json(values["judging"]), signals, alone)
+                _train_and_evaluate(job, signals, own_process)
             except (Stopped, KeyboardInterrupt):
                 raise
             except BaseException as error:
                 traceback.print_exc()
                 write_text(job.folder / "error.txt", f"{type(error).__name__}: {error}\n")
-                return FAILED
-    except Claimed as error:
+                return "failed"
+    except FolderInUse as error:
         print(error)
-        return BUSY
-    except Stopped as stopped:
-        print(stopped)
-        return 128 + stopped.number
-    except KeyboardInterrupt:
-        print("stopped at once, without a checkpoint")
-        return 128 + signal.SIGINT
-    return FINISHED
+        return "busy"
+    except (Stopped, KeyboardInterrupt) as stopped:
+        print(stopped if isinstance(stopped, Stopped) else "stopped at once, without a checkpoint")
+        return "stopped"
+    return "finished"
 
 
-def _train_and_judge(job: Job, judging: Judging, signals: StopSignals, alone: bool) -> None:
-    def stop() -> None:
+def _train_and_evaluate(job: Job, signals: StopSignals, own_process: bool) -> None:
+    def check_stop() -> None:
         if signals.number:
             raise Stopped(signals.number)
 
-    check_there(job)
-    if not job.finished:
-        _train(job.config, job.folder, signals, alone)
-    judge(job.config, job.folder, judging, stop)
+    check_folder(job)
+    if job.untrained and not job.trained:
+        write_json(job.folder / "config.json", to_json(job.config))
+    elif not job.trained:
+        train(job, signals, own_process)
+    evaluate_run(job.config, job.folder, job.protocol, check_stop)
 
 
-def _train(config: RunConfig, folder: Path, signals: StopSignals, alone: bool) -> None:
-    """Train to the end, and note in ``sessions.json`` what it took; a process that is killed leaves no note."""
-    if config.algo in REFERENCE_POLICIES:
-        config.check()
-        write_json(folder / "config.json", to_json(config))
-        write_json(folder / "sessions.json", {"finished": config.ends()[-1], "sessions": []})
-        return
-    there, cost = read_sessions(folder), folder / "teacher" / "cost.json"
-    run = Run(find(config.algo), config, folder, True, signals)
-    begun, start, whole = run.step, time.perf_counter(), False
+def train(job: Job, signals: StopSignals, own_process: bool = True) -> None:
+    """Train to the end, and record the cost of this session in ``sessions.json``; a killed process leaves no record."""
+    earlier = read_sessions(job.folder)["sessions"]
+    run = Run(find(job.config.algo), job.config, job.folder, True, signals)
+    first_step, start, finished = run.step, time.perf_counter(), False
     try:
         run.train()
-        whole = True
+        finished = True
     finally:
-        seconds = time.perf_counter() - start
-        session: dict[str, Any] = {
-            "from": begun,
+        record = {
+            "from": first_step,
             "to": run.step,
-            "seconds": seconds,
-            "judging": run.evaluation_seconds,
-            "memory": None,
+            "seconds": time.perf_counter() - start,
+            "evaluation_seconds": run.evaluation_seconds,
+            "memory": peak_memory() if own_process else None,
+            "device": choose_device(job.config.device),
+            "host": socket.gethostname(),
+            "process": os.getpid(),
+            "finished": finished,
         }
-        if cost.exists() and not any("teacher" in earlier for earlier in there["sessions"]):
-            teacher = read_json(cost)
-            session["teacher"] = {"steps": teacher["steps"], "seconds": teacher["seconds"]}
-            session["judging"] += teacher["evaluation_seconds"]
-        session |= {"memory": peak_memory() if alone else None, "device": choose_device(config.device)}
-        session |= {"host": socket.gethostname(), "process": os.getpid(), "finished": whole}
-        finished = config.ends()[-1] if whole else False
-        write_json(folder / "sessions.json", {"finished": finished, "sessions": [*there["sessions"], session]})
+        end = job.config.ends()[-1] if finished else False
+        write_json(job.folder / "sessions.json", {"finished": end, "sessions": [*earlier, record]})
 
 
 def _stop_with_parent() -> None:
@@ -132,15 +121,16 @@ def _stop_with_parent() -> None:
 
 
 def main() -> int:
-    """Entry of the process; returns its exit code."""
-    values = json.loads(sys.stdin.readline())
+    """Entry point of the process; returns its exit code."""
+    job, lock_timeout = decode(sys.stdin.readline())
     threading.Thread(target=_stop_with_parent, daemon=True).start()
     keep_memory()
-    return work(values)
+    with StopSignals() as signals:
+        return EXIT_CODES[carry_out(job, signals, lock_timeout)]
 
 
 if __name__ == "__main__":
-    # A daemon thread that reads the standard input must not be waited for, nor its lock, when the interpreter ends.
+    # The daemon thread holds the lock of the standard input, for which a normal exit of the interpreter would wait.
     code = main()
     sys.stdout.flush()
     sys.stderr.flush()

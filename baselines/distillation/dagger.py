@@ -87,13 +87,13 @@ def drop_entries(values: Tensor, probability: float, grid: int | None = None) ->
     Args:
         values: (B, ..., A, A).
         probability: Of an entry, in these elements.
-        grid: Rows and columns on which entries are drawn, see `cfp.envs.disturbances.lose`; A if None.
+        grid: Rows and columns on which entries are drawn, see `cfp.envs.disturbances.drop`; A if None.
     """
     if not probability:
         return values
     mask = torch.rand(values.shape if grid is None else (*values.shape[:-2], grid, grid)) < probability
     mask &= torch.rand(len(values), *[1] * (values.ndim - 1)) < 0.5
-    return disturbances.lose(values, mask.to(values.device))
+    return disturbances.drop(values, mask.to(values.device))
 
 
 class Collector:

@@ -18,7 +18,7 @@ from cfp.policy import Policy, SeesState
 from cfp.sections import EnvironmentConfig
 from cfp.weights import check_trained_for, read_policy
 from dittogym import TorchEnv, make_spec
-from dittogym.action import Layout, bicubic_matrix, from_grid_layout, to_grid_layout
+from dittogym.action import ActionIndexing, bicubic_matrix, from_grid_indexing, to_grid_indexing
 
 
 class Teacher(ABC):
@@ -57,7 +57,7 @@ class PolicyTeacher(Teacher):
         layout: Orientation of the returned actions.
     """
 
-    def __init__(self, policy: Policy, policy_layout: Layout, layout: Layout) -> None:
+    def __init__(self, policy: Policy, policy_layout: ActionIndexing, layout: ActionIndexing) -> None:
         self.policy, self.policy_layout, self.layout = policy, policy_layout, layout
         self.resolution = policy.resolution
         self._memory: tuple[np.ndarray, ...] | None = None
@@ -70,7 +70,7 @@ class PolicyTeacher(Teacher):
         memory = (steps,) if isinstance(policy, OpenLoop) else self._memory
         array, self._memory = policy.predict(observation.cpu().numpy(), memory, steps == 0, deterministic=True)
         action = torch.as_tensor(array, device=env.device)
-        return from_grid_layout(to_grid_layout(action, self.policy_layout), self.layout)
+        return from_grid_indexing(to_grid_indexing(action, self.policy_layout), self.layout)
 
     def state_dict(self) -> dict[str, Any]:
         """The policy's memory."""

@@ -26,7 +26,7 @@ from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teach
 from baselines.planning.gradient import GradientPlannerConfig
 from baselines.shac.networks import fix_std
 from cfp.agent.actor import build_actor
-from cfp.agent.policies import ActorPolicy
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device, make_torch_env
 from cfp.errors import NonFiniteError

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from baselines.common.rollout import repeat, rollout, to_dtype
 from cfp.errors import ConfigError
-from dittogym.core import EnvState, Model
+from dittogym.model import EnvState, Model
 
 STEP_SIZES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 """Step sizes of the finite differences, root mean square per action value."""

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from baselines.modular.nodes import unpack
-from cfp.agent.actor import Sample, SquashedActor, draw
+from cfp.agent.actor import Sample, SquashedActor, sample_squashed_gaussian
 from cfp.agent.networks import at_least_float32, initialise
 
 Kind = Literal["gnn", "transformer"]
@@ -101,7 +101,7 @@ class ModularActor(SquashedActor):
     def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
         """Draw actions (B, K, 2) for rows (B, K, columns)."""
         mean, width = at_least_float32(self.head(self.trunk(observation))).chunk(2, -1)
-        return Sample(*draw(mean, width, deterministic), None)
+        return Sample(*sample_squashed_gaussian(mean, width, deterministic), None)
 
 
 class ModularCritics(nn.Module):

@@ -10,9 +10,9 @@ from torch.nn.functional import pad
 
 from baselines.modular.kmeans import adjacency, segment_means, squared_distances
 from dittogym import TorchEnv
-from dittogym.action import from_grid_layout, patch_corner
-from dittogym.observation.window import in_window
+from dittogym.action import from_grid_indexing, patch_corner
 from dittogym.spec import TaskSpec
+from dittogym.window import centre_in_window
 from torchmpm import checks
 
 LENGTH_SCALE, SPEED_SCALE = 0.1, 0.5
@@ -64,7 +64,7 @@ class Nodes:
 
     def observe(self, env: TorchEnv, labels: Tensor) -> Tensor:
         """Rows (B, K, columns), float32, of the environment's present state with labels (B, N)."""
-        state, robot = env.env_state, env.model.robot
+        state, robot = env.env_state, env.model.num_robot_particles
         x, v = visible_positions(env), state.particles.v[:, :robot].clamp(-MAX_SPEED, MAX_SPEED)
         com = x.mean(1)[:, None]
         offset = x - com
@@ -104,25 +104,25 @@ class Nodes:
         if env.action_resolution != size:
             raise ValueError(f"env must have the task's patch, {size}, as action grid, got {env.action_resolution}")
         grid = env.model.solver.grid.resolution
-        corner = patch_corner(in_window(env.spec.reach, state.centre, state.origin), size, grid)
+        corner = patch_corner(centre_in_window(env.spec.reach, state.centre, state.origin), size, grid)
         index = torch.arange(size, device=env.device)
         indices = torch.stack(torch.meshgrid(index, index, indexing="ij"), -1).flatten(0, 1)
         position = state.origin[:, None] + (corner[:, None] + indices) / grid
         centres, _ = segment_means(visible_positions(env), labels, self.count)
         nearest = squared_distances(position.to(centres), centres).argmin(-1)
         field = values.to(centres).gather(1, nearest[..., None].expand(-1, -1, 2))
-        return from_grid_layout(field.transpose(1, 2).unflatten(2, (size, size)), env.action_layout)
+        return from_grid_indexing(field.transpose(1, 2).unflatten(2, (size, size)), env.action_layout)
 
 
 def visible_positions(env: TorchEnv) -> Tensor:
     """Positions (B, N, 2), m, of the robot's particles, cut at `MAX_DISTANCE` from the window, which is 1 m wide."""
     state = env.env_state
     low = state.origin[:, None] - MAX_DISTANCE
-    return state.particles.x[:, : env.model.robot].clamp(low, low + 1.0 + 2.0 * MAX_DISTANCE)
+    return state.particles.x[:, : env.model.num_robot_particles].clamp(low, low + 1.0 + 2.0 * MAX_DISTANCE)
 
 
 def _has_object(spec: TaskSpec) -> bool:
-    return any(body.moves_visibly for body in spec.objects)
+    return not all(body.hidden_velocity for body in spec.objects)
 
 
 def pack(edges: Tensor) -> Tensor:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, cast, get_args
 
-import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecMonitor
@@ -17,10 +16,8 @@ from baselines.modular.env import SegmentedEnv
 from baselines.modular.networks import Kind, ModularActor, ModularCritics
 from baselines.modular.nodes import Nodes
 from baselines.modular.policy import SegmentPolicy
-from cfp.agent.composition import Composition
 from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
 from cfp.agent.policies import NetworkPolicy
-from cfp.agent.sac import CFP
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import TorchVecEnv
@@ -147,22 +144,12 @@ class ModularPolicy(NetworkPolicy):
         return ModularCritics(self.kind, self.features)
 
 
-class ModularSAC(CFP):
-    """`cfp.agent.sac.CFP` on segments."""
-
-    def _random(
-        self, actions: np.ndarray, stored: np.ndarray, composition: Composition | None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        return actions, stored
-
-
 class Modular(SACAlgorithm):
     """A modular policy, trained by soft actor-critic; a subclass says which."""
 
     algo: ClassVar[str]
     sees: ClassVar[Sees] = "state"
     config: ModularConfig
-    model_type = ModularSAC
 
     @classmethod
     def preset(cls, task: str, name: str) -> ModularConfig:

@@ -9,12 +9,14 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from baselines.common.rollout import Judge, Judgement, judge, rollout
+from baselines.common.rollout import StepFunction, rollout, soft_step
 from cfp.errors import ConfigError
 from cfp.validation import check_at_least
 from dittogym import TorchEnv
-from dittogym.core import EnvState, Model
-from dittogym.rewards import measure
+from dittogym.contract import measure
+from dittogym.core import StepResult
+from dittogym.model import EnvState, Model
+from torchmpm import tree
 
 SPLIT_MARGIN = 0.8
 """Fraction of the task's limit on the robot's spread from which a spread costs."""
@@ -59,7 +61,7 @@ class Planner(ABC, Generic[Config]):
     Args:
         env: The environment, after its reset. It is only read.
         config: Options; the defaults if None.
-        judge: Reward of a step. The search may climb its smooth reward; its true reward chooses the plan.
+        step: Advances the simulations. The search may climb its smooth reward; its true reward chooses the plan.
         seed: Seed of the noise.
 
     Attributes:
@@ -72,10 +74,12 @@ class Planner(ABC, Generic[Config]):
 
     config_type: type[Config]
 
-    def __init__(self, env: TorchEnv, config: Config | None = None, *, judge: Judge = judge, seed: int = 0) -> None:
+    def __init__(
+        self, env: TorchEnv, config: Config | None = None, *, step: StepFunction = soft_step, seed: int = 0
+    ) -> None:
         self.config = config = config or self.config_type()
         config.check()
-        self.env, self.judge = env, judge
+        self.env, self.step = env, step
         self.generator = torch.Generator().manual_seed(seed)
         self.num_plans = self.num_failed = 0
         self.reset()
@@ -103,7 +107,7 @@ class Planner(ABC, Generic[Config]):
 
     def plan(self) -> Tensor:
         """Make new plans (T, B, 2, R, R) from the environment's present state."""
-        state = self.env.env_state.detach()
+        state = tree.detach(self.env.env_state)
         remaining = self._remaining_steps(state)
         length = min(self.config.horizon, remaining) if remaining else self.config.horizon
         kept = self._plan[self._step :][:length]
@@ -130,15 +134,15 @@ class Planner(ABC, Generic[Config]):
         charge = torch.where(steps.ended, charged / len(plan) * total.clamp_min(0.0), 0.0)
         return steps.rewards.sum(0), total - charge
 
-    def _penalised(self, model: Model, state: EnvState, field: Tensor) -> Judgement:
+    def _penalised(self, model: Model, state: EnvState, action: Tensor) -> StepResult:
         """Rewards of a step less a cost of being nearly torn: the task's own penalty comes when it is too late."""
-        judgement, limit = self.judge(model, state, field), model.spec.split_limit
+        result, limit = self.step(model, state, action), model.spec.split_limit
         if limit is None:
-            return judgement
-        excess = measure(judgement.state.particles, model.robot).split / limit - SPLIT_MARGIN
+            return result
+        excess = measure(result.state.particles, model.num_robot_particles).split / limit - SPLIT_MARGIN
         cost = self.config.split_weight * excess.clamp_min(0.0).square()
-        reward, true_reward = judgement.reward - cost, judgement.true_reward - cost.detach()
-        return judgement._replace(reward=reward, true_reward=true_reward)
+        reward, true_reward = result.reward - cost, result.true_reward - cost.detach()
+        return result._replace(reward=reward, true_reward=true_reward)
 
     def _remaining_steps(self, state: EnvState) -> int:
         """Control steps to the end of the youngest episode."""

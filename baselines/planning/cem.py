@@ -9,13 +9,13 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from baselines.common.rollout import Judge, judge_true
+from baselines.common.rollout import StepFunction
 from baselines.planning.base import BestPlans, Planner, PlannerConfig
 from cfp.errors import ConfigError
 from cfp.validation import check_positive
-from dittogym import TorchEnv
+from dittogym import TorchEnv, core
 from dittogym.action import bicubic
-from dittogym.core import EnvState
+from dittogym.model import EnvState
 from torchmpm import tree
 
 
@@ -66,10 +66,10 @@ class CEMPlanner(Planner[CEMPlannerConfig]):
         env: TorchEnv,
         config: CEMPlannerConfig | None = None,
         *,
-        judge: Judge = judge_true,
+        step: StepFunction = core.step,
         seed: int = 0,
     ) -> None:
-        super().__init__(env, config, judge=judge, seed=seed)
+        super().__init__(env, config, step=step, seed=seed)
 
     @torch.no_grad()
     def _search(self, state: EnvState, plan: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from baselines.planning.base import BestPlans, Planner, PlannerConfig, where_simulation
 from cfp.validation import check_positive
-from dittogym.core import EnvState
+from dittogym.model import EnvState
 
 
 @dataclass(frozen=True)

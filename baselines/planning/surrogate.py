@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dittogym import TorchEnv
-from dittogym.core import EnvState
+from dittogym.model import EnvState
 from dittogym.physics import PER_PARTICLE
 from torchmpm import tree
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dittogym import TorchEnv
-from dittogym.observation.window import in_window
+from dittogym.window import centre_in_window
 from torchmpm.spline import quadratic_weights
 
 CELLS = 16
@@ -45,7 +45,7 @@ class StateFeatures:
 
     def __call__(self, env: TorchEnv) -> Tensor:
         """Features (B, D) of the environment's present state, with its autograd graph."""
-        state, robot = env.env_state, env.model.robot
+        state, robot = env.env_state, env.model.num_robot_particles
         particles = state.particles
         mass = torch.ones_like(particles.Jp)
         channels = torch.cat((mass[:, None], particles.v.movedim(-1, 1)), 1)
@@ -68,7 +68,7 @@ class StateFeatures:
         """Positions (B, N, 2) in cells from the patch's lower left corner."""
         state, spec = env.env_state, env.spec
         width = spec.patch / env.model.solver.grid.resolution
-        centre = in_window(spec.reach, state.centre, state.origin).detach().clamp(0.5 * width, 1.0 - 0.5 * width)
+        centre = centre_in_window(spec.reach, state.centre, state.origin).detach().clamp(0.5 * width, 1.0 - 0.5 * width)
         corner = state.origin.detach() + centre - 0.5 * width
         return (state.particles.x - corner[:, None]) * (CELLS / width)
 

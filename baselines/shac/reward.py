@@ -120,5 +120,5 @@ def training_reward(
         excess = (info["split"] / limit - config.split_margin).clamp_min(0.0)
         reward = reward - config.split_weight * excess.square()
     if config.integrity_weight:
-        reward = reward - config.integrity_weight * neighbours.drift(env.state.x[:, : env.model.robot])
+        reward = reward - config.integrity_weight * neighbours.drift(env.state.x[:, : env.model.num_robot_particles])
     return config.scale * torch.where(info["finite"], reward, terms["failure"])

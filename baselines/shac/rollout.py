@@ -92,7 +92,7 @@ class Rollout:
 
     def _robot_positions(self) -> Tensor:
         """The robots' particles (B, N, 2), m."""
-        return self.env.state.x[:, : self.env.model.robot].detach()
+        return self.env.state.x[:, : self.env.model.num_robot_particles].detach()
 
     def _act(self, mean: Tensor) -> Tensor:
         """Actions with noise, which stop gradients that are not finite."""

@@ -19,7 +19,7 @@ from baselines.shac.features import StateFeatures
 from baselines.shac.networks import ImageActor, StateActor, StatePolicy, fix_std, image_critic, state_critic
 from baselines.shac.reward import RewardConfig
 from baselines.shac.rollout import Rollout, Window
-from cfp.agent.policies import ActorPolicy
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.config import RunConfig, check_training_layouts
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dittogym import TorchEnv
-from dittogym.observation.smooth import soft_silhouette
+from dittogym.observation.image import soft_silhouette
 
 
 class Objective(Protocol):

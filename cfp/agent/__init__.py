@@ -1,1 +1,1 @@
-"""The method: networks, losses and soft actor-critic. Imports nothing of `cfp.experiment`."""
+"""The method: networks, actors, losses, soft actor-critic. Imports nothing of `cfp.experiment` or `cfp.evaluation`."""

@@ -1,4 +1,4 @@
-"""The actors: a plain one, and one that refines a frozen coarser one (paper, Section 4.2)."""
+"""The actors: a plain one, and one that refines the action of a frozen coarser one (paper, Section 4.2)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from cfp.agent import fused as joint
+from cfp.agent import fused
 from cfp.agent.composition import blend
 from cfp.agent.networks import (
     IMAGE_SIZE,
@@ -24,18 +24,18 @@ from cfp.agent.networks import (
 from cfp.agent.spec import ActorSpec
 
 STD_BOUNDS = (0.1, 6.0)
-"""Bounds of the standard deviation before tanh: sampling never becomes deterministic."""
+"""Bounds of the standard deviation before tanh; the lower one keeps sampling stochastic."""
 
 
 class Sample(NamedTuple):
-    """One draw from an actor.
+    """One sample of an actor.
 
     Attributes:
-        action: What is executed, (B, 2, A, A) with A from `ActorSpec.action_size`. A composed action may leave [-1, 1]
-            a little and is not clipped.
-        log_prob: Log-density of the sampled part (a residual actor's own action only), (B,).
+        action: Action to execute, (B, 2, A, A) with A from `ActorSpec.action_size`. A composed action may exceed
+            [-1, 1] slightly and is not clipped.
+        log_prob: Log-density of the sampled part (for a residual actor the residual action only), (B,).
         gate: Weight of the residual action, (B, 2, R, R), or None for a plain actor.
-        parts: What the action is made of, see `cfp.agent.composition.Composition`.
+        parts: Parts of the action, see `cfp.agent.composition.Composition`.
     """
 
     action: Tensor
@@ -45,63 +45,63 @@ class Sample(NamedTuple):
 
 
 def squashed_log_prob(noise: Tensor, std: Tensor, action: Tensor) -> Tensor:
-    """Log-density (B,) of ``action = tanh(mean + std * noise)`` summed over all 2 R R entries.
+    """Log-density (B,) of ``action = tanh(mean + std * noise)``, summed over all 2 R R entries.
 
-    ln N(x; m, s^2) - ln(1 - a^2 + 1e-6), where (x - m)/s is the noise itself.
+    It is ln N(x; m, s^2) - ln(1 - a^2 + 1e-6), where (x - m)/s is the noise.
     """
     normal = -0.5 * noise.square() - std.log() - 0.5 * math.log(2 * math.pi)
     return (normal - torch.log(1 - action.square() + 1e-6)).flatten(1).sum(1)
 
 
-def draw(mean: Tensor, width: Tensor, deterministic: bool) -> tuple[Tensor, Tensor]:
-    """Draw tanh(m + s eps), the tanh-Gaussian of all actors; deterministic means eps = 0.
+def sample_squashed_gaussian(mean: Tensor, raw_std: Tensor, deterministic: bool) -> tuple[Tensor, Tensor]:
+    """Sample tanh(m + s eps) with eps ~ N(0, I).
 
     Args:
         mean: Network output z_m, (B, ...); the mean m before tanh.
-        width: Network output z_s, the same shape; s = clip(softplus(3 z_s - 1), 0.1, 6).
-        deterministic: Without noise.
+        raw_std: Network output z_s of the same shape; s = clip(softplus(3 z_s - 1), 0.1, 6).
+        deterministic: Use eps = 0.
 
     Returns:
-        The action, the same shape, and its log-density (B,).
+        The action, of the same shape, and its log-density (B,).
     """
-    std = F.softplus(3 * width - 1).clamp(*STD_BOUNDS)
+    std = F.softplus(3 * raw_std - 1).clamp(*STD_BOUNDS)
     noise = torch.zeros_like(mean) if deterministic else torch.randn_like(mean)
     action = torch.tanh(mean + std * noise)
     return action, squashed_log_prob(noise, std, action)
 
 
 class SquashedActor(nn.Module):
-    """What soft actor-critic asks of an actor; a subclass says how it draws."""
+    """Base class of actors with tanh-squashed Gaussian actions; subclasses implement `sample`."""
 
     optimizer: torch.optim.Optimizer
 
     def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
-        """Draw an action for observations with leading B."""
+        """Sample an action for observations (B, ...)."""
         raise NotImplementedError
 
     def trainable_parameters(self) -> list[nn.Parameter]:
-        """Parameters that an optimiser may change: all but those of frozen coarser levels."""
+        """Parameters to optimise: all but those of frozen coarser stages."""
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> Tensor:
-        """The action for observations with leading B."""
+        """Action for observations (B, ...)."""
         return self.sample(observation, deterministic).action
 
     def action_log_prob(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Flat actions and log-densities (B,): what stable-baselines3's own SAC asks of an actor."""
+        """Flat actions and log-densities (B,), as stable-baselines3's SAC expects of its actor."""
         sample = self.sample(observation)
         return sample.action.flatten(1), sample.log_prob
 
     def set_training_mode(self, mode: bool) -> None:
-        """Switch between training and evaluation; without effect on these layers, asked for by stable-baselines3."""
+        """Switch between training and evaluation mode; required by stable-baselines3."""
         self.train(mode)
 
 
 class Actor(SquashedActor):
-    """Stage-1 actor: a tanh-Gaussian over (2, R, R), from the observation alone; see `draw`."""
+    """Actor of stage 1: a squashed Gaussian over (2, R, R), given the observation."""
 
     def __init__(self, resolution: int) -> None:
-        """Create encoder (width 32 in every task) and the heads for mean and std."""
+        """Create the encoder, of width 32 in every task, and the heads for mean and standard deviation."""
         super().__init__()
         self.resolution = resolution
         self.encoder: nn.Module = Encoder(3, 32)
@@ -109,32 +109,28 @@ class Actor(SquashedActor):
         self.std = make_head(resolution)
         initialise(self)
 
-    def own_action(self, latent: Tensor, deterministic: bool, *heads: nn.Sequential) -> tuple[Tensor, ...]:
-        """Draw tanh(m + s eps) from a latent (B, 32, 4, 4); deterministic means eps = 0.
-
-        Returns:
-            The action, its log-density, and what further heads give for the latent.
-        """
-        mean, width, *others = map(at_least_float32, joint.decode([self.mean, self.std, *heads], latent))
-        return *draw(mean, width, deterministic), *others
-
     def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
-        """Draw an action for uint8 observations (B, 3, 64, 64)."""
+        """Sample an action for uint8 observations (B, 3, 64, 64)."""
         latent = self.encoder(normalise_image(observation))
-        action, log_prob = self.own_action(latent, deterministic)
+        mean, raw_std = self._decode(latent, self.mean, self.std)
+        action, log_prob = sample_squashed_gaussian(mean, raw_std, deterministic)
         return Sample(action, log_prob, None, (action,))
+
+    @staticmethod
+    def _decode(latent: Tensor, *heads: nn.Sequential) -> list[Tensor]:
+        return [at_least_float32(output) for output in fused.decode(heads, latent)]
 
 
 class ResidualActor(Actor):
-    """Stage-2 actor: refines the action of a frozen coarser actor through a gate (paper, Section 4.2).
+    """Actor of a later stage: refines the action of a frozen coarser actor through a gate (paper, Section 4.2).
 
-    ``a = up(g) * up(a_res) + (1 - up(g)) * up(a_coarse)`` with ``g = gate_scale * sigmoid(z_g + gate_bias)``, one gate
-    value per cell and muscle; ``up`` enlarges to `ActorSpec.action_size`. The coarser actor is drawn anew at every
-    call, may itself be residual, and is never trained.
+    ``a = up(g) up(a_res) + (1 - up(g)) up(a_coarse)`` with ``g = gate_scale sigmoid(z_g + gate_bias)``, one gate value
+    per cell and muscle; ``up`` enlarges to `ActorSpec.action_size`. The coarser actor is sampled anew in every call,
+    may be residual itself, and is never trained.
     """
 
     def __init__(self, coarse: Actor, resolution: int, gate_bias: float, spec: ActorSpec) -> None:
-        """Wrap and freeze ``coarse``; the spec says how images are merged and interpolated."""
+        """Wrap and freeze ``coarse``."""
         super().__init__(resolution)
         self.interpolation = spec.interpolation
         self.action_size = spec.patch or resolution
@@ -145,23 +141,24 @@ class ResidualActor(Actor):
         self.coarse = coarse.requires_grad_(False)
 
     def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
-        """Draw a composed action; log_prob belongs to the residual part alone, as in the reference."""
+        """Sample a composed action; ``log_prob`` is that of the residual part alone, as in the reference."""
         with torch.no_grad():
-            below = self.coarse.sample(observation, deterministic)
-            coarse = self._enlarge(below.action)
+            coarse_sample = self.coarse.sample(observation, deterministic)
+            coarse = self._enlarge(coarse_sample.action)
         patch = upsample(coarse, IMAGE_SIZE, self.interpolation)
         latent = self.encoder(normalise_image(observation), patch)
-        residual, log_prob, logit = self.own_action(latent, deterministic, self.gate)
-        gate = self.gate_scale * torch.sigmoid(logit + self.gate_bias)
+        mean, raw_std, gate_logit = self._decode(latent, self.mean, self.std, self.gate)
+        residual, log_prob = sample_squashed_gaussian(mean, raw_std, deterministic)
+        gate = self.gate_scale * torch.sigmoid(gate_logit + self.gate_bias)
         action = blend(coarse, residual, gate, self._enlarge)
-        return Sample(action, log_prob, gate, (*below.parts, residual, gate))
+        return Sample(action, log_prob, gate, (*coarse_sample.parts, residual, gate))
 
     def _enlarge(self, image: Tensor) -> Tensor:
         return upsample(image, self.action_size, self.interpolation)
 
 
 def build_actor(spec: ActorSpec) -> Actor:
-    """Build the actor of the finest level with all coarser ones inside it, freshly initialised."""
+    """Build the freshly initialised actor of the last stage, which contains those of all coarser stages."""
     actor = Actor(spec.resolutions[0])
     for resolution, bias in zip(spec.resolutions[1:], spec.gate_bias, strict=True):
         actor = ResidualActor(actor, resolution, bias, spec)

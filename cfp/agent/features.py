@@ -1,4 +1,4 @@
-"""The encoder of the coarse-to-fine policy for stable-baselines3's own algorithms."""
+"""The encoder of the coarse-to-fine policy as a features extractor for the algorithms of stable-baselines3."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ class ImageFeatures(BaseFeaturesExtractor):
     """Three convolutions with coordinate channels, for ``policy_kwargs={"features_extractor_class": ImageFeatures}``.
 
     Args:
-        observation_space: Images (3, 64, 64), uint8; stable-baselines3 hands them on divided by 255.
+        observation_space: uint8 images (3, 64, 64), which stable-baselines3 divides by 255.
         width: Channels of the last layer.
 
     Raises:
-        ValueError: Images of another shape.
+        ValueError: The images have another shape.
     """
 
     def __init__(self, observation_space: spaces.Box, width: int = 32) -> None:
         shape = (3, IMAGE_SIZE, IMAGE_SIZE)
         if observation_space.shape != shape:
-            raise ValueError(f"observation_space: got shape {observation_space.shape}, allowed {shape}")
+            raise ValueError(f"observation_space must have shape {shape}, got {observation_space.shape}")
         super().__init__(observation_space, LATENT // 32 * width)
         self.encoder = Encoder(3, width)
 

@@ -1,8 +1,7 @@
 """The convolutional networks of the coarse-to-fine policy: encoder, heads, critics.
 
-Every network reads the observation as an image (3, 64, 64) and every action is an image (2, R, R): channel 0 drives
-the x-muscles, channel 1 the y-muscles. Sizes follow the reference implementation of DittoGym (ICLR 2024), Section 4.2
-and Appendix B; parameter totals are held by a test.
+Observations are images (3, 64, 64) and actions are images (2, R, R), in which channel 0 drives the x-muscles and
+channel 1 the y-muscles. Sizes follow the reference implementation of DittoGym (ICLR 2024), Section 4.2 and Appendix B.
 """
 
 from __future__ import annotations
@@ -13,29 +12,30 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from cfp.agent import fused as joint
+from cfp.agent import fused
 from cfp.agent.spec import Interpolation
 from dittogym.action import bicubic
 
 IMAGE_SIZE = 64
-"""Rows and columns of the observation and of every action that enters an encoder."""
+"""Rows and columns of the observation, and of every action as input of an encoder."""
 
 LATENT = 32 * 4 * 4
+"""Number of entries of a latent image."""
 
-_STRETCH, _KEEP = (4, 2, 1), (3, 1, 1)  # (kernel, stride, padding): doubles the size, keeps the size
+_DOUBLE, _KEEP = (4, 2, 1), (3, 1, 1)  # (kernel, stride, padding) that double or keep the size
 _DECODERS: dict[int, tuple[tuple[tuple[int, int, int], ...], tuple[int, ...]]] = {
-    8: ((_STRETCH, _KEEP, _KEEP), (32, 16, 8, 2)),
-    16: ((_STRETCH, _STRETCH, _KEEP), (32, 16, 8, 2)),
-    32: ((_STRETCH, _STRETCH, _STRETCH), (32, 16, 8, 2)),
-    64: ((_STRETCH, _STRETCH, _STRETCH, _STRETCH), (32, 16, 8, 4, 2)),
+    8: ((_DOUBLE, _KEEP, _KEEP), (32, 16, 8, 2)),
+    16: ((_DOUBLE, _DOUBLE, _KEEP), (32, 16, 8, 2)),
+    32: ((_DOUBLE, _DOUBLE, _DOUBLE), (32, 16, 8, 2)),
+    64: ((_DOUBLE, _DOUBLE, _DOUBLE, _DOUBLE), (32, 16, 8, 4, 2)),
 }
 
 
 def upsample(action: Tensor, size: int, interpolation: Interpolation) -> Tensor:
     """Bicubic interpolation (kernel parameter -0.75) of an action image (B, 2, R, R) to (B, 2, size, size).
 
-    The reference implementation aligns corners here but uses half-pixel centres in the environment, so that a closed
-    gate does not reproduce the coarse force field there; ``"half_pixel"`` uses the environment's rule everywhere.
+    The reference implementation aligns corners here but uses half-pixel centres in the environment, so a closed gate
+    does not reproduce the coarse force field; ``"half_pixel"`` uses the rule of the environment everywhere.
     """
     if action.shape[-1] == size:
         return action
@@ -43,19 +43,19 @@ def upsample(action: Tensor, size: int, interpolation: Interpolation) -> Tensor:
 
 
 def normalise_image(observation: Tensor) -> Tensor:
-    """Map uint8 pixels 0..255 to [-1, 1]: ``s / 255 * 2 - 1``. A floating-point image is taken as mapped already."""
+    """Map uint8 pixels to [-1, 1] by ``s / 255 * 2 - 1``; floating-point images are returned as they are."""
     if observation.is_floating_point():
         return observation
     return observation.float().mul_(2.0 / 255.0).sub_(1.0)
 
 
 def at_least_float32(output: Tensor) -> Tensor:
-    """The output of a network in the precision that densities, losses and statistics need."""
+    """Convert the output of a network to the precision that densities, losses and statistics need."""
     return output.to(torch.promote_types(output.dtype, torch.float32))
 
 
 def initialise(module: nn.Module) -> nn.Module:
-    """Xavier-uniform linear layers with zero bias; convolutions keep PyTorch's default, as in the reference."""
+    """Initialise linear layers Xavier-uniform with zero bias; convolutions keep PyTorch's default."""
     for layer in module.modules():
         if isinstance(layer, nn.Linear):
             nn.init.xavier_uniform_(layer.weight)
@@ -70,12 +70,12 @@ class Encoder(nn.Module):
     embedding channel"); they are neither trained nor saved.
 
     Args:
-        channels: Feature channels C of the input.
-        width: Channels w of the first and last layer (the middle one has 2w).
+        channels: Channels C of the input.
+        width: Channels w of the first and last layer; the middle one has 2w.
     """
 
     patches: Tensor
-    """What the first layer sees of the coordinates at its 15 x 15 places, (2 x 8 x 8, 225)."""
+    """Coordinate channels in the receptive fields of the first layer, unfolded to (2 x 8 x 8, 225)."""
 
     def __init__(self, channels: int, width: int) -> None:
         """Create the layers."""
@@ -93,15 +93,15 @@ class Encoder(nn.Module):
         self.register_buffer("patches", F.unfold(grid[None], 8, stride=4)[0], persistent=False)
 
     def forward(self, *images: Tensor) -> Tensor:
-        """Encode images (B, c, 64, 64), stacked along their channels, with values about [-1, 1], to (B, w, 4, 4)."""
-        return joint.encode([self], *images)
+        """Encode images (B, c, 64, 64) with values about [-1, 1], stacked along their channels, to (B, w, 4, 4)."""
+        return fused.encode([self], *images)
 
 
 class PairEncoder(nn.Module):
-    """Encode observation and action together, to a latent of 32 x 4 x 4.
+    """Encode observation and action together, to a latent of (B, 32, 4, 4).
 
-    Merged: the action is stacked after the observation's channels. Split: two narrow encoders whose latents are
-    concatenated; used where action and observation do not show the same place (DIG).
+    Merged, the action is stacked after the observation's channels. Split, two narrow encoders are used and their
+    latents concatenated, for tasks in which action and observation show different places.
     """
 
     def __init__(self, split: bool) -> None:
@@ -119,7 +119,7 @@ class PairEncoder(nn.Module):
 
 
 def make_head(resolution: int) -> nn.Sequential:
-    """Decoder from the latent (B, 32, 4, 4) to an action-shaped output (B, 2, R, R); no activation at the end."""
+    """Decoder from the latent (B, 32, 4, 4) to an image (B, 2, R, R), without a final activation."""
     if resolution == 4:
         return nn.Sequential(
             nn.Flatten(),
@@ -138,10 +138,10 @@ def make_head(resolution: int) -> nn.Sequential:
 
 
 class Critic(nn.Module):
-    """One action-value network with its own encoder: (observation, action) -> Q, (B, 1)."""
+    """An action-value network with its own encoder."""
 
     def __init__(self, split: bool) -> None:
-        """Create encoder and a 512-256-256-1 perceptron."""
+        """Create the encoder and a 512-256-256-1 perceptron."""
         super().__init__()
         self.encoder = PairEncoder(split)
         self.value = nn.Sequential(
@@ -161,12 +161,12 @@ class Critic(nn.Module):
 
 
 class TwinCritic(nn.Module):
-    """Two critics that share nothing, neither with each other nor with the actor.
+    """Two critics that share no parameters with each other or with the actor.
 
     Args:
-        resolution: Action grid R.
-        split: Separate encoders for observation and action (DIG).
-        interpolation: See `ActorSpec`.
+        resolution: Rows and columns R of the actions.
+        split: Separate encoders for observation and action.
+        interpolation: See `cfp.agent.spec.ActorSpec`.
     """
 
     optimizer: torch.optim.Optimizer
@@ -178,24 +178,24 @@ class TwinCritic(nn.Module):
         self.critics = nn.ModuleList(Critic(split) for _ in range(2))
 
     def forward(self, observation: Tensor, action: Tensor) -> tuple[Tensor, ...]:
-        """Both Q-values, (B, 1) each, of uint8 observations (B, 3, 64, 64) and actions (B, 2, R, R) or (B, 2 R R)."""
+        """Q-values (B, 1) of both critics for observations (B, 3, 64, 64) and actions (B, 2, R, R) or (B, 2 R R)."""
         image = normalise_image(observation)
-        field = action.reshape(-1, 2, self.resolution, self.resolution)
-        patch = upsample(field, IMAGE_SIZE, self.interpolation)
-        return tuple(at_least_float32(self._judge(image, patch)))
+        action = action.reshape(-1, 2, self.resolution, self.resolution)
+        patch = upsample(action, IMAGE_SIZE, self.interpolation)
+        return tuple(at_least_float32(self._q_values(image, patch)))
 
-    def _judge(self, image: Tensor, patch: Tensor) -> Tensor:
-        """What `Critic.forward` gives for each critic, (2, B, 1), computed for both together."""
+    def _q_values(self, image: Tensor, patch: Tensor) -> Tensor:
+        """The results (2, B, 1) of `Critic.forward`, computed for both critics at once."""
         critics = cast(list[Critic], list(self.critics))
         encoders = list(zip(*(critic.encoder.encoders for critic in critics), strict=True))
         inputs = [(image, patch)] if len(encoders) == 1 else [(image,), (patch,)]
         parts = [
-            joint.encode(alike, *images).unflatten(1, (len(alike), -1))
-            for alike, images in zip(encoders, inputs, strict=True)
+            fused.encode(pair, *images).unflatten(1, (len(pair), -1))
+            for pair, images in zip(encoders, inputs, strict=True)
         ]
         latents = torch.cat(parts, dim=2).transpose(0, 1)  # (2, B, 32, 4, 4)
-        return joint.perceive([critic.value for critic in critics], latents)
+        return fused.multilayer_perceptrons([critic.value for critic in critics], latents)
 
     def set_training_mode(self, mode: bool) -> None:
-        """Switch between training and evaluation; without effect on these layers, asked for by stable-baselines3."""
+        """Switch between training and evaluation mode; required by stable-baselines3."""
         self.train(mode)

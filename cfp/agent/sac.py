@@ -1,23 +1,24 @@
 """CFP: soft actor-critic with the update rule of the DittoGym reference implementation (paper, Appendix B).
 
-What differs from stable-baselines3's SAC: rewards are centred and scaled by running statistics, every parameter
-tensor's gradient is clipped by itself, the gate of a residual actor is penalised, the temperature is a constant, the
-random phase and the start of the updates are two settings, and nothing that is not finite is stored or learned from.
+Differences from stable-baselines3's SAC: rewards are normalised by running statistics, the gradient of each parameter
+tensor is clipped separately, the gate of a residual actor is penalised, the temperature is constant, the random phase
+and the start of the updates are independent, and non-finite rewards, actions and losses are errors.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from cfp.agent.actor import Actor
 from cfp.agent.composition import Composition
@@ -41,15 +42,15 @@ METRICS: dict[str, str] = {
     "train/n_updates": "gradient updates so far in this stage",
     "train/learning_rate": "learning rate of the critics, and of the actor unless it has its own",
 }
-"""Every scalar that `CFP.train` logs, and what it means."""
+"""Scalars that `CFP.train` logs."""
 REFINING_METRICS: dict[str, str] = {
     "train/drift": "mean square by which sampled actions differ from the mean ones of the policy that is refined",
 }
-"""What it logs besides where a policy is refined."""
+"""Additional scalars where a policy is refined."""
 
 
 class RewardStatistics(nn.Module):
-    """Running mean and variance of raw rewards, updated from every replay batch before they are used.
+    """Running mean and variance of raw rewards, updated with each batch before it is normalised.
 
     ``M <- m M + (1 - m) mean(r)``, ``V <- m V + (1 - m) var(r)`` (unbiased), starting at 0 and 1;
     ``normalised r = (r - M) / (sqrt(V) + 1e-8)``.
@@ -65,35 +66,36 @@ class RewardStatistics(nn.Module):
         self.register_buffer("mean", torch.zeros(()))
         self.register_buffer("variance", torch.ones(()))
 
+    @torch.no_grad()
     def forward(self, rewards: Tensor) -> Tensor:
-        """Update the statistics with a batch of raw rewards (any shape) and return the rewards normalised."""
-        with torch.no_grad():
-            self.mean.lerp_(rewards.mean(), 1 - self.momentum)
-            self.variance.lerp_(rewards.var(), 1 - self.momentum)
-            return (rewards - self.mean) / (self.variance.sqrt() + 1e-8)
+        """Update the statistics with raw rewards of any shape and return them normalised."""
+        self.mean.lerp_(rewards.mean(), 1 - self.momentum)
+        self.variance.lerp_(rewards.var(), 1 - self.momentum)
+        return (rewards - self.mean) / (self.variance.sqrt() + 1e-8)
 
 
-def clip_each(parameters: list[nn.Parameter], limit: float) -> None:
-    """Scale the gradient of every parameter tensor, each by itself, to a norm of at most ``limit``."""
+def clip_each(parameters: Iterable[nn.Parameter], max_norm: float) -> None:
+    """Scale the gradient of each parameter tensor separately to a norm of at most ``max_norm``."""
+    # The public torch.nn.utils.clip_grad_norm_, called for each tensor, takes ten times as long.
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     norms = torch.stack(torch._foreach_norm(gradients))
-    torch._foreach_mul_(gradients, list((limit / (norms + 1e-6)).clamp(max=1.0).unbind()))
+    torch._foreach_mul_(gradients, list((max_norm / (norms + 1e-6)).clamp(max=1.0).unbind()))
 
 
 class CFP(SAC):
-    """Soft actor-critic as the coarse-to-fine policy uses it, on stable-baselines3's loop and replay buffer.
+    """Soft actor-critic as the coarse-to-fine policy uses it, on stable-baselines3's loop.
 
-    Stage 1 is a `CFPPolicy` with a plain actor; stage 2 one with a residual actor whose coarser level is frozen. The
-    coarse action is drawn anew in every update, and the entropy counts the residual part only, as in the reference.
+    Stage 1 is a `CFPPolicy` with a plain actor, later stages have a residual actor whose coarser stage is frozen. The
+    coarse action is sampled anew in every update, and the entropy covers the residual part only, as in the reference.
 
     Args:
         policy: `CFPPolicy` or its name, or another `cfp.agent.policies.NetworkPolicy`.
-        env: A vectorised environment with actions in [-1, 1]; (2, R, R) for `CFPPolicy`.
-        hyperparameters: See there.
+        env: Vectorised environment with actions in [-1, 1], of shape (2, R, R) for `CFPPolicy`.
+        hyperparameters: Hyperparameters of the stage.
         sac_options: Further options of stable-baselines3's SAC.
 
     Attributes:
-        origin: Actor that is refined, None for none; it has the same action grid and does not change.
+        origin: Actor to stay close to while it is refined, with the same action grid; None otherwise.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CFPPolicy": CFPPolicy}
@@ -109,11 +111,11 @@ class CFP(SAC):
         """Create networks, replay buffer and reward statistics."""
         self.hyperparameters = hyperparameters
         self.origin: Actor | None = None
-        sac_options.setdefault("replay_buffer_class", ReplayRing)
         spec = (sac_options.get("policy_kwargs") or {}).get("spec")
-        noisy = sac_options.get("action_noise") is not None  # then what is executed has no parts
-        ring = {"seed": sac_options.get("seed"), "composition": Composition.of(spec) if spec and not noisy else None}
-        sac_options.setdefault("replay_buffer_kwargs", ring)
+        noisy = sac_options.get("action_noise") is not None  # then the executed action is not composed of parts
+        composition = Composition.of(spec) if spec and not noisy else None
+        sac_options.setdefault("replay_buffer_class", ReplayRing)
+        sac_options.setdefault("replay_buffer_kwargs", {"seed": sac_options.get("seed"), "composition": composition})
         super().__init__(
             policy,
             env,
@@ -130,8 +132,10 @@ class CFP(SAC):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self.reward_statistics = RewardStatistics(self.hyperparameters.reward_momentum).to(self.device)
-        self.losses = Losses(self.device, self.hyperparameters.precision, self.hyperparameters.compile)
+        own = self.hyperparameters
+        self.reward_statistics = RewardStatistics(own.reward_momentum).to(self.device)
+        self.losses = Losses(self.device, own.precision, own.compile)
+        self.update_average = get_ema_multi_avg_fn(1 - self.tau)
 
     def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
         """Actor, critics and target critics with their own types."""
@@ -139,10 +143,10 @@ class CFP(SAC):
         return self.policy.networks()
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Do some updates: critics, then actor, then target critics.
+        """Perform updates of critics, actor and target critics.
 
         Args:
-            gradient_steps: How many.
+            gradient_steps: Number of updates.
             batch_size: Transitions in each.
 
         Raises:
@@ -157,45 +161,47 @@ class CFP(SAC):
         for _ in range(gradient_steps):
             scalars = self.update(self.replay_buffer.sample(batch_size))
             self._n_updates += 1
-            values = torch.stack(tuple(scalars.values())).tolist()  # one wait for the device, not one for each
+            values = torch.stack(tuple(scalars.values())).tolist()  # waits for the device once, not for each scalar
             for name, value in zip(scalars, values, strict=True):
                 self.logger.record_mean(f"train/{name}", value)
         self.logger.record("train/n_updates", self._n_updates)
 
     def update(self, batch: ReplayBufferSamples) -> dict[str, Tensor]:
-        """Do one update on a ``batch``; what it is judged by, scalars by name, see `METRICS`."""
-        _, critic, target = self.networks()
-        now, later = map(self.losses.prepare, (batch.observations, batch.next_observations))
-        scalars = self._update_critic(now, later, batch)
+        """Perform one update; returns scalars by name, see `METRICS`."""
+        obs, next_obs = map(self.losses.prepare, (batch.observations, batch.next_observations))
+        scalars = self._update_critic(obs, next_obs, batch)
         if self.num_timesteps >= self.hyperparameters.actor_start:
-            scalars |= self._update_actor(now)
-        with torch.no_grad():
-            torch._foreach_lerp_(list(target.parameters()), list(critic.parameters()), self.tau)
+            scalars |= self._update_actor(obs)
+        _, critic, target = self.networks()
+        self.update_average(list(target.parameters()), list(critic.parameters()), 1)
         scalars["reward_mean"] = self.reward_statistics.mean
         scalars["reward_std"] = self.reward_statistics.variance.sqrt()
         return scalars
 
-    def _update_critic(self, now: Tensor, later: Tensor, batch: ReplayBufferSamples) -> dict[str, Tensor]:
+    def _update_critic(self, obs: Tensor, next_obs: Tensor, batch: ReplayBufferSamples) -> dict[str, Tensor]:
         actor, critic, target = self.networks()
-        rewards = self.reward_statistics(batch.rewards)
-        goes_on = 1 - batch.dones
-        wanted = self.losses.critic_target(actor, target, later, rewards, goes_on, self.ent_coef_tensor, self.gamma)
-        loss = self.losses.critic_loss(critic, now, batch.actions, wanted)
+        rewards, not_done = self.reward_statistics(batch.rewards), 1 - batch.dones
+        target_q = self.losses.critic_target(
+            actor, target, next_obs, rewards, not_done, self.ent_coef_tensor, self.gamma
+        )
+        loss = self.losses.critic_loss(critic, obs, batch.actions, target_q)
         self._descend(loss, critic.optimizer, list(critic.parameters()), "critic")
-        return {"critic_loss": loss.detach(), "q_target": wanted.mean()}
+        return {"critic_loss": loss.detach(), "q_target": target_q.mean()}
 
-    def _update_actor(self, now: Tensor) -> dict[str, Tensor]:
+    def _update_actor(self, obs: Tensor) -> dict[str, Tensor]:
         actor, critic, _ = self.networks()
-        critic.requires_grad_(False)  # spares the critics' weight gradients, which would be thrown away
         own = self.hyperparameters
+        critic.requires_grad_(False)  # avoids computing weight gradients of the critics, which would be discarded
         loss, scalars = self.losses.actor_loss(
-            actor, critic, now, self.ent_coef_tensor, own.gate_penalty, self.origin, own.anchor
+            actor, critic, obs, self.ent_coef_tensor, own.gate_penalty, self.origin, own.anchor
         )
         self._descend(loss, actor.optimizer, actor.trainable_parameters(), "actor")
         critic.requires_grad_(True)
         return scalars | {"actor_loss": loss.detach()}
 
-    def _descend(self, loss: Tensor, optimizer: torch.optim.Optimizer, weights: list[nn.Parameter], name: str) -> None:
+    def _descend(
+        self, loss: Tensor, optimizer: torch.optim.Optimizer, parameters: list[nn.Parameter], name: str
+    ) -> None:
         if not torch.isfinite(loss):
             raise NonFiniteError(
                 f"the {name} loss became {loss.item()} at update {self._n_updates + 1} "
@@ -203,43 +209,44 @@ class CFP(SAC):
             )
         optimizer.zero_grad()
         loss.backward()
-        clip_each(weights, self.hyperparameters.max_grad_norm)
+        clip_each(parameters, self.hyperparameters.max_grad_norm)
         optimizer.step()
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Actions to execute, and what the replay memory stores of them."""
-        composition = getattr(self.replay_buffer, "composition", None)
-        if self.num_timesteps >= self.hyperparameters.random_steps and composition is not None:
-            actions, stored = self._act_in_parts(composition)
-            self._check_finite("action", actions)  # here, as environments refuse it with an error of their own
-            return actions, stored
-        # stable-baselines3 ties the random phase to the start of the updates; here they are two settings.
-        actions, stored = super()._sample_action(self.hyperparameters.random_steps, action_noise, n_envs)
+        """Actions to execute, and their form in the replay buffer."""
+        composition: Composition | None = getattr(self.replay_buffer, "composition", None)
         if self.num_timesteps < self.hyperparameters.random_steps:
-            return self._random(actions, stored, composition)
+            # stable-baselines3 ends its random phase where updates start; here the two are independent.
+            actions, stored = super()._sample_action(self.hyperparameters.random_steps, action_noise, n_envs)
+            return self._on_action_grid(actions, stored, composition)
+        if composition is not None:
+            actions, stored = self._act_in_parts(composition)
+        else:
+            actions, stored = super()._sample_action(0, action_noise, n_envs)
         self._check_finite("action", actions)
         return actions, stored
 
-    def _random(
+    def _on_action_grid(
         self, actions: np.ndarray, stored: np.ndarray, composition: Composition | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Of uniform actions (B, 2, A, A), those of the random phase, and what is stored of them."""
-        grid = self.networks()[0].resolution
-        if grid == self.action_resolution:
+        """Coarsen uniform actions to the action grid of the stage.
+
+        Of independent values for each pixel of a larger patch little would be left in the force field.
+        """
+        if not isinstance(self.policy, CFPPolicy):
             return actions, stored
-        # As coarse as the level acts: of independent pixels little would be left in the field.
+        grid, size = self.networks()[0].resolution, self.policy.spec.action_size
+        if grid == size:
+            return actions, stored
         corner = torch.as_tensor(stored[..., :grid, :grid], dtype=torch.float32)
-        assert isinstance(self.policy, CFPPolicy)
-        actions = stored = upsample(corner, self.action_resolution, self.policy.spec.interpolation).numpy()
-        if composition is not None:
-            stored = composition.alone(corner).numpy()
-        return actions, stored
+        actions = upsample(corner, size, self.policy.spec.interpolation).numpy()
+        return actions, actions if composition is None else composition.from_finest(corner).numpy()
 
     @torch.no_grad()
     def _act_in_parts(self, composition: Composition) -> tuple[np.ndarray, np.ndarray]:
-        """Act as ``predict`` does, keeping the images that the actions were blended from."""
+        """Act as ``predict`` does, and keep the parts of the actions."""
         assert self._last_obs is not None
         self.policy.set_training_mode(False)
         observation, _ = self.policy.obs_to_tensor(self._last_obs)
@@ -272,10 +279,4 @@ class CFP(SAC):
         return [*modules, "reward_statistics"], tensors
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "reward_statistics", "losses", "origin"]
-
-    @property
-    def action_resolution(self) -> int:
-        """Rows and columns of an action."""
-        assert isinstance(self.action_space, spaces.Box)
-        return int(self.action_space.shape[-1])
+        return [*super()._excluded_save_params(), "reward_statistics", "losses", "origin", "update_average"]

@@ -1,1 +1,1 @@
-"""Environments for training: the `VecEnv` adapter and the disturbances of robustness tests."""
+"""Environments of a run for stable-baselines3, and their disturbances. Imports no networks."""

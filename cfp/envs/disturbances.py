@@ -1,11 +1,11 @@
-"""Faults and changed constants under which a policy is tried, without learning."""
+"""Disturbances and changed constants under which policies are evaluated."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -28,18 +28,18 @@ FLOOR = floor().name
 
 @dataclass(frozen=True)
 class Case:
-    """One way to disturb a policy.
+    """One disturbance.
 
     Attributes:
-        name: For tables and plots.
-        action_dropout: Share of the policy's decisions that become 0, drawn anew in every step: of the 2 R R entries of
-            its own grid, or what else it decides, see `Decides`.
-        observation_dropout: Share of the 3 x 64 x 64 raw pixels that become 0, drawn anew in every step. A velocity
-            pixel of 0 means fast motion, not rest, which is 132.
-        action_noise: Standard deviation of Gaussian noise on every decision; 1 is the full actuation.
-        latency: Control steps by which actions come late; the first ones of an episode are 0.
-        physics: Factors on the task's own ``mu``, ``yield_stress`` and ``gravity``.
-        friction: Coulomb coefficient of the floor; ``math.inf`` sticks. ``None``: the task's own.
+        name: Name in tables and plots.
+        action_dropout: Fraction of the policy's decisions that are set to 0, drawn anew in each step; decisions are the
+            2 R R entries of its action grid, or those of `Decides`.
+        observation_dropout: Fraction of the 3 x 64 x 64 pixels that are set to 0, drawn anew in each step. A velocity
+            pixel of 0 means fast motion, a pixel of 132 rest.
+        action_noise: Standard deviation of Gaussian noise on each decision; 1 is the full actuation.
+        latency: Delay of the actions in control steps; the first actions of an episode are 0.
+        physics: Factors on ``mu``, ``yield_stress`` and ``gravity`` of the task.
+        friction: Coulomb coefficient of the floor; ``math.inf`` sticks, None keeps that of the task.
     """
 
     name: str
@@ -51,41 +51,41 @@ class Case:
     friction: float | None = None
 
 
-def idle(case: Case, spec: TaskSpec, sees_image: bool = True) -> str:
-    """Why a case changes nothing in a task for a policy; empty if it changes something.
+def reason_without_effect(case: Case, spec: TaskSpec, sees_image: bool = True) -> str:
+    """Why a case has no effect on a policy in a task; empty if it has one.
 
     Args:
-        case: One way to disturb it.
+        case: The disturbance.
         spec: The task.
-        sees_image: Whether the policy looks at pixels.
+        sees_image: Whether the policy uses the image.
     """
     if case.observation_dropout and not sees_image:
-        return "the policy looks at no pixels"
+        return "the policy does not use the image"
     if "gravity" in case.physics and not any(spec.gravity):
         return f"{spec.name} has no gravity"
     if case.friction is None:
         return ""
     floors = [item for item in spec.obstacles if item.name == FLOOR]
     if not floors:
-        return f"{spec.name} has no obstacle with the name {FLOOR!r}"
-    own = {rule.friction for item in floors for rule in item.rules}
-    if not own:
+        return f"{spec.name} has no obstacle named {FLOOR!r}"
+    present = {rule.friction for item in floors for rule in item.velocity_rules}
+    if not present:
         return f"the floor of {spec.name} has no rules"
-    return f"the floor of {spec.name} has this friction" if own == {case.friction} else ""
+    return f"the floor of {spec.name} has this friction" if present == {case.friction} else ""
 
 
 def disturbed_env(
     config: RunConfig, resolution: int, num_envs: int, case: Case, seed: int, grid: int | None = None
 ) -> Disturbed:
-    """The environment of a run under a case.
+    """Create the environment of a run with a disturbance.
 
     Args:
         config: The run's options.
         resolution: Action grid R.
-        num_envs: Robots side by side.
-        case: What is disturbed.
-        seed: Of the disturbances, and of a first reset that sets the constants.
-        grid: Of the policy, see `Disturbed`.
+        num_envs: Number of robots.
+        case: The disturbance.
+        seed: Seed of the disturbance, and of a first reset that sets the constants.
+        grid: Action grid of the policy, see `Disturbed`.
     """
     spec = make_spec(config.task, **config.environment.task_options())
     options = {} if case.friction is None else {"obstacles": _with_friction(spec, case.friction)}
@@ -96,100 +96,96 @@ def disturbed_env(
 
 
 def _with_friction(spec: TaskSpec, friction: float) -> tuple[Obstacle, ...]:
-    return tuple(
-        replace(item, rules=tuple(replace(rule, friction=friction) for rule in item.rules))
-        if item.name == FLOOR
-        else item
-        for item in spec.obstacles
-    )
+    return tuple(item.with_friction(friction) if item.name == FLOOR else item for item in spec.obstacles)
 
 
-def lose(values: Tensor, lost: Tensor) -> Tensor:
-    """Values (B, ..., A, A) without what is lost (B, ..., R, R), bool: each entry takes its whole cell along."""
-    if lost.shape != values.shape:
-        size, grid = values.shape[-1], lost.shape[-1]
-        cell = torch.arange(size, device=lost.device) * grid // size
-        lost = lost[..., cell[:, None], cell]
-    return values.masked_fill(lost, 0)
+def drop(values: Tensor, mask: Tensor) -> Tensor:
+    """Set entries of (B, ..., A, A) to 0, selected by a bool mask (B, ..., R, R) whose entries cover whole cells."""
+    if mask.shape != values.shape:
+        size, grid = values.shape[-1], mask.shape[-1]
+        cell = torch.arange(size, device=mask.device) * grid // size
+        mask = mask[..., cell[:, None], cell]
+    return values.masked_fill(mask, 0)
 
 
 @runtime_checkable
 class Decides(Protocol):
-    """A policy that decides something else than a grid, from which its actions are painted."""
+    """A policy whose decisions are not on an action grid, from which its actions are computed."""
 
     def through(self, change: Callable[[np.ndarray], np.ndarray]) -> Policy:
-        """The same policy, with ``change`` made to its decisions (B, ...) before its actions are painted from them."""
+        """The same policy, with ``change`` applied to its decisions (B, ...) before they become actions."""
 
 
 class Disturbed(VecEnvWrapper):
-    """Disturbs actions and observations of a vectorised environment; the same from every ``reset`` on.
+    """Disturbs actions and observations of a vectorised environment, in the same way after each ``reset``.
 
-    A policy of several levels decides on a grid and hands over an enlarged blend. Its actions are disturbed on that
-    grid: lost entries take away all that they became, noise is enlarged as the environment enlarges actions.
+    A policy of several stages decides on an action grid and returns an enlarged blend. Its actions are disturbed on
+    that grid: a dropped entry clears its whole cell, noise is enlarged as the environment enlarges actions.
 
     Args:
         venv: The environment, with actions (B, 2, A, A) and observations uint8 (B, 3, 64, 64).
-        case: What is disturbed; its constants of the matter are not applied here.
-        seed: Of the generator, which every ``reset`` starts anew.
-        grid: Rows and columns R of the grid on which the policy decides; A if None, 0 if it decides on none and calls
+        case: The disturbance; its constants are not applied here.
+        seed: Seed of the generator, which restarts at each ``reset``.
+        grid: Rows and columns R of the grid on which the policy decides; None: A; 0: none, and the policy calls
             `disturb` itself, see `Decides`.
     """
 
     def __init__(self, venv: VecEnv, case: Case, seed: int, grid: int | None = None) -> None:
         super().__init__(venv)
-        self.case, self.seed_of_noise = case, seed
+        self.case, self.noise_seed = case, seed
         assert self.action_space.shape is not None
         self.size = self.action_space.shape[-1]
         self.grid = self.size if grid is None else grid
-        self._begin()
+        self._restart()
 
-    def _begin(self) -> None:
-        self.generator = np.random.default_rng(self.seed_of_noise)
-        nothing = np.zeros((self.num_envs, 2, self.size, self.size), np.float32)
-        self._late = deque(nothing.copy() for _ in range(self.case.latency))
+    def _restart(self) -> None:
+        self.generator = np.random.default_rng(self.noise_seed)
+        zeros = np.zeros((self.num_envs, 2, self.size, self.size), np.float32)
+        self._delayed = deque(zeros.copy() for _ in range(self.case.latency))
 
     def reset(self) -> VecEnvObs:
-        """Start new episodes, with the disturbances of the first time."""
-        self._begin()
-        return self._seen(self.venv.reset())
+        """Start new episodes, and the sequence of disturbances anew."""
+        self._restart()
+        return self._disturb_observation(self.venv.reset())
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Hand on what becomes of the actions (B, 2, A, A)."""
-        self._late.append(np.array(actions, np.float32))
-        actions = self._late.popleft()
+        """Pass on the disturbed actions (B, 2, A, A)."""
+        self._delayed.append(np.array(actions, np.float32))
+        actions = self._delayed.popleft()
         if self.grid:
-            actions = self._disturbed(actions, (len(actions), 2, self.grid, self.grid))
+            actions = self._disturb(actions, (len(actions), 2, self.grid, self.grid))
         self.venv.step_async(actions)
 
     def disturb(self, decisions: np.ndarray) -> np.ndarray:
-        """What becomes of decisions (B, ...) that are no grid."""
-        return self._disturbed(decisions, decisions.shape)
+        """Disturb decisions (B, ...) that are not on a grid."""
+        return self._disturb(decisions, decisions.shape)
 
-    def _disturbed(self, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """Values with noise and losses that are drawn in another shape."""
-        found = torch.from_numpy(values)
+    def _disturb(self, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+        """Apply noise and dropout that are drawn in ``shape``."""
+        disturbed = torch.from_numpy(values)
         if self.case.action_noise:
             noise = torch.from_numpy(self.generator.standard_normal(shape, np.float32))
-            found = found + self.case.action_noise * (noise if shape == values.shape else bicubic(noise, self.size))
+            disturbed = disturbed + self.case.action_noise * (
+                noise if shape == values.shape else bicubic(noise, self.size)
+            )
         if self.case.action_dropout:
-            found = lose(found, torch.from_numpy(self.generator.random(shape) < self.case.action_dropout))
-        disturbed: np.ndarray = found.numpy()
-        return disturbed
+            disturbed = drop(disturbed, torch.from_numpy(self.generator.random(shape) < self.case.action_dropout))
+        result: np.ndarray = disturbed.numpy()
+        return result
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step; a new episode does not get the late actions of the one before."""
+        """Step; delayed actions of an ended episode are cleared."""
         observation, reward, done, infos = self.venv.step_wait()
-        for actions in self._late:
+        for actions in self._delayed:
             actions[done] = 0
-        return self._seen(observation), reward, done, infos
+        return self._disturb_observation(observation), reward, done, infos
 
-    def _seen(self, observation: VecEnvObs) -> VecEnvObs:
+    def _disturb_observation(self, observation: VecEnvObs) -> VecEnvObs:
         assert isinstance(observation, np.ndarray)
         if not self.case.observation_dropout:
             return observation
-        lost = self.generator.random(observation.shape) < self.case.observation_dropout
-        seen: np.ndarray = lose(torch.from_numpy(observation), torch.from_numpy(lost)).numpy()
-        return seen
+        mask = self.generator.random(observation.shape) < self.case.observation_dropout
+        return np.where(mask, observation.dtype.type(0), observation)
 
 
 def make_cases(
@@ -199,14 +195,14 @@ def make_cases(
     shift: float = 0.2,
     friction: tuple[float, ...] = (0.0, 0.5, math.inf),
 ) -> list[Case]:
-    """The cases of a report, the unperturbed one first.
+    """The cases of a robustness report, the unperturbed one first.
 
     Args:
-        dropout: Share of lost action and of lost observation entries.
+        dropout: Fraction of dropped action and of dropped observation entries.
         noise: Standard deviation of the action noise.
-        latency: Control steps.
-        shift: Constants of the matter are tried at 1 - shift and 1 + shift times their own value.
-        friction: Coefficients of the floor.
+        latency: Delay in control steps.
+        shift: Physical constants are multiplied by 1 - shift and by 1 + shift.
+        friction: Friction coefficients of the floor.
     """
     cases = [
         Case("unperturbed"),

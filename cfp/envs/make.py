@@ -1,4 +1,4 @@
-"""From a run's options to environments."""
+"""Environments from the options of a run."""
 
 from __future__ import annotations
 
@@ -16,46 +16,46 @@ from dittogym import TorchEnv
 
 
 def choose_device(name: str) -> str:
-    """Resolve ``"auto"`` to CUDA where there is one.
+    """Resolve ``"auto"`` to CUDA if available, else to the CPU.
 
     Raises:
-        ConfigError: CUDA is asked for and there is none, or torch does not know the name.
+        ConfigError: The name is unknown, or CUDA is requested but not available.
     """
     if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     try:
         kind = torch.device(name).type
     except RuntimeError as error:
-        raise ConfigError(f"device: got {name!r}, allowed auto, cpu or cuda") from error
+        raise ConfigError(f"device must be auto, cpu or cuda, got {name!r}") from error
     if kind == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(f"device: got {name!r}, but torch finds no CUDA device; allowed here: auto, cpu")
+        raise ConfigError(f"device must be auto or cpu where torch finds no CUDA device, got {name!r}")
     return name
 
 
 def make_env(config: RunConfig, resolution: int, num_envs: int | None = None) -> VecMonitor:
-    """Build the environment of a run for stable-baselines3, see `make_torch_env`."""
+    """Create the environment of a run for stable-baselines3, see `make_torch_env`."""
     return monitored(make_torch_env(config, resolution, num_envs))
 
 
 def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = None, **changes: Any) -> TorchEnv:
-    """Build the environment of a run.
+    """Create the environment of a run.
 
     Args:
         config: The run's options.
         resolution: Action grid R.
-        num_envs: Robots side by side; the run's own number if None.
-        changes: Options of `dittogym.TorchEnv` that are not the run's, such as ``obstacles``.
+        num_envs: Number of robots; None: that of the run.
+        changes: Further options of `dittogym.TorchEnv`, such as ``obstacles``.
 
     Raises:
-        ConfigError: The environment refuses an option; the message is its own.
+        ConfigError: The environment refuses an option.
     """
     options = dataclasses.asdict(config.environment)
-    own = options.pop("num_envs")
+    default = options.pop("num_envs")
     for name in TASK_OPTIONS:
         options.pop(name)
     options |= config.environment.task_options() | changes
     device = choose_device(config.device)
     try:
-        return TorchEnv(config.task, num_envs or own, resolution, device=device, **options)
+        return TorchEnv(config.task, num_envs or default, resolution, device=device, **options)
     except (ValueError, TypeError, OSError) as error:
         raise ConfigError(" ".join(str(error).split())) from error

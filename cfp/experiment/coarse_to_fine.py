@@ -12,9 +12,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecMonitor
 
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.hyperparameters import Hyperparameters
-from cfp.agent.policies import ActorPolicy, CFPPolicy, NetworkPolicy
-from cfp.agent.replay import FIELDS
+from cfp.agent.policies import CFPPolicy, NetworkPolicy
 from cfp.agent.sac import CFP
 from cfp.config import Config, RunConfig
 from cfp.envs.make import choose_device, make_env
@@ -22,6 +22,7 @@ from cfp.errors import ConfigError
 from cfp.evaluation.pictures import policy_pictures
 from cfp.experiment.algorithm import Algorithm, Cost, Position, Scalars, mean_seconds
 from cfp.experiment.folder import policy_path
+from cfp.experiment.replay_archive import FIELDS
 from cfp.experiment.sac_state import load_model_state_dict, model_state_dict
 from cfp.presets import preset
 from cfp.weights import KIND, fitting, load, policy_for, read_policy, save_policy, write_policy
@@ -43,8 +44,6 @@ class SACAlgorithm(Algorithm):
         stage: Which stage, 1 is the first.
         model: As the stage begins.
     """
-
-    model_type: type[CFP] = CFP
 
     def __init__(self, config: Any, stage: int, model: CFP) -> None:
         self.config, self.stage, self.model = config, stage, model
@@ -81,7 +80,7 @@ class SACAlgorithm(Algorithm):
         """
         if hyperparameters.compile:
             print("compiling the updates; the first time on a machine this takes minutes ...", flush=True)
-        model = cls.model_type(
+        model = CFP(
             policy,
             env,
             hyperparameters,

@@ -20,7 +20,7 @@ from cfp.experiment.estimate import estimate
 from cfp.experiment.folder import holds_run, read_config
 from cfp.experiment.process import Stopped, StopSignals
 from cfp.experiment.run import Run
-from cfp.experiment.run_lock import claim
+from cfp.experiment.run_lock import run_lock
 from cfp.files import read_json
 from cfp.from_dict import update_from_dict
 from cfp.policy import Policy
@@ -160,7 +160,7 @@ def _train(program: Program, arguments: Sequence[str], started: str) -> None:
         print(estimate(program.find(config.algo), config, folder if command.resume else None))
         return
     print(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed} -> {folder}")
-    with claim(folder):
+    with run_lock(folder):
         with StopSignals() as signals:
             run = Run(program.find(config.algo), config, folder, command.resume, signals)
             if config.environment.backend == "compile":

@@ -14,11 +14,11 @@ import numpy as np
 
 from dittogym.bodies.images import read_grey
 from dittogym.bodies.shapes import Figure, Shape
-from dittogym.spec import Body, TaskSpec
+from dittogym.spec import BodySpec, TaskSpec
 from torchmpm import sampling
 
 #: A path or an array (picture), (K, 2) corners (outline), a shape, or a body.
-BodyLike: TypeAlias = "str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, float]] | Shape | Body"
+BodyLike: TypeAlias = "str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, float]] | Shape | BodySpec"
 
 #: Grey values above this belong to the robot.
 THRESHOLD = 127
@@ -39,14 +39,14 @@ def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
         spec: The task.
         body: The path of an image or an array (H, W), (H, W, 3), (H, W, 4), bright pixels belong to the robot; corners
             (K, 2) of an outline with x to the right and y upwards, in any unit; a shape of
-            :mod:`dittogym.bodies.shapes` in world coordinates; or a :class:`dittogym.spec.Body`.
+            :mod:`dittogym.bodies.shapes` in world coordinates; or a :class:`dittogym.spec.BodySpec`.
 
     Raises:
         ValueError: Not readable as one of these, empty, out of the window, in the place of the task's object, or so
             long that the task would end at once.
     """
     own = spec.robot
-    if isinstance(body, Body):
+    if isinstance(body, BodySpec):
         robot = body
     elif isinstance(body, Shape):
         robot = replace(own, shape=body, count=max(1, round(own.count * body.area / own.shape.area)))
@@ -69,7 +69,7 @@ def _figure(body: str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, fl
 
 def _mask(body: str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, float]]) -> np.ndarray:
     if not isinstance(body, (str, os.PathLike)):
-        kinds = "a path, an array, an outline (K, 2), a Shape or a Body"
+        kinds = "a path, an array, an outline (K, 2), a Shape or a BodySpec"
         try:
             body = np.asarray(body)
         except ValueError as error:  # rows of different lengths

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import cv2
 import numpy as np
 from torch import Tensor
 
 from dittogym.action import place
 from dittogym.geometry import Box
-from dittogym.observation.window import in_window
-from torchmpm import Soil, checks
+from dittogym.model import EnvState, Model
+from dittogym.window import centre_in_window
+from torchmpm import Snow, checks
 from torchmpm.materials.body import slices
-
-if TYPE_CHECKING:
-    from dittogym.core import EnvState, Model
 
 GROUND = (248, 246, 240)
 SOLID = (112, 119, 130)
@@ -33,14 +29,14 @@ OVERSAMPLING = 2
 LARGEST = 8192
 
 
-def frame(model: Model, state: EnvState, index: int, field: Tensor | None, size: int) -> np.ndarray:
+def frame(model: Model, state: EnvState, index: int, actuation: Tensor | None, size: int) -> np.ndarray:
     """Draw one element of a batch: the whole window, obstacles, target and particles coloured by body.
 
     Args:
         model: The task.
         state: The batch.
         index: Which element.
-        field: (B, 2, P, P) actuation on the patch, to colour the robot by; ``None`` for plain colours.
+        actuation: (B, 2, P, P) on the patch, to colour the robot by, Pa; ``None`` for plain colours.
         size: Pixels per side.
 
     Returns:
@@ -64,17 +60,17 @@ def frame(model: Model, state: EnvState, index: int, field: Tensor | None, size:
     if spec.target is not None:
         canvas.target(spec.target, state.centre[index].detach().cpu().double().numpy())
     for obstacle in spec.obstacles:
-        for box in obstacle.shown:
-            canvas.box(box, filled=bool(obstacle.drawn) or box.ground)
+        for box in obstacle.boxes:
+            canvas.box(box, filled=bool(obstacle.observed_boxes) or box.ground)
     x = particles.x[0].cpu().double().numpy()
     counts = [body.count for body in model.solver.bodies]
-    kinds = [ROBOT, *(GROUND_BODY if isinstance(body.material, Soil) else OBJECT for body in spec.objects)]
+    kinds = [ROBOT, *(GROUND_BODY if isinstance(body.material, Snow) else OBJECT for body in spec.objects)]
     colours = np.repeat(np.array(kinds), counts, axis=0)
-    if field is not None:
-        colours[: model.robot] = _muscle_colours(model, state, index, field)
+    if actuation is not None:
+        colours[: model.num_robot_particles] = _muscle_colours(model, state, index, actuation)
     parts = [part for _, part in slices(model.solver.bodies)]
-    for part, share in reversed(list(zip(parts, model.shares, strict=True))):  # the robot last, on top
-        canvas.dots(x[part], colours[part], radius=_radius(share, size * OVERSAMPLING))
+    for part, weight in reversed(list(zip(parts, model.particle_weight, strict=True))):  # the robot last, on top
+        canvas.dots(x[part], colours[part], radius=_radius(weight, size * OVERSAMPLING))
     return cv2.resize(canvas.image, (size, size), interpolation=cv2.INTER_AREA)
 
 
@@ -140,17 +136,19 @@ class Canvas:
                 self.image[r[ok], c[ok]] = colours[ok]
 
 
-def _radius(share: float, pixels: int) -> int:
+def _radius(weight: float, pixels: int) -> int:
     """Dots just large enough to close a body at its initial density."""
-    return max(1, round(FULL_SIZE_RADIUS * np.sqrt(share) * pixels))
+    return max(1, round(FULL_SIZE_RADIUS * np.sqrt(weight) * pixels))
 
 
-def _muscle_colours(model: Model, state: EnvState, index: int, field: Tensor) -> np.ndarray:
+def _muscle_colours(model: Model, state: EnvState, index: int, actuation: Tensor) -> np.ndarray:
     spec = model.spec
     one = slice(index, index + 1)
-    centre = in_window(spec.reach, state.centre[one], state.origin[one])
-    nodes = place(field[one], centre, model.solver.grid.resolution)[0].sum(0).cpu().double().numpy()
-    relative = (state.particles.x[index, : model.robot] - state.origin[index]).detach().cpu().double().numpy()
+    centre = centre_in_window(spec.reach, state.centre[one], state.origin[one])
+    nodes = place(actuation[one], centre, model.solver.grid.resolution)[0].sum(0).cpu().double().numpy()
+    relative = (
+        (state.particles.x[index, : model.num_robot_particles] - state.origin[index]).detach().cpu().double().numpy()
+    )
     finite = np.isfinite(relative).all(1, keepdims=True)
     at = np.clip(np.where(finite, relative, 0.0) * len(nodes), 0, len(nodes) - 1).astype(int)
     strength = float(state.physics["max_actuation"][index]) if "max_actuation" in state.physics else spec.max_actuation

@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 from dittogym.bodies.shapes import Disc, Rectangle
+from dittogym.contract import Moment, Outcome
 from dittogym.geometry import ceiling, floor, side_walls
-from dittogym.rewards import limited, signed_quadratic
-from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
-from torchmpm import Soil, lame
+from dittogym.rewards import signed_quadratic
+from dittogym.spec import BodySpec, TaskSpec
+from dittogym.window import Window
+from torchmpm import Snow, lame
 
 GOAL = (0.2, 0.17)
 #: Mean distance of the robot's particles (|x| + |y|) from the goal that counts as success (our definition), m.
 REACHED = 0.1
-SOIL = Soil(*lame(5000.0, 0.2))
+SOIL = Snow(*lame(5000.0, 0.2))
 
 
-def judge(moment: Moment, weights: Weights) -> Outcome:
+def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
     """Mean distance of all particles from the goal, under a square root; speed to the right and downwards."""
-    x = moment.particles.x[:, : moment.robot]
-    distance = (x - x.new_tensor(GOAL)).abs().sum(-1).mean(1)
-    rightwards, upwards = moment.now.velocity.unbind(1)
-    speeds = (rightwards, -upwards)
-    along, down = (limited(signed_quadratic(v, 5.0), -20.0, 20.0, soft=moment.soft) for v in speeds)
+    x = moment.robot_x
+    distance = (x - spec.goal_like(x)).abs().sum(-1).mean(1)
+    right, up = moment.now.velocity.unbind(1)
+    rightwards, downwards = (moment.ops.clamp(signed_quadratic(v, 5.0), -20.0, 20.0) for v in (right, -up))
     return Outcome(
-        terms={"distance": -weights.location * distance.sqrt(), "velocity": weights.velocity * (along + down)},
+        terms={"distance": -distance.sqrt(), "velocity": rightwards + downwards},
         success=distance < REACHED,
         info={"distance": distance},
     )
@@ -33,14 +34,14 @@ def dig() -> TaskSpec:
     return TaskSpec(
         name="dig",
         horizon=1000,
-        robot=Body(Disc((-0.2, 0.5), 0.14), count=12000),
+        robot=BodySpec(Disc((-0.2, 0.5), 0.14), count=12000),
         objects=(
-            Body(
+            BodySpec(
                 Rectangle((-0.25, 0.16), (0.5, 0.33), draws=2),
                 count=8000,
                 lite=3400,
                 material=SOIL,
-                moves_visibly=False,
+                hidden_velocity=True,
             ),
         ),
         mu=400.0,
@@ -53,6 +54,6 @@ def dig() -> TaskSpec:
         obstacles=(side_walls(None), floor(friction=0.0), ceiling(126)),
         goal=GOAL,
         split_limit=0.12,
-        judge=judge,
-        weights=Weights(location=20.0, velocity=5.0, split=1.0, action=2e-4, alive=15.0),
+        reward_fn=reward_fn,
+        weights={"distance": 20.0, "velocity": 5.0, "split": 1.0, "action": 2e-4, "alive": 15.0},
     )

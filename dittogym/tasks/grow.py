@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
-from torch import Tensor
-
 from dittogym.bodies.shapes import Lattice
+from dittogym.contract import Memory, Moment, Outcome
 from dittogym.geometry import Obstacle, ceiling, floor, nodes, side_walls
-from dittogym.rewards import beyond, distance, drop_widest, pick, share_of
-from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
+from dittogym.rewards import count_of, distance, drop_widest, pick
+from dittogym.spec import BodySpec, TaskSpec
+from dittogym.window import Window
 from torchmpm import VelocityRule
 
 GOAL = (0.0, 0.5)
@@ -17,54 +15,51 @@ GOAL = (0.0, 0.5)
 REACHED = 0.04
 #: It ends, in failure, with the tip this far away, m.
 LOST = 0.28
-BONUS = 200.0
-#: Where the reward is soft, the bonus sets in over this distance, m.
+#: In a smooth reward the bonus sets in over this distance, m.
 BONUS_WIDTH = 0.005
-#: Share of the robot's particles that are its tip: 2,000 of 19,600.
+#: Fraction of the robot's particles that are its tip: 2,000 of 19,600.
 TIP = 2000 / 19600
 
 RIGHT_BEAM = Obstacle(
     "right beam",
-    (
+    (nodes(15, 32, 38, 41),),
+    rules=(
         VelocityRule("+x", (15, 16), (38, 41)),
         VelocityRule("-x", (30, 31), (38, 41)),
         VelocityRule("-y", (15, 32), (41, 41)),
         VelocityRule("+y", (15, 32), (38, 38)),
     ),
-    drawn=(nodes(15, 31, 38, 41),),
-    shown=(nodes(15, 32, 38, 41),),
+    observed=(nodes(15, 31, 38, 41),),
 )
 LEFT_BEAM = Obstacle(
     "left beam",
-    (
+    (nodes(-30, 2, 54, 57),),
+    rules=(
         VelocityRule("+x", (-30, -29), (54, 57)),
         VelocityRule("-x", (1, 2), (54, 57)),
         VelocityRule("-y", (-30, 2), (56, 57)),
         VelocityRule("+y", (-30, 2), (54, 54)),
     ),
-    drawn=(nodes(-30, 2, 54, 57),),
-    shown=(nodes(-30, 2, 54, 57),),
 )
 
 
-def remember(moment: Moment) -> Mapping[str, Tensor]:
+def initial_memory(moment: Moment, spec: TaskSpec) -> Memory:
     """The tip: the highest particles at the start; of equally high ones the first.
 
     Which ones the reference takes there is not defined; these reproduce its published rewards to 1e-3.
     """
-    x = moment.particles.x[:, : moment.robot].detach()
-    highest = x[..., 1].argsort(dim=1, descending=True, stable=True)[:, : share_of(TIP, x)]
+    x = moment.robot_x.detach()
+    highest = x[..., 1].argsort(dim=1, descending=True, stable=True)[:, : count_of(TIP, x)]
     return {"tip": drop_widest(highest, x)}
 
 
-def judge(moment: Moment, weights: Weights) -> Outcome:
+def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
     """Mean distance of the tip from the goal, under a square root."""
     tip = pick(moment.particles.x, moment.memory["tip"])
-    gap = distance(tip, tip.new_tensor(GOAL)[None]).mean(1)
+    gap = distance(tip, spec.goal_like(tip)[None]).mean(1)
     reached = gap < REACHED
-    bonus = BONUS * beyond(REACHED - gap, BONUS_WIDTH, soft=moment.soft)
     return Outcome(
-        terms={"distance": -weights.location * gap.sqrt(), "success": bonus},
+        terms={"distance": -gap.sqrt(), "success": moment.ops.heaviside(REACHED - gap, BONUS_WIDTH)},
         terminated=reached | (gap > LOST),
         success=reached,
         info={"distance": gap},
@@ -76,7 +71,7 @@ def grow() -> TaskSpec:
     return TaskSpec(
         name="grow",
         horizon=600,
-        robot=Body(Lattice((-0.06, 0.16), (0.16, 0.16)), count=19600),
+        robot=BodySpec(Lattice((-0.06, 0.16), (0.16, 0.16)), count=19600),
         mu=400.0,
         yield_stress=50.0,
         max_actuation=30.0,
@@ -88,7 +83,7 @@ def grow() -> TaskSpec:
         obstacles=(side_walls(39), floor(), ceiling(126), RIGHT_BEAM, LEFT_BEAM),
         goal=GOAL,
         split_limit=0.16,
-        remember=remember,
-        judge=judge,
-        weights=Weights(location=40.0, split=1.0, action=2e-4, alive=23.0),
+        initial_memory=initial_memory,
+        reward_fn=reward_fn,
+        weights={"distance": 40.0, "success": 200.0, "split": 1.0, "action": 2e-4, "alive": 23.0},
     )

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dittogym.bodies.shapes import Lattice
-from dittogym.geometry import NODES, Box, Obstacle, ceiling, floor, nodes
-from dittogym.spec import Body, TaskSpec, Weights, Window
+from dittogym.geometry import Obstacle, ceiling, floor, nodes
+from dittogym.spec import BodySpec, TaskSpec
 from dittogym.tasks.run import Forward
+from dittogym.window import Window
 from torchmpm import VelocityRule
 
 #: Displacement that brings the robot past the stairs and counts as success (our definition), m.
@@ -15,14 +16,13 @@ GOAL = 0.5
 def stair(k: int) -> Obstacle:
     """Column k of six, each one node lower than the one on its left."""
     left, right, top = 30 + 3 * k, 33 + 3 * k, 26 - k
-    box = Box(left / NODES, right / NODES, top=top / NODES, closed=True)
     rules = (
         VelocityRule("+x", (left, right - 1), (None, top)),
         VelocityRule("-x", (left + 1, right), (None, top)),
         # Without friction, and before the floor: inside the columns the floor does not stick.
         VelocityRule("-y", (left, right), (None, top)),
     )
-    return Obstacle(f"stair {k}", rules, drawn=(box,), shown=(nodes(left, right, top=top),))
+    return Obstacle(f"stair {k}", (nodes(left, right, top=top, closed=True),), rules=rules)
 
 
 def obstacle() -> TaskSpec:
@@ -30,7 +30,7 @@ def obstacle() -> TaskSpec:
     return TaskSpec(
         name="obstacle",
         horizon=800,
-        robot=Body(Lattice((0.0, 0.16), (0.16, 0.16)), count=14400),
+        robot=BodySpec(Lattice((0.0, 0.16), (0.16, 0.16)), count=14400),
         mu=700.0,
         yield_stress=75.0,
         max_actuation=45.0,
@@ -40,6 +40,6 @@ def obstacle() -> TaskSpec:
         reach=(None, 0.28),
         obstacles=(*map(stair, range(6)), floor(), ceiling(119)),
         split_limit=0.10,
-        judge=Forward(GOAL),
-        weights=Weights(location=2.0, velocity=6.0, split=1.0, action=2e-4, alive=3.0),
+        reward_fn=Forward(GOAL),
+        weights={"location": 2.0, "velocity": 6.0, "split": 1.0, "action": 2e-4, "alive": 3.0},
     )

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dittogym.bodies.shapes import Disc
+from dittogym.contract import Moment, Outcome
 from dittogym.geometry import Obstacle, ceiling, floor, nodes
-from dittogym.rewards import limited, signed_quadratic
-from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
+from dittogym.rewards import signed_quadratic
+from dittogym.spec import BodySpec, TaskSpec
+from dittogym.window import Window
 from torchmpm import VelocityRule
 
 #: Displacement from which the location term no longer grows, m; reaching it counts as success (our definition).
@@ -15,15 +17,16 @@ GOAL = 1.70
 #: The episode ends when the robot's centre gets behind this, m.
 REAR_LIMIT = -0.2
 
-# Invisible to the robot: nothing in the observation tells of it.
+# The observation does not show it.
 HANGING_BLOCK = Obstacle(
     "hanging block",
-    (
+    (nodes(32, 47, 59),),
+    rules=(
         VelocityRule("+x", (32, 34), (61, None)),
         VelocityRule("-x", (46, 47), (61, None)),
         VelocityRule("+y", (33, 46), (59, 60)),
     ),
-    shown=(nodes(32, 47, 59),),
+    observed=(),
 )
 
 
@@ -37,13 +40,13 @@ class Forward:
 
     goal: float
 
-    def __call__(self, moment: Moment, weights: Weights) -> Outcome:
-        """Judge a step."""
+    def __call__(self, moment: Moment, spec: TaskSpec) -> Outcome:
+        """Displacement, speed and end of the episode."""
         travelled = moment.now.com[:, 0] - moment.start.com[:, 0]
         values = (travelled, moment.now.velocity[:, 0])
-        location, velocity = (limited(signed_quadratic(z, 5.0), -20.0, 20.0, soft=moment.soft) for z in values)
+        location, velocity = (moment.ops.clamp(signed_quadratic(z, 5.0), -20.0, 20.0) for z in values)
         return Outcome(
-            terms={"location": weights.location * location, "velocity": weights.velocity * velocity},
+            terms={"location": location, "velocity": velocity},
             terminated=moment.now.com[:, 0] < REAR_LIMIT,
             success=travelled >= self.goal,
             info={"displacement": travelled},
@@ -55,7 +58,7 @@ def run() -> TaskSpec:
     return TaskSpec(
         name="run",
         horizon=800,
-        robot=Body(Disc((0.0, 0.16), 0.18), count=22000),
+        robot=BodySpec(Disc((0.0, 0.16), 0.18), count=22000),
         mu=650.0,
         yield_stress=90.0,
         max_actuation=45.0,
@@ -66,6 +69,6 @@ def run() -> TaskSpec:
         reach=(None, 0.28),
         obstacles=(HANGING_BLOCK, floor(), ceiling(119)),
         split_limit=0.10,
-        judge=Forward(GOAL),
-        weights=Weights(location=1.0, velocity=4.0, split=1.0, action=2e-4, alive=3.0),
+        reward_fn=Forward(GOAL),
+        weights={"location": 1.0, "velocity": 4.0, "split": 1.0, "action": 2e-4, "alive": 3.0},
     )

@@ -3,67 +3,65 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Literal
 
 from torch import Tensor
 
 from dittogym.bodies.shapes import Disc, Rectangle
-from dittogym.geometry import NODES, Box, Obstacle, ceiling, floor, nodes
-from dittogym.rewards import beyond, distance, limited, mean_over_nearest, signed_quadratic
-from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
+from dittogym.contract import Memory, Moment, Outcome
+from dittogym.geometry import Obstacle, ceiling, floor, nodes
+from dittogym.rewards import distance, signed_quadratic
+from dittogym.spec import BodySpec, TaskSpec
+from dittogym.window import Window
 from torchmpm import VelocityRule, fixed
 
 #: Below this height the cap has fallen, and the episode ends, m.
 FALLEN = 0.24
 #: Right of this it fell on the far side, which is success, m.
 FAR_SIDE = 0.67
-#: Where the reward is soft, falling and reaching the far side set in over this distance, m.
+#: In a smooth reward falling and reaching the far side set in over this distance, m.
 FALL_WIDTH = 0.01
 #: Where the cap rests at the start, m.
 CAP_START = 0.585
 #: The episode ends when the robot's centre gets behind this, m.
 REAR_LIMIT = -0.05
-#: Share of the robot's particles that reach for the cap: 2,000 of 20,000.
+#: Fraction of the robot's particles that reach for the cap: 2,000 of 20,000.
 FRONT = 2000 / 20000
 #: (mu, yield stress, muscle limit), Pa: of the registered environment, and of the published training run.
 VARIANTS = {"registered": (500.0, 85.0, 40.0), "published": (650.0, 90.0, 45.0)}
 
 BLOCK = Obstacle(
     "hanging block",
-    (
+    (nodes(32, 45, 36),),
+    rules=(
         VelocityRule("+x", (32, 34), (36, None)),
         VelocityRule("-x", (44, 45), (36, None)),
         VelocityRule("+y", (32, 45), (35, 36)),
     ),
-    drawn=(nodes(32, 45, 36),),
-    shown=(nodes(32, 45, 36),),
 )
 SHELF = Obstacle(
     "shelf",
-    (
+    (nodes(45, 70, 38, 40, closed=True),),
+    rules=(
         VelocityRule("+x", (45, 46), (40, 40)),
         VelocityRule("-x", (69, 70), (40, 40)),
         VelocityRule("-y", (45, 70), (40, 40), friction=math.inf),
         VelocityRule("+y", (45, 70), (40, 40)),
     ),
-    drawn=(Box(45 / NODES, 70 / NODES, 38 / NODES, 40 / NODES, closed=True),),
-    shown=(nodes(45, 70, 38, 40),),
 )
 POST = Obstacle(
     "post",
-    (
+    (nodes(81, 85, top=40, closed=True),),
+    rules=(
         VelocityRule("+x", (81, 82), (None, 39)),
         VelocityRule("-x", (84, 85), (None, 39)),
         VelocityRule("-y", (82, 85), (40, 40), friction=math.inf),
     ),
-    drawn=(Box(81 / NODES, 85 / NODES, top=40 / NODES, closed=True),),
-    shown=(nodes(81, 85, top=40),),
 )
 # Moves with the robot: a wall behind it and one ahead.
 FRAME = Obstacle(
     "frame",
-    tuple(
+    rules=tuple(
         rule for end in ((0, 0), (127, 127)) for rule in (*fixed(i=end, frame="window"), *fixed(j=end, frame="window"))
     ),
 )
@@ -71,33 +69,27 @@ FRAME = Obstacle(
 
 def front_distance(moment: Moment) -> Tensor:
     """Mean distance of the robot's front from the cap's centre, (B,), m."""
-    x, cap = moment.particles.x[:, : moment.robot], moment.now.object_com
-    assert cap is not None
-    return mean_over_nearest(distance(x, cap)[..., None], x, cap, FRONT, soft=moment.soft)[:, 0]
+    x, cap = moment.robot_x, moment.object_com
+    return moment.ops.mean_over_nearest(distance(x, cap)[..., None], x, cap, FRONT)[:, 0]
 
 
-def remember(moment: Moment) -> Mapping[str, Tensor]:
+def initial_memory(moment: Moment, spec: TaskSpec) -> Memory:
     """The distance at the start, against which progress is measured."""
     return {"front_distance": front_distance(moment)}
 
 
-def judge(moment: Moment, weights: Weights) -> Outcome:
+def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
     """Approach to the cap, displacement of the cap, where it falls, and speed in both directions."""
-    cap, front = moment.now.object_com, front_distance(moment)
-    assert cap is not None
+    cap, front, ops = moment.object_com, front_distance(moment), moment.ops
     z = 2.0 * (moment.memory["front_distance"] - front)
-    soft = moment.soft
-    approach = limited(16.0 * z * z.abs() + 10.0 * z, -20.0, 50.0, soft=soft)
     fallen, far = cap[:, 1] < FALLEN, cap[:, 0] >= FAR_SIDE
-    where = 2.0 * beyond(cap[:, 0] - FAR_SIDE, FALL_WIDTH, soft=soft) - 1.0
-    fall = 100.0 * where * beyond(FALLEN - cap[:, 1], FALL_WIDTH, soft=soft)
-    velocity = limited(signed_quadratic(moment.now.velocity, 10.0), -20.0, 20.0, soft=soft).sum(1)
+    side = 2.0 * ops.heaviside(cap[:, 0] - FAR_SIDE, FALL_WIDTH) - 1.0
     return Outcome(
         terms={
-            "approach": weights.location * approach,
-            "object_location": weights.location * 200.0 * (cap[:, 0] - CAP_START),
-            "fall": weights.location * fall,
-            "velocity": weights.velocity * velocity,
+            "approach": ops.clamp(16.0 * z * z.abs() + 10.0 * z, -20.0, 50.0),
+            "object_location": 200.0 * (cap[:, 0] - CAP_START),
+            "fall": 100.0 * side * ops.heaviside(FALLEN - cap[:, 1], FALL_WIDTH),
+            "velocity": ops.clamp(signed_quadratic(moment.now.velocity, 10.0), -20.0, 20.0).sum(1),
         },
         terminated=fallen | (moment.now.com[:, 0] < REAR_LIMIT),
         success=fallen & far,
@@ -120,8 +112,8 @@ def slot(variant: Literal["registered", "published"] = "registered") -> TaskSpec
     return TaskSpec(
         name="slot",
         horizon=1500,
-        robot=Body(Disc((0.0, 0.16), 0.16), count=20000),
-        objects=(Body(Rectangle((0.52, 0.322), (0.13, 0.03)), count=2000),),
+        robot=BodySpec(Disc((0.0, 0.16), 0.16), count=20000),
+        objects=(BodySpec(Rectangle((0.52, 0.322), (0.13, 0.03)), count=2000),),
         mu=mu,
         yield_stress=yield_stress,
         max_actuation=max_actuation,
@@ -131,7 +123,15 @@ def slot(variant: Literal["registered", "published"] = "registered") -> TaskSpec
         reach=(None, 0.28),
         obstacles=(BLOCK, SHELF, POST, floor(), ceiling(119), FRAME),
         split_limit=0.12,
-        remember=remember,
-        judge=judge,
-        weights=Weights(location=2.0, velocity=6.0, split=1.0, action=2e-4, alive=3.0),
+        initial_memory=initial_memory,
+        reward_fn=reward_fn,
+        weights={
+            "approach": 2.0,
+            "object_location": 2.0,
+            "fall": 2.0,
+            "velocity": 6.0,
+            "split": 1.0,
+            "action": 2e-4,
+            "alive": 3.0,
+        },
     )

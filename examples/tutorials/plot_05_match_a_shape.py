@@ -16,7 +16,7 @@ import torch
 from torch.nn.functional import conv2d
 
 import dittogym
-from dittogym.observation.smooth import soft_silhouette
+from dittogym.observation.image import soft_silhouette
 
 env = dittogym.TorchEnv("shapematch", resolution=16, particles="lite", target="star", segment=None)
 target = torch.as_tensor(env.spec.target, dtype=torch.float32)

@@ -8,9 +8,9 @@ gradients, and with every algorithm.
 """
 
 # %%
-# The function gets a :class:`dittogym.spec.Moment` and returns named terms, one number for each simulation of the
-# batch. What all tasks share, the cost of actions, the end of a torn robot and the term for staying alive, is added
-# by the engine as the weights say.
+# The function gets a :class:`dittogym.contract.Moment` and returns named terms, one number for each simulation of the
+# batch. Each term is multiplied by its weight. The engine adds the terms that all tasks share: the action cost, the
+# penalty for a torn robot, and a constant for every step.
 
 import dataclasses
 
@@ -23,10 +23,10 @@ import dittogym
 from dittogym.geometry import ceiling, floor, solid
 
 
-def judge(moment: dittogym.spec.Moment, weights: dittogym.Weights) -> dittogym.Outcome:
+def reward_fn(moment: dittogym.contract.Moment, spec: dittogym.TaskSpec) -> dittogym.Outcome:
     """Reward height above the start; a hop of 3 cm is a success."""
     height = moment.now.com[:, 1] - moment.start.com[:, 1]
-    return dittogym.Outcome({"height": weights.location * height}, success=height > 0.03)
+    return dittogym.Outcome({"height": height}, success=height > 0.03)
 
 
 def hop(wall: int = 60) -> dittogym.TaskSpec:
@@ -35,8 +35,8 @@ def hop(wall: int = 60) -> dittogym.TaskSpec:
         dittogym.make_spec("run"),
         name="hop",
         horizon=20,
-        judge=judge,
-        weights=dittogym.Weights(location=100.0, split=1.0, action=2e-4),
+        reward_fn=reward_fn,
+        weights={"height": 100.0, "split": 1.0, "action": 2e-4},
         obstacles=(solid("wall", i=(wall, wall + 4), j=(None, 40)), floor(), ceiling(119)),
     )
 
@@ -54,8 +54,8 @@ for _ in range(20):
 print(f"zero actions: return {total:.2f}, terms {sorted(info['reward_terms'])}, ended {terminated or truncated}")
 
 # %%
-# The same task as a differentiable function: because ``judge`` is made of torch operations, its reward can be
-# climbed.
+# The same task as a differentiable function: because ``reward_fn`` is made of torch operations, its reward can be
+# maximised by gradient ascent.
 
 batch = dittogym.TorchEnv("hop", particles="lite")
 theta = torch.zeros(20, *batch.action_shape, requires_grad=True)
@@ -91,7 +91,7 @@ figure.tight_layout()
 print(f"highest {max(heights) - heights[0]:.3f} m above the first step; {successes} of 20 steps count as success")
 
 # %%
-# To train a policy on it, put ``judge``, ``hop`` and the line that registers it into a file ``hop.py``:
+# To train a policy on it, put ``reward_fn``, ``hop`` and the line that registers it into a file ``hop.py``:
 # ``python -m cfp.train --task hop:hop --out runs/hop``.
 
 assert curve[-1] > curve[0] + 1.0

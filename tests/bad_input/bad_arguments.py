@@ -12,7 +12,7 @@ import dittogym
 from dittogym import Outcome, TorchEnv, make_spec
 from dittogym.bodies.shapes import Disc, Figure, Lattice, Rectangle
 from dittogym.geometry import ceiling, solid
-from dittogym.spec import Body as RobotBody
+from dittogym.spec import BodySpec as RobotBody
 from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VelocityRule, VonMises, lame, sampling
 
 ID = "dittogym/run-coarse-v0"
@@ -59,8 +59,8 @@ def step(made, action):
     return made.step(action)
 
 
-def judged(judge):
-    return step(env(task=spec(judge=judge)), torch.zeros(1, 2, 8, 8))
+def rewarded(reward_fn):
+    return step(env(task=spec(reward_fn=reward_fn)), torch.zeros(1, 2, 8, 8))
 
 
 def table(rows, error=ValueError):
@@ -184,9 +184,9 @@ ENVIRONMENT = table(
         ("task, no action", lambda: spec(coarse=0), "coarse must be at least 1, got 0"),
         ("task, two objects", lambda: spec(objects=(spec().robot,) * 2), "objects must be at most one body, got 2"),
         (
-            "judge for three",
-            lambda: judged(lambda moment, weights: Outcome({"speed": torch.zeros(3)})),
-            ("judge of task 'run' must return terms of shape (B,)", "(3,) for 'speed'"),
+            "rewards for three",
+            lambda: rewarded(lambda moment, spec: Outcome({"velocity": torch.zeros(3)})),
+            ("reward_fn of task 'run' must return terms of shape (B,)", "(3,) for 'velocity'"),
         ),
         ("disc of nothing", lambda: Disc((0.4, 0.2), 0.0), "diameter must be positive, got 0.0"),
         ("disc at a name", lambda: Disc("home", 0.1), "corner must be two numbers (x, y), got 'home'"),
@@ -208,13 +208,13 @@ ENVIRONMENT = table(
     [
         ("unknown option", lambda: env(colour="red"), ("task 'run' has no option 'colour'", "body, obstacles")),
         ("single environment of three", lambda: single(num_envs=3), ("num_envs must not be given", "make_vec")),
-        ("judge of nothing", lambda: judged(lambda moment, weights: None), "must return an Outcome, got NoneType"),
+        ("reward of nothing", lambda: rewarded(lambda moment, spec: None), "must return an Outcome, got NoneType"),
         (
-            "judge as text",
-            lambda: spec(judge="fair"),
-            "judge must be a function",
+            "reward function as text",
+            lambda: spec(reward_fn="fair"),
+            "reward_fn must be a function",
         ),
-        ("no robot", lambda: spec(robot=None), "robot must be a Body, got None"),
+        ("no robot", lambda: spec(robot=None), "robot must be a BodySpec, got None"),
         ("task of nothing", lambda: dittogym.register("x", None), "make must be a function that returns a TaskSpec"),
     ],
     TypeError,

@@ -95,7 +95,7 @@ POLICIES = [
     Case(
         "policy missing",
         lambda desk: cfp.load("nobody"),
-        ("nobody.safetensors", "shipped (catch, grow, run, "),
+        ("nobody.safetensors", "(catch, grow, run, "),
         CheckpointError,
     ),
     Case(
@@ -110,57 +110,57 @@ POLICIES = [
     policy("cut in its header", "damaged", content=SHIPPED[:100]),
     policy("with a header of terabytes", "damaged", content=struct.pack("<Q", 2**42) + b"{}"),
     policy("with a tensor of terabytes", "damaged", content=header(HUGE)),
-    policy("without a description", "got a file without a cfp-policy description", content=header({})),
+    policy("without a description", "must have a cfp-policy description", content=header({})),
     policy("with a broken description", "damaged", content=header({"__metadata__": {"cfp-policy": "{"}})),
     policy(
         "with a deep description", "nested too deeply", content=header({"__metadata__": {"cfp-policy": "[" * 99_999}})
     ),
-    policy("with a list for a description", "without a", content=header({"__metadata__": {"cfp-policy": "[1]"}})),
+    policy("with a list for a description", "must have a", content=header({"__metadata__": {"cfp-policy": "[1]"}})),
     policy("of another version", "description of version 1", changes={"version": 2}),
-    policy("of another kind", "kind 'mpc', allowed 'cfp'", changes={"kind": "mpc"}),
-    policy("of a task by number", "task: got 3, allowed a string", changes={"task": 3}),
-    policy("of no grid", "resolution: got 0, allowed 1 to 128", changes={"resolution": 0}),
-    policy("of a grid of True", "resolution: got True, allowed 1 to 128", changes={"resolution": True}),
-    policy("of stage -1", "stage: got -1, allowed 1 to", changes={"stage": -1}),
+    policy("of another kind", "kind must be 'cfp', got 'mpc'", changes={"kind": "mpc"}),
+    policy("of a task by number", "task must be a string, got 3", changes={"task": 3}),
+    policy("of no grid", "resolution must be between 1 and 128, got 0", changes={"resolution": 0}),
+    policy("of a grid of True", "resolution must be between 1 and 128, got True", changes={"resolution": True}),
+    policy("of stage -1", "stage must be between 1 and", changes={"stage": -1}),
     policy(
         "that is maybe deterministic",
-        "deterministic: got 'yes', allowed true or false",
+        "deterministic must be true or false, got 'yes'",
         changes={"deterministic": "yes"},
     ),
-    policy("for a layout by name", "layout: got 'x', allowed 0 to", changes={"layout": "x"}),
-    policy("for no environment", "environment: got None, allowed an object", changes={"environment": None}),
+    policy("for a layout by name", "layout must be between 0 and", changes={"layout": "x"}),
+    policy("for no environment", "environment must be an object, got None", changes={"environment": None}),
     policy("for an unknown environment", "environment.colour is not an option", changes={"environment": {"colour": 1}}),
-    policy("without a network", "do not fit", changes={"network": {}}),
+    policy("without a network", "do not match", changes={"network": {}}),
     policy(
-        "with an unknown network", "do not fit", "network.colour is not an option", changes={"network": {"colour": 1}}
+        "with an unknown network", "do not match", "network.colour is not an option", changes={"network": {"colour": 1}}
     ),
     policy(
         "with a grid of 7", "resolutions must be increasing values of (4, 8", changes={"network": {"resolutions": [7]}}
     ),
-    policy("with grids in a text", "do not fit", changes={"network": {"resolutions": "8, 16"}}),
+    policy("with grids in a text", "do not match", changes={"network": {"resolutions": "8, 16"}}),
     policy(
         "with a patch of a mile",
         "and 128, got 1000000",
         changes={"network": {"resolutions": [8], "patch": 10**6}},
     ),
-    policy("with another ladder", "do not fit", changes={"network": {"resolutions": [16]}}),
-    policy("of NaN", "weights that are NaN or infinite", weights=first(lambda tensor: tensor * float("nan"))),
-    policy("of other shapes", "do not fit", "size mismatch", weights=first(lambda tensor: tensor[..., :1])),
+    policy("with another ladder", "do not match", changes={"network": {"resolutions": [16]}}),
+    policy("of NaN", "got NaN or infinity", weights=first(lambda tensor: tensor * float("nan"))),
+    policy("of other shapes", "do not match", "size mismatch", weights=first(lambda tensor: tensor[..., :1])),
     policy(
-        "with a tensor too many", "do not fit", "extra", weights=lambda tensors: {**tensors, "extra": torch.zeros(1)}
+        "with a tensor too many", "do not match", "extra", weights=lambda tensors: {**tensors, "extra": torch.zeros(1)}
     ),
     policy(
-        "with a tensor too few", "do not fit", "Missing key", weights=lambda tensors: dict(list(tensors.items())[1:])
+        "with a tensor too few", "do not match", "Missing key", weights=lambda tensors: dict(list(tensors.items())[1:])
     ),
     policy(
         "of shac with a mile of inputs",
-        "do not fit",
+        "do not match",
         load=baselines.load,
         changes={"kind": "shac", "inputs": 10**12, "features": {}, "noise": 0.1},
     ),
     policy(
         "of segments without number",
-        "do not fit",
+        "do not match",
         load=baselines.load,
         changes={
             "kind": "gnn-16",
@@ -168,7 +168,7 @@ POLICIES = [
             "nodes": {"count": 10**9, "graph": 1},
         },
     ),
-    policy("of actions that are none", "do not fit", load=baselines.load, changes={"kind": "gradient"}),
+    policy("of actions that are none", "do not match", load=baselines.load, changes={"kind": "gradient"}),
     Case(
         "policy of alchemy",
         prepared(
@@ -251,7 +251,7 @@ RUNS = [
     resumed("a checkpoint of broken options", state(config="{"), "does not fit this program (JSONDecodeError"),
     resumed("a checkpoint of another task", state(config='{"task": "run"}'), "task: the run was started with 'run'"),
     resumed("a chunk outside", chunk_outside, "got a chunk '../../../secret.npz', allowed are files in this folder"),
-    resumed("a chunk of objects", chunk_of_objects, "this part of the replay memory is missing or damaged"),
+    resumed("a chunk of objects", chunk_of_objects, "this part of the replay buffer is missing or damaged"),
     resumed("broken options", write("config.json", "{"), "config.json: cannot be read"),
     resumed("a task that is not", options(task="swim"), "config.json: cannot be read (task must be catch"),
     evaluated("no options", lambda folder: (folder / "config.json").unlink(), "there is no run (no config.json)"),

@@ -79,7 +79,9 @@ TRAIN = [
     training("a target that is not there", "--target none.png", "target must be 'star'", "no such file: 'none.png'"),
     training("a variant of another task", "--variant published", "task 'shapematch' has no option 'variant'"),
     training("a policy that is not there", "--start-from none", "none.safetensors: there is no policy"),
-    training("a policy of another task", "--start-from run", "start_from: got a policy for run, allowed shapematch"),
+    training(
+        "a policy of another task", "--start-from run", "start_from must be a policy for shapematch, got one for run"
+    ),
     training("an algorithm of baselines", "--algo shac", "algo must be 'cfp', got 'shac'; python -m baselines.train"),
     training("robots on judging layouts", "--num-envs 10001", "num_envs must be at most 10000, got 10001"),
     Case(
@@ -121,9 +123,7 @@ OTHERS = [
     learning("mpc", "a horizon before its end", "--horizon 2 --commit 3", "commit", "got 3"),
     learning("cem", "one elite", "--elites 1", "elites", "got 1"),
     learning("shac", "an endless discount", "--gamma nan", "gamma must be finite, got nan"),
-    learning(
-        "shac", "a policy of the state", "--start-from run", "start_from: got a policy, allowed with sees 'image'"
-    ),
+    learning("shac", "a policy of the state", "--start-from run", "start_from", "sees 'image'"),
     learning("gnn-16", "a layout of images", "--action-layout grid", "action_layout requires algo"),
     learning("coarse", "an anchor", "--anchor 3", "anchor requires refine"),
     learning("shac", "an image without a clock", "--sees image --no-clock", "clock requires sees state"),
@@ -138,7 +138,9 @@ OTHERS = [
     distilling("plans of no planner", "--iterations 9", "iterations requires teacher mpc"),
     learning("zero", "a grid of none", "--grid 0", "resolution must be 'coarse', 'fine' or 1 to 64, got 0"),
     distilling("an unknown teacher", "--teacher socrates", "teacher: got 'socrates'", "mpc, shac, gradient"),
-    distilling("a teacher of another task", "--teacher run", "teacher: got a policy for run, allowed shapematch"),
+    distilling(
+        "a teacher of another task", "--teacher run", "teacher must be a policy for shapematch, got one for run"
+    ),
     distilling("a decay of 2", "--beta-decay 2", "beta_decay must be between 0 and 1, got 2.0"),
     learning(
         "shac",
@@ -150,7 +152,7 @@ OTHERS = [
     distilling("no labels", "--capacity 0", "capacity must be at least 1, got 0"),
     evaluating("nothing", "", "policy: got None and the folder None, allowed is one of the two"),
     evaluating("a folder that is not there", "{folder}/none", "none: there is no run (no config.json)"),
-    evaluating("an unknown policy", "--policy alchemy", "none of that name is shipped (catch, grow, run, "),
+    evaluating("an unknown policy", "--policy alchemy", "no shipped one has that name (catch, grow, run, "),
     evaluating("no episodes", "--policy run --episodes 0", "episodes must be at least 1, got 0"),
     evaluating("with seed -1", "--policy run --seed -1", "seed must be between 0 and"),
     evaluating("with noise maybe", "--policy run --noise maybe", "'maybe'", "--noise", "without"),
@@ -164,28 +166,30 @@ OTHERS = [
         main=baselines.robustness.main,
     ),
     comparing("unknown tasks", "--tasks swim", "task must be catch"),
-    comparing("unknown algorithms", "--algos alchemy", "algo: got 'alchemy', allowed cfp"),
-    comparing("a seed twice", "--seeds 1 1", "seeds: got 1 1, allowed one or more, each once"),
-    comparing("without seeds", "--seeds", "seeds: got none, allowed one or more"),
-    comparing("seed -1", "--seeds -1", "seeds: got -1, allowed 0 to 8999"),
-    comparing("no episodes", "--episodes 0", "episodes: got 0, allowed 1 or more"),
-    comparing("minus one worker", "--workers -1", "workers: got -1, allowed 0 or more"),
-    comparing(
-        "parts of a GPU at home", "--gpus-per-run 0.5", "gpus_per_run: got 0.5, allowed with --executor ray only"
-    ),
-    comparing("run 99", "--only 99", "only: got 99, allowed 0 to 3"),
+    comparing("unknown algorithms", "--algos alchemy", "algo must be one of cfp"),
+    comparing("a seed twice", "--seeds 1 1", "seeds must be one or more different values, got 1 1"),
+    comparing("without seeds", "--seeds", "seeds must be one or more different values, got none"),
+    comparing("seed -1", "--seeds -1", "seeds must be between 0 and 8999, got -1"),
+    comparing("no episodes", "--episodes 0", "episodes must be at least 1, got 0"),
+    comparing("minus one worker", "--workers -1", "workers must be at least 0, got -1"),
+    comparing("parts of a GPU at home", "--gpus-per-run 0.5", "gpus_per_run must be 0 without --executor ray, got 0.5"),
+    comparing("run 99", "--only 99", "only must be between 0 and 3, got 99"),
     comparing("a plan that is not there", "--plan none.json", "plan: none.json cannot be read"),
     planned("of a list", [1], "plan: plan.json cannot be read as JSON (it holds list"),
-    planned("of other parts", {"colour": 1}, "holds colour, allowed an object with common, tasks, algos"),
-    planned("with a part of nothing", {"common": None}, "plan: common: got None, allowed an object"),
-    planned("with a task of nothing", {"tasks": {"shapematch": 3}}, "plan: tasks.shapematch: got 3, allowed an object"),
-    planned("with a seed of its own", {"common": {"seed": 5}}, "plan: common: got seed, allowed are options that"),
-    planned("with another task", {"algos": {"cfp": {"task": "run"}}}, "plan: algos.cfp: got task, allowed are options"),
-    planned("with tasks of a number", {"algos": {"cfp": {"tasks": 3}}}, "plan: algos.cfp.tasks: got 3, allowed an obj"),
+    planned("of other parts", {"colour": 1}, "must hold common, tasks and algos only, got colour"),
+    planned("with a part of nothing", {"common": None}, "plan: common must be a JSON object, got None"),
+    planned(
+        "with a task of nothing", {"tasks": {"shapematch": 3}}, "plan: tasks.shapematch must be a JSON object, got 3"
+    ),
+    planned("with a seed of its own", {"common": {"seed": 5}}, "plan: common must not hold seed"),
+    planned("with another task", {"algos": {"cfp": {"task": "run"}}}, "plan: algos.cfp must not hold task"),
+    planned(
+        "with tasks of a number", {"algos": {"cfp": {"tasks": 3}}}, "plan: algos.cfp.tasks must be a JSON object, got 3"
+    ),
     planned(
         "with a device in a task",
         {"algos": {"cfp": {"tasks": {"run": {"device": "cpu"}}}}},
-        "plan: algos.cfp.tasks.run: got device, allowed are options",
+        "plan: algos.cfp.tasks.run must not hold device",
     ),
     planned("with unknown options", {"common": {"colour": 1}}, "zero on shapematch: colour is not an option"),
 ]

@@ -17,7 +17,7 @@ from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.process import peak_memory
 from cfp.presets import preset
 from cfp.weights import describe, save_policy
-from dittogym.targets import load_target
+from dittogym.tasks.targets import load_target
 
 LARGEST_GROWTH = 2**30
 """Bytes by which the memory may grow at most while a file of a few kilobytes is refused."""

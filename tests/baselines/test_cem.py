@@ -5,8 +5,8 @@ import torch
 from test_planning import drive, small
 
 from baselines import CEMPlanner, CEMPlannerConfig
-from baselines.common.rollout import judge_true
 from cfp.errors import ConfigError
+from dittogym import core
 
 
 def quick(**options) -> CEMPlannerConfig:
@@ -21,21 +21,22 @@ def test_planned_episode_beats_rest() -> None:
 
 
 def wanted(target: torch.Tensor):
-    """Judge a step by how close the muscles' field is to a pattern of every simulation (B, 1, 1, 1), or all."""
+    """Reward a step for how close the muscles' field is to a pattern of every simulation (B, 1, 1, 1), or all."""
 
-    def judge(model, state, field):
-        pattern = target.repeat_interleave(len(field) // len(target), 0)
-        value = -(field / 45.0 - pattern).square().mean((1, 2, 3))
-        return judge_true(model, state, field)._replace(reward=value, true_reward=value)
+    def step(model, state, action):
+        result = core.step(model, state, action)
+        pattern = target.repeat_interleave(len(action) // len(target), 0)
+        value = -(result.actuation / 45.0 - pattern).square().mean((1, 2, 3))
+        return result._replace(reward=value, true_reward=value)
 
-    return judge
+    return step
 
 
 def test_search_finds_what_every_simulation_wants() -> None:
     env = small("run", 2, substeps=1)
     target = torch.tensor([0.6, -0.4]).view(2, 1, 1, 1)
     config = CEMPlannerConfig(horizon=2, commit=1, iterations=12, candidates=40, noise_grid=1, noise=0.0)
-    plan = CEMPlanner(env, config, judge=wanted(target)).plan()
+    plan = CEMPlanner(env, config, step=wanted(target)).plan()
     assert plan.shape == (2, 2, 2, 4, 4) and plan.abs().max() <= 1.0
     assert (plan.mean((0, 2, 3, 4)) - target.flatten()).abs().max() < 0.1
 
@@ -59,19 +60,19 @@ def test_simulations_of_a_batch_are_planned_apart() -> None:
         def _noise(self, plan):
             return noise.expand(-1, plan.shape[1], -1, -1, -1, -1)
 
-    together = Same(small("kick", 2, substeps=1), quick(noise=0.0), judge=wanted(target)).plan()
+    together = Same(small("kick", 2, substeps=1), quick(noise=0.0), step=wanted(target)).plan()
     for i in range(2):
         alone = small("kick", substeps=1)
         alone.reset(seed=i)
-        plan = Same(alone, quick(noise=0.0), judge=wanted(target[i : i + 1])).plan()
+        plan = Same(alone, quick(noise=0.0), step=wanted(target[i : i + 1])).plan()
         assert torch.allclose(together[:, i], plan[:, 0], atol=1e-6)
     assert not torch.allclose(together[:, 0], together[:, 1], atol=1e-3)
 
 
 def test_plan_is_never_worse_than_what_is_kept() -> None:
     env = small("run", substeps=1)
-    judge = wanted(torch.full((1, 1, 1, 1), 0.25))
-    planner = CEMPlanner(env, quick(noise=0.3, initial_std=5.0, iterations=1), judge=judge)
+    step = wanted(torch.full((1, 1, 1, 1), 0.25))
+    planner = CEMPlanner(env, quick(noise=0.3, initial_std=5.0, iterations=1), step=step)
     planner._plan = torch.full_like(planner._plan, 0.25)
     planner._step = 0  # all of it is kept, and it is the best there can be
     assert (planner.plan() == 0.25).all()
@@ -79,7 +80,7 @@ def test_plan_is_never_worse_than_what_is_kept() -> None:
 
 def test_rest_is_tried() -> None:
     env = small("run", substeps=1)
-    planner = CEMPlanner(env, quick(initial_std=5.0, noise=0.5), judge=wanted(torch.zeros(1, 1, 1, 1)))
+    planner = CEMPlanner(env, quick(initial_std=5.0, noise=0.5), step=wanted(torch.zeros(1, 1, 1, 1)))
     assert (planner.plan() == 0).all()
 
 
@@ -98,10 +99,10 @@ def test_state_goes_on_the_same_and_repeats_by_seed() -> None:
 def test_plans_that_are_not_finite_are_counted_and_no_elites(monkeypatch) -> None:
     env = small("run", 2)
     planner = CEMPlanner(env, quick(candidates=4, elites=3))
-    judge = planner._returns
+    returns = planner._returns
 
     def breaks(start, plan):
-        climbed, value = judge(start, plan)
+        climbed, value = returns(start, plan)
         spoilt = torch.tensor([0.0, torch.nan, torch.nan, 0.0, *[torch.inf] * 4])  # all of the second simulation
         return climbed, value + spoilt
 

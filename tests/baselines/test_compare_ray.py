@@ -59,8 +59,8 @@ def test_runs_of_a_lost_node_are_finished_elsewhere_and_none_twice(cluster, tmp_
     killer = threading.Thread(target=kill)
     killer.start()
     options = f"--algos mpc --seeds 0 1 2 --plan {tmp_path / 'plan.json'} --out {tmp_path / 'out'} --device cpu"
-    judging = "--episodes 1 --tier 100 --robustness none"
-    code = main([*options.split(), *judging.split(), "--executor", "ray", "--address", made.address])
+    protocol = "--episodes 1 --tier 100 --robustness none"
+    code = main([*options.split(), *protocol.split(), "--executor", "ray", "--address", made.address])
     killer.join()
     assert killed == [[]]  # two runs were under way, none was finished
     assert code == 0
@@ -74,4 +74,4 @@ def test_runs_of_a_lost_node_are_finished_elsewhere_and_none_twice(cluster, tmp_
         assert [row["step"] for row in read_table(folder / "progress.csv")] == [str(step) for step in range(1, 31)]
         assert not (folder / ".lock").exists() and not (folder / "error.txt").exists()
     assert resumed == 1
-    assert "3 of 3 runs are finished and judged." in (tmp_path / "out" / "report.md").read_text()
+    assert "3 of 3 runs are finished and evaluated." in (tmp_path / "out" / "report.md").read_text()

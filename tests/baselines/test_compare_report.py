@@ -3,23 +3,24 @@
 import csv
 import hashlib
 import json
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
 import torch
 
-from baselines.compare import plots as pictures
 from baselines.compare.__main__ import main
-from baselines.compare.evaluations import Judging
-from baselines.compare.plan import Plan, make_jobs
+from baselines.compare.evaluations import Protocol
+from baselines.compare.jobs import make_jobs
+from baselines.compare.plan import Plan
+from baselines.compare.plots import learning_curves
 from baselines.compare.report import make_tables
-from baselines.compare.results import find_runs, group
+from baselines.compare.results import group_results, read_result
 from baselines.compare.tables import aggregate_table, cost_table, efficiency_table, paper_table
 from cfp.config import to_json
 from cfp.files import write_json, write_text
-from cfp.weights import origin, write_policy
+from cfp.weights import describe_run, write_policy
 
-CASES = [case.name for case in Judging(1).cases()]
 LABELS = ["zero", "cfp", "shac", "shac-image"]
 PLAN = {"algos": {"shac-image": {"algo": "shac", "sees": "image"}}}
 
@@ -40,23 +41,34 @@ class TagBalance(HTMLParser):
         assert self.open.pop() == tag
 
 
-def write_run(job, scores, curve, *, successes=0, seconds=100.0, cases=(0.8, 0.5), tier="lite"):
-    """A folder as a run that was trained to step 1000 and judged leaves it."""
+def plan_jobs(folder, tasks, labels, seeds, protocol, plan=None):
+    return make_jobs(plan or Plan(), tasks, labels, seeds, folder, protocol)
+
+
+def write_run(job, scores, curve, *, successes=0, seconds=100.0, cases=(0.8, 0.5)):
+    """A folder as a run that was trained to step 1000 and evaluated leaves it."""
     write_json(job.folder / "config.json", to_json(job.config))
     newest = job.folder / "policy.safetensors"
-    write_policy(newest, {}, origin(job.config, job.config.algo, 0, 0))
+    write_policy(newest, {}, describe_run(job.config, job.config.algo, 0, 0))
     lines = [f"{step},{value}" for step, value in curve.items()]
     write_text(job.folder / "evaluations.csv", "\n".join(["step,mean", *lines]) + "\n")
-    session = {"from": 0, "to": 1000, "seconds": seconds + 7, "judging": 7.0, "memory": 2**30, "device": "cpu"}
+    session = {"from": 0, "to": 1000, "seconds": seconds + 7, "evaluation_seconds": 7.0, "memory": 2**30}
+    session |= {"device": "cpu"}
     write_json(job.folder / "sessions.json", {"finished": True, "sessions": [session]})
-    judging = Judging(len(scores), tier)
-    first = {"returns": scores, "successes": successes}
-    entries = {judging.key(f"layouts 0 to {len(scores) - 1}"): first}
-    for name, share in zip(CASES[1:], cases, strict=True):
-        found = [] if share is None else [{"returns": [share * sum(scores) / len(scores)], "successes": 0}]
-        entries[judging.key(f"{name}, layouts 0 to {len(scores) - 1}")] = found
-    policy = hashlib.sha256(newest.read_bytes()).hexdigest()
-    write_json(job.folder / "judged.json", {"policy": policy, "entries": entries})
+    protocol, task = replace(job.protocol, episodes=len(scores)), job.config.task
+    (first,) = protocol.batch_keys(task)
+    entries = {first: {"returns": scores, "successes": successes}}
+    for case, share in zip(protocol.cases()[1:], cases, strict=True):
+        (key,) = protocol.batch_keys(task, case)
+        found = share and {"returns": [share * sum(scores) / len(scores)], "successes": 0}
+        entries[key] = found
+    policy = "zero" if job.untrained else hashlib.sha256(newest.read_bytes()).hexdigest()
+    write_json(job.folder / "final_evaluation.json", {"policy": policy, "entries": entries})
+
+
+def two_or_four(config):
+    """Episodes of the runs below: SLOT has four of each algorithm."""
+    return Protocol(4 if config.task == "slot" and config.algo == "zero" else 2)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +76,7 @@ def report(tmp_path_factory):
     """RUN and SLOT; zero, cfp, shac (state) and shac-image; seeds 0 and 1; shac-image failed on SLOT."""
     out = tmp_path_factory.mktemp("report")
     (out / "plan.json").write_text(json.dumps(PLAN))
-    jobs = make_jobs(Plan(**PLAN), ["run", "slot"], LABELS, [0, 1], out / "runs")
+    jobs = plan_jobs(out / "runs", ["run", "slot"], LABELS, [0, 1], two_or_four, Plan(**PLAN))
     for job in jobs:
         if job.label == "zero":
             write_run(job, [3000, 3000] if job.config.task == "run" else [5000] * 4, {1: 2990})
@@ -84,9 +96,12 @@ def report(tmp_path_factory):
     return out
 
 
+def read_groups(jobs):
+    return group_results([read_result(job) for job in jobs])
+
+
 def groups_of(report, tasks=("run", "slot"), labels=LABELS):
-    jobs = make_jobs(Plan(**PLAN), tasks, labels, [0, 1], report / "runs")
-    return group(find_runs(jobs, lambda job: Judging(4 if job.name.startswith("zero-slot") else 2)))
+    return read_groups(plan_jobs(report / "runs", tasks, labels, [0, 1], two_or_four, Plan(**PLAN)))
 
 
 def rows(folder, name):
@@ -125,15 +140,17 @@ def test_what_learns_nothing_is_one_run(report):
     row = find(rows(report, "returns"), task="run", algo="zero")
     assert (row["seeds"], row["episodes"], row["iqm"], row["low"]) == ("1", "2", "3000.0", "")
     assert find(rows(report, "returns"), task="slot", algo="zero")["episodes"] == "4", "as many as of two seeds"
-    assert "Nothing is learned by zero: one run for all seeds." in (report / "index.html").read_text()
+    assert "One run stands for all seeds of zero." in (report / "index.html").read_text()
 
 
 def test_paper_s_returns_are_set_beside_full_size_only(report):
     assert rows(report, "aggregate") == rows(report, "paper") == []
     for name in ("index.html", "report.md"):
-        assert "None of them is set beside the paper" in (report / name).read_text()
+        assert "They are not compared with the paper" in (report / name).read_text()
     groups = groups_of(report)
-    full, lite = ({each.name: each.rows for each in make_tables([], groups, 2, tier)} for tier in ("full", "lite"))
+    full, lite = (
+        {each.name: each.rows for each in make_tables([], groups, Protocol(2, tier))} for tier in ("full", "lite")
+    )
     assert full["aggregate"] and full["paper"] and not lite["aggregate"] and not lite["paper"]
 
 
@@ -159,17 +176,13 @@ def test_sample_efficiency(report):
 @pytest.mark.parametrize(
     ("labels", "tier", "words"),
     [
-        (["cfp"], "lite", "Rest was not measured in run: add zero to --algos."),
-        (
-            ["zero", "cfp"],
-            "full",
-            "None for cfp, evaluated in training with other particles than those that are judged",
-        ),
+        (["cfp"], "lite", "add zero to --algos"),
+        (["zero", "cfp"], "full", "No entry for cfp, evaluated during training with particles other than full"),
     ],
 )
 def test_efficiency_without_a_rest_of_its_size_says_so(report, labels, tier, words):
     table = efficiency_table(groups_of(report, ["run"], labels), tier)
-    assert words in table.about and "steps_50%" not in find(table.rows, algo="cfp")
+    assert words in table.description and "steps_50%" not in find(table.rows, algo="cfp")
 
 
 def test_cost_beside_the_paper_s(report):
@@ -181,24 +194,20 @@ def test_cost_beside_the_paper_s(report):
 
 
 def test_cost_names_the_particles_of_planners_without_a_tier_of_their_own(tmp_path):
-    (job,) = make_jobs(Plan(), ["run"], ["mpc"], [0], tmp_path)
+    (job,) = plan_jobs(tmp_path, ["run"], ["mpc"], [0], lambda _: Protocol(1))
     write_run(job, [1.0], {})
-    judging = Judging(1)
-    (row,) = cost_table(group(find_runs([job], lambda _: judging))).rows
+    (row,) = cost_table(read_groups([job])).rows
     assert row["particles"] == "lite"
 
 
 def test_training_of_a_teacher_is_counted_by_itself(tmp_path):
-    (job,) = make_jobs(Plan(), ["run"], ["distill"], [0], tmp_path)
-    write_run(job, [1.0], {500: 1.0, 1000: 2.0}, seconds=160.0)
-    noted = json.loads((job.folder / "sessions.json").read_text())
-    noted["sessions"][0]["teacher"] = {"steps": 300, "seconds": 60.0}
-    write_json(job.folder / "sessions.json", noted)
-    judging = Judging(1)
-    groups = group(find_runs([job], lambda _: judging))
+    (job,) = plan_jobs(tmp_path, ["run"], ["distill"], [0], lambda _: Protocol(1))
+    write_run(job, [1.0], {500: 1.0, 1000: 2.0}, seconds=165.0)
+    write_json(job.folder / "teacher" / "cost.json", {"steps": 300, "seconds": 65.0, "evaluation_seconds": 5.0})
+    groups = read_groups([job])
     (row,) = cost_table(groups).rows
     assert (row["speed"], row["minutes"], row["teacher"], row["teacher_steps"]) == (10, 100 / 60, 1, 300)
-    (line,) = pictures.curves(groups, minutes=True).axes[0].lines
+    (line,) = learning_curves(groups, minutes=True).axes[0].lines
     assert line.get_xdata().tolist() == pytest.approx([1 + 50 / 60, 1 + 100 / 60])
 
 
@@ -226,14 +235,14 @@ def test_paper_s_returns_stand_beside_ours(report):
 
 
 def test_curves_over_time_end_with_the_training(report):
-    axes = pictures.curves(groups_of(report, labels=LABELS[1:]), minutes=True).axes[0]
+    axes = learning_curves(groups_of(report, labels=LABELS[1:]), minutes=True).axes[0]
     assert [line.get_xdata().tolist() for line in axes.lines] == [pytest.approx([50 / 60, 100 / 60])] * 3
 
 
 def test_failures_are_named(report):
     row = find(rows(report, "runs"), run="shac-image-slot-quick-1")
     assert (row["state"], row["error"]) == ("failed", "NonFiniteError: a loss | is not finite")
-    assert "12 of 14 runs are finished and judged; the others:" in (report / "index.html").read_text()
+    assert "12 of 14 runs are finished and evaluated; the others:" in (report / "index.html").read_text()
     assert "NonFiniteError: a loss \\| is not finite" in (report / "report.md").read_text()
 
 
@@ -248,9 +257,9 @@ def test_page_shows_only_files_beside_it(report):
 
 
 def test_evaluations_of_another_policy_do_not_count(report, tmp_path):
-    (job,) = make_jobs(Plan(), ["run"], ["cfp"], [0], tmp_path / "runs")
+    (job,) = plan_jobs(tmp_path / "runs", ["run"], ["cfp"], [0], lambda _: Protocol(2))
     write_run(job, [1.0, 2.0], {1000: 5.0})
-    write_policy(job.folder / "policy.safetensors", {"more": torch.zeros(1)}, origin(job.config, "cfp", 0, 0))
+    write_policy(job.folder / "policy.safetensors", {"more": torch.zeros(1)}, describe_run(job.config, "cfp", 0, 0))
     assert main(f"--tasks run --algos cfp --seeds 0 --out {tmp_path} --episodes 2 --report-only".split()) == 1
     assert find(rows(tmp_path, "returns"), task="run")["iqm"] == ""
-    assert find(rows(tmp_path, "runs"), task="run")["state"] == "unjudged"
+    assert find(rows(tmp_path, "runs"), task="run")["state"] == "unevaluated"

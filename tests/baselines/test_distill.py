@@ -12,7 +12,10 @@ import cfp
 import cfp.train
 from baselines import Distill, GradientPlannerConfig, OpenLoop, Shac, distill
 from baselines.common.episodes import Episodes
-from baselines.compare.worker import _train
+from baselines.compare.evaluations import Protocol
+from baselines.compare.jobs import Job
+from baselines.compare.results import read_result
+from baselines.compare.worker import train
 from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entries
 from baselines.distillation.teachers import PolicyTeacher, Teacher, project, read_teacher
 from baselines.distillation.train import METRICS
@@ -26,9 +29,9 @@ from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.process import StopSignals
 from cfp.sections import EnvironmentConfig, ReportConfig
 from cfp.tables import read_table
-from cfp.weights import origin, read_policy, write_policy
+from cfp.weights import describe_run, read_policy, write_policy
 from dittogym import TASKS, TorchEnv
-from dittogym.action import patch_field, to_grid_layout
+from dittogym.action import patch_field, to_grid_indexing
 
 
 def make(**changes):
@@ -50,7 +53,7 @@ def privileged(tmp_path_factory):
     paths = {task: tmp_path_factory.mktemp(task) / "policy.safetensors" for task in ("run", "shapematch")}
     for task, path in paths.items():
         config = replace(Shac.preset(task, "quick"), environment=EnvironmentConfig(2, 300, 4), train_particles=300)
-        Shac(config).save_policy(path, origin(config, "shac", 0, 0))
+        Shac(config).save_policy(path, describe_run(config, "shac", 0, 0))
     return paths
 
 
@@ -59,7 +62,7 @@ def segments(tmp_path_factory):
     """An untrained policy of segments, on file."""
     path = tmp_path_factory.mktemp("segments") / "policy.safetensors"
     config = configure({"algo": "gnn-16", "task": "run", "environment": {"particles": 300, "substeps": 4}})
-    SegmentPolicy(ModularActor("gnn", 10), Nodes(16, True), origin(config, "gnn-16", 0, 0)).save(path)
+    SegmentPolicy(ModularActor("gnn", 10), Nodes(16, True), describe_run(config, "gnn-16", 0, 0)).save(path)
     return path
 
 
@@ -297,9 +300,9 @@ def test_action_of_the_other_layout_acts_at_the_same_place():
     seen = torch.zeros(1, 3, 64, 64, dtype=torch.uint8)
     action = PolicyTeacher(record, "image", "image").act(env, seen)
     as_grid = PolicyTeacher(record, "image", "grid").act(env, seen)
-    assert torch.equal(as_grid, to_grid_layout(action, "image"))
+    assert torch.equal(as_grid, to_grid_indexing(action, "image"))
     back = PolicyTeacher(record, "grid", "image").act(env, seen)
-    assert torch.equal(to_grid_layout(back, "image"), action)
+    assert torch.equal(to_grid_indexing(back, "image"), action)
 
 
 def test_sequence_teaches_by_the_step_of_the_episode():
@@ -362,19 +365,20 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch, caps
     last = "not counted: the teacher's training, which comes first (python -m baselines.train --algo shac"
     assert last in capsys.readouterr().out.splitlines()[-1]
     config = configure(json.loads((folder / "config.json").read_text()))
+    job = Job("distill", config, tmp_path / "timed", Protocol(1))
     with StopSignals() as signals:
-        _train(config, tmp_path / "noted", signals, False)
-    (session,) = json.loads((tmp_path / "noted" / "sessions.json").read_text())["sessions"]
-    assert (session["from"], session["to"], session["teacher"]["steps"]) == (0, 32, 32)
-    assert 0 < session["teacher"]["seconds"] < session["seconds"] - session["judging"]
+        train(job, signals, False)
+    cost = read_result(job).cost
+    assert (cost.steps, cost.last_step, cost.teacher_steps) == (32, 32, 32)
+    assert cost.teacher_seconds > 0 and cost.seconds > 0.01
 
 
 @pytest.mark.parametrize(
     ("task", "kind", "target", "message"),
     [
-        ("shapematch", "gradient", "T", "teacher: got a policy for the target T, allowed star"),
-        ("kick", "gradient", None, "teacher: got a policy for kick, allowed run"),
-        ("run", "gradient", "T", "teacher: its target or the one wanted cannot be read"),
+        ("shapematch", "gradient", "T", "teacher must be a policy for the target star, got T"),
+        ("kick", "gradient", None, "teacher must be a policy for run, got one for kick"),
+        ("run", "gradient", "T", "teacher: cannot compare its target"),
         (None, "", None, "allowed mpc, shac, gradient, catch, grow, run, shapematch"),
     ],
 )
@@ -382,7 +386,7 @@ def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, kind, targ
     path = tmp_path / "policy.safetensors"
     if task:
         config = replace(Distill.preset(task, "quick"), environment=EnvironmentConfig(1, 100, 4, target=target))
-        write_policy(path, {"actions": torch.zeros(3, 2, 8, 8)}, origin(config, kind, 0, 0))
+        write_policy(path, {"actions": torch.zeros(3, 2, 8, 8)}, describe_run(config, kind, 0, 0))
     folder = tmp_path / "run"
     student = ["--target", "star"] if task == "shapematch" else ["--task", "run"]
     assert distill.main([*TINY, *LESSONS, *student, "--teacher", str(path), "--out", str(folder)]) == 2
@@ -394,7 +398,7 @@ def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, kind, targ
 def test_record_of_one_episode_teaches(tmp_path, capsys, task, alike):
     config = replace(Distill.preset(task, "quick"), environment=EnvironmentConfig(1, 100, 1))
     path, size = tmp_path / "record.safetensors", config.resolution(0)
-    write_policy(path, {"actions": torch.ones(3, 2, size, size)}, origin(config, "mpc", 0, 0) | {"layout": 0})
+    write_policy(path, {"actions": torch.ones(3, 2, size, size)}, describe_run(config, "mpc", 0, 0) | {"layout": 0})
     teacher = read_teacher(path, task, config.environment)
     assert isinstance(teacher, OpenLoop) and len(teacher.actions) == 3
     student = ["--task", task, "--teacher", str(path), "--substeps", "1", "--backend", "auto"]

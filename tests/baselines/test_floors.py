@@ -17,7 +17,7 @@ from cfp.experiment.training import parse
 from cfp.files import write_json
 from cfp.tables import read_table
 from dittogym import TorchEnv
-from dittogym.action import from_grid_layout, patch_field, to_grid_layout
+from dittogym.action import from_grid_indexing, patch_field, to_grid_indexing
 from dittogym.rewards import action_cost
 
 TINY = "--particles 100 --substeps 2 --eval-episodes 2 --no-video --device cpu".split()
@@ -52,7 +52,7 @@ def test_wave_is_the_one_of_the_reference_figures():
     drive = wave(3, 8, "grid")
     assert drive[0, 1, 2, 3] == pytest.approx(np.sin(0.3 + 1.4 + 3.3 + 2.0), abs=1e-6)
     for layout in ("image", "grid"):
-        field = patch_field(to_grid_layout(wave(1, 8, layout), layout), 64, 45.0)  # RUN's muscles
+        field = patch_field(to_grid_indexing(wave(1, 8, layout), layout), 64, 45.0)  # RUN's muscles
         assert torch.allclose(field[0, 0, :, 5], patch_field(drive[:1], 64, 45.0)[0, 0, :, 5], atol=1e-4)
         assert float(action_cost(field)) == pytest.approx(4115.537, rel=1e-5)
 
@@ -68,7 +68,7 @@ def test_scripted_drives_the_whole_episode_in_the_layout_of_the_environment():
 def test_layouts_are_inverse():
     action = torch.rand(2, 2, 5, 5)
     for layout in ("image", "grid"):
-        assert torch.equal(to_grid_layout(from_grid_layout(action, layout), layout), action)
+        assert torch.equal(to_grid_indexing(from_grid_indexing(action, layout), layout), action)
         assert TorchEnv("run", particles=100, action_layout=layout).action_layout == layout
 
 

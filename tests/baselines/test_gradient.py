@@ -162,6 +162,7 @@ def test_iteration_that_breaks_the_robot_is_undone(monkeypatch, loss):
     scalars = algorithm.update()
     assert not algorithm.theta.any() and scalars["train/failed"] == 1  # back to the start, the best so far
     monkeypatch.setattr(algorithm, "_episode", good)
+    algorithm.num_timesteps = 30  # the same place in the schedule
     assert algorithm.update()["train/learning_rate"] == pytest.approx(0.7 * scalars["train/learning_rate"])
     assert algorithm.theta.any() and algorithm.failed_in_a_row == 0
     monkeypatch.setattr(algorithm, "_episode", fail)
@@ -213,8 +214,9 @@ def test_only_polish_takes_place_where_the_result_is_judged():
     first, polish = (
         Gradient(make("run", environment=environment, train_particles=200, polish=1), stage) for stage in (1, 2)
     )
-    assert first.env.num_particles == 200 and max(first.env.model.shares) > 1 and not first.env.model.pixels
-    assert polish.env.num_particles == 300 and max(polish.env.model.shares) == 1 and polish.env.model.pixels
+    for env, count, scaled in ((first.env, 200, True), (polish.env, 300, False)):
+        assert env.num_particles == count and (max(env.model.particle_weight) > 1) is scaled
+        assert env.model.camera.pixels is not scaled
     assert first.env.action_layout == polish.env.action_layout == "grid"
 
 

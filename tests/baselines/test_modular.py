@@ -23,7 +23,7 @@ from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import CheckpointError, ConfigError
 from cfp.robustness import report
 from cfp.sections import EnvironmentConfig, ReportConfig
-from cfp.weights import origin
+from cfp.weights import describe_run
 from dittogym import TorchEnv
 
 KINDS = ("gnn", "transformer")
@@ -84,7 +84,7 @@ def test_networks_have_the_documented_sizes(kind, actor, critics):
 
 
 def config(algo, **changes):
-    base = baselines.ALGORITHMS[algo].preset("run", "quick")
+    base = find(algo).preset("run", "quick")
     return replace(
         base,
         device="cpu",
@@ -130,7 +130,7 @@ def test_policy_of_a_file_acts_like_the_one_in_training(tmp_path):
     """In the training environment and attached to one of its own, step by step."""
     model = model_of("gnn-16", tmp_path / "run")
     nodes = Nodes(16, True)
-    description = origin(preset("gnn-16", "run", "quick"), "gnn-16", 0, 0)
+    description = describe_run(preset("gnn-16", "run", "quick"), "gnn-16", 0, 0)
     SegmentPolicy(model.networks()[0], nodes, description).save(tmp_path / "a.safetensors")
     policy = baselines.load(tmp_path / "a.safetensors")
     env = TorchEnv("run", 2, 64, particles=200, substeps=2)
@@ -192,10 +192,10 @@ def test_policy_must_be_shown_its_own_kind_of_task(tmp_path):
 
 @pytest.mark.parametrize("algo", ["gnn-16", "gnn-64", "transformer-16", "transformer-64"])
 def test_presets_learn_as_the_first_stage_does(algo):
-    assert baselines.ALGORITHMS[algo].sees == "state"
+    assert find(algo).sees == "state"
     for task in cfp.presets.TASKS:
         for name in ("quick", "paper"):
-            mine, ladder = baselines.ALGORITHMS[algo].preset(task, name), cfp.preset(task, name)
+            mine, ladder = find(algo).preset(task, name), cfp.preset(task, name)
             mine.check()
             assert (mine.learning, mine.environment, mine.steps) == (ladder.learning, ladder.environment, ladder.steps)
             assert (mine.alpha, mine.random_steps) == (ladder.alpha[0], ladder.random_steps[0])

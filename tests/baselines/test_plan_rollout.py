@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from baselines.common.rollout import judge, repeat, rollout, to_dtype
+from baselines.common.rollout import repeat, rollout, soft_step, to_dtype
 from dittogym import TorchEnv
 
 
@@ -45,8 +45,9 @@ def test_checkpoints_do_not_change_the_gradient() -> None:
 def test_nothing_is_earned_after_the_end() -> None:
     env = small("run", 2)
 
-    def ends_soon_for_the_second(model, state, field):
-        return judge(model, state, field)._replace(ended=torch.tensor([False, True]) & (state.steps == 2))
+    def ends_soon_for_the_second(model, state, action):
+        result = soft_step(model, state, action)
+        return result._replace(terminated=torch.tensor([False, True]) & (result.state.steps == 2))
 
     result = rollout(env.model, env.env_state, actions(env, 4), ends_soon_for_the_second)
     assert result.ended.tolist() == [False, True]

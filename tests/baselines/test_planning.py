@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from baselines.common.rollout import judge
+from baselines.common.rollout import soft_step
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig, clip_steps
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
@@ -91,20 +91,22 @@ def test_state_of_a_planner_goes_on_the_same() -> None:
 
 @pytest.mark.parametrize(("layout", "place"), [("image", (0, 0)), ("grid", (0, 3))])
 def test_action_layout_is_the_environments(layout: str, place: tuple[int, int]) -> None:
-    def upper_left(model, state, field):
-        value = field[:, 0, :8, -8:].mean((1, 2))  # small x, large y
-        return judge(model, state, field)._replace(reward=value, true_reward=value.detach())
+    def upper_left(model, state, action):
+        result = soft_step(model, state, action)
+        value = result.actuation[:, 0, :8, -8:].mean((1, 2))  # small x, large y
+        return result._replace(reward=value, true_reward=value.detach())
 
     env = small(action_layout=layout)
     config = GradientPlannerConfig(horizon=1, commit=1, iterations=1, noise=0.0)
-    plan = GradientPlanner(env, config, judge=upper_left).plan()[0, 0, 0]
+    plan = GradientPlanner(env, config, step=upper_left).plan()[0, 0, 0]
     assert float(plan[place]) == pytest.approx(0.6, rel=1e-3) and plan[3, 0] == plan[3, 3] == 0
 
 
 def test_ending_the_episode_forgoes_what_comes_after() -> None:
-    def ends_if_contracted(model, state, field):
-        value = field[:, 0].mean((1, 2)) / 45.0
-        return judge(model, state, field)._replace(reward=value, true_reward=1.0 + value.detach(), ended=value > 0.3)
+    def ends_if_contracted(model, state, action):
+        result = soft_step(model, state, action)
+        value = result.actuation[:, 0].mean((1, 2)) / 45.0
+        return result._replace(reward=value, true_reward=1.0 + value.detach(), terminated=value > 0.3)
 
     chosen = {}
     for termination_steps in (0.0, 5.0):
@@ -112,7 +114,7 @@ def test_ending_the_episode_forgoes_what_comes_after() -> None:
         config = GradientPlannerConfig(
             horizon=1, commit=1, iterations=2, noise=0.0, learning_rate=0.25, termination_steps=termination_steps
         )
-        chosen[termination_steps] = float(GradientPlanner(env, config, judge=ends_if_contracted).plan()[0, 0, 0].mean())
+        chosen[termination_steps] = float(GradientPlanner(env, config, step=ends_if_contracted).plan()[0, 0, 0].mean())
     assert chosen[0.0] == pytest.approx(0.5, abs=0.02) and chosen[5.0] == pytest.approx(0.25, abs=0.02)
 
 
@@ -133,10 +135,10 @@ def test_plans_that_are_not_finite_are_counted_and_not_carried_out(monkeypatch) 
     planner = GradientPlanner(
         env, GradientPlannerConfig(horizon=2, commit=1, iterations=2, noise=0.0, learning_rate=0.01)
     )
-    judge, calls = planner._returns, []
+    returns, calls = planner._returns, []
 
     def breaks(start, plan):
-        climbed, value = judge(start, plan)
+        climbed, value = returns(start, plan)
         calls.append(plan.detach().clone())
         spoilt = torch.tensor([0.0, torch.nan if len(calls) > 1 else 0.0])
         return climbed + spoilt, value + spoilt

@@ -10,8 +10,8 @@ from baselines.modular.kmeans import adjacency, connect, fit, segment_means, squ
 from baselines.modular.nodes import LENGTH_SCALE, SPEED_SCALE, Nodes, pack, unpack
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
-from dittogym.action import place, to_grid_layout
-from dittogym.observation.window import in_window
+from dittogym.action import place, to_grid_indexing
+from dittogym.window import centre_in_window
 
 
 def segmented(task="run", num_envs=2, count=16, graph=True, **options):
@@ -99,7 +99,7 @@ def test_neighbours_survive_packing(count):
 
 def test_rows_say_what_the_segments_are():
     env = segmented("catch", 1)
-    state, robot = env.env.env_state, env.env.model.robot
+    state, robot = env.env.env_state, env.env.model.num_robot_particles
     state.particles.v[:] = torch.rand(state.particles.v.shape, generator=torch.Generator().manual_seed(0))
     rows = env.nodes.observe(env.env, env.labels)
     mine = env.labels[0] == 5
@@ -133,9 +133,9 @@ def test_nodes_of_the_grid_get_the_value_of_the_nearest_segment(task, layout):
     values = torch.stack((torch.linspace(-1, 1, 16), torch.linspace(1, 0, 16)), -1)[None]
     action = env.nodes.to_grid(env.env, env.labels, values)
     state, spec = env.env.env_state, env.env.spec
-    centre = in_window(spec.reach, state.centre, state.origin)
-    field = place(to_grid_layout(action, layout), centre, 128)
-    robot = state.particles.x[:, : env.env.model.robot]
+    centre = centre_in_window(spec.reach, state.centre, state.origin)
+    field = place(to_grid_indexing(action, layout), centre, 128)
+    robot = state.particles.x[:, : env.env.model.num_robot_particles]
     centres, _ = segment_means(robot, env.labels, 16)
     for point in robot[0, ::50]:
         i, j = ((point - state.origin[0]) * 128).round().long().tolist()

@@ -29,7 +29,7 @@ def test_stands_for_the_same_robot(task: str) -> None:
     for _ in range(3):
         large.step(0.5 * torch.ones(2, *large.action_shape))
     surrogate.sync(large.env_state)
-    robot, body = small.state.x[:, : small.model.robot], large.state.x[:, : large.model.robot]
+    robot, body = (env.state.x[:, : env.model.num_robot_particles] for env in (small, large))
     torch.testing.assert_close(robot.mean(1), body.mean(1), atol=4e-3, rtol=0)
     torch.testing.assert_close(robot.std(1), body.std(1), atol=4e-3, rtol=0)
     mass = [
@@ -46,9 +46,10 @@ def test_stands_for_the_same_robot(task: str) -> None:
 def test_each_stands_for_another() -> None:
     large, small = make("kick", 400), make("kick", 300, seed=5)
     chosen = Surrogate(large, small).indices
-    count = large.model.robot
+    count = large.model.num_robot_particles
     assert all(len(set(row.tolist())) == len(row) for row in chosen)
-    assert bool((chosen[:, : small.model.robot] < count).all() and (chosen[:, small.model.robot :] >= count).all())
+    few = small.model.num_robot_particles
+    assert bool((chosen[:, :few] < count).all() and (chosen[:, few:] >= count).all())
 
 
 def test_takes_over_constants_of_particles() -> None:

@@ -6,7 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchmpm import tree
 
+
+@tree.register
 @dataclass(frozen=True)
 class FakeState:
     """A number per element that actions push up and down, and the steps taken."""
@@ -32,6 +35,7 @@ class FakeEnv:
         self.num_envs, self.action_resolution, self.horizon = num_envs, resolution, horizon
         self.end_above, self.faults, self.device = end_above, faults or {}, torch.device("cpu")
         self.start, self.push = start, push
+        self.observation_shape, self.action_shape = (3, 64, 64), (2, resolution, resolution)
         self.first = start + torch.arange(num_envs) / 10.0
         self.env_state = FakeState(self.first.clone(), torch.zeros(num_envs, dtype=torch.int64))
         self.actions, self.generators = [], {}
@@ -64,7 +68,7 @@ class FakeEnv:
             "is_success": height > 0.4,
             "reward_terms": {"near": reward - 1, "alive": reward * 0 + 1},
         }
-        return self._observe(), reward, height > self.end_above, self.env_state.steps >= self.horizon, info
+        return self._observe(), reward, (height > self.end_above) | ~finite, self.env_state.steps >= self.horizon, info
 
     def render(self, index=0):
         return np.full((512, 512, 3), index, np.uint8)

@@ -83,7 +83,9 @@ def test_resumed_training_equals_uninterrupted_training_to_the_last_bit(tmp_path
     assert all(torch.equal(*pair) for pair in zip(batch[:5], again[:5], strict=True))
 
 
-@pytest.mark.parametrize("writer", ["cfp.experiment.checkpoint.write_atomically", "cfp.agent.replay.write_atomically"])
+@pytest.mark.parametrize(
+    "writer", ["cfp.experiment.checkpoint.write_atomically", "cfp.experiment.replay_archive.write_atomically"]
+)
 def test_checkpoint_survives_a_crash_while_the_next_is_written(tmp_path, monkeypatch, writer):
     checkpoint, algorithm = Checkpoint(tmp_path), make()
     algorithm.learn(20)
@@ -110,7 +112,7 @@ def test_next_level_replaces_the_replay_of_the_last(tmp_path):
     checkpoint.save(coarse, CONFIG, Position(1))
     fine.learn(8)
     checkpoint.save(fine, CONFIG, Position(2, 12))
-    assert [path.name for path in (tmp_path / "replay").iterdir()] == ["level2-000000000-000000004.npz"]
+    assert [path.name for path in (tmp_path / "replay").iterdir()] == ["stage2-000000000-000000004.npz"]
     state = Checkpoint(tmp_path).read()
     other = make(2)
     Checkpoint(tmp_path).restore(other, state)

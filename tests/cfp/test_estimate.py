@@ -7,10 +7,11 @@ import pytest
 
 from baselines import train as baselines_train
 from cfp import train
-from cfp.agent.policies import ActorPolicy
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.sac import CFP
 from cfp.config import Config
-from cfp.experiment.estimate import REPEATS, _duration, seconds
+from cfp.experiment.algorithm import mean_seconds
+from cfp.experiment.estimate import _duration
 from cfp.from_dict import update_from_dict
 from cfp.presets import preset
 from dittogym import make_spec
@@ -56,20 +57,21 @@ def test_an_actor_that_waits_longer_than_its_stage_is_named(tmp_path, capsys, mo
     monkeypatch.setattr(CFP, "_update_actor", lambda *given: (updates.append(1), update(*given))[1])
     assert train.main([*TINY, *LEARNS, "--buffer-size", "60", "--actor-start", "75", "--dry-run"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "stage 1: no actor update in its 70 steps (--actor-start 75)"
-    assert len(updates) == 2 * (REPEATS + 1)  # what is timed is a whole update all the same
+    assert len(updates) == 2 * (3 + 1)  # what is timed is a whole update all the same
 
 
 def test_what_follows_the_training_is_counted_with_the_policies_own_time(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     asked, predict = [], ActorPolicy.predict
     monkeypatch.setattr(ActorPolicy, "predict", lambda *given: (asked.append(1), predict(*given))[1])
-    monkeypatch.setattr("cfp.experiment.estimate.seconds", lambda action: action() or 1.0)
+    monkeypatch.setattr("cfp.experiment.estimate.mean_seconds", lambda action: action() or 1.0)
     monkeypatch.setattr("cfp.experiment.estimate.available", lambda: True)
     episode = make_spec("shapematch").horizon
-    floor = "--algo zero --particles 100 --substeps 1 --dry-run".split()
-    assert baselines_train.main(floor) == 0  # an evaluation; a row for zero, random and the floor; a film
-    assert f"time: about {_duration(5 * episode)}, {_duration(4 * episode)} of it for" in capsys.readouterr().out
-    assert train.main([*TINY, *LEARNS, "--buffer-size", "60", "--eval-every", "50", "--no-video", "--dry-run"]) == 0
+    command = [*TINY, *LEARNS, "--buffer-size", "60", "--eval-every", "50", "--dry-run"]
+    assert train.main(command) == 0  # a row for zero, random and two stages; a film
+    assert f"{_duration(5 * episode)} of it for" in capsys.readouterr().out
+    asked.clear()
+    assert train.main([*command, "--no-video"]) == 0
     printed = capsys.readouterr().out
     assert f"{_duration(4 * episode)} of it for" in printed and len(asked) == 4
     stages = [re.split("  +", line.strip()) for line in printed.splitlines()[-4:-2]]
@@ -125,10 +127,10 @@ def test_dry_run_names_wrong_options(capsys):
 
 def test_the_first_time_is_not_timed(monkeypatch):
     now, calls = [0.0], []
-    monkeypatch.setattr("cfp.experiment.estimate.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("cfp.experiment.algorithm.time.perf_counter", lambda: now[0])
 
     def action():
         now[0] += 100.0 if not calls else 2.0
         calls.append(1)
 
-    assert seconds(action, 4) == pytest.approx(2.0)
+    assert mean_seconds(action, 4) == pytest.approx(2.0)

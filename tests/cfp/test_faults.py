@@ -126,4 +126,4 @@ def test_first_level_of_another_ladder_is_refused(finished, tmp_path, capsys):
     for suffix in ("safetensors", "json"):
         (folder / f"stage1.{suffix}").write_bytes((finished / f"stage1.{suffix}").read_bytes())
     assert run(folder, *SHORT, "--resolutions", "8", "16", "--steps", "100", "--resume") == 2
-    assert "stage1.safetensors: weights and description do not fit" in capsys.readouterr().err
+    assert "stage1.safetensors: weights and description do not match" in capsys.readouterr().err

@@ -73,14 +73,14 @@ def test_second_level_starts_from_a_policy(coarse, tmp_path, name):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--task", "run"], "start_from: got a policy for shapematch, allowed run"),
+        (["--task", "run"], "start_from must be a policy for run, got one for shapematch"),
         (["--resolutions", "8", "16"], "start_from: got a policy of levels (4,), allowed the first of (8, 16)"),
         (["--warm-critic"], "warm_critic must be False with start_from"),
         (["--start-from", "no/such"], "there is no policy"),
-        (["--action-layout", "grid"], "start_from: got a policy for action layout image, allowed grid"),
-        (["--target", "T"], "start_from: got a policy for the target None, allowed T"),
-        (["--substeps", "2"], "start_from: got a policy for substeps 1, allowed 2"),
-        (["--parity", "reference"], "start_from: got a policy for action layout image, allowed grid"),
+        (["--action-layout", "grid"], "start_from must be a policy for action_layout grid, got image"),
+        (["--target", "T"], "start_from must be a policy for the target T, got None"),
+        (["--substeps", "2"], "start_from must be a policy for substeps 2, got 1"),
+        (["--parity", "reference"], "start_from must be a policy for action_layout grid, got image"),
         (
             ["--refine", "--resolutions", "8", "16"],
             "start_from: got a policy of levels (4,), allowed the first of (8, 16)",

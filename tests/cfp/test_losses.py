@@ -32,7 +32,7 @@ def one_by_one(patch):
     patch.setattr("cfp.agent.fused.encode", encode_one_by_one)
     patch.setattr("cfp.agent.fused.decode", lambda heads, latent: [head(latent) for head in heads])
     patch.setattr(
-        "cfp.agent.fused.perceive",
+        "cfp.agent.fused.multilayer_perceptrons",
         lambda each, values: torch.stack([one(x) for one, x in zip(each, values, strict=True)]),
     )
 
@@ -130,17 +130,16 @@ def test_acting_is_in_float32():
     assert (actions[0] == actions[1]).all()
 
 
-@pytest.mark.parametrize("found", [None, "_is_avx512_bf16_supported", "_is_amx_tile_supported"])
+@pytest.mark.parametrize("found", [None, "avx512_bf16", "amx_bf16"])
 def test_bfloat16_is_chosen_where_the_processor_multiplies_it(monkeypatch, found):
-    for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported"):
-        monkeypatch.setattr(torch.cpu, name, lambda name=name: name == found, raising=False)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {found: True, "avx2": True}, raising=False)
     assert choose_precision("auto", CPU) == ("float32" if found is None else "bfloat16")
     assert choose_precision("auto", torch.device("cuda")) == "float32"
     assert choose_precision("bfloat16", CPU) == "bfloat16"
 
 
 def test_unknown_precision_is_refused():
-    with pytest.raises(ValueError, match="precision: got 'half', allowed auto, float32, bfloat16"):
+    with pytest.raises(ValueError, match="precision must be 'auto', 'float32' or 'bfloat16', got 'half'"):
         make_model(PLAIN, precision="half")
 
 
@@ -169,7 +168,7 @@ def test_failed_compilation_says_so_once_and_goes_on(monkeypatch, caplog):
     expected = sum(F.mse_loss(value, wanted) for value in critic(batch.observations, batch.actions))
     assert values[0] == values[1] == pytest.approx(expected.item())
     assert [record.getMessage() for record in caplog.records] == [
-        "the update is not compiled, only slower: torch.compile failed (disk full)"
+        "updates are not compiled, only slower: torch.compile failed (disk full)"
     ]
 
 

@@ -1,19 +1,14 @@
 import numpy as np
 import pytest
+from gymnasium import spaces
 
-from cfp.agent.policies import action_space, observation_space
-from cfp.agent.replay import ReplayArchive, ReplayRing
-from cfp.errors import CheckpointError
+from cfp.agent.replay import ReplayRing
+
+SPACES = spaces.Box(0, 255, (3, 64, 64), np.uint8), spaces.Box(-1, 1, (2, 8, 8), np.float32)
 
 
 def make_ring(rows=6, envs=2):
-    return ReplayRing(rows * envs, observation_space(), action_space(8), device="cpu", n_envs=envs, seed=0)
-
-
-def test_ring_keeps_next_observations():
-    options = {"device": "cpu", "n_envs": 2, "handle_timeout_termination": False}
-    with pytest.raises(ValueError, match="optimize_memory_usage: got True, allowed is False"):
-        ReplayRing(12, observation_space(), action_space(8), optimize_memory_usage=True, **options)
+    return ReplayRing(rows * envs, *SPACES, device="cpu", n_envs=envs, seed=0)
 
 
 def fill(ring, start, stop):
@@ -25,96 +20,10 @@ def fill(ring, start, stop):
         ring.add(image, image + 1, action, np.array([row, -row], np.float32), np.array([row % 2 == 0] * 2), infos)
 
 
-def contents(ring):
-    names = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-    return {name: getattr(ring, name) for name in names} | {"pos": ring.pos, "full": ring.full}
-
-
-def assert_same(first, second):
-    for name, value in contents(first).items():
-        np.testing.assert_array_equal(contents(second)[name], value, err_msg=name)
-
-
-@pytest.mark.parametrize("saves", [(4,), (3, 4, 6), (3, 7), (5, 8, 11, 14), (20,), (2, 20, 23)])
-def test_ring_comes_back_from_its_chunks(tmp_path, saves):
-    ring, archive, done = make_ring(), ReplayArchive(tmp_path, 0), 0
-    for rows in saves:
-        fill(ring, done, rows)
-        done = rows
-        chunks = archive.save(ring, rows)
-        archive.prune()
-        other = make_ring()
-        ReplayArchive(tmp_path, 0).load(other, rows, chunks)
-        assert_same(ring, other)
-        assert sorted(path.name for path in tmp_path.iterdir()) == sorted(chunk["file"] for chunk in chunks)
-        assert all(chunk["stop"] > rows - 6 for chunk in chunks)
-
-
-def test_only_new_rows_are_written_and_old_files_never_change(tmp_path):
-    ring, archive = make_ring(), ReplayArchive(tmp_path, 0)
-    fill(ring, 0, 3)
-    archive.save(ring, 3)
-    before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in tmp_path.iterdir()}
-    fill(ring, 3, 5)
-    chunks = archive.save(ring, 5)
-    assert [(chunk["start"], chunk["stop"]) for chunk in chunks] == [(0, 3), (3, 5)]
-    assert all(
-        ((tmp_path / name).stat().st_mtime_ns, (tmp_path / name).read_bytes()) == old for name, old in before.items()
-    )
-
-
-def test_chunks_of_the_last_checkpoint_outlive_the_next_save(tmp_path):
-    ring, archive = make_ring(), ReplayArchive(tmp_path, 0)
-    fill(ring, 0, 4)
-    chunks = archive.save(ring, 4)
-    kept = make_ring()
-    fill(kept, 0, 4)
-    fill(ring, 4, 16)
-    archive.save(ring, 16)  # killed here: the state file still names the old chunks
-    other = make_ring()
-    ReplayArchive(tmp_path, 0).load(other, 4, chunks)
-    assert_same(kept, other)
-
-
-def test_resumed_archive_goes_on_where_it_stopped(tmp_path):
-    ring, archive = make_ring(), ReplayArchive(tmp_path, 0)
-    fill(ring, 0, 4)
-    chunks = archive.save(ring, 4)
-    other, resumed = make_ring(), ReplayArchive(tmp_path, 0)
-    resumed.load(other, 4, chunks)
-    fill(ring, 4, 9)
-    fill(other, 4, 9)
-    assert resumed.save(other, 9) == archive.save(ring, 9)
-    assert_same(ring, other)
-
-
-@pytest.mark.parametrize("damage", ["missing", "cut", "flipped"])
-def test_damaged_chunk_is_named(tmp_path, damage):
-    ring, archive = make_ring(), ReplayArchive(tmp_path, 0)
-    fill(ring, 0, 4)
-    chunks = archive.save(ring, 4)
-    path = tmp_path / chunks[0]["file"]
-    content = bytearray(path.read_bytes())
-    if damage == "missing":
-        path.unlink()
-    elif damage == "cut":
-        path.write_bytes(content[: len(content) // 2])
-    else:
-        content[len(content) // 2] ^= 0xFF
-        path.write_bytes(content)
-    with pytest.raises(CheckpointError, match=chunks[0]["file"]):
-        ReplayArchive(tmp_path, 0).load(make_ring(), 4, chunks)
-
-
-def test_gap_between_chunks_is_noticed(tmp_path):
-    ring, archive = make_ring(), ReplayArchive(tmp_path, 0)
-    for rows in (2, 4, 6):
-        fill(ring, rows - 2, rows)
-        chunks = archive.save(ring, rows)
-    with pytest.raises(CheckpointError, match="rows 2 to 4"):
-        ReplayArchive(tmp_path, 0).load(make_ring(), 6, [chunks[0], chunks[2]])
-    with pytest.raises(CheckpointError, match="rows 4 to 6"):
-        ReplayArchive(tmp_path, 0).load(make_ring(), 6, chunks[:2])
+def test_ring_keeps_next_observations():
+    options = {"device": "cpu", "n_envs": 2, "handle_timeout_termination": False}
+    with pytest.raises(ValueError, match="optimize_memory_usage must be False"):
+        ReplayRing(12, *SPACES, optimize_memory_usage=True, **options)
 
 
 def test_batch_has_no_repetition_and_keeps_rows_together():
@@ -131,17 +40,3 @@ def test_batch_has_no_repetition_and_keeps_rows_together():
     expected = ((row % 2 == 0) & ~limit & (row > 0)).float()
     assert (batch.dones[row > 0, 0] == expected[row > 0]).all()
     assert len(ring.sample(20).rewards) == 20
-
-
-def test_pruning_deletes_chunks_only(tmp_path):
-    """The folder of a stranger's run may be a link to one of mine."""
-    mine = tmp_path / "mine"
-    mine.mkdir()
-    (mine / "thesis.tex").write_text("precious")
-    (tmp_path / "replay").symlink_to(mine)
-    ring, archive = make_ring(), ReplayArchive(tmp_path / "replay", 0)
-    fill(ring, 0, 4)
-    chunks = archive.save(ring, 4)
-    (mine / "level1-000000000-000000002.npz").touch()
-    archive.prune()
-    assert sorted(path.name for path in mine.iterdir()) == [chunks[0]["file"], "thesis.tex"]

@@ -14,7 +14,7 @@ import cfp
 from cfp import robustness
 from cfp.agent.actor import build_actor
 from cfp.config import to_json
-from cfp.envs.disturbances import Case, Disturbed, disturbed_env, idle, make_cases
+from cfp.envs.disturbances import Case, Disturbed, disturbed_env, make_cases, reason_without_effect
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from cfp.evaluate import open_policy, open_run
@@ -112,14 +112,14 @@ def test_constants_reach_the_physics_of_every_task(task):
     assert physics["gravity"].tolist() == [[2 * value for value in spec.gravity]] * 2
     env = disturbed_env(config, 8, 2, Case("ice", friction=0.25), 3)
     floors = [item for item in env.unwrapped.torch_env.spec.obstacles if item.name == "floor"]
-    assert [rule.friction for item in floors for rule in item.rules] == [0.25]
+    assert [rule.friction for item in floors for rule in item.velocity_rules] == [0.25]
     others = [item for item in spec.obstacles if item.name != "floor"]
     assert [item for item in env.unwrapped.torch_env.spec.obstacles if item.name != "floor"] == others
 
 
 def test_cases_that_change_nothing_in_a_task_are_left_out():
     cases = make_cases()
-    names = {task: [case.name for case in cases if not idle(case, make_spec(task))] for task in TASKS}
+    names = {task: [case.name for case in cases if not reason_without_effect(case, make_spec(task))] for task in TASKS}
     assert "gravity x 0.8" in names["run"] and "gravity x 0.8" not in names["shapematch"]
     assert "floor friction sticky" in names["dig"] and "floor friction 0" not in names["dig"]
     assert "floor friction sticky" not in names["run"] and "floor friction 0" in names["run"]
@@ -156,7 +156,7 @@ def test_command_writes_table_and_plot(folder, capsys):
     printed = capsys.readouterr().out
     rows = json.loads((folder / "robustness.json").read_text())
     assert [row["case"] for row in rows] == [
-        case.name for case in make_cases() if not idle(case, make_spec("shapematch"))
+        case.name for case in make_cases() if not reason_without_effect(case, make_spec("shapematch"))
     ]
     assert rows[0]["ratio"] == 1
     for row in rows:
@@ -207,17 +207,17 @@ def test_chosen_cases_that_change_nothing_are_refused(folder):
     policy = open_run(PROGRAM, folder, "cpu")[1]["stage 2"]
     robustness.check_words(make_cases(), [*words, "observation"], run, policy)
     ground = [replace(item, name="ground") if item.name == "floor" else item for item in run.obstacles]
-    with pytest.raises(ConfigError, match="floor friction 0: run has no obstacle with the name 'floor'; floor"):
+    with pytest.raises(ConfigError, match="floor friction 0: run has no obstacle named 'floor'; floor"):
         robustness.check_words(make_cases(), words, replace(run, obstacles=tuple(ground)), policy)
     with pytest.raises(ConfigError, match="floor friction sticky: the floor of run has this friction"):
         robustness.check_words(make_cases(), ["sticky"], run, policy)
     policy.sees_image = False
-    with pytest.raises(ConfigError, match="observation dropout 20%: the policy looks at no pixels"):
+    with pytest.raises(ConfigError, match="observation dropout 20%: the policy does not use the image"):
         robustness.check_words(make_cases(), ["observation"], run, policy)
 
 
 def test_floor_counts_with_all_its_rules():
-    run, (slippery,) = make_spec("run"), floor(0.0).rules
+    run, (slippery,) = make_spec("run"), floor(0.0).velocity_rules
     rough = replace(slippery, friction=0.5)
     for rules, reason in (
         ((), "the floor of run has no rules"),
@@ -225,7 +225,7 @@ def test_floor_counts_with_all_its_rules():
         ((slippery, rough), ""),
     ):
         ground = replace(floor(), rules=rules)
-        assert idle(Case("ice", friction=0.0), replace(run, obstacles=(ground,))) == reason
+        assert reason_without_effect(Case("ice", friction=0.0), replace(run, obstacles=(ground,))) == reason
 
 
 WHAT = ("action", "observation")
@@ -250,7 +250,7 @@ def test_ratios_need_a_positive_return():
         (["--latency", "0"], "latency must be at least 1, got 0"),
         (["--noise", "nan"], "noise: got nan"),
         (["--friction", "-1"], "friction: got (-1.0,), allowed 0 or more"),
-        (["--device", "abacus"], "device: got 'abacus'"),
+        (["--device", "abacus"], "device must be auto, cpu or cuda, got 'abacus'"),
         (["--cases", "noise", "gravity"], "cases: got 'gravity', allowed words of cases that change something"),
     ],
 )

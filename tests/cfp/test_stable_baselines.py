@@ -47,5 +47,5 @@ def test_features_are_those_of_the_encoder():
     features = extractor(image.float() / 255)
     assert features.shape == (2, extractor.features_dim) == (2, 512)
     torch.testing.assert_close(features, extractor.encoder(normalise_image(image)).flatten(1))
-    with pytest.raises(ValueError, match=r"got shape \(3, 32, 32\), allowed \(3, 64, 64\)"):
+    with pytest.raises(ValueError, match=r"must have shape \(3, 64, 64\), got \(3, 32, 32\)"):
         ImageFeatures(spaces.Box(0, 255, (3, 32, 32), np.uint8))

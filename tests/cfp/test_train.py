@@ -19,7 +19,7 @@ import cfp
 import dittogym
 from cfp import evaluate, train
 from cfp.agent.actor import build_actor
-from cfp.agent.policies import ActorPolicy
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.spec import ActorSpec
 from cfp.envs.vec_env import monitored
 from cfp.evaluation import plots as plot
@@ -245,7 +245,7 @@ def test_damaged_checkpoint_is_an_error_that_names_it(tmp_path, capsys):
         (["--particles", "0"], "particles"),
         (["--target", "no/such.png"], "target"),
         (["--num-envs", "0"], "num_envs must be at least 1, got 0"),
-        (["--device", "abacus"], "device: got 'abacus'"),
+        (["--device", "abacus"], "device must be auto, cpu or cuda, got 'abacus'"),
         (["--config", "no/such.json"], "config: no/such.json cannot be read"),
         (["--backend", "slide-rule"], "backend"),
     ],

@@ -80,9 +80,8 @@ def test_options_are_used_at_the_next_reset_only():
     env.reset()
     env.step(actions(env))
     mask = torch.tensor([True, False])
-    for options in ({"reset_mask": mask}, [{"reset_mask": mask.clone()} for _ in range(2)]):
-        env.set_options(options)
-        assert env.reset()[:, 1, 0, 0].tolist() == [0, 1]
+    env.set_options({"reset_mask": mask})
+    assert env.reset()[:, 1, 0, 0].tolist() == [0, 1]
     assert env.reset()[:, 1, 0, 0].tolist() == [0, 0]
 
 
@@ -90,7 +89,7 @@ def test_options_are_used_at_the_next_reset_only():
 def test_options_that_differ_are_refused(others):
     env = TorchVecEnv(FakeEnv(num_envs=2))
     env.set_options([{"physics": {"mu": np.full(3, 1.0)}}, *others])
-    with pytest.raises(ValueError, match=r"options: got .* allowed are one for all elements, or the same 2 times"):
+    with pytest.raises(ValueError, match="options must be one dictionary for all 2 elements"):
         env.reset()
 
 
@@ -115,7 +114,7 @@ def test_episode_in_progress_can_be_put_back():
     got = other.step(actions(env, 0.25))
     np.testing.assert_array_equal(got[0], expected[0])
     np.testing.assert_array_equal(got[1], expected[1])
-    with pytest.raises(ValueError, match="allowed \\(3,\\)"):
+    with pytest.raises(ValueError, match="state must hold tensors of shapes"):
         TorchVecEnv(FakeEnv(num_envs=3)).load_state_dict(state)
 
 

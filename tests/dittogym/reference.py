@@ -11,9 +11,9 @@ import pytest
 import torch
 
 import dittogym
-from dittogym import core as dynamics
+from dittogym import core
 from dittogym.action import patch_field, place
-from dittogym.observation.window import in_window
+from dittogym.window import centre_in_window
 from torchmpm.boundary import constrain
 from torchmpm.grid import PAD
 from torchmpm.substep import grid_velocity, particles_to_grid
@@ -83,7 +83,7 @@ def make(data: dict[str, np.ndarray], **options: Any) -> dittogym.TorchEnv:
     )
     env.reset(seed=0)
     # Not through the option "positions": one file parks particles that it does not need outside the window.
-    env.env_state, _ = dynamics.initial(env.model, torch.as_tensor(data["x0"])[None].to(env.dtype))
+    env.env_state, _ = core.reset(env.model, torch.as_tensor(data["x0"])[None].to(env.dtype))
     return env
 
 
@@ -113,7 +113,7 @@ def _first_grid(data: dict[str, np.ndarray], env: dittogym.TorchEnv, recorded: t
     """Actuation, mass and velocity on the nodes in the first substep."""
     spec, solver, start = env.spec, env.model.solver, env.env_state
     patch = patch_field(action(data, env, 0), spec.patch, spec.max_actuation)
-    ours = place(patch, in_window(spec.reach, start.centre, start.origin), solver.grid.resolution)
+    ours = place(patch, centre_in_window(spec.reach, start.centre, start.origin), solver.grid.resolution)
     scene = solver.scene(start.particles, recorded, start.origin)
     grid = particles_to_grid(scene, start.particles.planes())
     along = torch.stack(interpolate(grid.nodes, scene.actuation), -1)[0]
@@ -136,7 +136,7 @@ def _first_grid(data: dict[str, np.ndarray], env: dittogym.TorchEnv, recorded: t
 def episode_errors(data: dict[str, np.ndarray]) -> dict[str, float]:
     """Largest difference over the recorded episode, in the measure that :data:`EPISODE` names."""
     env = make(data)
-    robot = env.model.robot
+    robot = env.model.num_robot_particles
     rows: dict[str, list[Any]] = {name: [] for name in EPISODE}
     for t in range(len(data["actions"])):
         observation, reward, terminated, _, info = env.step(action(data, env, t))
@@ -149,7 +149,7 @@ def episode_errors(data: dict[str, np.ndarray]) -> dict[str, float]:
         rows["v_mean"].append(v[:robot].mean(0))
         rows["reward"].append(reward[0])
         rows["terminated"].append(terminated[0])
-        rows["action_norm"].append(env._field.flatten(2).norm(dim=2).sum())
+        rows["action_norm"].append(env._actuation.flatten(2).norm(dim=2).sum())
         rows["kinetic"].append(0.5 * (torch.as_tensor(data["mass"]) * v.square().sum(-1)).sum())
         rows["det_F_mean"].append(torch.linalg.det(F).mean())
         rows["obs"].append(observation[0])

@@ -8,7 +8,7 @@ import torch
 from tiny import FIXED, SMALL, TASKS, actions, assert_same_bits, everything, leaves, stir, tiny
 
 from dittogym import BatchEnv, TorchEnv
-from dittogym.spec import FAILURE_REWARD
+from dittogym.core import FAILURE_REWARD
 
 
 def assert_element_is(batch: TorchEnv, result: tuple, i: int, single: TorchEnv, one: tuple) -> None:
@@ -112,7 +112,7 @@ def spoil(env: TorchEnv, how: str) -> None:
     elif how == "shot":
         state.v[1] = 1e300
     else:
-        robot = slice(0, env.model.robot)
+        robot = slice(0, env.model.num_robot_particles)
         axis, distance = {"up": (1, 1.5), "down": (1, -1.5), "left": (0, -1.5), "right": (0, 1.5)}[how]
         state.x[1, robot, axis] += distance
 

@@ -135,7 +135,7 @@ def test_deterministic_drive(task: str) -> None:
         action = torch.as_tensor(np.sin(0.3 * t + 0.7 * r + 1.1 * s + 2 * c), dtype=torch.float32)[None]
         observation, reward, *_, info = env.step(action)
         rewards.append(float(reward))
-        norms.append(float(action_cost(env._field)))
+        norms.append(float(action_cost(env._actuation)))
     wanted, com, split, norm, sums = DRIVE[task]
     if wanted is not None:
         assert [rewards[i] for i in (0, 1, 4, 9)] == pytest.approx(wanted, abs=TOLERANCE.get(task, 1e-3))

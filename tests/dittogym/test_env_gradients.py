@@ -46,7 +46,7 @@ def inputs(task: str, per_particle: bool) -> Leaves:
     shape = (B, n) if per_particle else (B,)
     matter = {name: own[name] * (1.0 + 0.1 * normal(*shape, seed=k).abs()) for k, name in enumerate(MATTER)}
     strain = 0.08 * normal(B, n, 2, 2, seed=10)
-    strain[:, env.model.robot :] *= 0.2
+    strain[:, env.model.num_robot_particles :] *= 0.2
     return {
         "action": 0.6 * actions(env, STEPS),
         "x": env.state.x.clone(),

@@ -14,7 +14,7 @@ def test_a_solid_box_stops_matter() -> None:
     """A task of one's own: RUN with a wall, without gravity; a robot thrown at it does not get through."""
     base = dittogym.make_spec("run")
     wall = solid("wall", (30, 40), (None, None))
-    assert wall.drawn and wall.shown and not solid("glass", (30, 40), (0, 9), visible=False).drawn
+    assert wall.observed_boxes == wall.boxes and not solid("glass", (30, 40), (0, 9), visible=False).observed_boxes
     spec = dataclasses.replace(base, name="wall", gravity=(0.0, 0.0), obstacles=(wall, floor()))
     env = dittogym.TorchEnv(spec, 1, particles=500)
     observation, _ = env.reset(seed=0)
@@ -31,7 +31,7 @@ def test_bad_geometry() -> None:
         solid("thin", (3, 5), (0, 9))
     with pytest.raises(ValueError, match="friction must not be negative"):
         floor(-1.0)
-    assert floor().rules[0].friction == math.inf
+    assert floor().velocity_rules[0].friction == math.inf
 
 
 def test_specifications_take_no_options() -> None:

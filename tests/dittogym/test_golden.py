@@ -32,7 +32,7 @@ def rollout(task: str) -> list[dict[str, Any]]:
     """Centres, spread, reward terms and channel sums of the observation after each step under a moving wave."""
     env = dittogym.TorchEnv(task, 1, **OPTIONS)
     env.reset(seed=0)
-    env.state.v[:, : env.model.robot] = torch.tensor(THROW, dtype=env.dtype)
+    env.state.v[:, : env.model.num_robot_particles] = torch.tensor(THROW, dtype=env.dtype)
     c, r, s = np.indices(env.action_shape)
     rows = []
     for t in range(1, STEPS + 1):

@@ -2,15 +2,13 @@
 
 import math
 from dataclasses import replace
-from unittest import mock
 
 import pytest
 import torch
 from tiny import TASKS, actions, tiny
 
 import dittogym
-from dittogym import core as dynamics
-from dittogym.observation import native
+from dittogym import core
 from torchmpm import ParticleState
 from torchmpm.backends import compiler_found
 
@@ -19,10 +17,9 @@ pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
 
 def both(env: dittogym.TorchEnv) -> tuple[torch.Tensor, torch.Tensor]:
     """The present observation, natively and in torch."""
-    assert native.paints(env.model, env.env_state)
-    drawn = dynamics.observe(env.model, env.env_state)
-    with mock.patch.object(native, "paints", return_value=False):
-        return drawn, dynamics.observe(env.model, env.env_state)
+    assert env.model.camera.native
+    plain = replace(env.model, camera=replace(env.model.camera, native=False, _drawings={}))
+    return core.observe(env.model, env.env_state), core.observe(plain, env.env_state)
 
 
 def put(env: dittogym.TorchEnv, x: torch.Tensor, v: torch.Tensor) -> None:
@@ -46,7 +43,7 @@ def test_same_bytes(task: str, parity: str, dtype: str) -> None:
     put(env, x, 4.0 * torch.randn(x.shape, generator=generator, dtype=env.dtype))
     ours, plain = both(env)
     assert len(ours.unique()) > 20
-    assert (ours.int() - plain.int()).abs().max() <= (env.model.pixels is False)
+    assert (ours.int() - plain.int()).abs().max() <= (env.model.camera.pixels is False)
 
 
 @pytest.mark.parametrize("parity", ["clean", "reference"])
@@ -79,13 +76,11 @@ def test_threads_share_a_batch() -> None:
     try:
         for count in (1, 2, 3):
             torch.set_num_threads(count)
-            images.append(dynamics.observe(env.model, env.env_state))
+            images.append(core.observe(env.model, env.env_state))
     finally:
         torch.set_num_threads(threads)
     assert torch.equal(images[0], images[1]) and torch.equal(images[0], images[2])
 
 
 def test_eager_physics_draws_in_torch() -> None:
-    env = tiny("run", backend="eager")
-    with mock.patch.object(native.Painter, "paint", side_effect=AssertionError):
-        env.reset(seed=0)
+    assert not tiny("run", backend="eager").model.camera.native

@@ -6,6 +6,7 @@ import torch
 
 from dittogym.geometry import Box
 from dittogym.observation import raster as obs
+from dittogym.observation.image import quantise
 
 
 def loop_raster(position: np.ndarray, velocity: np.ndarray, row: int, column: int, mask: np.ndarray) -> np.ndarray:
@@ -34,7 +35,8 @@ def test_pixels_equal_the_loop() -> None:
     mask = rng.random((2, 512, 512)) < 0.01
     p, v = torch.as_tensor(position), torch.as_tensor(velocity)
     seen = (p[..., 0] > 0) & (p[..., 0] < 1)
-    ours = obs.pixel_means(obs.Sight(p, v, seen, torch.zeros(4000, dtype=torch.bool), row, column, background(mask)))
+    weight, hidden = torch.ones(4000), torch.zeros(4000, dtype=torch.bool)
+    ours = obs.pixel_means(obs.RasterInput(p, v, weight, seen, hidden, row, column, background(mask)))
     for i in range(2):
         kept = seen[i].numpy()
         loop = loop_raster(position[i][kept], velocity[i][kept], int(row[i]), int(column[i]), mask[i])
@@ -49,40 +51,40 @@ def test_splat_is_the_mean_of_random_rasters() -> None:
     generator = torch.Generator().manual_seed(0)
     corner = (torch.tensor([[256]]), torch.tensor([[256]]))
     means = {}
-    for count, share in ((40000, None), (4000, 10.0)):
+    for count, weight, raster in ((40000, 1.0, obs.pixel_means), (4000, 10.0, obs.splat_means)):
         position = 0.4 + 0.2 * torch.rand(1, count, 2, generator=generator, dtype=torch.float64)
         velocity = torch.tensor([1.5, -0.5], dtype=torch.float64).expand(1, count, 2)
         seen = torch.ones(1, count, dtype=torch.bool)
-        sight = obs.Sight(position, velocity, seen, ~seen[0], *corner, None)
-        image = obs.pixel_means(sight) if share is None else obs.splat_means(sight, torch.full((count,), share))
+        image = raster(obs.RasterInput(position, velocity, torch.full((count,), weight), seen, ~seen[0], *corner, None))
         means[count] = image[0, :, 25:38, 25:38].mean((1, 2))
     assert means[4000].tolist() == pytest.approx(means[40000].tolist(), rel=0.08)
 
 
-@pytest.mark.parametrize("raster", [obs.pixel_means, lambda sight: obs.splat_means(sight, torch.ones(2))])
-def test_silent_particles_are_seen_but_do_not_move(raster) -> None:
-    """Two particles in one place: the velocity of the pixel is that of the one which speaks."""
+@pytest.mark.parametrize("raster", [obs.pixel_means, obs.splat_means])
+def test_hidden_velocities(raster) -> None:
+    """Two particles in one place: the velocity of the pixel is that of the one whose velocity is not hidden."""
     velocity = torch.tensor([[[3.0, -2.0], [0.0, 0.0]]])
     corner = (torch.tensor([[256]]), torch.tensor([[256]]))
     means = {}
-    for silent in ([False, True], [True, True], [False, False]):
+    for hidden in ([False, True], [True, True], [False, False]):
         here = torch.full((1, 2, 2), 0.5)
-        sight = obs.Sight(here, velocity, torch.ones(1, 2, dtype=torch.bool), torch.tensor(silent), *corner, None)
-        if all(silent):
-            sight = sight._replace(velocity=torch.zeros(1, 2, 2))
-        means[tuple(silent)] = raster(sight)[0].sum((1, 2))
-    speaks, mute, both = means.values()
-    assert speaks[0] == mute[0] == both[0]
-    assert mute[1:].tolist() == [0.0, 0.0]
-    assert speaks[1] == pytest.approx(3.0 / 64, rel=0.05) and speaks[2] == pytest.approx(-2.0 / 64, rel=0.05)
-    assert abs(both[1]) < abs(speaks[1]) * 1.01
+        visible = torch.ones(1, 2, dtype=torch.bool)
+        shown = obs.RasterInput(here, velocity, torch.ones(2), visible, torch.tensor(hidden), *corner, None)
+        if all(hidden):
+            shown = shown._replace(velocity=torch.zeros(1, 2, 2))
+        means[tuple(hidden)] = raster(shown)[0].sum((1, 2))
+    one, none, both = means.values()
+    assert one[0] == none[0] == both[0]
+    assert none[1:].tolist() == [0.0, 0.0]
+    assert one[1] == pytest.approx(3.0 / 64, rel=0.05) and one[2] == pytest.approx(-2.0 / 64, rel=0.05)
+    assert abs(both[1]) < abs(one[1]) * 1.01
 
 
 def test_coding() -> None:
     means = torch.zeros(1, 3, 64, 64)
     means[0, 0, 0, :4] = torch.tensor([0.0, 0.5, 1.0, 21 / 64])
     means[0, 1, 0, :4] = torch.tensor([0.0, 0.965, -1.036, 10.0])
-    code = obs.quantise(means)
+    code = quantise(means)
     assert code[0, 0, 0, :4].tolist() == [0, 127, 255, 83]
     assert code[0, 1, 0, :4].tolist() == [132, 255, 0, 255]
     assert code.dtype == torch.uint8

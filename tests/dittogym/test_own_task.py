@@ -12,13 +12,15 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
-from tiny import SMALL, actions, tiny
+from tiny import SMALL, actions, assert_same_bits, everything, tiny
 
 import dittogym
 from dittogym.bodies.shapes import Disc, Rectangle
+from dittogym.contract import Moment, Outcome
 from dittogym.geometry import Obstacle, ceiling, floor
-from dittogym.spec import Body, Moment, Outcome, TaskSpec, Weights, Window
+from dittogym.spec import BodySpec, TaskSpec
 from dittogym.tasks import fingerprint
+from dittogym.window import Window
 from torchmpm import Elastic, VelocityRule
 
 
@@ -34,17 +36,17 @@ def unregister() -> Iterator[None]:
 
 
 # A task in about ten lines: get high above the start.
-def height(moment: Moment, weights: Weights) -> Outcome:
+def height(moment: Moment, spec: TaskSpec) -> Outcome:
     risen = moment.now.com[:, 1] - moment.start.com[:, 1]
-    return Outcome({"height": weights.location * risen}, terminated=risen > 0.3, success=risen > 0.2)
+    return Outcome({"height": risen}, terminated=risen > 0.3, success=risen > 0.2)
 
 
 def hop(pull: float = -5.0, horizon: int = 40, coarse: int = 4) -> TaskSpec:
-    robot = Body(Disc((0.4, 0.16), 0.18), count=5000)
+    robot = BodySpec(Disc((0.4, 0.16), 0.18), count=5000)
     matter = {"mu": 500.0, "yield_stress": 80.0, "max_actuation": 60.0, "gravity": (0.0, pull)}
     world = {"obstacles": (floor(), ceiling(119)), "coarse": coarse, "fine": 8}
-    weights = Weights(location=7.0, action=1e-4, alive=1.0)
-    return TaskSpec("hop", horizon, robot, judge=height, weights=weights, **matter, **world)
+    weights = {"height": 7.0, "action": 1e-4, "alive": 1.0}
+    return TaskSpec("hop", horizon, robot, reward_fn=height, weights=weights, **matter, **world)
 
 
 def test_through_gymnasium_make_in_both_resolutions() -> None:
@@ -194,15 +196,15 @@ def test_a_specification_needs_no_registration() -> None:
     assert dittogym.BatchEnv(hop(), 2, particles=50, substeps=1).single_action_space.shape == (2, 4, 4)
 
 
-def remember_peak(moment: Moment) -> dict[str, torch.Tensor]:
+def initial_peak(moment: Moment, spec: TaskSpec) -> dict[str, torch.Tensor]:
     return {"peak": moment.now.com[:, 1]}
 
 
-def judge_peak(moment: Moment, weights: Weights) -> Outcome:
+def peak_reward(moment: Moment, spec: TaskSpec) -> Outcome:
     peak = torch.maximum(moment.memory["peak"], moment.now.com[:, 1])
     assert moment.now.object_com is not None
     return Outcome(
-        {"peak": weights.location * (peak - moment.start.com[:, 1])},
+        {"peak": peak - moment.start.com[:, 1]},
         info={"peak": peak, "stone": moment.now.object_com},
         memory={"peak": peak},
     )
@@ -210,8 +212,15 @@ def judge_peak(moment: Moment, weights: Weights) -> Outcome:
 
 def test_memory_and_objects_of_a_task_of_ones_own() -> None:
     """The highest point so far is remembered by each element until its own reset."""
-    stone = Body(Rectangle((0.7, 0.16), (0.06, 0.06)), count=500, mass=4.0)
-    spec = dataclasses.replace(hop(), objects=(stone,), remember=remember_peak, judge=judge_peak, gravity=(0.0, 0.0))
+    stone = BodySpec(Rectangle((0.7, 0.16), (0.06, 0.06)), count=500, mass=4.0)
+    spec = dataclasses.replace(
+        hop(),
+        objects=(stone,),
+        initial_memory=initial_peak,
+        reward_fn=peak_reward,
+        weights={"peak": 7.0},
+        gravity=(0.0, 0.0),
+    )
     env = tiny(spec, 2, particles=(100, 30))
     env.reset(seed=0)
     start = env.state.x[:, :100, 1].mean(1)
@@ -230,36 +239,118 @@ def test_memory_and_objects_of_a_task_of_ones_own() -> None:
     assert "is_success" not in info
 
 
+def test_an_outcome_without_info() -> None:
+    env = tiny(dataclasses.replace(hop(), reward_fn=lambda moment, spec: height(moment, spec)._replace(info=None)))
+    env.reset(seed=0)
+    assert set(env.step(actions(env, 1)[0])[-1]) == {"reward_terms", "com", "split", "finite", "is_success"}
+
+
+def test_a_reset_of_some_elements_leaves_the_others_alone() -> None:
+    """Only the positions and images of the elements that are reset are computed."""
+    sizes = []
+
+    def memory(moment: Moment, spec: TaskSpec) -> dict[str, torch.Tensor]:
+        sizes.append((len(moment.particles.x), len(moment.observation)))
+        return {"start": moment.now.com}
+
+    env = tiny(dataclasses.replace(hop(), initial_memory=memory), 3)
+    env.reset(seed=0)
+    env.reset(options={"reset_mask": [False, True, False]})
+    assert sizes == [(3, 3), (1, 1)]
+
+
+def test_a_reset_that_fails_changes_nothing() -> None:
+    working = True
+
+    def memory(moment: Moment, spec: TaskSpec) -> dict[str, torch.Tensor]:
+        return {"start": moment.now.com} if working else {}["missing"]
+
+    spec = dataclasses.replace(hop(), initial_memory=memory)
+    env, untouched = (tiny(spec, 2, resample=True) for _ in range(2))
+    env.reset(seed=0), untouched.reset(seed=0)
+    before, working = everything(env), False
+    for options in ({"physics": {"mu": 100.0}}, {"positions": env.state.x + 0.01}, {"reset_mask": [True, False]}):
+        with pytest.raises(KeyError):
+            env.reset(seed=[7, None], options=options)
+    assert_same_bits(everything(env), before)
+    working = True
+    env.reset(), untouched.reset()
+    assert_same_bits(everything(env), everything(untouched))
+
+
+def test_weights_name_every_term() -> None:
+    env = tiny(dataclasses.replace(hop(), weights={"heigth": 7.0}))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"weights of task 'hop' must hold every term .* got none for \['height'\]"):
+        env.step(actions(env, 1)[0])
+
+
+@pytest.mark.parametrize("task", ["grow", "dig", "catch"])
+def test_a_goal_that_is_replaced_is_rewarded_and_marked(task: str) -> None:
+    spec = dittogym.make_spec(task)
+    far = dataclasses.replace(spec, goal=(spec.goal[0] + 0.2, spec.goal[1]))
+    results = []
+    for each in (spec, far):
+        env = tiny(each)
+        observation = env.reset(seed=0)[0]
+        results.append((observation, env.step(torch.zeros(1, *env.action_shape, dtype=env.dtype))[1]))
+    assert not torch.equal(results[0][0], results[1][0]) and not torch.equal(results[0][1], results[1][1])
+
+
+def test_a_target_that_is_replaced_is_rewarded() -> None:
+    spec = dittogym.make_spec("shapematch")
+    envs = [tiny(each) for each in (dataclasses.replace(spec, target=~spec.target), spec)]
+    mismatch = []
+    for env in envs:
+        env.reset(seed=0)
+        mismatch.append(float(env.step(actions(env, 1)[0])[-1]["reward_terms"]["mismatch"]))
+    assert sum(mismatch) == pytest.approx(-0.1 * 64 * 64)  # each pixel differs from one of the two
+
+
 @pytest.mark.parametrize(
     ("remembered", "error", "message"),
     [
-        ("peak", TypeError, "remember must be a function from Moment to tensors by name, got 'peak'"),
-        (lambda moment: None, TypeError, "remember of task 'hop' must return tensors by name, got NoneType"),
-        (lambda moment: moment.now.com, TypeError, r"must return tensors by name, got torch.float64 of shape \(1, 2\)"),
-        (lambda moment: {"peak": 1.0}, ValueError, r"must return memory of shape \(B, ...\), got float for 'peak'"),
-        (lambda moment: {"peak": torch.tensor(1.0)}, ValueError, r"got torch.float32 of shape \(\) for 'peak'"),
+        ("peak", TypeError, "initial_memory must be a function of a Moment and a TaskSpec, got 'peak'"),
+        (
+            lambda moment, spec: None,
+            TypeError,
+            "initial_memory of task 'hop' must return tensors by name, got NoneType",
+        ),
+        (
+            lambda moment, spec: moment.now.com,
+            TypeError,
+            r"must return tensors by name, got torch.float64 of shape \(1, 2\)",
+        ),
+        (
+            lambda moment, spec: {"peak": 1.0},
+            ValueError,
+            r"must return memory of shape \(B, ...\), got float for 'peak'",
+        ),
+        (lambda moment, spec: {"peak": torch.tensor(1.0)}, ValueError, r"got torch.float32 of shape \(\) for 'peak'"),
     ],
 )
 def test_memory_that_cannot_be_kept_is_refused(remembered: object, error: type, message: str) -> None:
     with pytest.raises(error, match=message):
-        tiny(dataclasses.replace(hop(), remember=remembered)).reset(seed=0)
+        tiny(dataclasses.replace(hop(), initial_memory=remembered)).reset(seed=0)
 
 
 def test_names_that_a_reset_cannot_leave_stale_are_refused() -> None:
-    spec = dataclasses.replace(hop(), remember=remember_peak, stale=("summit",))
-    with pytest.raises(ValueError, match=r"stale of task 'hop' must be names that remember returns, .* \['summit'\]"):
+    spec = dataclasses.replace(hop(), initial_memory=initial_peak, stale_memory=("summit",))
+    with pytest.raises(
+        ValueError, match=r"stale_memory of task 'hop' must be names that initial_memory returns, .* \['summit'\]"
+    ):
         tiny(spec).reset(seed=0)
-    with pytest.raises(TypeError, match="stale must be a sequence of str, got 'summit'"):
-        dataclasses.replace(hop(), stale="summit")
+    with pytest.raises(TypeError, match="stale_memory must be a sequence of str, got 'summit'"):
+        dataclasses.replace(hop(), stale_memory="summit")
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_term_that_is_not_finite_is_named(value: float) -> None:
-    def judge(moment: Moment, weights: Weights) -> Outcome:
+    def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
         broken = torch.where(moment.now.com[:, 1] > 10.0, 0.0, value)
         return Outcome({"height": moment.now.split, "way": broken})
 
-    env = tiny(dataclasses.replace(hop(), judge=judge), 2)
+    env = tiny(dataclasses.replace(hop(), reward_fn=reward_fn, weights={"height": 1.0, "way": 1.0}), 2)
     env.reset(seed=0)
     with pytest.raises(ValueError, match=f"must return finite terms .* got {value} for 'way' in simulation 0"):
         env.step(torch.zeros(2, *env.action_shape))
@@ -285,7 +376,7 @@ def test_a_name_that_gymnasium_would_refuse_leaves_nothing_behind() -> None:
 
 
 def test_terms_of_the_engine_are_refused() -> None:
-    spec = dataclasses.replace(hop(), judge=lambda moment, weights: Outcome({"alive": moment.now.split}))
+    spec = dataclasses.replace(hop(), reward_fn=lambda moment, spec: Outcome({"alive": moment.now.split}))
     env = tiny(spec)
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"must not return the engine's own terms, got \['alive'\]"):
@@ -308,8 +399,8 @@ def test_a_longer_limit_than_the_horizon() -> None:
         ({"terminated": torch.zeros(2, 2, dtype=torch.bool)}, r"terminated as bool of shape \(B,\), got torch.bool of"),
         ({"success": torch.zeros(2)}, r"success as bool of shape \(B,\), got torch.float32 of shape \(2,\)"),
         (
-            {"terms": {"high": torch.zeros(3)}},
-            r"terms of shape \(B,\), got torch.float32 of shape \(3,\) for 'high'",
+            {"terms": {"height": torch.zeros(3)}},
+            r"terms of shape \(B,\), got torch.float32 of shape \(3,\) for 'height'",
         ),
         ({"terms": {"alive": torch.zeros(2)}}, r"must not return the engine's own terms, got \['alive'\]"),
         ({"info": {"com": torch.zeros(2)}}, r"must not return the engine's own info, got \['com'\]"),
@@ -317,16 +408,19 @@ def test_a_longer_limit_than_the_horizon() -> None:
         ({"info": {"risen": torch.tensor(1.0)}}, r"got torch.float32 of shape \(\) for 'risen'"),
         (
             {"memory": {"best": torch.zeros(2)}},
-            r"memory like that of remember, {'first': .*got {'best': 'torch.float32",
+            r"memory like that of initial_memory, {'first': .*got {'best': 'torch.float32",
         ),
+        ({"memory": {}}, r"memory like that of initial_memory, {'first': .*, got {}"),
         ({"memory": {"first": torch.zeros(2)}}, r"{'first': 'torch.float64 of shape \(2, 2\)'}, got {'first': 'torch"),
     ],
 )
 def test_a_judgement_that_would_do_harm_later_is_refused(changes: dict, message: str) -> None:
-    def judge(moment: Moment, weights: Weights) -> Outcome:
-        return height(moment, weights)._replace(**changes)
+    def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
+        return height(moment, spec)._replace(**changes)
 
-    spec = dataclasses.replace(hop(), judge=judge, remember=lambda moment: {"first": moment.now.com})
+    spec = dataclasses.replace(
+        hop(), reward_fn=reward_fn, initial_memory=lambda moment, spec: {"first": moment.now.com}
+    )
     env = tiny(spec, 2)
     env.reset(seed=0)
     with pytest.raises(ValueError, match=message):
@@ -334,9 +428,9 @@ def test_a_judgement_that_would_do_harm_later_is_refused(changes: dict, message:
 
 
 def test_terms_without_names_are_refused() -> None:
-    env = tiny(dataclasses.replace(hop(), judge=lambda moment, weights: Outcome([moment.now.split])))
+    env = tiny(dataclasses.replace(hop(), reward_fn=lambda moment, spec: Outcome([moment.now.split])))
     env.reset(seed=0)
-    with pytest.raises(TypeError, match="judge of task 'hop' must return terms by name, got list"):
+    with pytest.raises(TypeError, match="reward_fn of task 'hop' must return terms by name, got list"):
         env.step(actions(env, 1)[0])
 
 
@@ -377,7 +471,7 @@ def test_a_function_that_is_written_anew_takes_the_place_of_the_old_one() -> Non
         ({"reach": (None, "up")}, ValueError, "reach y must be a number, got 'up'"),
         ({"gravity": (None, -9.0)}, ValueError, "gravity x must be a number, got None"),
         ({"target": np.zeros((3, 3), bool)}, ValueError, r"target must have shape \(64, 64\), got \(3, 3\)"),
-        ({"weights": {"location": 1.0}}, TypeError, "weights must be a Weights, got dict"),
+        ({"weights": 1.0}, TypeError, "weights must be a Mapping, got 1.0"),
         ({"obstacles": (VelocityRule("-y"),)}, TypeError, r"obstacles\[0\] must be a Obstacle, got VelocityRule"),
         ({"obstacles": floor()}, TypeError, "obstacles must be a sequence of Obstacle, got Obstacle"),
     ],
@@ -389,22 +483,26 @@ def test_numbers_that_would_fail_late_are_refused(changes: dict, error: type, me
 
 def test_obstacles_and_windows_check_their_parts() -> None:
     with pytest.raises(TypeError, match="rules must be a sequence of VelocityRule, got VelocityRule"):
-        Obstacle("ledge", VelocityRule("-y"))
-    with pytest.raises(TypeError, match=r"drawn\[0\] must be a Box, got tuple"):
-        Obstacle("ledge", (), drawn=((0.0, 1.0),))
+        Obstacle("ledge", rules=VelocityRule("-y"))
+    with pytest.raises(TypeError, match=r"observed\[0\] must be a Box, got tuple"):
+        Obstacle("ledge", rules=(), observed=((0.0, 1.0),))
     with pytest.raises(ValueError, match="left must be finite, got nan"):
         Window(left=math.nan)
 
 
 def test_a_robot_outside_its_window_is_refused() -> None:
-    wide = Body(Rectangle((0.9, 0.2), (0.3, 0.1)), count=100)
+    wide = BodySpec(Rectangle((0.9, 0.2), (0.3, 0.1)), count=100)
     env = tiny(dataclasses.replace(hop(), robot=wide, window=Window(left=0.0)))
     with pytest.raises(ValueError, match="positions must lie inside the window"):
         env.reset(seed=0)
 
 
-def test_what_a_robot_cannot_have_is_refused() -> None:
-    for name, value in (("material", Elastic(1.0, 1.0)), ("lite", 100)):
-        body = dataclasses.replace(hop().robot, **{name: value})
-        with pytest.raises(ValueError, match=f"robot.{name} must be None"):
-            dataclasses.replace(hop(), robot=body)
+def test_a_robot_of_another_material_and_size() -> None:
+    robot = dataclasses.replace(hop().robot, material=Elastic(1500.0, 50.0), lite=100)
+    elastic = tiny(dataclasses.replace(hop(), robot=robot), particles="lite", substeps=20)
+    own = tiny(hop(), particles=100, substeps=20)
+    for env in (elastic, own):
+        env.reset(seed=0)
+        env.step(torch.ones(1, *env.action_shape, dtype=env.dtype))
+    assert elastic.num_particles == 100
+    assert (elastic.state.x - own.state.x).abs().max() > 1e-6

@@ -14,7 +14,7 @@ from dittogym.bodies import positions as layout
 from dittogym.bodies.shapes import Disc, Figure, Lattice, Rectangle
 from dittogym.geometry import ceiling, floor, solid
 from dittogym.render.frame import SOLID
-from dittogym.spec import Body
+from dittogym.spec import BodySpec
 from torchmpm import sampling
 
 #: An L: a column of two by six cells on the left, a foot of four by two to its right.
@@ -123,9 +123,9 @@ def test_a_shape_lies_where_it_says_and_is_as_dense() -> None:
 
 
 def test_a_body_is_taken_as_it_is() -> None:
-    body = Body(Disc((0.1, 0.2), 0.1), count=77, mass=3.5)
+    body = BodySpec(Disc((0.1, 0.2), 0.1), count=77, mass=3.5)
     env = tiny("kick", body=body, particles="full")
-    assert env.spec.robot is body and env.model.robot == 77
+    assert env.spec.robot is body and env.model.num_robot_particles == 77
     assert env.model.solver.bodies[0].mass == 3.5
 
 
@@ -166,7 +166,7 @@ def test_a_square_robot_in_every_task(task: str) -> None:
         ("kick", Rectangle((0.25, 0.16), (0.1, 0.1)), r"place of the object free, \[0.3, 0.16\] to \[0.35"),
         ("catch", Disc((-0.1, 0.14), 0.1), "place of the object free"),
         ("dig", Rectangle((-0.2, 0.45), (0.1, 0.1)), "place of the object free"),
-        ("kick", Body(Disc((0.28, 0.16), 0.1), count=10), "place of the object free"),
+        ("kick", BodySpec(Disc((0.28, 0.16), 0.1), count=10), "place of the object free"),
         ("run", [(0, 0), (6, 0), (6, 1), (0, 1)], "more compact: its spread is 0.11. m, and run ends at 0.1 m"),
         ("run", Rectangle((0.0, 0.16), (0.36, 0.05)), "more compact"),
         ("run", "no/such/file.png", "body must be an outline .* no such file: 'no/such/file.png'"),
@@ -297,7 +297,7 @@ def test_lite_counts() -> None:
 
 
 def test_lite_counts_of_other_bodies() -> None:
-    few = Body(Disc((0.0, 0.16), 0.1), count=500)
+    few = BodySpec(Disc((0.0, 0.16), 0.1), count=500)
     assert layout.particle_counts(dittogym.make_spec("run", body=few), "lite") == (500,)
     assert layout.particle_counts(dittogym.make_spec("kick", body=few), "lite") == (500, 2000)
     assert layout.particle_counts(dittogym.make_spec("kick", body=SQUARE), "lite") == (2000, 164)
@@ -314,7 +314,9 @@ def test_mass_and_volume_are_the_same_with_any_number_of_particles(task: str) ->
 
 @pytest.mark.parametrize("body", [42, {"a": 1}, [(0, 0), (1, 0, 3)]])
 def test_bodies_of_the_wrong_kind(body: object) -> None:
-    with pytest.raises(ValueError, match=r"body must be a path, an array, an outline \(K, 2\), a Shape or a Body, got"):
+    with pytest.raises(
+        ValueError, match=r"body must be a path, an array, an outline \(K, 2\), a Shape or a BodySpec, got"
+    ):
         dittogym.make_spec("run", body=body)
 
 

@@ -9,13 +9,19 @@ from tiny import TASKS, actions, stir, tiny
 from torch import Tensor
 
 from dittogym import TorchEnv
-from dittogym.core import EnvState, observe
+from dittogym.contract import measure
+from dittogym.core import observe, soft_observation
 from dittogym.geometry import Box
-from dittogym.observation import raster as obs
-from dittogym.observation.smooth import ON_COUNT, ON_WIDTH, soft_observation, soft_share, soft_silhouette
-from dittogym.observation.window import window_origin
-from dittogym.rewards import measure
-from dittogym.tasks.shapematch import silhouette
+from dittogym.model import EnvState
+from dittogym.observation.image import (
+    OCCUPIED_COUNT,
+    OCCUPIED_WIDTH,
+    RASTER,
+    SATURATION,
+    silhouette,
+    soft_silhouette,
+)
+from dittogym.observation.smooth import box_fraction
 from torchmpm import ParticleState
 
 
@@ -33,8 +39,8 @@ def moment(env: TorchEnv, x: Tensor, v: Tensor) -> EnvState:
     """The present moment with particles at ``x`` (B, N, 2), window and centre along with them."""
     state = env.env_state
     particles = ParticleState(x, v, state.particles.C, state.particles.F, state.particles.Jp)
-    com = measure(particles, env.model.robot).com
-    origin = window_origin(env.spec, com)
+    com = measure(particles, env.model.num_robot_particles).com
+    origin = env.spec.window.origin(com)
     return replace(state, particles=particles, centre=com, origin=origin)
 
 
@@ -94,12 +100,14 @@ def test_silhouette_at_full_size(task: str) -> None:
 
 
 def test_silhouette_is_a_sigmoid_in_the_expected_count() -> None:
-    count = torch.tensor([0.0, 10.0, ON_COUNT, 30.0, 100.0, 1e6], dtype=torch.float64)
+    count = torch.tensor([0.0, 10.0, OCCUPIED_COUNT, 30.0, 100.0, 1e6], dtype=torch.float64)
     image = torch.zeros(1, 3, 1, 6, dtype=torch.float64)
-    image[0, 0, 0] = 255.0 * (1.0 - torch.exp(-count / obs.SATURATION))
+    image[0, 0, 0] = 255.0 * (1.0 - torch.exp(-count / SATURATION))
     image.requires_grad_()
     result = soft_silhouette(image)
-    assert result[0, 0].tolist() == pytest.approx(torch.sigmoid((count - ON_COUNT) / ON_WIDTH).tolist(), rel=1e-9)
+    assert result[0, 0].tolist() == pytest.approx(
+        torch.sigmoid((count - OCCUPIED_COUNT) / OCCUPIED_WIDTH).tolist(), rel=1e-9
+    )
     (gradient,) = torch.autograd.grad(result.sum(), image)
     assert gradient.isfinite().all() and gradient[0, 0, 0, 2] > 0
 
@@ -129,7 +137,7 @@ def test_background_moves_without_steps() -> None:
 
 def test_soil_has_no_velocity_and_broken_particles_are_not_seen() -> None:
     env = stirred("dig")
-    robot = env.model.robot
+    robot = env.model.num_robot_particles
     x, v = (t.detach().clone().requires_grad_() for t in (env.state.x, env.state.v))
     with torch.no_grad():
         x[0, 3], v[1, 5] = torch.nan, torch.inf
@@ -158,8 +166,8 @@ def test_through_steps_of_the_environment() -> None:
 
 def test_boxes_that_touch() -> None:
     """In the same pixel, and at the upper end of the picture; their rule is by left and upper edges of fine pixels."""
-    zero, half = torch.zeros(1, 1, dtype=torch.float64), 0.5 / obs.RASTER
+    zero, half = torch.zeros(1, 1, dtype=torch.float64), 0.5 / RASTER
     boxes = [Box(-half, 2.25 / 128), Box(2.25 / 128, 4 / 128 - half), Box(bottom=1.0 - 1 / 128 + half)]
-    share = soft_share(boxes, torch.zeros(1, 2, dtype=torch.float64), zero, zero)[0]
-    assert share[0].tolist() == pytest.approx([1.0] * 64)
-    assert share[1:].tolist() == [pytest.approx([1.0] * 4 + [0.0] * 60)] * 63
+    fraction = box_fraction(boxes, torch.zeros(1, 2, dtype=torch.float64), zero, zero)[0]
+    assert fraction[0].tolist() == pytest.approx([1.0] * 64)
+    assert fraction[1:].tolist() == [pytest.approx([1.0] * 4 + [0.0] * 60)] * 63

@@ -10,9 +10,9 @@ from tiny import TASKS, actions, assert_same_bits, everything, stir, tiny
 from torch import Tensor
 
 from dittogym import Outcome, TorchEnv, make_spec
-from dittogym.core import EnvState, judge, observe
-from dittogym.observation.smooth import soft_observation
-from dittogym.rewards import FADE, beyond, limited, mean_over_nearest, nearest, split_penalty
+from dittogym.core import evaluate
+from dittogym.model import EnvState
+from dittogym.rewards import EXACT, SELECTION_WIDTH, SMOOTH, nearest
 from dittogym.tasks.grow import GOAL
 from dittogym.tasks.slot import FALLEN, FAR_SIDE
 from torchmpm import ParticleState
@@ -28,14 +28,13 @@ def normal(*shape: int, seed: int = 1) -> Tensor:
 def soft_reward(env: TorchEnv, state: EnvState) -> Tensor:
     """The task's soft reward (B,) of a state, under a full actuation."""
     field = torch.ones(env.num_envs, 2, env.spec.patch, env.spec.patch, dtype=env.dtype)
-    terms = judge(env.model, state, field, soft_observation(env.model, state), soft=True)[1].terms
-    return sum(terms.values())
+    return evaluate(env.model, state, field, soft=True).reward
 
 
 def reward(env: TorchEnv, state: EnvState) -> Tensor:
     """The true one."""
     field = torch.ones(env.num_envs, 2, env.spec.patch, env.spec.patch, dtype=env.dtype)
-    return sum(judge(env.model, state, field, observe(env.model, state))[1].terms.values())
+    return evaluate(env.model, state, field).reward
 
 
 def placed(env: TorchEnv, x: Tensor, v: Tensor | None = None) -> EnvState:
@@ -50,7 +49,7 @@ def at_threshold(task: str) -> tuple[TorchEnv, Tensor, Tensor]:
     env = tiny(task, 2)
     env.reset(seed=0)
     stir(env)
-    x, v, robot = env.state.x.clone(), env.state.v.clone(), env.model.robot
+    x, v, robot = env.state.x.clone(), env.state.v.clone(), env.model.num_robot_particles
     if task == "grow":
         x[0] += torch.tensor(GOAL) + 0.02 - x[0][env.env_state.memory["tip"][0]].mean(0)
     elif task == "slot":
@@ -95,7 +94,7 @@ def jumps(values: list[float]) -> float:
 def test_soft_rewards_pass_thresholds_without_a_jump(task: str) -> None:
     """Tearing the robot, reaching GROW's goal, SLOT's cap falling, in 50 small steps."""
     env, x, _ = at_threshold(task)
-    robot = env.model.robot
+    robot = env.model.num_robot_particles
     soft, true = [], []
     for k in range(50):
         z = x.clone()
@@ -150,17 +149,21 @@ def test_step_with_soft_rewards(task: str) -> None:
 def test_a_task_of_ones_own() -> None:
     """One that is smooth already needs nothing; one that asks gets the soft image."""
 
-    def judged(moment, weights):
-        if moment.soft:
+    def brightness(moment, spec):
+        if moment.ops.smooth:
             return Outcome({"brightness": moment.observation[:, 0].mean((1, 2))})
         return Outcome({"brightness": moment.observation[:, 0].to(torch.float64).mean((1, 2))})
 
     action = torch.zeros(1, 2, 8, 8, dtype=torch.float64, requires_grad=True)
-    env = tiny(replace(make_spec("shapematch"), judge=judged), resolution=8)
+    env = tiny(replace(make_spec("shapematch"), reward_fn=brightness, weights={"brightness": 1.0}), resolution=8)
     env.reset(seed=0)
     _, soft, *_, info = env.step(action, soft=True)
     assert soft.item() == pytest.approx(info["true_reward"].item(), abs=0.5) and soft.requires_grad
-    height = replace(make_spec("run"), judge=lambda moment, weights: Outcome({"height": moment.now.com[:, 1]}))
+    height = replace(
+        make_spec("run"),
+        reward_fn=lambda moment, spec: Outcome({"height": moment.now.com[:, 1]}),
+        weights={"height": 1.0},
+    )
     env = tiny(height)
     env.reset(seed=0)
     _, soft, *_, info = env.step(action, soft=True)
@@ -169,41 +172,39 @@ def test_a_task_of_ones_own() -> None:
 
 def test_soft_limits() -> None:
     z = torch.linspace(-40.0, 60.0, 101, dtype=torch.float64)
-    hard, soft = limited(z, -20.0, 30.0), limited(z, -20.0, 30.0, soft=True)
+    hard, soft = EXACT.clamp(z, -20.0, 30.0), SMOOTH.clamp(z, -20.0, 30.0)
     assert torch.equal(hard, z.clamp(-20.0, 30.0))
     assert (soft - hard).abs().max().item() == pytest.approx(1.5 * math.log(2))
     assert soft[40].item() == pytest.approx(0.0, abs=1e-7)
     assert (soft.diff() > 0).all()
-    assert torch.equal(limited(z, high=30.0), z.clamp_max(30.0))
-    zero = limited(z / 50.0, 0.0, 1.0, soft=True)
+    assert torch.equal(EXACT.clamp(z, high=30.0), z.clamp_max(30.0))
+    zero = SMOOTH.clamp(z / 50.0, 0.0, 1.0)
     assert (zero - (z / 50.0).clamp(0.0, 1.0)).abs().max().item() == pytest.approx(0.05 * math.log(2))
-    relu = limited(z, 0.0, soft=True, width=2.0)
+    relu = SMOOTH.clamp(z, 0.0, width=2.0)
     assert (relu - z.clamp_min(0.0)).abs().max().item() == pytest.approx(2.0 * math.log(2))
     with pytest.raises(ValueError, match="width must be given where all limits are 0"):
-        limited(z, 0.0, soft=True)
+        SMOOTH.clamp(z, 0.0)
     with pytest.raises(ValueError, match="width must be positive, got 0"):
-        limited(z, 0.0, soft=True, width=0)
-    assert beyond(torch.tensor([-1.0, 0.0, 1.0]), 0.1).tolist() == [0.0, 0.0, 1.0]
-    near = beyond(torch.tensor([-0.4, 0.0, 0.4]), 0.1, soft=True).tolist()
+        SMOOTH.clamp(z, 0.0, width=0)
+    assert EXACT.heaviside(torch.tensor([-1.0, 0.0, 1.0]), 0.1).tolist() == [0.0, 0.0, 1.0]
+    near = SMOOTH.heaviside(torch.tensor([-0.4, 0.0, 0.4]), 0.1).tolist()
     assert near == pytest.approx([0.018, 0.5, 0.982], abs=1e-3)
 
 
 def test_soft_split() -> None:
     split = torch.tensor([0.05, 0.1 - 1e-9, 0.1 + 1e-9, 0.15, 0.3], dtype=torch.float64)
-    soft, torn = split_penalty(split, 0.1, soft=True)
-    hard, _ = split_penalty(split, 0.1)
+    hard, soft = (ops.split_penalty(split, 0.1) for ops in (EXACT, SMOOTH))
     assert hard.tolist() == pytest.approx([0.0, 0.0, -4.0, -9.0, -16.0])
     assert soft.tolist() == pytest.approx([0.0, -2.0, -2.0, -9.0, -36.0], abs=1e-3)
-    assert torn.tolist() == [False, False, True, True, True]
 
 
 def test_soft_choice_of_the_nearest() -> None:
     """Near the mean over the chosen; a particle fades in while it passes the edge."""
     x = torch.rand(2, 500, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     point = torch.full((2, 2), 0.3, dtype=torch.float64)
-    hard = mean_over_nearest(x, x, point, 0.2)
+    hard = EXACT.mean_over_nearest(x, x, point, 0.2)
     assert torch.equal(hard, x.gather(1, nearest(x, point, 0.2)[..., None].expand(-1, -1, 2)).mean(1))
-    soft = mean_over_nearest(x, x, point, 0.2, soft=True)
-    assert (soft - hard).abs().max() < FADE
-    alone = mean_over_nearest(x[:, :1], x[:, :1], x[:, 0], 0.2, soft=True)
+    soft = SMOOTH.mean_over_nearest(x, x, point, 0.2)
+    assert (soft - hard).abs().max() < SELECTION_WIDTH
+    alone = SMOOTH.mean_over_nearest(x[:, :1], x[:, :1], x[:, 0], 0.2)
     assert torch.allclose(alone, x[:, 0])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import dittogym
-from dittogym.targets import load_target
+from dittogym.tasks.targets import load_target
 
 #: Published areas and centroids (row, column) of the reference's pictures.
 FACTS = {

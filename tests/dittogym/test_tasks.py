@@ -7,7 +7,6 @@ import torch
 
 import dittogym
 from dittogym.observation import raster as obs
-from dittogym.observation.window import window_origin
 from torchmpm import Grid
 from torchmpm.boundary import constrain, faces
 from torchmpm.grid import PAD
@@ -114,8 +113,8 @@ def test_velocity_rules_are_the_published_ones(task: str) -> None:
     spec = dittogym.make_spec(task)
     generator = torch.Generator().manual_seed(0)
     com = torch.cat((torch.tensor([0.09]), torch.empty(39).uniform_(-1.5, 3.0, generator=generator)))
-    origins = window_origin(spec, torch.stack((com, com), 1))
-    rules = tuple(rule for obstacle in spec.obstacles for rule in obstacle.rules)
+    origins = spec.window.origin(torch.stack((com, com), 1))
+    rules = tuple(rule for obstacle in spec.obstacles for rule in obstacle.velocity_rules)
     for origin in origins:
         velocity = torch.randn(2, 128, 128, generator=generator)
         padded = torch.nn.functional.pad(velocity, [PAD] * 4).flatten(1)[:, None]
@@ -129,7 +128,8 @@ def drawn_pixels(task: str, origin_x: float) -> torch.Tensor:
     origin = torch.tensor([[origin_x, 0.0]], dtype=torch.float64)
 
     def quarter(row: int, column: int) -> torch.Tensor:
-        drawn = obs.draw_boxes(dittogym.make_spec(task).drawn, origin, torch.tensor([[row]]), torch.tensor([[column]]))
+        corner = torch.tensor([[row]]), torch.tensor([[column]])
+        drawn = obs.draw_boxes(dittogym.make_spec(task).observed_boxes, origin, *corner)
         return torch.zeros(512, 512, dtype=torch.bool) if drawn is None else drawn.mask[0]
 
     return torch.cat([torch.cat([quarter(row, column) for column in (0, 512)], 1) for row in (0, 512)], 0)
@@ -169,5 +169,5 @@ def published_pixels(task: str, origin_x: float) -> torch.Tensor:
 @pytest.mark.parametrize("task", TABLES)
 @pytest.mark.parametrize("com", [0.09, 0.7131])
 def test_the_robot_sees_the_published_pixels(task: str, com: float) -> None:
-    origin = float(window_origin(dittogym.make_spec(task), torch.tensor([[com, 0.2]], dtype=torch.float64))[0, 0])
+    origin = float(dittogym.make_spec(task).window.origin(torch.tensor([[com, 0.2]], dtype=torch.float64))[0, 0])
     assert torch.equal(drawn_pixels(task, origin), published_pixels(task, origin))

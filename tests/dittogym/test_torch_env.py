@@ -10,9 +10,9 @@ import torch
 
 import dittogym
 from dittogym import TorchEnv
-from dittogym import core as dynamics
 from dittogym.bodies import positions as layout
-from dittogym.spec import FAILURE_REWARD
+from dittogym.core import FAILURE_REWARD
+from dittogym.observation.camera import per_particle
 
 TASKS = ("run", "shapematch")
 
@@ -158,9 +158,9 @@ def test_layouts_of_arrays_do_not_matter() -> None:
     """Mirrored, of the other byte order, or read-only."""
     env = dittogym.Env("run", particles=60, substeps=1, dtype="float64")
     masses = np.linspace(1.0, 2.0, 60)[None]
-    positions = (
-        small(particles=60)._layouts.draw(0, np.ones(1, bool), None, torch.zeros(1, dtype=torch.float64))[0].numpy()
-    )
+    drawn = small(particles=60)
+    drawn.reset(seed=0)
+    positions = drawn.state.x[0].numpy()
     action = np.random.default_rng(0).uniform(-1, 1, env.action_space.shape)
     results = []
     for form in (
@@ -178,7 +178,7 @@ def test_defaults_of_torch_change_nothing() -> None:
     """Neither of dtype, nor of the device, nor autocast."""
     rewards = []
     for context in (nullcontext(), torch.device("meta"), torch.autocast("cpu", torch.bfloat16), float64()):
-        dynamics._per_particle.cache_clear()
+        per_particle.cache_clear()
         with context:
             env = small(dtype="float32", particles=60, backend="auto")
             env.reset(seed=0)

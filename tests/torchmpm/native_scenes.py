@@ -7,7 +7,7 @@ import torch
 from scenes import FLOOR, lively, normal, robot
 from torch import Tensor
 
-from torchmpm import Body, Elastic, ParticleState, Soil, Solver, VelocityRule, VonMises, fixed
+from torchmpm import Body, Elastic, ParticleState, Snow, Solver, VelocityRule, VonMises, fixed
 
 #: Rules of every kind and frame, some of which overlap.
 RULES = (
@@ -26,7 +26,7 @@ def values(*shape: int, seed: int) -> Tensor:
 
 def soil(count: int) -> Body:
     """Loose ground with a cutoff that catches many particles."""
-    return Body(count, Soil(800.0, 500.0, 0.025, 0.01, shear_cutoff=1e-3), mass=1.5)
+    return Body(count, Snow(800.0, 500.0, 0.025, 0.01, shear_cutoff=1e-3), mass=1.5)
 
 
 def solvers(count: int, batch: int) -> dict[str, Solver]:
@@ -37,7 +37,7 @@ def solvers(count: int, batch: int) -> dict[str, Solver]:
     own = VonMises(500.0 * values(batch, seed=1), 50.0 * values(batch, part, seed=2), torch.tensor(60.0).double())
     varied = (
         Body(part, own, mass=2.0 * values(batch, part, seed=3), volume=values(batch, seed=4), muscle=True),
-        Body(part, Soil(800.0 * values(batch, seed=5), 500.0, 0.025 * values(1, part, seed=6)), mass=1.5),
+        Body(part, Snow(800.0 * values(batch, seed=5), 500.0, 0.025 * values(1, part, seed=6)), mass=1.5),
         replace(ball, volume=1.5 * values(batch, part, seed=7)),
     )
     free = robot(count, rules=())

@@ -2,7 +2,6 @@
 
 import importlib.util
 import math
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.autograd import forward_ad
 
 from torchmpm import Body, Grid, ParticleState, Solver, VelocityRule, VonMises, backends, trajectory
-from torchmpm.backends import BACKENDS, compiler_found
+from torchmpm.backends import compiler_found
 from torchmpm.native.cpu import library
 from torchmpm.native.kernels import triton_missing
 from torchmpm.substep import Scene
@@ -118,22 +117,6 @@ def test_subclasses_are_heard(
             kind(grid, (body,), backend="native").step(state)
 
 
-@pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
-def test_subclasses_that_change_nothing_stay_fast(fresh_process: None, caplog: pytest.LogCaptureFixture) -> None:
-    class Named(Solver):
-        """Only has more to say."""
-
-        def title(self) -> str:
-            """What it is."""
-            return "named"
-
-    solver, state = robot(30, backend="auto"), lively(30)
-    assert_identical(
-        Named(**vars(solver)).step(state, substeps=2), replace(solver, backend="native").step(state, substeps=2)
-    )
-    assert messages(caplog) == []
-
-
 def test_long_steps_go_through_torch_func() -> None:
     """Which knows no checkpoints; and through vmap, with rules and a constant for each."""
     state, zeros = lively(5), torch.zeros(2, 1, 5, 2, dtype=torch.float64)
@@ -230,12 +213,6 @@ def test_auto_with_a_compiler_that_fails(
     assert "could not be built" in message and "failed with code 1" in message
 
 
-def test_unknown_backend() -> None:
-    with pytest.raises(ValueError, match=r"backend must be one of \('auto', .*'native'\), got 'warp'"):
-        robot(5, backend="warp")
-    assert BACKENDS == ("auto", "eager", "compile", "native")
-
-
 @pytest.mark.parametrize("backend", ["compile", "native"])
 def test_missing_compiler_is_said_at_once(monkeypatch: pytest.MonkeyPatch, backend: str) -> None:
     monkeypatch.setenv("PATH", "")
@@ -244,27 +221,6 @@ def test_missing_compiler_is_said_at_once(monkeypatch: pytest.MonkeyPatch, backe
     with pytest.raises(ValueError, match=message):
         robot(5, backend=backend)
     robot(5, backend="eager")
-
-
-@pytest.mark.parametrize(
-    ("installed", "variable", "found"),
-    [
-        ({"g++"}, None, True),
-        ({"clang++"}, None, True),
-        (set(), None, False),
-        ({"g++"}, "icpx", False),
-        ({"icpx"}, "icpx -pipe", True),
-        ({"icpx"}, "icpx", True),
-    ],
-)
-def test_compiler_search(
-    monkeypatch: pytest.MonkeyPatch, installed: set[str], variable: str | None, found: bool
-) -> None:
-    monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}" if name in installed else None)
-    monkeypatch.delenv("CXX", raising=False)
-    if variable is not None:
-        monkeypatch.setenv("CXX", variable)
-    assert compiler_found() == found
 
 
 def test_what_native_wants_on_other_devices(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,8 +12,10 @@ from scenes import lively, normal, robot, robot_and_ball
 from test_native_adjoint import assert_gradients_close, gradients, state_leaves
 from torch import Tensor
 
+from torchmpm import tree
 from torchmpm.backends import compiler_found
 from torchmpm.native import operator
+from torchmpm.native.inputs import Inputs
 
 pytestmark = [
     pytest.mark.skipif(not compiler_found(), reason="no C++ compiler"),
@@ -39,9 +41,9 @@ def program(seed: int, adjoint: bool) -> programs.Program:
     ((*tensors, handle, substeps),) = calls
     tables = cuda.tables.device_tables(handle, torch.float64, tensors[0].device)
     if not adjoint:
-        return programs.Forward(programs.Inputs(*tensors), tables, substeps)
+        return programs.Forward(Inputs(*tensors), tables, substeps)
     bars = normal(*tensors[0].shape, seed=seed).to(DEVICE)
-    return programs.Backward(programs.Inputs(*tensors, bars), tables, substeps, True, True)
+    return programs.Backward(Inputs(*tensors, bars), tables, substeps, True, True)
 
 
 @pytest.mark.parametrize("adjoint", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -51,7 +53,7 @@ def test_a_program_runs_again(adjoint: bool) -> None:
     with interpreted():
         used.run()
         before = [t.clone() for t in used.results()]
-        for own, given in zip(used.inputs.tensors(), new.inputs.tensors(), strict=True):
+        for own, given in zip(tree.leaves(used.inputs), tree.leaves(new.inputs), strict=True):
             own.copy_(given)
         used.run()
         new.run()
@@ -65,7 +67,7 @@ class Adder(programs.Program):
 
     built = 0
 
-    def __init__(self, inputs: programs.Inputs) -> None:
+    def __init__(self, inputs: Inputs) -> None:
         Adder.built += 1
         self.inputs, self.sum = inputs, torch.empty_like(inputs.planes)
 
@@ -115,7 +117,7 @@ def events(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def add_one(cache: graphs.Cache, key: object, value: float, size: int = 4, most: float = 1e9) -> float:
     """Run the adder once."""
     planes = torch.full((size,), value)
-    (result,) = cache.run(key, Adder, programs.Inputs(planes, None, planes, planes, planes, planes), most)
+    (result,) = cache.run(key, Adder, Inputs(planes, None, planes, planes, planes, planes), most)
     return float(result[0])
 
 
@@ -129,7 +131,7 @@ def test_second_call_is_recorded_and_later_ones_played(events: list[str]) -> Non
 def test_results_are_not_overwritten_by_the_next_call(events: list[str]) -> None:
     cache = graphs.Cache()
     planes = torch.ones(3)
-    inputs = [programs.Inputs(k * planes, None, planes, planes, planes, planes) for k in range(3)]
+    inputs = [Inputs(k * planes, None, planes, planes, planes, planes) for k in range(3)]
     results = [cache.run("a", Adder, given, 1e9)[0] for given in inputs]
     assert [float(r[0]) for r in results] == [1.0, 2.0, 3.0]
 

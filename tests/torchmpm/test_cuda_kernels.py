@@ -20,7 +20,7 @@ from test_native_adjoint import (
 )
 from torch import Tensor
 
-from torchmpm import Body, Elastic, Grid, ParticleState, Soil, Solver, VelocityRule, VonMises
+from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
 from torchmpm.backends import compiler_found
 from torchmpm.native.kernels import Kernels
 
@@ -95,7 +95,7 @@ def test_gradient_in_one_thing_alone(wanted: str) -> None:
     both_gradients(lambda leaves: varied(30, leaves), given, (wanted,), 1)
 
 
-@pytest.mark.parametrize("material", [Elastic(300.0, 80.0), VonMises(500.0, 50.0, 60.0), Soil(800.0, 500.0)])
+@pytest.mark.parametrize("material", [Elastic(300.0, 80.0), VonMises(500.0, 50.0, 60.0), Snow(800.0, 500.0)])
 def test_corners_have_the_derivatives_of_the_plain_substep(material: Elastic) -> None:
     solver = robot(12, bodies=(Body(12, material, muscle=True),))
     both_gradients(lambda _: solver, corner_leaves(), STATE, 1)

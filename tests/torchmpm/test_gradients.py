@@ -137,13 +137,6 @@ def test_frozen_particles_pass_their_gradient_through() -> None:
     assert torch.equal(gradient, torch.ones_like(x))
 
 
-def test_no_graph_without_gradients() -> None:
-    state = replace(lively(10), v=torch.ones(1, 10, 2, dtype=torch.float64, requires_grad=True))
-    with torch.no_grad():
-        assert not robot(10).step(state, substeps=4).x.requires_grad
-    assert robot(10).step(state, substeps=4).x.requires_grad
-
-
 def test_gradient_descent_finds_a_stiffness() -> None:
     """What gradients are for: recover mu from the motion it caused."""
     state, true = lively(60, strain=0.08), 420.0

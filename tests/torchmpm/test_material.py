@@ -263,21 +263,6 @@ def test_gradient_of_a_field_has_no_infinities() -> None:
         assert torch.autograd.grad(total, point)[0].isfinite().all()
 
 
-def test_elastic_matter_keeps_its_deformation() -> None:
-    F, Jp = deformations(50, 0.1, 5.0, seed=11), torch.rand(1, 50, generator=generator(0), dtype=torch.float64)
-    mapped, same = Elastic(MU, LAM).return_map(planes(F), Jp)
-    assert torch.equal(matrix(mapped), F)
-    assert torch.equal(same, Jp)
-
-
-def test_von_mises_limit_is_yield_stress_over_twice_mu() -> None:
-    F = deformations(200, 0.5, 2.0, seed=12)
-    Jp = torch.ones(1, 200, dtype=torch.float64)
-    mapped, same = VonMises(MU, LAM, YIELD).return_map(planes(F), Jp)
-    assert torch.equal(matrix(mapped), returned(F, YIELD / (2 * MU)))
-    assert torch.equal(same, Jp)
-
-
 @pytest.mark.parametrize("shape", [(), (3,), (3, 40), (1, 40)])
 def test_values_per_simulation_and_particle_equal_separate_materials(shape: tuple[int, ...]) -> None:
     F = deformations(120, 0.6, 1.6, seed=13).view(3, 40, 2, 2)
@@ -314,21 +299,6 @@ def test_lame() -> None:
     mu, lam = lame(young, poisson)
     torch.testing.assert_close(mu * (3 * lam + 2 * mu) / (lam + mu), young)
     torch.testing.assert_close(lam / (2 * (lam + mu)), poisson)
-
-
-@pytest.mark.parametrize(
-    ("shape", "result"), [((), ()), ((3,), (3, 1)), ((3, 5), (3, 5)), ((1, 5), (1, 5)), ((3, 1), (3, 1))]
-)
-def test_column_shapes(shape: tuple[int, ...], result: tuple[int, ...]) -> None:
-    value = normal(*shape, seed=0)
-    found = broadcast_plane(value, torch.ones(3, 5))
-    assert found.shape == result
-    assert found.dtype == torch.float32
-    torch.testing.assert_close(found.flatten(), value.float().flatten())
-
-
-def test_column_leaves_numbers_alone() -> None:
-    assert broadcast_plane(2.5, torch.ones(3, 5)) == 2.5
 
 
 @pytest.mark.parametrize("shape", [(5,), (2,), (1,), (2, 5), (3, 4), (3, 5, 1), (5, 3)])

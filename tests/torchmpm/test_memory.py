@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from peak_memory import PeakMemory
 from scenes import lively, normal, robot, robot_and_ball
 
 from torchmpm import Solver, estimate_memory, segment_for, trajectory
 from torchmpm.backends import compiler_found
-from torchmpm.memory import PeakMemory
 from torchmpm.native.cpu import call
 
 needs_compiler = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")

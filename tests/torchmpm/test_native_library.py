@@ -2,6 +2,8 @@
 
 import ctypes
 import stat
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -68,12 +70,6 @@ def test_failing_compiler_is_quoted_and_not_asked_twice(monkeypatch: pytest.Monk
     assert list((tmp_path / "cache").rglob("*.so")) == []
 
 
-def test_result_that_does_not_load(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("CXX", script(tmp_path, 'echo rubbish > "$last"'))
-    with pytest.raises(ValueError, match="could not be built: the compiled library does not load"):
-        library.load("float")
-
-
 def test_kept_on_disk(quick_compiler: None, tmp_path: Path) -> None:
     first = library.load("float")
     assert library.load("float") is first
@@ -118,9 +114,8 @@ def test_folder_that_cannot_be_written(quick_compiler: None, monkeypatch: pytest
     assert runs(tmp_path) == 2
 
 
-@pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
-def test_compiler_with_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
-    command = library.find_compiler()
-    assert command is not None
-    monkeypatch.setenv("CXX", f"{command[0]} -pipe")
-    assert library.find_compiler() == (command[0], "-pipe")
+def test_import_without_fork() -> None:
+    """Windows has no ``os.register_at_fork``."""
+    program = "import os, torch, jaxtyping; del os.register_at_fork; import torchmpm; print(torchmpm.Grid().h)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == str(1 / 128), done.stderr

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scenes import assert_close, assert_identical, generator
 from torch import Tensor
 
-from torchmpm import Body, Elastic, Grid, ParticleState, Soil, Solver, VelocityRule, VonMises, diagnostics
+from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises, diagnostics
 from torchmpm.backends import compiler_found
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -37,7 +37,7 @@ class Case:
 
 
 MATERIAL = st.sampled_from(
-    [Elastic(300.0, 80.0), VonMises(500.0, 50.0, 60.0), VonMises(200.0, 300.0, 1.0), Soil(400.0, 250.0, 0.05, 0.02)]
+    [Elastic(300.0, 80.0), VonMises(500.0, 50.0, 60.0), VonMises(200.0, 300.0, 1.0), Snow(400.0, 250.0, 0.05, 0.02)]
 )
 BODY = st.builds(
     Body,

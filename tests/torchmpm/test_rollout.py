@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from peak_memory import PeakMemory
 from scenes import lively, normal, robot
 from torch import Tensor
 
 from torchmpm import Body, Elastic, ParticleState, estimate_memory, repeated, trajectory
 from torchmpm.backends import compiler_found
-from torchmpm.memory import PeakMemory
 
 NATIVE = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
 
@@ -95,14 +95,6 @@ def test_repeated_rejects() -> None:
             repeated(double, torch.ones(1), 3, segment=segment)
 
 
-def test_solver_passes_its_mistakes_on() -> None:
-    solver, state = robot(5), lively(5)
-    with pytest.raises(ValueError, match="substeps must not be negative"):
-        solver.step(state, substeps=-1)
-    with pytest.raises(ValueError, match="segment must be at least 1"):
-        solver.step(state, segment=0)
-
-
 @pytest.mark.parametrize("checkpointed", [True, False])
 def test_trajectory_collects_what_it_observes(checkpointed: bool) -> None:
     inputs = [torch.tensor(float(k), requires_grad=True) for k in (1, 2, 3)]
@@ -115,11 +107,6 @@ def test_trajectory_collects_what_it_observes(checkpointed: bool) -> None:
     gradient = torch.autograd.grad(final + seen[1] / 10.0, [x, *inputs])
     # final = ((x a + 1) b + 1) c + 1, seen[1] / 10 = (x a + 1) b + 1
     assert [g.item() for g in gradient] == [6.0 + 2.0, 6.0 + 2.0, 6.0 + 2.0, 5.0]
-
-
-def test_trajectory_of_nothing() -> None:
-    x = torch.ones(1)
-    assert trajectory(lambda s, a: s, x, [], observe=lambda s: s) == (x, [])
 
 
 def test_trajectory_replays_each_step_once() -> None:

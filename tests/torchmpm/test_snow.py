@@ -1,4 +1,4 @@
-"""Soil against an independent singular value decomposition, and its derivatives against finite differences."""
+"""Snow against an independent singular value decomposition, and its derivatives against finite differences."""
 
 import math
 
@@ -8,7 +8,7 @@ import torch
 from test_material import deformations, matrix, planes, stretched, symmetric, turn
 from torch import Tensor
 
-from torchmpm import Soil, lame
+from torchmpm import Snow, lame
 from torchmpm.materials.elastic import corotated_stress
 from torchmpm.materials.snow import snow_return
 
@@ -16,8 +16,8 @@ MU, LAM = lame(5000.0, 0.2)
 LOW, HIGH = 0.975, 1.0045
 
 
-def soil(**values) -> Soil:
-    return Soil(MU, LAM, **values)
+def soil(**values) -> Snow:
+    return Snow(MU, LAM, **values)
 
 
 def by_svd(F: np.ndarray, cutoff: float) -> tuple[np.ndarray, float]:
@@ -103,7 +103,7 @@ POINTS = {
 
 def all_of_it(F: Tensor, Jp: Tensor, mu: Tensor) -> Tensor:
     """Return map and stress as the substep chains them, without the cutoff: it is not continuous."""
-    material = Soil(MU * mu, LAM, shear_cutoff=0.0)
+    material = Snow(MU * mu, LAM, shear_cutoff=0.0)
     mapped, after = material.return_map(planes(F), Jp)
     return torch.cat((matrix(mapped).flatten(2), torch.stack((*material.stress(mapped, Jp), after), -1) / MU), -1)
 

@@ -84,16 +84,6 @@ def test_what_is_no_number_has_an_address_and_no_effect(axis: int, number: float
     assert torch.equal(existing(scatter(nodes, nodes.weights[None])), torch.zeros(1, 1, R, R, dtype=torch.float64))
 
 
-def test_order_of_addresses() -> None:
-    """Offset in x slowest, then y, then particle; each row of the padded grid is a column of nodes in y."""
-    u, v = torch.tensor([[2.7, 4.6]]), torch.tensor([[1.8, 5.9]])
-    ids = at(u, v).ids.view(3, 3, 2)
-    for p in range(3):
-        for q in range(3):
-            expected = [(2 + p + PAD) * GRID.width + 1 + q + PAD, (4 + p + PAD) * GRID.width + 5 + q + PAD]
-            assert ids[p, q].tolist() == expected
-
-
 def test_origin_shifts_each_simulation() -> None:
     u, v = torch.full((2, 1), 3.3, dtype=torch.float64), torch.full((2, 1), 4.4, dtype=torch.float64)
     origin = torch.tensor([[0.0, 0.0], [GRID.h, -2 * GRID.h]], dtype=torch.float64)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import GRID, generator, normal, positions
 
-from torchmpm import Body, Elastic, ParticleState, Soil, Solver, VonMises, lame
+from torchmpm import Body, Elastic, ParticleState, Snow, Solver, VonMises, lame
 from torchmpm.backends import compiler_found
 from torchmpm.materials.linalg import Mat2
 from torchmpm.materials.muscle import muscle_stress
@@ -20,9 +20,9 @@ MU, LAM = 300.0, 200.0
 MATERIALS = {
     "elastic": Elastic(MU, LAM),
     "von Mises": VonMises(MU, LAM, 60.0),
-    "soil": Soil(MU, LAM),
-    "hard soil": Soil(MU, LAM, hardening_range=(3.0, 5.0)),
-    "weak soil": Soil(MU, LAM, hardening_range=(0.1, 0.5)),
+    "soil": Snow(MU, LAM),
+    "hard soil": Snow(MU, LAM, hardening_range=(3.0, 5.0)),
+    "weak soil": Snow(MU, LAM, hardening_range=(0.1, 0.5)),
 }
 
 

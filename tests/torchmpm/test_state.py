@@ -31,10 +31,6 @@ def test_at_rest_is_undeformed_and_without_velocity() -> None:
     assert state.device == x.device
 
 
-def test_at_rest_makes_a_batch_of_one() -> None:
-    assert ParticleState.at_rest(torch.rand(5, 2, dtype=torch.float64)).x.shape == (1, 5, 2)
-
-
 @pytest.mark.parametrize("shape", [(5, 3), (5,), (2, 5, 1), (1, 2, 5, 2)])
 def test_positions_of_the_wrong_shape_are_named(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"x must have shape \(B, N, 2\), got"):
@@ -110,11 +106,6 @@ def test_integer_index_keeps_the_batch_dimension() -> None:
 def test_integer_index_out_of_range(index: int) -> None:
     with pytest.raises(IndexError):
         lively(4, 3)[index]
-
-
-def test_iteration_yields_each_simulation_once() -> None:
-    state = lively(4, 3)
-    assert [torch.equal(one.x[0], x) for one, x in zip(state, state.x, strict=True)] == [True] * 3
 
 
 @pytest.mark.parametrize("index", [slice(1, None), [2, 0], torch.tensor([True, False, True])])

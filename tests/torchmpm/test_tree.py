@@ -53,11 +53,6 @@ def test_where_selects_whole_batch_elements() -> None:
     assert mixed.memory["steps"].tolist() == [1, 2, 1]
 
 
-def test_detach_leaves_the_graph() -> None:
-    state = tree.map(lambda tensor: tensor.requires_grad_(), lively(4))
-    assert not any(tensor.requires_grad for tensor in tree.leaves(tree.detach(state)))
-
-
 def loss(state: ParticleState) -> Tensor:
     final = robot(5).step(state, substeps=2)
     return (final.x.square().sum((1, 2)) + final.F.square().sum((1, 2, 3))).sum()

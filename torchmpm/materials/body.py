@@ -41,7 +41,7 @@ class Body:
             checks.value(name, getattr(self, name), above=0.0)
 
     def constants(self) -> dict[str, Value]:
-        """All constants of the body and its material that may be tensors, by name, such as ``material.mu``."""
+        """Constants of the body and its material by name, such as ``material.mu``; numbers, (), (B,) or (B, count)."""
         own = {name: getattr(self, name) for name in ("mass", "volume")}
         return own | {f"material.{name}": value for name, value in vars(self.material).items()}
 

@@ -17,7 +17,7 @@ from torchmpm.grid import Grid
 from torchmpm.materials.body import Body
 from torchmpm.native import operator
 from torchmpm.native.cpu import call
-from torchmpm.native.tables import KINDS, Tables, handle_of, make_tables, make_values, upload
+from torchmpm.native.tables import KINDS, make_tables, make_values, upload
 from torchmpm.rollout import Segment
 from torchmpm.state import ParticleState
 
@@ -89,14 +89,9 @@ class Kernels:
         call.library_for(dtype)
 
     @functools.cached_property
-    def tables(self) -> Tables:
-        """All that is constant but the values."""
-        return make_tables(self.grid, self.bodies, self.rules, self.dt, self.damping)
-
-    @functools.cached_property
     def handle(self) -> int:
-        """Stands for the tables in operators of torch."""
-        return handle_of(self.tables)
+        """Handle of the tables, see :func:`torchmpm.native.tables.make_tables`."""
+        return make_tables(self.grid, self.bodies, self.rules, self.dt, self.damping)
 
     def values(self, like: Tensor) -> Tensor:
         """The table of values (8, 1 or B, columns); kept where all of them are numbers.
@@ -160,7 +155,7 @@ class Kernels:
         if planes.is_cuda:
             limit = CUDA_TAPE_BYTES // (planes.element_size() * rows * particles * batch)
         else:
-            nodes = 3 * self.tables.width**2
+            nodes = 3 * self.grid.width**2
             substep = planes.element_size() * (rows * particles + nodes) * min(batch, torch.get_num_threads())
             limit = call.KEPT_BYTES // substep
         return max(1, min(limit, segment) if isinstance(segment, int) else limit)

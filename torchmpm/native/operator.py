@@ -1,4 +1,10 @@
-"""The kernels as operators of torch."""
+"""The kernels as operators of torch with an adjoint, for tensors on the CPU and on CUDA.
+
+``native_step`` advances all simulations by some substeps: it takes the tensors of
+:class:`torchmpm.native.inputs.Inputs`, a handle of :func:`torchmpm.native.tables.make_tables` and the number of
+substeps, and returns the planes (13, B, N) of the new state. ``native_step_backward`` replays the substeps, then goes
+back through them.
+"""
 
 from __future__ import annotations
 
@@ -8,47 +14,46 @@ import torch
 from torch import Tensor
 
 from torchmpm.native.cpu import call
-from torchmpm.native.tables import VALUES, tables_of
+from torchmpm.native.inputs import Inputs
+from torchmpm.native.tables import VALUES, bodies_of
+
+_INPUTS = "Tensor planes, Tensor? field, Tensor origin, Tensor gravity, Tensor values, Tensor shift"
+_NUMBERS = "int handle, int substeps"
+#: Derivatives in planes, field, origin and gravity, in their shapes, and in the values, (8, B, N): one column per
+#: particle. Those that are not wanted are empty.
+Bars = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+
+
+@torch.library.custom_op("torchmpm::native_step", mutates_args=(), schema=f"({_INPUTS}, {_NUMBERS}) -> Tensor")
+def native_step(*arguments: Any) -> Tensor:
+    """Advance all simulations: tensors, handle and substeps -> planes (13, B, N)."""
+    *tensors, handle, substeps = arguments
+    inputs = _contiguous(tensors)
+    result = torch.empty_like(inputs.planes)
+    call.run(inputs, handle, substeps, result=result)
+    return result
 
 
 @torch.library.custom_op(
-    "torchmpm::native_step",
+    "torchmpm::native_step_backward",
     mutates_args=(),
     schema=(
-        "(Tensor planes, Tensor? field, Tensor origin, Tensor gravity, Tensor values, Tensor shift, "
-        "int handle, int substeps) -> Tensor"
+        f"({_INPUTS}, Tensor result_bar, {_NUMBERS}, bool wants_field, bool wants_values) "
+        "-> (Tensor, Tensor, Tensor, Tensor, Tensor)"
     ),
 )
-def native_step(
-    planes: Tensor,
-    field: Tensor | None,
-    origin: Tensor,
-    gravity: Tensor,
-    values: Tensor,
-    shift: Tensor,
-    handle: int,
-    substeps: int,
-) -> Tensor:
-    """Advance all simulations by some substeps.
+def native_step_backward(*arguments: Any) -> Bars:
+    """Adjoint of :func:`native_step`: tensors, derivative in the result, handle, substeps, wishes -> derivatives."""
+    *tensors, handle, substeps, wants_field, wants_values = arguments
+    inputs = _contiguous(tensors)
+    bars = _empty_bars(inputs, wants_field, wants_values)
+    call.run(inputs, handle, substeps, **{n: bar for n, bar in zip(call.BARS, bars, strict=True) if bar.numel()})
+    return bars
 
-    Args:
-        planes: (13, B, N) components of the state, see :meth:`torchmpm.ParticleState.planes`.
-        field: (B, 2, G, G) muscle actuation on the nodes, Pa, or ``None``.
-        origin: (B, 2) lower left corner of the window, m.
-        gravity: (B, 2) acceleration, m/s^2.
-        values: (8, 1 or B, columns) from :func:`torchmpm.native.tables.make_values`.
-        shift: (B, 2) int64, nodes between the world's origin and the window's.
-        handle: Of the tables, from :func:`torchmpm.native.tables.handle_of`.
-        substeps: Number of substeps, at least 1.
 
-    Returns:
-        (13, B, N) planes of the new state.
-    """
-    planes = planes.contiguous()
-    result = torch.empty_like(planes)
-    inputs = call.Inputs(planes, field, origin, gravity, values, shift)
-    call.forward(inputs, handle, substeps, result)
-    return result
+def _contiguous(tensors: list[Any]) -> Inputs:
+    contiguous: list[Any] = [None if tensor is None else tensor.contiguous() for tensor in tensors]
+    return Inputs(*contiguous)
 
 
 @native_step.register_kernel("cuda")
@@ -58,94 +63,35 @@ def _(*arguments: Any) -> Tensor:
     return cuda.forward(*arguments)
 
 
-@native_step.register_fake
-def _(planes: Tensor, *_: object) -> Tensor:
-    return torch.empty_like(planes, memory_format=torch.contiguous_format)
-
-
-@torch.library.custom_op(
-    "torchmpm::native_step_backward",
-    mutates_args=(),
-    schema=(
-        "(Tensor result_bar, Tensor planes, Tensor? field, Tensor origin, Tensor gravity, Tensor values, Tensor shift, "
-        "int handle, int substeps, bool wants_field, bool wants_values) -> (Tensor, Tensor, Tensor, Tensor, Tensor)"
-    ),
-)
-def native_step_backward(
-    result_bar: Tensor,
-    planes: Tensor,
-    field: Tensor | None,
-    origin: Tensor,
-    gravity: Tensor,
-    values: Tensor,
-    shift: Tensor,
-    handle: int,
-    substeps: int,
-    wants_field: bool,
-    wants_values: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Adjoint of :func:`native_step`: replays its substeps, then goes back through them.
-
-    Args:
-        result_bar: (13, B, N) derivative of a loss in the result.
-        planes: As for :func:`native_step`, and all that follow.
-        field: As above.
-        origin: As above.
-        gravity: As above.
-        values: As above.
-        shift: As above.
-        handle: As above.
-        substeps: As above.
-        wants_field: Whether to compute the derivative in the field.
-        wants_values: Whether to compute the derivative in the values.
-
-    Returns:
-        Derivatives in planes, field, origin and gravity, in their shapes, and in the values, (8, B, N): one column per
-        particle. Those that are not wanted are empty.
-    """
-    planes, result_bar = planes.contiguous(), result_bar.contiguous()
-    bars = _empty_bars(planes, field, origin, gravity, wants_field, wants_values)
-    inputs = call.Inputs(planes, field, origin, gravity, values, shift)
-    call.backward(inputs, handle, substeps, result_bar, bars)
-    return bars
-
-
 @native_step_backward.register_kernel("cuda")
-def _(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def _(*arguments: Any) -> Bars:
     from torchmpm.native import cuda
 
     return cuda.backward(*arguments)
 
 
-def _empty_bars(
-    planes: Tensor, field: Tensor | None, origin: Tensor, gravity: Tensor, wants_field: bool, wants_values: bool
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Room for the derivatives in planes, field, origin, gravity and values."""
+def _empty_bars(inputs: Inputs, wants_field: bool, wants_values: bool) -> Bars:
+    """Room for the derivatives."""
+    planes, field = inputs.planes, inputs.field
     nothing = planes.new_empty(0)
     return (
         torch.empty_like(planes, memory_format=torch.contiguous_format),
         torch.empty_like(field) if wants_field and field is not None else nothing,
-        torch.empty_like(origin),
-        torch.empty_like(gravity),
+        torch.empty_like(inputs.origin),
+        torch.empty_like(inputs.gravity),
         planes.new_empty(VALUES, *planes.shape[1:]) if wants_values else nothing.clone(),
     )
 
 
+@native_step.register_fake
+def _(planes: Tensor, *_: object) -> Tensor:
+    return torch.empty_like(planes, memory_format=torch.contiguous_format)
+
+
 @native_step_backward.register_fake
-def _(
-    result_bar: Tensor,
-    planes: Tensor,
-    field: Tensor | None,
-    origin: Tensor,
-    gravity: Tensor,
-    values: Tensor,
-    shift: Tensor,
-    handle: int,
-    substeps: int,
-    wants_field: bool,
-    wants_values: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    return _empty_bars(planes, field, origin, gravity, wants_field, wants_values)
+def _(*arguments: Any) -> Bars:
+    *tensors, _handle, _substeps, wants_field, wants_values = arguments
+    return _empty_bars(Inputs(*tensors), wants_field, wants_values)
 
 
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -157,7 +103,7 @@ def _backward(ctx: Any, result_bar: Tensor) -> tuple[Tensor | None, ...]:
     saved = ctx.saved_tensors
     _, wants_field, wants_origin, wants_gravity, wants_values, *_ = ctx.needs_input_grad
     planes_bar, field_bar, origin_bar, gravity_bar, values_bar = native_step_backward(
-        result_bar, *saved, ctx.handle, ctx.substeps, wants_field, wants_values
+        *saved, result_bar, ctx.handle, ctx.substeps, wants_field, wants_values
     )
     return (
         planes_bar,
@@ -176,7 +122,7 @@ def _sum_shared(bar: Tensor, values: Tensor, handle: int) -> Tensor:
     if values.shape[1] == 1:
         bar = bar.sum(1, keepdim=True)
     columns = []
-    for body in tables_of(handle).bodies:
+    for body in bodies_of(handle):
         part = bar[:, :, body.first : body.first + body.count]
         columns.append(part if body.varying else part.sum(2, keepdim=True))
     return torch.cat(columns, dim=2)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import threading
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchmpm.boundary import VelocityRule
-from torchmpm.grid import PAD, Grid
+from torchmpm.grid import Grid
 from torchmpm.materials.base import Value, broadcast_plane
 from torchmpm.materials.body import Body, slices
 from torchmpm.materials.elastic import Elastic
@@ -25,119 +26,94 @@ KINDS: tuple[type, ...] = (Elastic, VonMises, Snow)
 VALUES = 8
 
 
-@dataclass(frozen=True)
-class BodyTable:
+def _members(kind: Any, *names: str) -> list[tuple[str, Any]]:
+    return [(name, kind) for name in names]
+
+
+class BodyTable(ctypes.Structure):
     """The particles of one body.
 
-    Attributes:
-        first: Its first particle.
-        count: Number of particles.
-        kind: Index of its material in :data:`KINDS`.
-        muscle: Whether the actuation acts on it.
-        varying: Whether its values have one column per particle instead of one for all.
-        column: Its first column in the table of values.
-        hardening_low: Lower bound of the hardening factor (snow).
-        hardening_high: Upper bound.
-        shear_cutoff: Shear stretch below this is dropped (snow).
+    ``first`` particle and ``count``; ``kind``, the index of its material in :data:`KINDS`; ``muscle``, whether the
+    actuation acts on it; ``varying``, whether its values have one column per particle instead of one for all, and the
+    first ``column``; for snow the bounds of the hardening factor and the cutoff of shear.
     """
 
-    first: int
-    count: int
-    kind: int
-    muscle: bool
-    varying: bool
-    column: int
-    hardening_low: float = 1.0
-    hardening_high: float = 1.0
-    shear_cutoff: float = 0.0
-
-    @property
-    def columns(self) -> int:
-        """Number of columns in the table of values."""
-        return self.count if self.varying else 1
+    _fields_ = [
+        *_members(ctypes.c_int64, "first", "count", "kind", "muscle", "varying", "column"),
+        *_members(ctypes.c_double, "hardening_low", "hardening_high", "shear_cutoff"),
+    ]
 
 
-@dataclass(frozen=True)
-class RuleTable:
+class RuleTable(ctypes.Structure):
     """One velocity rule.
 
-    Attributes:
-        axis: Component of the velocity that it acts on.
-        sign: Sign of the removed velocity.
-        i_low, i_high, j_low, j_high: Inclusive range of nodes.
-        friction: Coulomb coefficient; infinite for a sticky rule.
-        world: Whether the range counts nodes from the world's origin.
-        slot: Rules against one direction share a slot, of which the first that covers a node applies; slots apply in
-            their order.
+    It removes velocities along ``axis`` of one ``sign``, on an inclusive range of nodes, counted from the origin of the
+    ``world`` or of the window; infinite ``friction`` sticks. Rules against one direction share a ``slot``, of which the
+    first that covers a node applies; slots apply in their order.
     """
 
-    axis: int
-    sign: float
-    i_low: float
-    i_high: float
-    j_low: float
-    j_high: float
-    friction: float
-    world: bool
-    slot: int
+    _fields_ = [
+        *_members(ctypes.c_int64, "axis", "world", "slot"),
+        *_members(ctypes.c_double, "sign", "i_low", "i_high", "j_low", "j_high", "friction"),
+    ]
 
 
-@dataclass(frozen=True)
-class Tables:
-    """All that is constant about a solver but its values; equal for solvers that differ in values only."""
+class Tables(ctypes.Structure):
+    """All that is constant about a solver but its values, as the C++ kernels read it (``scene.hpp``)."""
 
-    resolution: int
-    h: float
-    dt: float
-    margin: float
-    damping: float
-    bodies: tuple[BodyTable, ...]
-    rules: tuple[RuleTable, ...]
-    mass_epsilon: float
-    stretch_floor: float
-
-    @property
-    def width(self) -> int:
-        """Nodes per axis with their padding."""
-        return self.resolution + 2 * PAD
-
-    @property
-    def slots(self) -> int:
-        """Number of directions that have velocity rules."""
-        return len({rule.slot for rule in self.rules})
+    _fields_ = [
+        *_members(ctypes.c_int64, "resolution", "num_bodies", "num_rules"),
+        *_members(ctypes.c_double, "h", "dt", "margin", "damping", "mass_epsilon", "stretch_floor"),
+        ("bodies", ctypes.POINTER(BodyTable)),
+        ("rules", ctypes.POINTER(RuleTable)),
+    ]
 
 
-def make_tables(grid: Grid, bodies: Sequence[Body], rules: Sequence[VelocityRule], dt: float, damping: float) -> Tables:
-    """Describe a solver.
+_lock = threading.Lock()
+_handles: dict[bytes, int] = {}
+_by_handle: list[Tables] = []
 
-    Args:
-        grid: The window of nodes.
-        bodies: The bodies, of materials in :data:`KINDS`.
-        rules: The velocity rules.
-        dt: Duration of a substep, s.
-        damping: Factor on node velocities in a substep.
+
+def make_tables(grid: Grid, bodies: Sequence[Body], rules: Sequence[VelocityRule], dt: float, damping: float) -> int:
+    """Describe a solver, of materials in :data:`KINDS`, to the kernels.
+
+    Returns:
+        A handle for :func:`tables_of`, because operators of torch take numbers and tensors only; the same one for
+        solvers that differ in their values only.
     """
-    body_tables: list[BodyTable] = []
+    directions = list(dict.fromkeys(rule.direction for rule in rules))
+    rule_tables = (RuleTable * len(rules))(*(_rule_table(rule, directions.index(rule.direction)) for rule in rules))
+    body_tables = (BodyTable * len(bodies))(*_body_tables(bodies))
+    numbers = (grid.h, dt, grid.margin, damping, MASS_EPSILON, STRETCH_FLOOR)
+    key = bytes(Tables(grid.resolution, len(bodies), len(rules), *numbers)) + bytes(body_tables) + bytes(rule_tables)
+    with _lock:
+        if key not in _handles:
+            sizes = (grid.resolution, len(bodies), len(rules))
+            _by_handle.append(Tables(*sizes, *numbers, body_tables, rule_tables))
+            _handles[key] = len(_by_handle) - 1
+        return _handles[key]
+
+
+def tables_of(handle: int) -> Tables:
+    """The tables that a handle stands for in this process."""
+    return _by_handle[handle]
+
+
+def bodies_of(handle: int) -> list[BodyTable]:
+    """The bodies among the tables of a handle."""
+    tables = tables_of(handle)
+    return tables.bodies[: tables.num_bodies]
+
+
+def _body_tables(bodies: Sequence[Body]) -> Iterator[BodyTable]:
     column = 0
     for body, part in slices(bodies):
-        kind, material = KINDS.index(type(body.material)), body.material
-        snow = (*map(float, (*material.hardening_range, material.shear_cutoff)),) if isinstance(material, Snow) else ()
-        table = BodyTable(part.start, body.count, kind, bool(body.muscle), _varying(body), column, *snow)
-        body_tables.append(table)
-        column += table.columns
-    directions = list(dict.fromkeys(rule.direction for rule in rules))
-    rule_tables = tuple(_rule_table(rule, directions.index(rule.direction)) for rule in rules)
-    return Tables(
-        resolution=grid.resolution,
-        h=float(grid.h),
-        dt=float(dt),
-        margin=float(grid.margin),
-        damping=float(damping),
-        bodies=tuple(body_tables),
-        rules=rule_tables,
-        mass_epsilon=MASS_EPSILON,
-        stretch_floor=STRETCH_FLOOR,
-    )
+        material, varying = body.material, _varying(body)
+        bounds = (1.0, 1.0, 0.0)
+        if isinstance(material, Snow):
+            bounds = (*material.hardening_range, material.shear_cutoff)
+        yield BodyTable(part.start, body.count, KINDS.index(type(material)), body.muscle, varying, column, *bounds)
+        column += body.count if varying else 1
 
 
 def _varying(body: Body) -> bool:
@@ -148,30 +124,12 @@ def _varying(body: Body) -> bool:
 
 
 def _rule_table(rule: VelocityRule, slot: int) -> RuleTable:
-    lows = [-math.inf if low is None else float(low) for low, _ in (rule.i, rule.j)]
-    highs = [math.inf if high is None else float(high) for _, high in (rule.i, rule.j)]
+    (i_low, j_low), (i_high, j_high) = (
+        [absent if end is None else end for end in ends]
+        for ends, absent in zip(zip(rule.i, rule.j, strict=True), (-math.inf, math.inf), strict=True)
+    )
     axis, sign = "xy".index(rule.direction[1]), 1.0 if rule.direction[0] == "+" else -1.0
-    world = rule.frame == "world"
-    return RuleTable(axis, sign, lows[0], highs[0], lows[1], highs[1], float(rule.friction), world, slot)
-
-
-_lock = threading.Lock()
-_handles: dict[Tables, int] = {}
-_by_handle: list[Tables] = []
-
-
-def handle_of(tables: Tables) -> int:
-    """A number that stands for tables in this process, because operators of torch take numbers and tensors only."""
-    with _lock:
-        if tables not in _handles:
-            _handles[tables] = len(_by_handle)
-            _by_handle.append(tables)
-        return _handles[tables]
-
-
-def tables_of(handle: int) -> Tables:
-    """The tables that a handle stands for."""
-    return _by_handle[handle]
+    return RuleTable(axis, rule.frame == "world", slot, sign, i_low, i_high, j_low, j_high, rule.friction)
 
 
 def upload(numbers: Sequence[float], like: Tensor) -> Tensor:

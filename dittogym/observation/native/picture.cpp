@@ -1,4 +1,5 @@
-// The observation of all simulations in one call: the same arithmetic as dittogym/observation/raster.py, in the same order.
+// The observation of all simulations in one call: the arithmetic of dittogym/observation/raster.py in the same order.
+// The sizes DITTOGYM_* are those of dittogym/observation/image.py.
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -11,7 +12,7 @@
 
 namespace {
 
-constexpr int SIZE = 64, BLOCK = 8, RASTER = 1024, FRAME = 3;
+constexpr int SIZE = DITTOGYM_SIZE, BLOCK = DITTOGYM_BLOCK, RASTER = DITTOGYM_RASTER, FRAME = DITTOGYM_FRAME;
 constexpr int FINE = SIZE * BLOCK, WORDS = FINE / 64, WIDE = SIZE + 2 * FRAME;
 
 }  // namespace
@@ -21,7 +22,7 @@ struct Picture {
     int64_t batch, particles, threads, pixels;
     Pool pool;
     int64_t bodies, boxes;
-    const double* body;      // (bodies, 3): particles, full-size particles that one stands for, whether velocities show
+    const double* body;      // (bodies, 3): particles, full-size particles that one stands for, hidden velocity
     const double* box;       // (boxes, 5): left, right, bottom, top, closed
     double view[2];          // centre of the view in the window, m; NaN: the robot's
     double margin, extent;   // particles between these are in the window, m
@@ -35,22 +36,22 @@ struct Picture {
 
 namespace {
 
-template <class Real> struct Painter {
+template <class Real> struct Drawing {
     const Picture& picture;
     int64_t element = 0;
     Real left = 0, bottom = 0;  // the window's corner
     int row = 0, column = 0;    // the crop's corner in fine pixels
     uint8_t resting;            // code of no velocity
     std::vector<Real> px, py, vx, vy;
-    std::vector<uint8_t> seen, wins;
+    std::vector<uint8_t> visible, wins;
     std::vector<int> pixel;                       // fine pixel of a particle, or -1 where it is not in the picture
-    std::vector<uint64_t> drawn, taken;           // a bit for each fine pixel
-    std::vector<Real> share;                      // of an image pixel that obstacles cover
+    std::vector<uint64_t> covered, taken;         // by obstacles, by particles: a bit for each fine pixel
+    std::vector<Real> fraction;                      // of an image pixel that obstacles cover
     std::vector<std::array<Real, 4>> sums;        // occupancy, two velocities, occupancy of what shows its velocity
 
-    explicit Painter(const Picture& given)
+    explicit Drawing(const Picture& given)
         : picture(given), px(given.particles), py(given.particles), vx(given.particles), vy(given.particles),
-          seen(given.particles), drawn(given.boxes ? FINE * WORDS : 0), share(given.boxes ? SIZE * SIZE : 0),
+          visible(given.particles), covered(given.boxes ? FINE * WORDS : 0), fraction(given.boxes ? SIZE * SIZE : 0),
           sums(given.pixels ? SIZE * SIZE : WIDE * WIDE) {
         resting = velocity_code(0);
         if (!given.pixels) return;
@@ -63,7 +64,7 @@ template <class Real> struct Painter {
         read_particles();
         draw_boxes();
         std::fill(sums.begin(), sums.end(), std::array<Real, 4>{});
-        picture.pixels ? paint_pixels() : splat();
+        picture.pixels ? draw_pixels() : splat();
     }
 
     static int corner(Real centre) {
@@ -92,14 +93,14 @@ template <class Real> struct Painter {
         int64_t first = 0;
         for (int64_t b = 0; b < picture.bodies; ++b) {
             const int64_t end = first + int64_t(picture.body[3 * b]);
-            const Real speaks = picture.body[3 * b + 2] != 0 ? Real(1) : Real(0);
+            const Real moving = picture.body[3 * b + 2] != 0 ? Real(0) : Real(1);
             for (int64_t k = first; k < end; ++k) {
                 px[k] = x[k] - left, py[k] = x[k + plane] - bottom;
-                vx[k] = speaks * std::min(std::max(Real(2) * v[k], -clip), clip);
-                vy[k] = speaks * std::min(std::max(Real(2) * v[k + plane], -clip), clip);
+                vx[k] = moving * std::min(std::max(Real(2) * v[k], -clip), clip);
+                vy[k] = moving * std::min(std::max(Real(2) * v[k + plane], -clip), clip);
                 // The difference of a number to itself is zero, that of anything else is not a number.
                 const Real all = (x[k] + v[k]) + (x[k + plane] + v[k + plane]);
-                seen[k] = (all - all == 0) & (px[k] > margin) & (px[k] < extent);
+                visible[k] = (all - all == 0) & (px[k] > margin) & (px[k] < extent);
             }
             first = end;
         }
@@ -111,7 +112,7 @@ template <class Real> struct Painter {
 
     void draw_boxes() {
         if (!picture.boxes) return;
-        std::fill(drawn.begin(), drawn.end(), uint64_t(0));
+        std::fill(covered.begin(), covered.end(), uint64_t(0));
         for (int64_t b = 0; b < picture.boxes; ++b) {
             const double* box = picture.box + 5 * b;
             std::array<uint64_t, WORDS> across{};
@@ -120,14 +121,14 @@ template <class Real> struct Painter {
                     across[c / 64] |= uint64_t(1) << (c % 64);
             for (int r = 0; r < FINE; ++r)
                 if (between(Real(float(RASTER - row - r) / RASTER) + bottom, Real(box[2]), Real(box[3]), box[4] != 0))
-                    for (int w = 0; w < WORDS; ++w) drawn[r * WORDS + w] |= across[w];
+                    for (int w = 0; w < WORDS; ++w) covered[r * WORDS + w] |= across[w];
         }
-        const uint8_t* bytes = reinterpret_cast<const uint8_t*>(drawn.data());
+        const uint8_t* bytes = reinterpret_cast<const uint8_t*>(covered.data());
         for (int r = 0; r < SIZE; ++r)
             for (int c = 0; c < SIZE; ++c) {
                 int set = 0;
                 for (int k = 0; k < BLOCK; ++k) set += __builtin_popcount(bytes[(r * BLOCK + k) * SIZE + c]);
-                share[r * SIZE + c] = Real(set) / (BLOCK * BLOCK);
+                fraction[r * SIZE + c] = Real(set) / (BLOCK * BLOCK);
             }
     }
 
@@ -136,17 +137,17 @@ template <class Real> struct Painter {
         for (int64_t k = 0; k < picture.particles; ++k) {
             const Real r = std::trunc((Real(1) - py[k]) * Real(RASTER)) - first_row;
             const Real c = std::trunc(px[k] * Real(RASTER)) - first_column;
-            const bool inside = seen[k] & (py[k] > 0) & (r >= 0) & (r < FINE) & (c >= 0) & (c < FINE);
+            const bool inside = visible[k] & (py[k] > 0) & (r >= 0) & (r < FINE) & (c >= 0) & (c < FINE);
             pixel[k] = inside ? int(inside ? r : 0) * FINE + int(inside ? c : 0) : -1;
         }
     }
 
     // A fine pixel belongs to the last particle in it that shows its velocity, or else to the last at all.
-    void claim(bool speaking) {
+    void claim(bool hidden) {
         int64_t end = picture.particles;
         for (int64_t b = picture.bodies - 1; b >= 0; --b) {
             const int64_t first = end - int64_t(picture.body[3 * b]);
-            if ((picture.body[3 * b + 2] != 0) == speaking)
+            if ((picture.body[3 * b + 2] != 0) == hidden)
                 for (int64_t k = end - 1; k >= first; --k) {
                     if (pixel[k] < 0) continue;
                     uint64_t& word = taken[pixel[k] / 64];
@@ -158,22 +159,22 @@ template <class Real> struct Painter {
         }
     }
 
-    void paint_pixels() {
+    void draw_pixels() {
         std::fill(taken.begin(), taken.end(), uint64_t(0));
         std::fill(wins.begin(), wins.end(), uint8_t(0));
         find_pixels();
-        claim(true), claim(false);
+        claim(false), claim(true);
         for (int64_t k = 0; k < picture.particles; ++k) {
             if (!wins[k]) continue;
             const int r = pixel[k] / FINE, c = pixel[k] % FINE;
             std::array<Real, 4>& sum = sums[(r / BLOCK) * SIZE + c / BLOCK];
-            if (!picture.boxes || !(drawn[pixel[k] / 64] >> (pixel[k] % 64) & 1)) sum[0] += 1;
+            if (!picture.boxes || !(covered[pixel[k] / 64] >> (pixel[k] % 64) & 1)) sum[0] += 1;
             sum[1] += vx[k], sum[2] += vy[k];
         }
         constexpr Real area = BLOCK * BLOCK;
         for (int cell = 0; cell < SIZE * SIZE; ++cell) {
             const auto& [occupied, across, up, _] = sums[cell];
-            quantise(cell, occupied / area + (picture.boxes ? share[cell] : Real(0)), across / area, up / area);
+            quantise(cell, occupied / area + (picture.boxes ? fraction[cell] : Real(0)), across / area, up / area);
         }
     }
 
@@ -182,14 +183,14 @@ template <class Real> struct Painter {
         int64_t k = 0;
         for (int64_t b = 0; b < picture.bodies; ++b) {
             const Real stands_for = Real(picture.body[3 * b + 1]);
-            const Real speaks = picture.body[3 * b + 2] != 0 ? Real(1) : Real(0);
+            const Real moving = picture.body[3 * b + 2] != 0 ? Real(0) : Real(1);
             for (const int64_t end = k + int64_t(picture.body[3 * b]); k < end; ++k) {
                 const Real u = px[k] * Real(RASTER / BLOCK) - Real(float(column) / BLOCK) - Real(0.5);
                 const Real w = (Real(1) - py[k]) * Real(RASTER / BLOCK) - Real(float(row) / BLOCK) - Real(0.5);
-                if (!seen[k] || !(std::abs(u - middle) < reach && std::abs(w - middle) < reach)) continue;
+                if (!visible[k] || !(std::abs(u - middle) < reach && std::abs(w - middle) < reach)) continue;
                 const Real base_u = std::floor(u - Real(0.5)), base_w = std::floor(w - Real(0.5));
                 const std::array<Real, 3> across = weights(u - base_u), along = weights(w - base_w);
-                const std::array<Real, 4> each{1, speaks * vx[k], speaks * vy[k], speaks};
+                const std::array<Real, 4> each{1, moving * vx[k], moving * vy[k], moving};
                 std::array<Real, 4>* node = sums.data() + (int(base_w) + FRAME) * WIDE + int(base_u) + FRAME;
                 for (int i = 0; i < 3; ++i, node += WIDE)
                     for (int j = 0; j < 3; ++j) {
@@ -201,12 +202,12 @@ template <class Real> struct Painter {
         const Real saturation = Real(picture.saturation);
         for (int r = 0; r < SIZE; ++r)
             for (int c = 0; c < SIZE; ++c) {
-                const auto& [expected, across, up, heard] = sums[(r + FRAME) * WIDE + c + FRAME];
-                const Real free = picture.boxes ? Real(1) - share[r * SIZE + c] : Real(1);
+                const auto& [expected, across, up, expected_moving] = sums[(r + FRAME) * WIDE + c + FRAME];
+                const Real free = picture.boxes ? Real(1) - fraction[r * SIZE + c] : Real(1);
                 // Most pixels are empty: that spares their exponentials.
-                const Real missed = expected > 0 ? std::exp(-expected / saturation) : Real(1);
-                const Real hit = heard > 0 ? (Real(1) - std::exp(-heard / saturation)) / heard : Real(0);
-                quantise(r * SIZE + c, Real(1) - free * missed, across * hit, up * hit);
+                const Real miss = expected > 0 ? std::exp(-expected / saturation) : Real(1);
+                const Real hit = expected_moving > 0 ? (Real(1) - std::exp(-expected_moving / saturation)) / expected_moving : Real(0);
+                quantise(r * SIZE + c, Real(1) - free * miss, across * hit, up * hit);
             }
     }
 
@@ -230,13 +231,13 @@ template <class Real> struct Painter {
     static uint8_t code(Real value) { return uint8_t(std::min(std::max(value, Real(0)), Real(255))); }
 };
 
-template <class Real> int paint(const Picture* picture) {
+template <class Real> int draw(const Picture* picture) {
     try {
         const int threads = int(std::max<int64_t>(1, std::min(picture->threads, picture->batch)));
-        std::vector<Painter<Real>> painters(threads, Painter<Real>(*picture));
+        std::vector<Drawing<Real>> drawings(threads, Drawing<Real>(*picture));
         std::atomic<int64_t> next{0};
         const auto work = [&](int rank) {
-            for (int64_t element; (element = next.fetch_add(1)) < picture->batch;) painters[rank].run(element);
+            for (int64_t element; (element = next.fetch_add(1)) < picture->batch;) drawings[rank].run(element);
         };
         if (!run_together(picture->pool, threads, work)) work(0);
         return 0;
@@ -249,6 +250,6 @@ template <class Real> int paint(const Picture* picture) {
 
 // 0, or 1 where memory ran out.
 extern "C" {
-int dittogym_paint_float(const Picture* picture) { return paint<float>(picture); }
-int dittogym_paint_double(const Picture* picture) { return paint<double>(picture); }
+int dittogym_draw_float(const Picture* picture) { return draw<float>(picture); }
+int dittogym_draw_double(const Picture* picture) { return draw<double>(picture); }
 }

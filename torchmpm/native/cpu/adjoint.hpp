@@ -82,19 +82,19 @@ private:
         if (member.rank == 0) std::fill_n(work.gravity_bar, 2 * scene.width, Real(0));
     }
 
-    // Finish the adjoint of the substep that starts at `substep`, begin that of the one before.
-    void particles(int64_t substep, bool arriving, bool leaving) {
+    // Finish the adjoint of substep number `substep`, begin that of the one before it.
+    void particles(int64_t substep, bool finishing, bool beginning) {
         const Real* origin = scene.call.origin + 2 * element;
         for (int part = member.rank; part < scene.parts; part += member.size) work.sums[part].box = {};
         forward.own_blocks([&](int part, int index) {
             const Block* state = work.tape.states + substep * scene.blocks + index;
-            if (arriving) prefetch(state + 1, sizeof(Block));
-            if (leaving) prefetch(state + 1 - scene.blocks, 2 * LANES * sizeof(Real));
-            if (arriving) {
+            if (finishing) prefetch(state + 1, sizeof(Block));
+            if (beginning) prefetch(state + 1 - scene.blocks, 2 * LANES * sizeof(Real));
+            if (finishing) {
                 at.locate(scene, origin, *state);
-                take(index, *state, part);
+                block_adjoint(index, *state, part);
             }
-            if (!leaving) return;
+            if (!beginning) return;
             Sums& sums = work.sums[part];
             at.locate(scene, origin, *(state - scene.blocks));
             velocity_bars(scene, at, work.bars[index], impulse);
@@ -105,12 +105,13 @@ private:
         member.wait();
     }
 
-    // The tape of a large scene lies beyond the caches, and its blocks too far apart for processors to see what comes.
+    // The tape of a large scene does not fit into the caches, and its blocks are too far apart for hardware prefetching.
     static void prefetch(const Block* block, size_t size) {
-        for (size_t line = 0; line < size; line += 64) __builtin_prefetch(reinterpret_cast<const char*>(block) + line, 0, 2);
+        const char* start = reinterpret_cast<const char*>(block);
+        for (size_t line = 0; line < size; line += 64) __builtin_prefetch(start + line, 0, 2);
     }
 
-    void take(int index, const Block& state, int part) {
+    void block_adjoint(int index, const Block& state, int part) {
         const Body& body = scene.body(index);
         Block& bar = work.bars[index];
         const bool actuated = body.muscle && scene.muscles;
@@ -147,7 +148,7 @@ private:
         }
     }
 
-    // Hand out the derivatives.
+    // Write the derivatives to the tensors of the call.
     void finish() {
         const Call& call = scene.call;
         forward.own_blocks([&](int, int block) {

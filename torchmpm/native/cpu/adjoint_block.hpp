@@ -3,7 +3,7 @@
 #include "material_adjoint.hpp"
 #include "step.hpp"
 
-// Numbers of the nine nodes of a block's particles, node 3 p + q.
+// Two numbers of each of the nine nodes around a block's particles; node (p, q) is number 3 p + q.
 struct alignas(64) Nodes {
     Real v[9][2][LANES];
 
@@ -29,7 +29,7 @@ PASS void sample(const Nodes& field, const Stencil& at, Actuation& out) {
     }
 }
 
-// Nodes of one number.
+// One number of each of the nine nodes.
 struct alignas(64) Masses {
     Real v[9][LANES];
 
@@ -45,7 +45,7 @@ struct alignas(64) Masses {
     }
 };
 
-// What the nodes say to a block's particles of their momentum, and what follows from it.
+// Derivatives in the momentum that a block's particles gave to the nodes, and what follows from them.
 struct alignas(64) Momentum {
     Real mass[LANES];
     Real v_bar[2][LANES];       // sum w p_bar: derivative in m v
@@ -80,8 +80,8 @@ struct alignas(64) Momentum {
     }
 };
 
-// Adjoint of deform_one. The bars of F and Jp go from after the substep to before it; what the others need is kept in
-// `momentum`.
+// Adjoint of deform_one. Turns the derivatives in F and Jp after the substep into those before it; keeps in `momentum`
+// what the derivatives in the other components need.
 template <Kind kind, bool wants_values>
 INLINE void deform_adjoint_one(Real dt, Values m, Bounds bounds, bool on, Real act_x, Real act_y, int k,
                                const Block& state, Momentum& momentum, Block& bar, Real* values_bar) {
@@ -120,17 +120,17 @@ INLINE void deform_adjoint_one(Real dt, Values m, Bounds bounds, bool on, Real a
 }
 
 template <Kind kind, bool varying, bool wants_values>
-void deform_adjoint(const Scene& scene, const Real* table, Bounds bounds, const Stencil& at, const Actuation& actuation,
+void deform_adjoint(const Scene& scene, const Real* table, Bounds bounds, const Stencil& at, const Actuation& act,
                     const Block& state, Momentum& momentum, Block& bar, Real* values_bar) {
     const Real dt = scene.dt;
     const Values shared = values_at<false>(table, 0);
 #pragma omp simd
     for (int k = 0; k < LANES; ++k)
         deform_adjoint_one<kind, wants_values>(dt, varying ? values_at<true>(table, k) : shared, bounds, at.on[k] != 0,
-                                               actuation.x[k], actuation.y[k], k, state, momentum, bar, values_bar);
+                                               act.x[k], act.y[k], k, state, momentum, bar, values_bar);
 }
 
-INLINE void deform_adjoint(const Scene& scene, const Body& body, const Real* table, const Stencil& at, const Actuation& actuation,
+INLINE void deform_adjoint(const Scene& scene, const Body& body, const Real* table, const Stencil& at, const Actuation& act,
                            const Block& state, Momentum& momentum, Block& bar, Real* values_bar) {
     using Function = void (*)(const Scene&, const Real*, Bounds, const Stencil&, const Actuation&, const Block&, Momentum&,
                               Block&, Real*);
@@ -143,11 +143,12 @@ INLINE void deform_adjoint(const Scene& scene, const Body& body, const Real* tab
     static constexpr Function table_of[3][2][2] = {VARIANTS(Kind::elastic), VARIANTS(Kind::von_mises),
                                                    VARIANTS(Kind::snow)};
 #undef VARIANTS
-    table_of[int(body.kind)][body.varying][values_bar != nullptr](scene, table, body.bounds, at, actuation, state, momentum,
+    table_of[int(body.kind)][body.varying][values_bar != nullptr](scene, table, body.bounds, at, act, state, momentum,
                                                                   bar, values_bar);
 }
 
-// Derivative in the positions, through all weights and offsets of a substep; then the other bars move on to before it.
+// Derivative in the positions, through all weights and offsets of a substep; also turns the derivatives in v and C after
+// the substep into those before it.
 template <bool muscles>
 PASS void position_adjoint(const Scene& scene, const Stencil& at, const Nodes& velocity, const Nodes& p_bar,
                            const Masses& mass_bar, const Nodes& field, const Block& state, const Momentum& momentum,
@@ -198,7 +199,7 @@ PASS void position_adjoint(const Scene& scene, const Stencil& at, const Nodes& v
     }
 }
 
-// Derivatives in the node velocities as an impulse, so that the forward scatter can spread them.
+// Derivatives in the node velocities in the form of an impulse, so that the forward scatter can distribute them.
 PASS void velocity_bars(const Scene& scene, const Stencil& at, const Block& bar, Impulse& out) {
     const Real dt = scene.dt, scale = 4 * scene.inverse_h * scene.inverse_h;
 #pragma omp simd

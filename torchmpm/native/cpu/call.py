@@ -3,82 +3,36 @@
 from __future__ import annotations
 
 import ctypes
-import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchmpm.native.cpu.library import POOL, load, thread_pool
-from torchmpm.native.tables import tables_of
+from torchmpm.native.inputs import Inputs
+from torchmpm.native.tables import Tables, tables_of
 
 _REAL = {torch.float32: "float", torch.float64: "double"}
 #: Scratch memory up to this size, bytes, is kept for the next call: fresh pages cost a third of a backward pass. It is
 #: enough for 190 substeps of 22,000 particles in single precision; longer steps are cut.
 KEPT_BYTES = 2**28
 _kept: list[Tensor] = []
-
-
-def _members(kind: Any, *names: str) -> list[tuple[str, Any]]:
-    return [(name, kind) for name in names]
-
-
-class _Body(ctypes.Structure):
-    """A :class:`torchmpm.native.tables.BodyTable`, as ``struct BodyTable`` in ``scene.hpp``."""
-
-    _fields_ = [
-        *_members(ctypes.c_int64, "first", "count", "kind", "muscle", "varying", "column"),
-        *_members(ctypes.c_double, "hardening_low", "hardening_high", "shear_cutoff"),
-    ]
-
-
-class _Rule(ctypes.Structure):
-    """A :class:`torchmpm.native.tables.RuleTable`, as ``struct RuleTable`` in ``scene.hpp``."""
-
-    _fields_ = [
-        *_members(ctypes.c_int64, "axis", "world", "slot"),
-        *_members(ctypes.c_double, "sign", "i_low", "i_high", "j_low", "j_high", "friction"),
-    ]
-
-
-class _Tables(ctypes.Structure):
-    """A :class:`torchmpm.native.tables.Tables`, as ``struct Tables`` in ``scene.hpp``."""
-
-    _fields_ = [
-        *_members(ctypes.c_int64, "resolution", "num_bodies", "num_rules"),
-        *_members(ctypes.c_double, "h", "dt", "margin", "damping", "mass_epsilon", "stretch_floor"),
-        ("bodies", ctypes.POINTER(_Body)),
-        ("rules", ctypes.POINTER(_Rule)),
-    ]
+#: Derivatives that the adjoint writes.
+BARS = ("planes_bar", "field_bar", "origin_bar", "gravity_bar", "values_bar")
 
 
 class _Call(ctypes.Structure):
     """The arguments of one call, as ``struct Call`` in ``scene.hpp``."""
 
     _fields_ = [
-        *_members(ctypes.c_int64, "batch", "particles", "substeps", "threads"),
-        *_members(ctypes.c_void_p, *POOL),
-        ("tables", ctypes.POINTER(_Tables)),
-        *_members(ctypes.c_void_p, "planes", "field", "origin", "shift", "gravity", "values"),
-        *_members(ctypes.c_int64, "values_batch", "columns"),
-        *_members(ctypes.c_void_p, "result", "result_bar", "planes_bar", "field_bar", "origin_bar", "gravity_bar"),
-        *_members(ctypes.c_void_p, "values_bar"),
+        *((name, ctypes.c_int64) for name in ("batch", "particles", "substeps", "threads")),
+        *((name, ctypes.c_void_p) for name in POOL),
+        ("tables", ctypes.POINTER(Tables)),
+        *((name, ctypes.c_void_p) for name in ("planes", "field", "origin", "shift", "gravity", "values")),
+        *((name, ctypes.c_int64) for name in ("values_batch", "columns")),
+        *((name, ctypes.c_void_p) for name in ("result", "result_bar", *BARS)),
     ]
-
-
-@dataclass(frozen=True, eq=False)
-class Inputs:
-    """Tensors of a call; see :func:`torchmpm.native.operator.native_step`."""
-
-    planes: Tensor
-    field: Tensor | None
-    origin: Tensor
-    gravity: Tensor
-    values: Tensor
-    shift: Tensor
 
 
 def library_for(dtype: torch.dtype) -> ctypes.CDLL:
@@ -86,82 +40,54 @@ def library_for(dtype: torch.dtype) -> ctypes.CDLL:
     return load(_REAL[dtype])
 
 
-def forward(inputs: Inputs, handle: int, substeps: int, result: Tensor) -> None:
-    """Advance all simulations; writes the new planes to ``result``.
-
-    Raises:
-        MemoryError: There was not enough memory.
-    """
-    _run("forward", inputs, handle, substeps, result=result)
-
-
-def backward(inputs: Inputs, handle: int, substeps: int, result_bar: Tensor, bars: Sequence[Tensor]) -> None:
-    """Adjoint of :func:`forward`; writes to ``bars``, derivatives in planes, field, origin, gravity and values.
-
-    Raises:
-        MemoryError: There was not enough memory.
-    """
-    names = ("planes_bar", "field_bar", "origin_bar", "gravity_bar", "values_bar")
-    wanted = {name: bar for name, bar in zip(names, bars, strict=True) if bar.numel()}
-    _run("backward", inputs, handle, substeps, result_bar=result_bar, **wanted)
-
-
-def scratch_bytes(inputs: Inputs, handle: int, substeps: int, **outputs: Tensor) -> int:
-    """Bytes of scratch memory that a call asks for; backward if ``outputs`` holds derivatives.
+def run(inputs: Inputs, handle: int, substeps: int, **outputs: Tensor) -> None:
+    """Advance all simulations, or go back through their substeps.
 
     Args:
-        inputs: Tensors of the call; only their sizes count.
+        inputs: Contiguous tensors of the call.
         handle: Of the tables of the solver.
         substeps: Number of substeps.
-        outputs: Output tensors by their names in the call.
+        outputs: ``result``, to which the new planes are written; or, for the adjoint, those of :data:`BARS` that are to
+            be written.
+
+    Raises:
+        MemoryError: There was not enough memory.
     """
-    call = _make_call(inputs, handle, substeps, outputs)
-    direction = "backward" if "result_bar" in outputs else "forward"
-    return _measure(library_for(inputs.planes.dtype), direction, call)
-
-
-def _run(direction: str, inputs: Inputs, handle: int, substeps: int, **outputs: Tensor) -> None:
     call, library = _make_call(inputs, handle, substeps, outputs), library_for(inputs.planes.dtype)
-    run = getattr(library, f"torchmpm_{direction}")
-    with _scratch(_measure(library, direction, call)) as scratch:
-        if run(ctypes.byref(call), ctypes.c_void_p(scratch)):
+    function = getattr(library, f"torchmpm_{_direction(outputs)}")
+    with _scratch(_measure(call, inputs.planes.dtype, outputs)) as scratch:
+        if function(ctypes.byref(call), ctypes.c_void_p(scratch)):
             raise MemoryError("backend 'native' ran out of memory")
 
 
-def _measure(library: ctypes.CDLL, direction: str, call: _Call) -> int:
-    measure = getattr(library, f"torchmpm_{direction}_bytes")
+def scratch_bytes(inputs: Inputs, handle: int, substeps: int, **outputs: Tensor) -> int:
+    """Bytes of scratch memory that :func:`run` asks for; only the sizes of the tensors count."""
+    return _measure(_make_call(inputs, handle, substeps, outputs), inputs.planes.dtype, outputs)
+
+
+def _direction(outputs: dict[str, Tensor]) -> str:
+    return "forward" if "result" in outputs else "backward"
+
+
+def _measure(call: _Call, dtype: torch.dtype, outputs: dict[str, Tensor]) -> int:
+    measure = getattr(library_for(dtype), f"torchmpm_{_direction(outputs)}_bytes")
     measure.restype = ctypes.c_size_t
     return int(measure(ctypes.byref(call)))
 
 
 def _make_call(inputs: Inputs, handle: int, substeps: int, outputs: dict[str, Tensor]) -> _Call:
     batch, particles = inputs.planes.shape[1:]
-    tensors = vars(inputs) | outputs
+    tensors = inputs._asdict() | outputs
     return _Call(
         batch=batch,
         particles=particles,
         substeps=substeps,
         threads=torch.get_num_threads(),
-        tables=ctypes.pointer(_structure(handle)),
+        tables=ctypes.pointer(tables_of(handle)),
         values_batch=inputs.values.shape[1],
         columns=inputs.values.shape[2],
         **thread_pool(),
         **{name: _address(tensor) for name, tensor in tensors.items()},
-    )
-
-
-@functools.cache
-def _structure(handle: int) -> _Tables:
-    """Tables as the kernels read them."""
-    tables = tables_of(handle)
-    bodies, rules = [_Body(**asdict(body)) for body in tables.bodies], [_Rule(**asdict(rule)) for rule in tables.rules]
-    numbers = {name: value for name, value in vars(tables).items() if name not in ("bodies", "rules")}
-    return _Tables(
-        num_bodies=len(bodies),
-        num_rules=len(rules),
-        bodies=(_Body * len(bodies))(*bodies),
-        rules=(_Rule * len(rules))(*rules),
-        **numbers,
     )
 
 

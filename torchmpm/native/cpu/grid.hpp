@@ -2,7 +2,7 @@
 #pragma once
 #include "transfer.hpp"
 
-// Which rule holds on each node: one byte per slot, 0 for none, else its index plus one.
+// The rules that apply to each node: one byte per slot, 0 for none, else the index of the rule plus one.
 struct RuleCodes {
     uint32_t* code;
 
@@ -53,7 +53,7 @@ struct Rows {
     }
 };
 
-// The nodes of one row on which someone may ask for a velocity, and those of them that exist.
+// The nodes of one row whose velocity may be read, and those of them that exist.
 struct Span {
     int begin, end, inner_begin, inner_end;  // end is one past the last
 
@@ -77,8 +77,7 @@ INLINE void collect(Sums* sums, int parts, const Box& box, int i, int width, Rea
     }
 }
 
-// What the adjoint wants to know of a row of nodes, from the first of its box: velocity before gravity, and one over the
-// mass.
+// What the adjoint needs of a row of nodes, from the first node of the box: velocity before gravity, and 1 / mass.
 struct Record {
     Real *velocity = nullptr, *inverse_mass = nullptr;
 };

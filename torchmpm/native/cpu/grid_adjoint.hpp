@@ -2,7 +2,7 @@
 #pragma once
 #include "grid.hpp"
 
-// From the derivative in the velocity that a rule left to that in the one before, `v`, in place.
+// Turns the derivative in the velocity after a rule into that in the velocity before it, `v`, in place.
 INLINE void constrain_adjoint(const Rule& rule, const Real (&v)[2], Real (&bar)[2]) {
     const Real normal = v[rule.axis], tangent = v[1 - rule.axis];
     if (!(rule.sign > 0 ? normal > 0 : normal < 0)) return;
@@ -12,12 +12,13 @@ INLINE void constrain_adjoint(const Rule& rule, const Real (&v)[2], Real (&bar)[
         tangent_bar = 0;
     } else if (rule.friction != 0) {
         const bool slides = std::abs(tangent) - rule.friction * std::abs(normal) > 0;
-        if (slides) normal_bar = (tangent > 0) == (normal > 0) ? -rule.friction * tangent_bar : rule.friction * tangent_bar;
+        const Real drag = (tangent > 0) == (normal > 0) ? -rule.friction * tangent_bar : rule.friction * tangent_bar;
+        if (slides) normal_bar = drag;
         if (!slides) tangent_bar = 0;
     }
 }
 
-// All rules of a node: `v` becomes the velocity they leave, `bar` the derivative in the one before them.
+// All rules of a node: `v` becomes the velocity after them, `bar` the derivative in the velocity before them.
 INLINE void constrain_adjoint(const Scene& scene, uint32_t code, Real (&v)[2], Real (&bar)[2]) {
     const Rule* rules[4];
     Real before[4][2];
@@ -37,8 +38,8 @@ struct NodeBars {
     Real* mass;      // derivative in the mass
 };
 
-// Row i: from the derivatives in the velocities (`total`, four numbers a node from box.j0, two in use) to those in momentum
-// and mass. Also makes the velocities anew, and adds to the derivative in the velocity that gravity gave.
+// Row i: from the derivatives in the velocities (`total`, four numbers a node from box.j0, two in use) to those in
+// momentum and mass. Also recomputes the velocities, and adds to the derivative in the velocity gained from gravity.
 INLINE void node_adjoint(const Scene& scene, const Real* gravity, const RuleCodes& rules, const Box& box, int i,
                          const Real* total, Record record, Real* velocity, NodeBars out, Real* gravity_bar) {
     const Span span(scene, box, i);

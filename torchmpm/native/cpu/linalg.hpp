@@ -1,4 +1,4 @@
-// 2x2 matrices as the sum of a scaled rotation and a scaled reflection, see torchmpm/linalg.py.
+// 2x2 matrices as the sum of a scaled rotation and a scaled reflection, see torchmpm/materials/linalg.py.
 #pragma once
 #include "simd.hpp"
 
@@ -55,7 +55,7 @@ INLINE Direction direction(Parts v) {
 
 INLINE Mat2 orthogonal(Direction d) { return join({d.cos, d.sin, 0, 0, d.proper}); }
 
-// Adjoint of a direction, and what it means for the larger part.
+// Derivatives in a direction, and those in the larger part that follow from them.
 struct DirectionBar {
     Real total, cos, sin;
 };

@@ -1,12 +1,12 @@
-// Return maps and stresses, see torchmpm/material.py for the formulas and their sources.
+// Return maps and stresses, see torchmpm/materials/ for the formulas and their sources.
 #pragma once
 #include "linalg.hpp"
 
 enum class Kind : int { elastic = 0, von_mises = 1, snow = 2 };
 
-// One column of the table of values. `factor` is -dt V 4/h^2; `tanh2` the square of difference over sum of the stretches
-// at yield, `ratio` their ratio, `cosh2` and `sinh2` sum and difference of its square root and the inverse. Soil has its
-// own meaning for three of these.
+// One column of the table of values. `factor` is -dt V 4/h^2. With d the difference of the principal logarithmic strains
+// at yield, `tanh2` is tanh(d/2)^2, `exp` e^d, `cosh2` 2 cosh(d/2) and `sinh2` 2 sinh(d/2), see YieldSurface in
+// von_mises.py. Snow keeps its own values in three of these.
 struct Values {
     Real mass, factor, mu2, lam, tanh2, exp, cosh2, sinh2;
 
@@ -18,7 +18,7 @@ struct Values {
     INLINE Real hardening() const { return cosh2; }
 };
 constexpr int VALUES = 8;
-constexpr Real LARGEST_JP = Real(1e30);  // as in material.py
+constexpr Real LARGEST_JP = Real(1e30);  // as in snow.py
 
 // Column k of a block whose particles have their own values, or the only column.
 template <bool varying> INLINE Values values_at(const Real* table, int k) {
@@ -36,7 +36,8 @@ struct Sym2 {
     Real xx, xy, yy;
 };
 
-// Each takes the trial deformation to the returned one in place and gives the direction of R, which both share.
+// Each turns the trial deformation gradient into the returned one in place, and returns the direction of R, the same for
+// both.
 INLINE Direction elastic_return(const Mat2& F) { return direction(split(F)); }
 
 INLINE Direction von_mises_return(const Values& m, Bounds bounds, Mat2& F) {
@@ -84,13 +85,13 @@ template <Kind kind> INLINE Direction return_map(const Values& m, Bounds bounds,
     return elastic_return(F);
 }
 
-// Factor on the elastic constants; Jp is that of before the return map.
+// Factor on the elastic constants; Jp is from before the return map.
 template <Kind kind> INLINE Real hardening_factor(const Values& m, Bounds bounds, Real Jp) {
     if (kind != Kind::snow) return 1;
     return clamp(exponential(m.hardening() * (1 - Jp)), bounds.hardening_low, bounds.hardening_high);
 }
 
-// Kirchhoff stress of the fixed corotated solid cosh2 the muscles' F diag(actuation) F^T.
+// Kirchhoff stress of the fixed corotated solid plus the muscles' F diag(actuation) F^T.
 template <Kind kind> INLINE Sym2 stress(const Values& m, Real hard, Mat2 F, Direction R, Real act_x, Real act_y) {
     const Mat2 D = F + Real(-1) * orthogonal(R);
     const Real J = kind == Kind::snow ? std::abs(det(F)) : det(F);

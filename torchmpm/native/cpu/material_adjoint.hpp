@@ -1,5 +1,5 @@
-// Adjoints of material.hpp. Names with `bar` are derivatives of a loss. At corners the derivative is that of the side which
-// automatic differentiation of torchmpm/material.py takes.
+// Adjoints of material.hpp. Names with `bar` are derivatives of a loss. At kinks the derivative is that of the side which
+// automatic differentiation of torchmpm/materials takes.
 #pragma once
 #include "material.hpp"
 
@@ -49,7 +49,7 @@ template <Kind kind> INLINE Real hardening_adjoint(const Values& m, Bounds bound
     return -exponent * m.hardening();
 }
 
-// Each takes the derivative in the returned F, and that in R which the stress left in `bar`, to the trial F in place.
+// Each turns the derivative in the returned F, and that in R which the stress left in `bar`, into that in the trial F.
 INLINE void elastic_adjoint(Mat2 F, MaterialBar& bar, Mat2& F_bar) {
     F_bar = F_bar + join(adjoint(direction(split(F)), bar.R, 0, 0));
 }
@@ -85,9 +85,9 @@ INLINE void von_mises_adjoint(const Values& m, Bounds bounds, Mat2 F, MaterialBa
     F_bar = through + join(adjoint(R, bar.R, n1, n2));
 }
 
-// Begins with the lines of snow_return: handed over in a struct, their values keep the compiler from vectorising the return
-// map, and a step of soil takes three times as long.
-// Takes the derivative in Jp along: from that of after the return map to the part of it that reaches the one before.
+// Repeats the lines of snow_return: a struct of intermediate values would keep the compiler from vectorising the return
+// map, and a step of snow would take three times as long. Also turns the derivative in Jp after the return map into the
+// part of it that reaches Jp before.
 INLINE void snow_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, MaterialBar& bar, Mat2& F_bar, Real& Jp_bar) {
     const Real low = m.low(), high = m.high();
     const Parts v = split(F);
@@ -129,8 +129,8 @@ INLINE void snow_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, Materi
     F_bar = join(adjoint(R, bar.R, n1_bar, n2_bar));
 }
 
-// Adjoint of return map and stress together. `F` is the trial deformation, `S_bar` the derivative in S = factor tau, which
-// becomes `S`; F_bar and Jp_bar go from the returned to the trial ones in place.
+// Adjoint of return map and stress together. `F` is the trial deformation, `S_bar` the derivative in S = factor tau, and
+// `S` is an output; F_bar and Jp_bar are turned from those of the returned into those of the trial state.
 template <Kind kind>
 INLINE MaterialBar material_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, Real act_x, Real act_y,
                                     Sym2 S_bar, Mat2& F_bar, Real& Jp_bar, Sym2& S) {

@@ -1,4 +1,4 @@
-// Scalars, blocks of particles, and the few vector idioms that compilers do not find by themselves.
+// Scalars, blocks of particles, and the vector idioms that compilers do not find by themselves.
 #pragma once
 #include <cmath>
 #include <cstddef>
@@ -7,7 +7,7 @@
 
 #define INLINE inline __attribute__((always_inline))
 #define INLINE_LAMBDA __attribute__((always_inline))
-// Work on a whole block: a call costs nothing there, and profiles can tell one from the other.
+// Work on a whole block, where the cost of a call does not matter; profiles show these functions by name.
 #define PASS inline __attribute__((noinline))
 #define PASS_MEMBER __attribute__((noinline))
 
@@ -18,7 +18,7 @@ constexpr int PAD = 3;     // as torchmpm.grid.PAD
 
 typedef Real Real4 __attribute__((vector_size(4 * sizeof(Real))));
 typedef Real Real8 __attribute__((vector_size(8 * sizeof(Real))));
-// The same without a promise of alignment, for rows of nodes.
+// The same without guaranteed alignment, for rows of nodes.
 typedef Real Row4 __attribute__((vector_size(4 * sizeof(Real)), aligned(sizeof(Real)), may_alias));
 typedef Real Row8 __attribute__((vector_size(8 * sizeof(Real)), aligned(sizeof(Real)), may_alias));
 
@@ -39,7 +39,7 @@ template <class Function> INLINE void three(Function f) {
 }
 
 INLINE Real square(Real a) { return a * a; }
-// Lets a NaN in `a` through.
+// Propagates a NaN in `a`.
 INLINE Real at_least(Real a, Real low) { return a < low ? low : a; }
 
 INLINE void transpose(Real4 (&v)[4]) {
@@ -49,7 +49,7 @@ INLINE void transpose(Real4 (&v)[4]) {
     v[2] = SHUFFLE(b, d, 0, 1, 4, 5), v[3] = SHUFFLE(b, d, 2, 3, 6, 7);
 }
 
-// Both halves on their own.
+// Transposes both halves separately.
 INLINE void transpose(Real8 (&v)[4]) {
     const Real8 a = SHUFFLE(v[0], v[1], 0, 8, 1, 9, 4, 12, 5, 13), b = SHUFFLE(v[0], v[1], 2, 10, 3, 11, 6, 14, 7, 15);
     const Real8 c = SHUFFLE(v[2], v[3], 0, 8, 1, 9, 4, 12, 5, 13), d = SHUFFLE(v[2], v[3], 2, 10, 3, 11, 6, 14, 7, 15);
@@ -91,7 +91,7 @@ INLINE Real exponential(Real x) {
                    n * Real(single ? -2.12194440e-4 : 1.42860682030941723212e-6);
     Real sum = 1;
     for (int k = single ? 8 : 14; k > 0; --k) sum = 1 + sum * r * (Real(1) / Real(k));
-    // Two factors: each a power of two that exists, their product may overflow to infinity or vanish.
+    // Two factors: each is a representable power of two, while their product may overflow or underflow.
     const int first = int(n) / 2, second = int(n) - first;
     const auto power = [](int e) {
         const typename std::conditional<single, uint32_t, uint64_t>::type one = 1, bias = single ? 127 : 1023;

@@ -3,7 +3,8 @@
 #pragma once
 #include "workspace.hpp"
 
-// What a block's particles give to the nodes, zero for those that take no part: mass, momentum, and the affine momentum -dt V 4/h^2 tau + m C.
+// What a block's particles contribute to the nodes: mass, momentum, and the affine momentum -dt V 4/h^2 tau + m C. Zero for
+// particles that take no part.
 struct alignas(64) Impulse {
     Real mass[LANES], vx[LANES], vy[LANES], affine[4][LANES];
 };
@@ -27,7 +28,7 @@ struct alignas(64) Actuation {
     }
 };
 
-// New velocity and affine matrix from the velocities of the nodes, and the way they carry the particles.
+// New velocity, affine matrix and position from the velocities of the nodes.
 PASS void advance(const Scene& scene, const Real* velocity, const Stencil& at, Block& block) {
     const Real dt = scene.dt, scale = 4 * scene.inverse_h;
     for (int k = 0; k < LANES; k += 8) {
@@ -63,8 +64,8 @@ INLINE Mat2 matrix(const Block& block, int first, int k) {
 // I + dt C
 INLINE Mat2 growth(Real dt, Mat2 C) { return {1 + dt * C.a, dt * C.b, dt * C.c, 1 + dt * C.d}; }
 
-// Deform one particle and find what it gives to the nodes. A function of its own, because structures that are declared in
-// the body of a vector loop would be kept in memory.
+// Deform one particle and compute its contribution to the nodes. A separate function, because structures declared in the
+// body of a vector loop would be kept in memory.
 template <Kind kind>
 INLINE void deform_one(Real dt, Values m, Bounds bounds, bool on, Real act_x, Real act_y, int k, Block& block,
                        Impulse& out) {
@@ -87,17 +88,17 @@ INLINE void deform_one(Real dt, Values m, Bounds bounds, bool on, Real act_x, Re
 }
 
 template <Kind kind, bool varying>
-void deform(const Scene& scene, const Real* table, Bounds bounds, const Stencil& at, const Actuation& actuation, Block& block,
+void deform(const Scene& scene, const Real* table, Bounds bounds, const Stencil& at, const Actuation& act, Block& block,
             Impulse& out) {
     const Real dt = scene.dt;
     const Values shared = values_at<false>(table, 0);
 #pragma omp simd
     for (int k = 0; k < LANES; ++k)
-        deform_one<kind>(dt, varying ? values_at<true>(table, k) : shared, bounds, at.on[k] != 0, actuation.x[k], actuation.y[k],
+        deform_one<kind>(dt, varying ? values_at<true>(table, k) : shared, bounds, at.on[k] != 0, act.x[k], act.y[k],
                          k, block, out);
 }
 
-INLINE void deform(const Scene& scene, const Body& body, const Real* table, const Stencil& at, const Actuation& actuation,
+INLINE void deform(const Scene& scene, const Body& body, const Real* table, const Stencil& at, const Actuation& act,
                    Block& block, Impulse& out) {
     using Function = void (*)(const Scene&, const Real*, Bounds, const Stencil&, const Actuation&, Block&, Impulse&);
     static constexpr Function table_of[3][2] = {
@@ -105,7 +106,7 @@ INLINE void deform(const Scene& scene, const Body& body, const Real* table, cons
         {deform<Kind::von_mises, false>, deform<Kind::von_mises, true>},
         {deform<Kind::snow, false>, deform<Kind::snow, true>},
     };
-    table_of[int(body.kind)][body.varying](scene, table, body.bounds, at, actuation, block, out);
+    table_of[int(body.kind)][body.varying](scene, table, body.bounds, at, act, block, out);
 }
 
 // Add mass and momentum to the nodes.
@@ -125,7 +126,7 @@ PASS void scatter(const Scene& scene, const Impulse& in, const Stencil& at, Real
     }
 }
 
-// Where the forward pass leaves what the adjoint needs; null pointers keep nothing.
+// What the forward pass records for the adjoint; null pointers record nothing.
 struct Tape {
     Block* states = nullptr;        // [substeps][blocks] at the start of each substep
     Real* velocity = nullptr;       // two numbers a node in use, one substep after the other: before gravity
@@ -163,7 +164,7 @@ public:
         own_blocks([&](int, int block) { store(scene, block, element, work.state[block], scene.call.result); });
     }
 
-    // The blocks that are this thread's to advance.
+    // The blocks that this thread advances.
     template <class Function> void own_blocks(Function f) const {
         for (int part = member.rank; part < scene.parts; part += member.size)
             for (int block = scene.part_begin(part); block < scene.part_begin(part + 1); ++block) f(part, block);
@@ -191,30 +192,30 @@ private:
         if (member.rank == 0) work.team.begin(false);
     }
 
-    void particles(int64_t substep, bool arriving, bool leaving) {
+    void particles(int64_t substep, bool finishing, bool beginning) {
         const Real* origin = scene.call.origin + 2 * element;
         for (int part = member.rank; part < scene.parts; part += member.size) work.sums[part].box = {};
         own_blocks([&](int part, int index) {
             Block& block = work.state[index];
-            if (arriving) {
+            if (finishing) {
                 at.locate(scene, origin, block);
                 advance(scene, work.velocity, at, block);
             }
-            if (tape.states) keep(block, scene.body(index), tape.states[substep * scene.blocks + index]);
-            if (!leaving) return;
+            if (tape.states) record_state(block, scene.body(index), tape.states[substep * scene.blocks + index]);
+            if (!beginning) return;
             at.locate(scene, origin, block);
-            give(index, block, work.sums[part]);
+            scatter_block(index, block, work.sums[part]);
         });
         member.wait();
     }
 
-    // Only soil has a Jp that anyone asks for.
-    static void keep(const Block& block, const Body& body, Block& to) {
+    // Jp is only needed for snow.
+    static void record_state(const Block& block, const Body& body, Block& to) {
         const int planes = body.kind == Kind::snow ? PLANES : JP;
         std::copy_n(block.v[0], planes * LANES, to.v[0]);
     }
 
-    void give(int index, Block& block, Sums& sums) {
+    void scatter_block(int index, Block& block, Sums& sums) {
         const Body& body = scene.body(index);
         const bool actuated = body.muscle && scene.muscles;
         if (actuated) {
@@ -232,7 +233,7 @@ private:
     void nodes(int64_t substep) {
         Box box;
         for (const Sums& part : work.sums) box.include(part.box);
-        if (tape.boxes) remember(substep, box);
+        if (tape.boxes) record_box(substep, box);
         Real* total = work.total + member.rank * Workspace::row_length(scene);
         const Rows rows(box, member.rank, member.size);
         for (int i = rows.begin; i < rows.end; ++i) {
@@ -242,7 +243,7 @@ private:
         }
     }
 
-    void remember(int64_t substep, const Box& box) {
+    void record_box(int64_t substep, const Box& box) {
         if (member.rank == 0) {
             tape.boxes[substep] = box;
             tape.offsets[substep] = substep ? tape.offsets[substep - 1] + tape.boxes[substep - 1].nodes() : 0;

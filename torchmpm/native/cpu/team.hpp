@@ -1,5 +1,10 @@
-// Threads: those of torch where they can be had. After an operator torch's threads keep their cores for some milliseconds,
-// waiting for the next; threads of our own would have to share the cores with them. Elsewhere threads live for one call.
+// Threads: those of torch's OpenMP runtime if it can be reached. After an operator they spin for some milliseconds waiting
+// for the next one, so threads of our own would have to share the cores with them. Otherwise threads live for one call.
+//
+// A team waits for all its members several times per substep. When other programs occupy a core, one descheduled member
+// holds up all others at every barrier, so a step on two threads gets slower than on one: measured with three busy
+// processes on two cores, four times (benchmarks/test_solver.py, test_beside_other_programs). Then the first member goes on
+// alone and calls the others back after some milliseconds.
 #pragma once
 #include <atomic>
 #include <chrono>
@@ -14,7 +19,7 @@
 #define RELAX() ((void)0)
 #endif
 
-// Functions of GNU OpenMP, whose threads torch computes with; null where it has others.
+// Functions of GNU OpenMP, if torch uses it; else null.
 struct Pool {
     void (*parallel)(void (*)(void*), void*, unsigned, unsigned);
     int (*rank)();
@@ -27,11 +32,11 @@ public:
     using Clock = std::chrono::steady_clock;
 
     const int size;
-    std::atomic<int64_t> lost{0};  // nanoseconds that members waited in vain, all together
+    std::atomic<int64_t> stalled{0};  // nanoseconds that members waited in total
 
     explicit Barrier(int members) : size(members) {}
 
-    // Unless the wait `counts`, it is not one in vain however long it lasts.
+    // The wait is added to `stalled` if it `counts`.
     void wait(bool counts) {
         if (size == 1) return;
         const int now = phase.load(std::memory_order_relaxed);
@@ -40,7 +45,7 @@ public:
             phase.store(now + 1, std::memory_order_release);
             return;
         }
-        // The others are a few microseconds away, unless they lost their core.
+        // The others arrive within microseconds, unless they were descheduled.
         for (int spins = 0; spins < 500; ++spins) {
             if (phase.load(std::memory_order_acquire) != now) return;
             RELAX();
@@ -51,7 +56,7 @@ public:
                 std::this_thread::yield();
             else
                 std::this_thread::sleep_for(std::chrono::microseconds(50));
-        if (counts) lost += std::chrono::nanoseconds(Clock::now() - since).count();
+        if (counts) stalled += std::chrono::nanoseconds(Clock::now() - since).count();
     }
 
 private:
@@ -59,29 +64,28 @@ private:
     alignas(64) std::atomic<int> phase{0};
 };
 
-// What a team knows in common. Beside other programs, threads that wait for each other many times a millisecond are slower
-// together than one of them alone: then the first goes on alone, and calls the others back after a while.
+// State shared by the members of a team.
 struct Team {
     using Clock = Barrier::Clock;
 
     Barrier barrier;
-    bool dismissed = false;  // the first member's last word to the others
-    int64_t substep = 0;     // where it was when it called them
-    bool alone = false;      // known to the first member only, as is all below
+    bool suspended = false;  // whether the first member goes on alone
+    int64_t substep = 0;     // at which it called the others back
+    bool alone = false;      // this and all below belong to the first member only
     Clock::time_point since{};
 
     explicit Team(int members) : barrier(members) {}
 
-    void begin(bool by_itself) { alone = by_itself, barrier.lost = 0, since = Clock::now(); }
+    void begin(bool by_itself) { alone = by_itself, barrier.stalled = 0, since = Clock::now(); }
 
     int64_t nanoseconds() const { return std::chrono::nanoseconds(Clock::now() - since).count(); }
-    bool in_vain() const {
+    bool is_stalled() const {
         const int64_t passed = nanoseconds();
-        return passed > 1000000 && 2 * barrier.lost > passed * (barrier.size - 1);
+        return passed > 1000000 && 2 * barrier.stalled > passed * (barrier.size - 1);
     }
 };
 
-// One thread's place in its team.
+// One thread of a team.
 struct Member {
     int rank, size;
     Team& team;
@@ -90,13 +94,13 @@ struct Member {
         if (size > 1) team.barrier.wait(counts);
     }
 
-    // At the end of a substep, the last of several or not: wait for the others. Those whom the first member leaves behind
-    // sleep until it calls, and then are at its substep.
+    // Wait for the others at the end of a substep. Members that the first one leaves behind wait until it calls them back,
+    // and go on at its substep.
     void finish(int64_t& substep, bool last) {
         if (team.barrier.size == 1) return;
         if (rank > 0) {
             team.barrier.wait(true);
-            if (!team.dismissed) return;
+            if (!team.suspended) return;
             team.barrier.wait(false);
             substep = team.substep;
         } else if (team.alone) {
@@ -105,10 +109,10 @@ struct Member {
             team.barrier.wait(false);
             team.begin(false);
         } else {
-            team.dismissed = !last && team.in_vain();
-            if (team.dismissed) size = 1;
+            team.suspended = !last && team.is_stalled();
+            if (team.suspended) size = 1;
             team.barrier.wait(true);
-            if (team.dismissed) team.begin(true);
+            if (team.suspended) team.begin(true);
         }
     }
 };

@@ -1,4 +1,4 @@
-// Stencils, and the movement of numbers between particles and nodes.
+// Stencils, and transfers between particles and nodes.
 #pragma once
 #include "scene.hpp"
 
@@ -47,7 +47,7 @@ struct alignas(64) Stencil {
             wy[0][k] = inside ? Real(0.5) * square(Real(1.5) - dy) : 0;
             wy[1][k] = inside ? Real(0.75) - square(dy - 1) : 0;
             wy[2][k] = inside ? Real(0.5) * square(dy - Real(0.5)) : 0;
-            // Clamped before the conversion, which is undefined for large numbers; a NaN ends at the low end.
+            // Clamped before the conversion, which is undefined for large numbers; NaN goes to the low end.
             bx = bx > low ? bx : low, by = by > low ? by : low;
             bx = bx < high ? bx : high, by = by < high ? by : high;
             const int i = int(bx) + PAD, j = int(by) + PAD;
@@ -66,8 +66,8 @@ INLINE Real8 eight(const Real* from) { return *reinterpret_cast<const Real8*>(fr
 INLINE void put(Real8 value, Real* to) { *reinterpret_cast<Real8*>(to) = value; }
 
 // Read the nodes of eight particles, two numbers each: `use(p, row)` gets the nodes (p, q) as row[2 q] and row[2 q + 1]. A
-// row of three nodes is six numbers; two more are loaded and forgotten. Addresses are valid also for particles that take
-// no part, but what is read there is rubbish.
+// row of three nodes is six numbers; two more are loaded and ignored. Addresses are also valid for particles that take
+// no part, but the values read there are meaningless.
 template <class Function> INLINE void read_eight(const int32_t* node, int width, const Real* grid, Function use) {
     three([&](int p) INLINE_LAMBDA {
         Real8 row[8];
@@ -77,9 +77,9 @@ template <class Function> INLINE void read_eight(const int32_t* node, int width,
     });
 }
 
-// Add to the nodes of eight particles, numbers four by four: `value(p, q, numbers)` says what for a node. Aligned nodes
-// never overlap in part, so what was stored a moment ago is forwarded to the next load. Particles that take no part must
-// give zeros; they add them somewhere.
+// Add to the nodes of eight particles, numbers four by four: `value(p, q, numbers)` computes them for a node. Aligned
+// nodes never overlap partially, so a recent store is forwarded to the next load. Particles that take no part must
+// contribute zeros, which are added to some node.
 template <class Function> INLINE void add_eight(const int32_t* node, int width, Real* grid, Function value) {
     Real4* row[8];
     for (int l = 0; l < 8; ++l) row[l] = reinterpret_cast<Real4*>(grid) + node[l];
@@ -96,8 +96,7 @@ template <class Function> INLINE void add_eight(const int32_t* node, int width, 
     });
 }
 
-// A grid of nodes of four numbers on which sums build up. Nodes within `cleared` are zero or being added to; others hold
-// rubbish.
+// A grid of nodes of four numbers that collects sums. Only nodes within `cleared` have defined values.
 struct Sums {
     Real* nodes;
     Box box;      // nodes added to since the last reset

@@ -1,11 +1,11 @@
-// Memory of one simulation while it runs. A team of threads has one and uses it again for each of its simulations.
+// Memory of one simulation while it runs. A team of threads reuses one workspace for all its simulations.
 #pragma once
 #include <limits>
 
 #include "grid.hpp"
 #include "team.hpp"
 
-// Hands out aligned pieces of one buffer; without a buffer it only adds up what would be needed.
+// Hands out aligned pieces of one buffer; without a buffer it only adds up the size.
 class Arena {
 public:
     explicit Arena(char* base) : base(base) {}
@@ -60,8 +60,8 @@ struct Workspace {
     }
 };
 
-// Copy the particles of a block from planes (13, batch, particles). The lanes beyond the last particle lie nowhere and
-// so take no part.
+// Copy the particles of a block from planes (13, batch, particles). The lanes beyond the last particle have NaN
+// positions, so they take no part.
 INLINE void load(const Scene& scene, int block, int64_t element, const Real* planes, Block& out) {
     const int count = scene.particles_in(block);
     const int64_t first = scene.first_particle(block), n = scene.call.particles, stride = scene.call.batch * n;

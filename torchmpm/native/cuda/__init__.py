@@ -1,68 +1,51 @@
-"""The substep as Triton kernels on CUDA; the operators of :mod:`torchmpm.native.operator` on tensors that live there.
+"""The kernels in Triton, for tensors on CUDA; the operators of :mod:`torchmpm.native.operator` there.
 
 ``programs`` launches the kernels of a step and of its adjoint, ``graphs`` keeps the launches as CUDA graphs. Kernels,
-in order, each built on those before: ``linalg``, ``material``, ``transfer``, ``grid``, ``step``; for the adjoint
-``material_adjoint``, ``adjoint``. They are the formulas of the C++ kernels, a thread for each particle or node.
+in the order in which they build on each other: ``linalg``, ``material``, ``transfer``, ``grid``, ``step``; for the
+adjoint ``material_adjoint``, ``adjoint``. They compute the formulas of the C++ kernels, one thread a particle or node.
 
-Two launches make a substep: one over the particles, which reads velocities from the nodes, moves and deforms the
+A substep takes two launches: one over the particles, which reads velocities from the nodes, moves and deforms the
 particles, and adds mass and momentum to the nodes for the next substep; one over the nodes that are in use. Additions
 are atomic, in no fixed order: results differ from call to call in their last bits.
 
-This package imports Triton; nothing else does.
+Only this package imports Triton.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
+from torchmpm import tree
 from torchmpm.native.cuda.graphs import KEPT_SHARE, cache
-from torchmpm.native.cuda.programs import Backward, Forward, Inputs, Program
+from torchmpm.native.cuda.programs import Backward, Forward, Program
 from torchmpm.native.cuda.tables import device_tables
+from torchmpm.native.inputs import Inputs
 
 __all__ = ["backward", "cache", "forward"]
 
 
-def forward(
-    planes: Tensor,
-    field: Tensor | None,
-    origin: Tensor,
-    gravity: Tensor,
-    values: Tensor,
-    shift: Tensor,
-    handle: int,
-    substeps: int,
-) -> Tensor:
+def forward(*arguments: Any) -> Tensor:
     """Advance all simulations; see :func:`torchmpm.native.operator.native_step`."""
-    inputs = Inputs(planes, field, origin, gravity, values, shift)
-    (result,) = _run(Forward, inputs, handle, substeps)
+    *tensors, handle, substeps = arguments
+    (result,) = _run(Forward, Inputs(*tensors), handle, substeps)
     return result
 
 
-def backward(
-    result_bar: Tensor,
-    planes: Tensor,
-    field: Tensor | None,
-    origin: Tensor,
-    gravity: Tensor,
-    values: Tensor,
-    shift: Tensor,
-    handle: int,
-    substeps: int,
-    wants_field: bool,
-    wants_values: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def backward(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Adjoint of :func:`forward`; see :func:`torchmpm.native.operator.native_step_backward`."""
-    inputs = Inputs(planes, field, origin, gravity, values, shift, result_bar)
+    *tensors, handle, substeps, wants_field, wants_values = arguments
     planes_bar, field_bar, origin_bar, gravity_bar, values_bar = _run(
-        Backward, inputs, handle, substeps, wants_field, wants_values
+        Backward, Inputs(*tensors), handle, substeps, wants_field, wants_values
     )
     return planes_bar, field_bar, origin_bar, gravity_bar, values_bar
 
 
 def _run(kind: type[Program], inputs: Inputs, handle: int, substeps: int, *wants: bool) -> tuple[Tensor, ...]:
-    """Run a program, from a graph where that works: not while a caller records a graph of their own."""
-    inputs = inputs.map(Tensor.contiguous)
+    """Run a program, from a graph where that works: not while the caller records a graph of their own."""
+    inputs = tree.map(Tensor.contiguous, inputs)
     planes = inputs.planes
     tables = device_tables(handle, planes.dtype, planes.device)
 

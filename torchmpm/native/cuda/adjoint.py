@@ -61,11 +61,12 @@ def add(to, value, mask):
 
 @triton.jit
 def read_particle(state, at, stride, valid):
-    """Position, velocity and affine matrix of a state, or derivatives in them."""
+    """The components of a state, or derivatives in them."""
     x, y = tl.load(state + at, valid, other=0.0), tl.load(state + stride + at, valid, other=0.0)
     vx, vy = tl.load(state + 2 * stride + at, valid, other=0.0), tl.load(state + 3 * stride + at, valid, other=0.0)
     c0, c1, c2, c3 = load_matrix(state + 4 * stride + at, stride, valid)
-    return x, y, vx, vy, c0, c1, c2, c3
+    f0, f1, f2, f3 = load_matrix(state + 8 * stride + at, stride, valid)
+    return x, y, vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, tl.load(state + 12 * stride + at, valid, other=1.0)
 
 
 @triton.jit(do_not_specialize=SIZES)
@@ -84,9 +85,7 @@ def begin_adjoint(
     place = values_at(values, element, k, column, columns, values_batch, VARYING)
     mass, factor, mu2, lam, s0, s1, s2, s3 = read_values(values, values_batch, columns, place, valid)
     h, inverse_h, dt = tl.load(constants + H), tl.load(constants + INVERSE_H), tl.load(constants + DT)
-    x, y, vx, vy, c0, c1, c2, c3 = read_particle(state, at, stride, valid)
-    f0, f1, f2, f3 = load_matrix(state + 8 * stride + at, stride, valid)
-    Jp = tl.load(state + 12 * stride + at, valid, other=1.0)
+    x, y, vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, Jp = read_particle(state, at, stride, valid)
     on, i, j, fx, fy = locate(x, y, origin + 2 * element, valid, constants, resolution)
     node = i * width + j
     sums += ADJOINT * element * width * width
@@ -103,12 +102,55 @@ def begin_adjoint(
         sums, node, width, fx, fy, on, mass * vx, mass * vy,
         h * (xx + mass * c0), h * (xy + mass * c1), h * (xy + mass * c2), h * (yy + mass * c3), mass, True, ADJOINT,
     )  # fmt: skip
-    x_bar, y_bar, vx_bar, vy_bar, c0_bar, c1_bar, c2_bar, c3_bar = read_particle(bars, at, stride, valid)
+    x_bar, y_bar, vx_bar, vy_bar, c0_bar, c1_bar, c2_bar, c3_bar, _, _, _, _, _ = read_particle(bars, at, stride, valid)
     scale = 4.0 * inverse_h
     scatter(
         sums + 3, node, width, fx, fy, on, vx_bar + dt * x_bar, vy_bar + dt * y_bar,
         scale * c0_bar, scale * c1_bar, scale * c2_bar, scale * c3_bar, mass, False, ADJOINT,
     )  # fmt: skip
+
+
+@triton.jit
+def scatter_actuation(field_bar, i, j, fx, fy, act_x_bar, act_y_bar, on, resolution):
+    """Add derivatives in the actuation of particles to the field (2, G, G)."""
+    for p in tl.static_range(3):
+        for q in tl.static_range(3):
+            place, exists = field_at(field_bar, i, j, p, q, on, resolution)
+            w = weight(fx, p) * weight(fy, q)
+            tl.atomic_add(place, w * act_x_bar, exists, sem="relaxed")
+            tl.atomic_add(place + resolution * resolution, w * act_y_bar, exists, sem="relaxed")
+
+
+@triton.jit
+def subtract_sums(to, x, y):
+    """Subtract the sums over particles from two numbers."""
+    tl.atomic_add(to, -tl.sum(x, axis=0), sem="relaxed")
+    tl.atomic_add(to + 1, -tl.sum(y, axis=0), sem="relaxed")
+
+
+@triton.jit
+def add_values(to, stride, mass, factor, mu2, lam, s0, s1, s2, s3, mask):
+    """Add derivatives in the eight values of particles."""
+    add(to, mass, mask)
+    add(to + stride, factor, mask)
+    add(to + 2 * stride, mu2, mask)
+    add(to + 3 * stride, lam, mask)
+    add(to + 4 * stride, s0, mask)
+    add(to + 5 * stride, s1, mask)
+    add(to + 6 * stride, s2, mask)
+    add(to + 7 * stride, s3, mask)
+
+
+@triton.jit
+def store_bars(bars, stride, x, y, vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, Jp, mask):
+    """Store derivatives in the state of particles."""
+    tl.store(bars, x, mask)
+    tl.store(bars + stride, y, mask)
+    tl.store(bars + 2 * stride, vx, mask)
+    tl.store(bars + 3 * stride, vy, mask)
+    store_matrix(bars + 4 * stride, stride, c0, c1, c2, c3, mask)
+    store_matrix(bars + 8 * stride, stride, f0, f1, f2, f3, mask)
+    tl.store(bars + 12 * stride, Jp, mask)
 
 
 @triton.jit(do_not_specialize=SIZES)
@@ -118,32 +160,25 @@ def finish_adjoint(
     KIND: tl.constexpr, VARYING: tl.constexpr, MUSCLE: tl.constexpr, WANT_FIELD: tl.constexpr,
     WANT_VALUES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Bring the derivatives in the state after a substep to those in the one before, in place; add up all others.
-
-    ``answers`` are those of :func:`torchmpm.native.cuda.grid.node_adjoint`.
-    """
+    """From the derivatives in the state after a substep to those in the state before, in place; sums up all others."""
     element, k, at, valid = own_particles(first, count, particles, blocks, BLOCK)
     stride = stride.to(tl.int64)
     place = values_at(values, element, k, column, columns, values_batch, VARYING)
     mass, factor, mu2, lam, s0, s1, s2, s3 = read_values(values, values_batch, columns, place, valid)
     h, inverse_h, dt = tl.load(constants + H), tl.load(constants + INVERSE_H), tl.load(constants + DT)
-    x, y, vx, vy, c0, c1, c2, c3 = read_particle(state, at, stride, valid)
-    f0, f1, f2, f3 = load_matrix(state + 8 * stride + at, stride, valid)
-    Jp = tl.load(state + 12 * stride + at, valid, other=1.0)
-    x_bar, y_bar, vx_bar, vy_bar, c0_bar, c1_bar, c2_bar, c3_bar = read_particle(bars, at, stride, valid)
-    f0_bar, f1_bar, f2_bar, f3_bar = load_matrix(bars + 8 * stride + at, stride, valid)
-    Jp_bar = tl.load(bars + 12 * stride + at, valid, other=0.0)
+    x, y, vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, Jp = read_particle(state, at, stride, valid)
+    x_bar, y_bar, vx_bar, vy_bar, c0_bar, c1_bar, c2_bar, c3_bar, f0_bar, f1_bar, f2_bar, f3_bar, Jp_bar = (
+        read_particle(bars, at, stride, valid)
+    )
     on, i, j, fx, fy = locate(x, y, origin + 2 * element, valid, constants, resolution)
     node = i * width + j
     answers += ADJOINT * element * width * width
-    plane = 2 * resolution * resolution * element
-    field += plane
-    field_bar += plane
-    origin_bar += 2 * element
+    field += 2 * resolution * resolution * element
+    field_bar += 2 * resolution * resolution * element
     act_x, act_y = tl.zeros_like(x), tl.zeros_like(x)
     if MUSCLE:
         act_x, act_y = actuation_at(field, i, j, fx, fy, on, resolution)
-    # What the nodes say of momentum (m v) and affine momentum.
+    # Derivatives in the momentum (m v) and the affine momentum.
     px_bar, py_bar, pxx_bar, pxy_bar, pyx_bar, pyy_bar = gather(answers + 2, node, width, fx, fy, on, ADJOINT)
     pxx_bar, pxy_bar, pyx_bar, pyy_bar = h * pxx_bar, h * pxy_bar, h * pyx_bar, h * pyy_bar
     g0, g1, g2, g3 = 1.0 + dt * c0, dt * c1, dt * c2, 1.0 + dt * c3
@@ -159,7 +194,6 @@ def finish_adjoint(
     e0_bar, e1_bar, e2_bar, e3_bar = matmul(g0, g2, g1, g3, e0_bar, e1_bar, e2_bar, e3_bar)
     d0, d1 = mass * pxx_bar + dt * d0, mass * pxy_bar + dt * d1
     d2, d3 = mass * pyx_bar + dt * d2, mass * pyy_bar + dt * d3
-
     scale = 4.0 * inverse_h
     fx_bar, fy_bar, masses = position_adjoint(
         answers, node, width, fx, fy, on, vx_bar + dt * x_bar, vy_bar + dt * y_bar, mass * vx, mass * vy, mass,
@@ -168,29 +202,13 @@ def finish_adjoint(
         field, i, j, act_x_bar, act_y_bar, resolution, MUSCLE,
     )  # fmt: skip
     fx_bar, fy_bar = tl.where(on, fx_bar * inverse_h, 0.0), tl.where(on, fy_bar * inverse_h, 0.0)
-    tl.atomic_add(origin_bar, -tl.sum(fx_bar, axis=0), sem="relaxed")
-    tl.atomic_add(origin_bar + 1, -tl.sum(fy_bar, axis=0), sem="relaxed")
-    tl.store(bars + at, x_bar + fx_bar, on)
-    tl.store(bars + stride + at, y_bar + fy_bar, on)
-    tl.store(bars + 2 * stride + at, mass * px_bar, on)
-    tl.store(bars + 3 * stride + at, mass * py_bar, on)
-    store_matrix(bars + 4 * stride + at, stride, d0, d1, d2, d3, on)
-    store_matrix(bars + 8 * stride + at, stride, e0_bar, e1_bar, e2_bar, e3_bar, on)
-    tl.store(bars + 12 * stride + at, new_Jp_bar, on)
+    subtract_sums(origin_bar + 2 * element, fx_bar, fy_bar)
+    store_bars(
+        bars + at, stride, x_bar + fx_bar, y_bar + fy_bar, mass * px_bar, mass * py_bar,
+        d0, d1, d2, d3, e0_bar, e1_bar, e2_bar, e3_bar, new_Jp_bar, on,
+    )  # fmt: skip
     if MUSCLE and WANT_FIELD:
-        for p in tl.static_range(3):
-            for q in tl.static_range(3):
-                place, exists = field_at(field_bar, i, j, p, q, on, resolution)
-                w = weight(fx, p) * weight(fy, q)
-                tl.atomic_add(place, w * act_x_bar, exists, sem="relaxed")
-                tl.atomic_add(place + resolution * resolution, w * act_y_bar, exists, sem="relaxed")
+        scatter_actuation(field_bar, i, j, fx, fy, act_x_bar, act_y_bar, on, resolution)
     if WANT_VALUES:
         mass_bar = vx * px_bar + vy * py_bar + pxx_bar * c0 + pxy_bar * c1 + pyx_bar * c2 + pyy_bar * c3 + masses
-        add(values_bar + at, mass_bar, on)
-        add(values_bar + stride + at, factor_bar, on)
-        add(values_bar + 2 * stride + at, mu2_bar, on)
-        add(values_bar + 3 * stride + at, lam_bar, on)
-        add(values_bar + 4 * stride + at, s0_bar, on)
-        add(values_bar + 5 * stride + at, s1_bar, on)
-        add(values_bar + 6 * stride + at, s2_bar, on)
-        add(values_bar + 7 * stride + at, s3_bar, on)
+        add_values(values_bar + at, stride, mass_bar, factor_bar, mu2_bar, lam_bar, s0_bar, s1_bar, s2_bar, s3_bar, on)

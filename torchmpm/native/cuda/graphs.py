@@ -9,7 +9,9 @@ from collections.abc import Callable, Hashable
 import torch
 from torch import Tensor
 
-from torchmpm.native.cuda.programs import Inputs, Program
+from torchmpm import tree
+from torchmpm.native.cuda.programs import Program
+from torchmpm.native.inputs import Inputs
 
 #: At most so many graphs are kept, and at most this share of the device's memory in their buffers together; the longest
 #: unused go first. A call that needs more than that is launched kernel by kernel each time.
@@ -26,14 +28,14 @@ class Recorded:
 
     def __init__(self, build: Callable[[Inputs], Program], inputs: Inputs) -> None:
         with torch.inference_mode(False):  # what is made inside of it cannot be changed outside
-            self.inputs = inputs.map(torch.empty_like)
+            self.inputs = tree.map(torch.empty_like, inputs)
             self.program = build(self.inputs)
         self.graph: torch.cuda.CUDAGraph | None = None
         self.calls = 0
 
     def run(self, inputs: Inputs) -> tuple[Tensor, ...]:
         """Results for other inputs of the same shapes."""
-        for own, given in zip(self.inputs.tensors(), inputs.tensors(), strict=True):
+        for own, given in zip(tree.leaves(self.inputs), tree.leaves(inputs), strict=True):
             own.copy_(given)
         self.calls += 1
         if self.calls == 2:
@@ -50,7 +52,7 @@ class Recorded:
 
     def size(self) -> int:
         """Bytes of all buffers."""
-        held = [t for t in vars(self.program).values() if isinstance(t, Tensor)] + self.inputs.tensors()
+        held = [t for t in vars(self.program).values() if isinstance(t, Tensor)] + tree.leaves(self.inputs)
         return sum(t.numel() * t.element_size() for t in held)
 
 

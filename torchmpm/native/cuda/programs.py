@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -14,33 +13,13 @@ from torchmpm.native.cuda.grid import ADJOINT, SUMS, node_adjoint, node_velociti
 from torchmpm.native.cuda.step import particles_pass
 from torchmpm.native.cuda.tables import DeviceTables
 from torchmpm.native.cuda.transfer import NOWHERE
+from torchmpm.native.inputs import Inputs
 from torchmpm.native.tables import VALUES
 
 #: Particles, or nodes, of a program: one per thread.
 BLOCK = 128
 #: Programs for the nodes of all simulations together, at most, unless there are more simulations.
 NODE_PROGRAMS = 4096
-
-
-@dataclass(frozen=True, eq=False)
-class Inputs:
-    """Tensors of a call, contiguous and on one device; see :func:`torchmpm.native.operator.native_step`."""
-
-    planes: Tensor
-    field: Tensor | None
-    origin: Tensor
-    gravity: Tensor
-    values: Tensor
-    shift: Tensor
-    result_bar: Tensor | None = None
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> Inputs:
-        """Apply a function to all tensors that are there."""
-        return replace(self, **{name: function(t) for name, t in vars(self).items() if t is not None})
-
-    def tensors(self) -> list[Tensor]:
-        """All that are there."""
-        return [t for t in vars(self).values() if t is not None]
 
 
 def launch(kernel: Any, programs: int, *arguments: Any, **constants: Any) -> None:
@@ -59,10 +38,11 @@ class Program:
         planes = inputs.planes
         self.inputs, self.device_tables, self.tables, self.substeps = inputs, tables, tables.tables, substeps
         self.batch, self.particles = planes.shape[1:]
-        self.cells = self.tables.width**2
+        self.width = tables.width
+        self.cells = self.width**2
         self.sums = planes.new_zeros(self.batch * self.cells * numbers)
         self.boxes = torch.empty(substeps, self.batch, 4, dtype=torch.int32, device=planes.device)
-        nodes = self.batch * self.cells if self.tables.slots else 1
+        nodes = self.batch * self.cells if tables.slots else 1
         self.codes = torch.empty(nodes, dtype=torch.int32, device=planes.device)
 
     def run(self) -> None:
@@ -76,10 +56,10 @@ class Program:
     def prepare(self) -> None:
         """Empty the boxes and find the rule of each node."""
         self.boxes.fill_(NOWHERE.value)
-        if not self.tables.slots:
+        if not self.device_tables.slots:
             return
         rules, programs = self.device_tables.rules, -(-self.cells // BLOCK)
-        sizes = (len(rules), self.tables.width, self.cells, programs)
+        sizes = (len(rules), self.width, self.cells, programs)
         launch(rule_codes, self.batch * programs, self.codes, rules, self.inputs.shift, *sizes)
 
     def over_particles(self, kernel: Any, *buffers: Tensor, **flags: bool) -> None:
@@ -87,11 +67,11 @@ class Program:
         inputs, tables = self.inputs, self.tables
         field = inputs.origin if inputs.field is None else inputs.field  # nobody looks at one that is not there
         values_batch, columns = inputs.values.shape[1:]
-        for k, body in enumerate(tables.bodies):
+        for k, body in enumerate(self.device_tables.bodies):
             blocks = -(-body.count // BLOCK)
             constants = (self.device_tables.constants, self.device_tables.bounds_of(k))
             sizes = [self.particles, self.batch * self.particles, body.first, body.count, blocks]
-            sizes += [body.column, columns, values_batch, tables.resolution, tables.width]
+            sizes += [body.column, columns, values_batch, tables.resolution, self.width]
             muscle = body.muscle and inputs.field is not None
             kind = {"KIND": body.kind, "VARYING": body.varying, "MUSCLE": muscle}
             tensors = (*buffers, field, inputs.origin, inputs.values, *constants)
@@ -113,8 +93,8 @@ class Program:
         tables, inputs = self.tables, self.inputs
         programs = max(1, min(-(-self.cells // BLOCK), NODE_PROGRAMS // self.batch))
         tensors = (*buffers, self.codes, self.device_tables.rules, inputs.gravity, *bars, self.device_tables.constants)
-        sizes = (tables.resolution, tables.width, programs)
-        launch(kernel, self.batch * programs, *tensors, *sizes, SLOTS=tables.slots)
+        sizes = (tables.resolution, self.width, programs)
+        launch(kernel, self.batch * programs, *tensors, *sizes, SLOTS=self.device_tables.slots)
 
 
 class Forward(Program):

@@ -20,7 +20,7 @@ from torchmpm.native.cuda.transfer import SIZES, actuation_at, gather, include, 
 
 @triton.jit
 def load_matrix(planes, stride, mask):
-    """Four planes; those of no particle hold ones."""
+    """Four planes; ones where there is no particle."""
     a, b = tl.load(planes, mask, other=1.0), tl.load(planes + stride, mask, other=1.0)
     c, d = tl.load(planes + 2 * stride, mask, other=1.0), tl.load(planes + 3 * stride, mask, other=1.0)
     return a, b, c, d
@@ -37,7 +37,7 @@ def store_matrix(planes, stride, a, b, c, d, mask):
 
 @triton.jit
 def own_particles(first, count, particles, blocks, BLOCK: tl.constexpr):
-    """The simulation of a program, and of its particles: number within the body, place in a plane, and which exist."""
+    """The simulation of a program, and its particles: index in the body, offset in a plane, and whether they exist."""
     element = (tl.program_id(0) // blocks).to(tl.int64)
     k = tl.program_id(0) % blocks * BLOCK + tl.arange(0, BLOCK)
     return element, k, element * particles + first + k, k < count
@@ -45,7 +45,7 @@ def own_particles(first, count, particles, blocks, BLOCK: tl.constexpr):
 
 @triton.jit
 def values_at(values, element, k, column, columns, values_batch, VARYING: tl.constexpr):
-    """Where the values of particles stand in their table (8, values_batch, columns)."""
+    """Offsets of the values of particles in their table (8, values_batch, columns)."""
     at = tl.where(values_batch > 1, element, 0) * columns + column
     if VARYING:
         at += k
@@ -66,6 +66,18 @@ def deform(
     hard = hardening_factor(Jp, s2, bounds, KIND)
     xx, xy, yy = stress(a, b, c, d, r0, r1, r2, r3, hard * mu2, hard * lam, act_x, act_y, KIND)
     return a, b, c, d, after, factor * xx, factor * xy, factor * yy
+
+
+@triton.jit
+def advance(velocity, node, width, fx, fy, on, x, y, vx, vy, c0, c1, c2, c3, dt, inverse_h):
+    """Position, velocity and affine matrix after a substep, from the velocities of the nodes."""
+    ux, uy, xx, xy, yx, yy = gather(velocity, node, width, fx, fy, on, 2)
+    scale = 4.0 * inverse_h
+    x, y = tl.where(on, x + dt * ux, x), tl.where(on, y + dt * uy, y)
+    vx, vy = tl.where(on, ux, vx), tl.where(on, uy, vy)
+    c0, c1 = tl.where(on, scale * xx, c0), tl.where(on, scale * xy, c1)
+    c2, c3 = tl.where(on, scale * yx, c2), tl.where(on, scale * yy, c3)
+    return x, y, vx, vy, c0, c1, c2, c3
 
 
 @triton.jit(do_not_specialize=SIZES)
@@ -90,16 +102,13 @@ def particles_pass(
     c0, c1, c2, c3 = load_matrix(before + 4 * stride + at, stride, valid)
     on, i, j, fx, fy = locate(x, y, origin, valid, constants, resolution)
     if ARRIVE:
-        ux, uy, xx, xy, yx, yy = gather(velocity + 2 * cells, i * width + j, width, fx, fy, on, 2)
-        scale = 4.0 * inverse_h
-        x, y = tl.where(on, x + dt * ux, x), tl.where(on, y + dt * uy, y)
-        vx, vy = tl.where(on, ux, vx), tl.where(on, uy, vy)
-        c0, c1 = tl.where(on, scale * xx, c0), tl.where(on, scale * xy, c1)
-        c2, c3 = tl.where(on, scale * yx, c2), tl.where(on, scale * yy, c3)
+        x, y, vx, vy, c0, c1, c2, c3 = advance(
+            velocity + 2 * cells, i * width + j, width, fx, fy, on, x, y, vx, vy, c0, c1, c2, c3, dt, inverse_h
+        )
         tl.store(now + at, x, valid)
         tl.store(now + stride + at, y, valid)
         on, i, j, fx, fy = locate(x, y, origin, valid, constants, resolution)
-        # Whoever takes part in the coming substep gets a new velocity before anyone asks for this one.
+        # Particles that take part in the next substep get a new velocity before this one is read.
         kept = valid
         if LEAVE and not TAPE:
             kept = valid & (on == 0)

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchmpm.grid import PAD
 from torchmpm.materials.snow import LARGEST_JP
-from torchmpm.native.tables import RuleTable, Tables, tables_of
+from torchmpm.native.tables import BodyTable, Tables, bodies_of, tables_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,14 +19,23 @@ class DeviceTables:
 
     Attributes:
         tables: The description.
+        bodies: Its bodies.
+        slots: Number of directions that have velocity rules.
         constants: h, 1/h, dt, margin and extent of the window, damping, mass epsilon, stretch floor, largest Jp; then
             for each body the bounds of hardening and the shear cutoff, from :meth:`bounds_of`.
         rules: (rules, 9) float64: the numbers of each rule.
     """
 
     tables: Tables
+    bodies: tuple[BodyTable, ...]
+    slots: int
     constants: Tensor
     rules: Tensor
+
+    @property
+    def width(self) -> int:
+        """Nodes per axis with their padding."""
+        return int(self.tables.resolution) + 2 * PAD
 
     def bounds_of(self, body: int) -> Tensor:
         """The constants from the first one of a body."""
@@ -35,22 +45,21 @@ class DeviceTables:
 @functools.lru_cache(maxsize=64)
 def device_tables(handle: int, dtype: torch.dtype, device: torch.device) -> DeviceTables:
     """The tables of a handle on a device; kept, because a copy to a device waits for it."""
-    tables = tables_of(handle)
+    tables, bodies = tables_of(handle), bodies_of(handle)
+    rules = tables.rules[: tables.num_rules]
     extent = tables.resolution * tables.h - tables.margin
     constants = [tables.h, 1.0 / tables.h, tables.dt, tables.margin, extent, tables.damping, tables.mass_epsilon]
     constants += [tables.stretch_floor, LARGEST_JP]
     constants += [0.0] * 3  # parts of a table begin at whole fours, as Triton compiles a kernel anew for others
-    for body in tables.bodies:
+    for body in bodies:
         constants += [body.hardening_low, body.hardening_high, body.shear_cutoff, 0.0]
-    rows = [_row(rule) for rule in tables.rules] or [[0.0] * 9]
+    names = ("axis", "sign", "i_low", "i_high", "j_low", "j_high", "friction", "world", "slot")
+    rows = [[float(getattr(rule, name)) for name in names] for rule in rules] or [[0.0] * len(names)]
     with torch.inference_mode(False):
         return DeviceTables(
             tables=tables,
+            bodies=tuple(bodies),
+            slots=len({rule.slot for rule in rules}),
             constants=torch.tensor(constants, dtype=dtype, device=device),
             rules=torch.tensor(rows, dtype=torch.float64, device=device),
         )
-
-
-def _row(rule: RuleTable) -> list[float]:
-    ends = [rule.i_low, rule.i_high, rule.j_low, rule.j_high]
-    return [rule.axis, rule.sign, *ends, rule.friction, rule.world, rule.slot]

@@ -1,0 +1,213 @@
+"""The runs of a comparison: which there are, with which options, and which of them are finished."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from baselines.common.reference_policies import REFERENCE_POLICIES
+from baselines.compare.evaluations import RECORD, Protocol, read_record
+from baselines.compare.plan import Plan
+from baselines.registry import ALGORITHMS, ALIASES, configure, sees
+from cfp.config import EVALUATION_SEED, RunConfig, to_json
+from cfp.errors import ConfigError
+from cfp.experiment.folder import holds_run, read_config
+from cfp.from_dict import flatten
+from cfp.sections import TASK_OPTIONS
+from cfp.weights import is_of_another_task, is_same_task, read_policy
+from dittogym.tasks import task_name
+
+LARGEST_SEED = EVALUATION_SEED - 1001
+"""Larger seeds would train on the layouts of the final evaluation."""
+IRRELEVANT_OPTIONS = ("device", "environment.backend", "report.video", "report.checkpoint_every", "report.log_every")
+"""Options that change neither what a run learns nor which policy it keeps."""
+TASK_DEFINING_OPTIONS = ("substeps", "dtype", "parity", "resample", "target", "variant")
+"""Options of the environment on which all algorithms of a task must agree."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run of the comparison.
+
+    Attributes:
+        label: Name of the algorithm in the report: its own, or that of a variant in the plan file.
+        config: Options of the run.
+        folder: Run folder.
+        protocol: How its policy is evaluated.
+    """
+
+    label: str
+    config: RunConfig
+    folder: Path
+    protocol: Protocol
+
+    @property
+    def name(self) -> str:
+        """Name of the run folder, for messages."""
+        return self.folder.name
+
+    @property
+    def observes(self) -> str:
+        """What the policy observes: image, state, simulator or nothing."""
+        return str(getattr(self.config, "sees", sees(self.config.algo)))
+
+    @property
+    def untrained(self) -> bool:
+        """Whether it evaluates a reference policy, which learns nothing and does not depend on the seed."""
+        return self.config.algo in REFERENCE_POLICIES
+
+    @property
+    def trained(self) -> bool:
+        """Whether training has ended, here or by ``python -m baselines.train``, if there is any."""
+        if self.untrained:
+            return (self.folder / RECORD).exists()
+        finished = read_sessions(self.folder)["finished"]
+        return finished in (True, self.config.ends()[-1]) or (self.folder / "results.json").exists()
+
+    @property
+    def state(self) -> str:
+        """One of finished, failed, begun, missing; the final evaluation is not looked at."""
+        if self.trained:
+            return "finished"
+        if (self.folder / "error.txt").exists():
+            return "failed"
+        return "begun" if holds_run(self.folder) else "missing"
+
+
+def make_jobs(
+    plan: Plan,
+    tasks: Sequence[str],
+    labels: Sequence[str],
+    seeds: Sequence[int],
+    folder: Path,
+    protocol: Callable[[RunConfig], Protocol],
+    *,
+    preset: str = "quick",
+    steps: int | None = None,
+    device: str = "auto",
+) -> list[Job]:
+    """All runs of a comparison, ordered by seed, so that a comparison that is stopped early has something to compare.
+
+    Reference policies have one run, that of the first seed.
+
+    Args:
+        plan: Options beyond the presets.
+        tasks: Names of tasks.
+        labels: Algorithms and variants.
+        seeds: Seeds of the runs.
+        folder: Folder of the run folders.
+        protocol: From the options of a run to how its policy is evaluated.
+        preset: Preset of all runs.
+        steps: Environment steps of algorithms that have this option, unless the plan gives it.
+        device: Device of all runs.
+
+    Raises:
+        ConfigError: An option is wrong, or two algorithms would not solve the same task.
+    """
+    for name, values in (("tasks", tasks), ("algos", labels), ("seeds", seeds)):
+        if not values or len(set(values)) < len(values):
+            raise ConfigError(
+                f"{name} must be one or more different values, got {' '.join(map(str, values)) or 'none'}"
+            )
+    for seed in seeds:
+        if not 0 <= seed <= LARGEST_SEED:
+            raise ConfigError(f"seeds must be between 0 and {LARGEST_SEED}, got {seed}")
+    jobs = []
+    for seed in seeds:
+        for task in tasks:
+            for label in labels:
+                config = resolve(plan, label, task, preset, seed, steps, device)
+                job = Job(label, config, folder / f"{label}-{task_name(task)}-{preset}-{seed}", protocol(config))
+                if seed == seeds[0] or not job.untrained:
+                    jobs.append(job)
+    _check_same_task(jobs)
+    return jobs
+
+
+def resolve(plan: Plan, label: str, task: str, preset: str, seed: int, steps: int | None, device: str) -> RunConfig:
+    """Options of a run: from the preset, then the plan file, then the command line.
+
+    Raises:
+        ConfigError: An option is wrong.
+    """
+    values = plan.options(label, task)
+    variant_of = values.pop("algo", label)
+    algo = label if label in {*ALGORITHMS, *ALIASES, *REFERENCE_POLICIES} else variant_of
+    algo = plan.own_options(label, task).get("algo", algo)
+    start: dict[str, Any] = {"algo": algo, "task": task, "preset": preset}
+    base = configure(start)
+    if steps is not None and hasattr(base, "steps"):
+        values.setdefault("steps", steps)
+    report = {"video": False, **values.pop("report", {})}
+    try:
+        config = configure({**start, "seed": seed, "device": device, **values, "report": report}).with_derived(
+            base, values
+        )
+        config.check()
+        # Options for all algorithms may have no effect on some of them.
+        config.check_effect(base, flatten(plan.own_options(label, task)))
+    except ConfigError as error:
+        raise ConfigError(f"{label} on {task}: {error}") from error
+    return config
+
+
+def _check_same_task(jobs: Sequence[Job]) -> None:
+    first: dict[str, Job] = {}
+    for job in jobs:
+        task = job.config.task
+        other = first.setdefault(task, job)
+        for name in TASK_DEFINING_OPTIONS:
+            mine, theirs = (getattr(each.config.environment, name) for each in (job, other))
+            if mine != theirs and not _names_default(task, name, mine, theirs):
+                raise ConfigError(
+                    f"{name} must be the same for all algorithms on {task}, got {mine!r} for {job.label} "
+                    f"and {theirs!r} for {other.label}"
+                )
+
+
+def _names_default(task: str, option: str, mine: Any, theirs: Any) -> bool:
+    """Whether one of two values is None and the other names the task's default."""
+    try:
+        return option in TASK_OPTIONS and is_same_task(task, option, mine, theirs)
+    except (ValueError, TypeError, OSError):  # a wrong value is reported by the run itself
+        return False
+
+
+def check_folder(job: Job) -> None:
+    """Check that the run in a job's folder, if there is one, has the job's options.
+
+    Raises:
+        ConfigError: It has other options, of which the message names the first, or its custom task has changed since.
+        CheckpointError: A file of the run is damaged.
+    """
+    if not holds_run(job.folder):
+        return
+    if not (job.folder / "config.json").exists():
+        raise ConfigError(f"out: {job.folder} holds files of a run but no config.json")
+    there = read_config(job.folder, configure)
+    old, new = (flatten(json.loads(json.dumps(to_json(config)))) for config in (there, job.config))
+    for name in {**old, **new}:
+        if name not in IRRELEVANT_OPTIONS and old.get(name) != new.get(name):
+            raise ConfigError(
+                f"{name} must be {old.get(name)!r} as in the run in {job.folder}, got {new.get(name)!r}; or name "
+                "another --out"
+            )
+    policy = job.folder / "policy.safetensors"
+    if policy.exists() and is_of_another_task(read_policy(policy)[1], job.config.task):
+        raise ConfigError(
+            f"task: the file that defines {job.config.task!r} has changed since the run in {job.folder} was trained; "
+            "name another --out"
+        )
+
+
+def read_sessions(folder: Path) -> dict[str, Any]:
+    """``sessions.json``: the step at which training ended or false, and a record of each session that ended in order.
+
+    Raises:
+        CheckpointError: The file is damaged.
+    """
+    path = folder / "sessions.json"
+    return read_record(path, finished=int, sessions=list) if path.exists() else {"finished": False, "sessions": []}

@@ -1,0 +1,89 @@
+"""A trained actor on its own, for acting; independent of stable-baselines3, so that loading a policy is quick."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from torch import Tensor, nn
+
+from cfp.agent.actor import build_actor
+from cfp.agent.networks import IMAGE_SIZE
+from cfp.agent.spec import ActorSpec
+
+IMAGE_SHAPE = (3, IMAGE_SIZE, IMAGE_SIZE)
+
+
+def check_images(observation: object) -> None:
+    """Check the observation of an image policy, whose networks would take other numbers as normalised already.
+
+    Raises:
+        ValueError: It is neither an image nor a batch of images.
+    """
+    found = type(observation).__name__
+    if isinstance(observation, np.ndarray):
+        if observation.dtype == np.uint8 and observation.shape[-3:] == IMAGE_SHAPE and observation.ndim in (3, 4):
+            return
+        found = f"{observation.dtype} array of shape {observation.shape}"
+    raise ValueError(f"observation must be a uint8 array of shape (3, 64, 64) or (B, 3, 64, 64), got {found}")
+
+
+class ActorPolicy(nn.Module):
+    """An actor with stable-baselines3's ``predict``; `cfp.load` returns one.
+
+    Args:
+        spec: Structure of the actor, whose weights are random until a state is loaded.
+        deterministic_by_default: Whether the run that trained it evaluates it without noise.
+    """
+
+    sees_image = True
+
+    def __init__(self, spec: ActorSpec, deterministic_by_default: bool = False) -> None:
+        super().__init__()
+        self.spec = spec
+        self.deterministic_by_default = deterministic_by_default
+        self.description: dict[str, Any] = {}
+        self.actor = build_actor(spec).requires_grad_(False)
+        self.observation_space = spaces.Box(0, 255, IMAGE_SHAPE, np.uint8)
+        self.action_space = spaces.Box(-1.0, 1.0, (2, self.resolution, self.resolution), np.float32)
+
+    @property
+    def resolution(self) -> int:
+        """Rows and columns of its actions, for ``gymnasium.make(..., resolution=...)``."""
+        return self.spec.action_size
+
+    def forward(self, observation: Tensor, deterministic: bool = False) -> Tensor:
+        """Actions (B, 2, R, R) for uint8 observations (B, 3, 64, 64)."""
+        action: Tensor = self.actor(observation, deterministic)
+        return action
+
+    @torch.no_grad()
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Choose actions, with the signature of stable-baselines3's ``predict``.
+
+        Args:
+            observation: (3, 64, 64) or (B, 3, 64, 64) uint8.
+            state: Returned as it is: the policy has no memory.
+            episode_start: Without effect.
+            deterministic: Act without noise.
+
+        Returns:
+            Actions (2, R, R) or (B, 2, R, R) float32, and ``state``.
+
+        Raises:
+            ValueError: The observation is something else.
+        """
+        check_images(observation)
+        assert isinstance(observation, np.ndarray)
+        batch = torch.as_tensor(observation, device=next(self.parameters()).device)
+        action: np.ndarray = self(batch.reshape(-1, *IMAGE_SHAPE), deterministic).cpu().numpy()
+        action = (action + 1) - 1  # rounds as stable-baselines3 does when it maps [-1, 1] to the bounds of the space
+        return action if observation.ndim == 4 else action[0], state

@@ -1,0 +1,190 @@
+"""What the engine and a task tell each other: measurements and moments one way, outcomes the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, TypeAlias
+
+import torch
+from torch import Tensor
+
+from dittogym.rewards import RewardOps
+from torchmpm import ParticleState
+
+#: Terms that the engine adds to those of a task.
+ENGINE_TERMS = frozenset({"split", "action", "alive", "failure"})
+#: What the engine puts into ``info``.
+ENGINE_INFO = frozenset({"com", "split", "finite", "object_com", "reward_terms", "is_success", "true_reward"})
+
+
+class Measurement(NamedTuple):
+    """Averages over bodies at one moment.
+
+    Attributes:
+        com: (B, 2) mean position of the robot's particles in the world, m.
+        velocity: (B, 2) mean velocity of the robot's particles, m/s.
+        split: (B,) spread of the robot, sqrt(Var x + Var y), m.
+        object_com: (B, 2) mean position of the object's particles; ``None`` in tasks without an object.
+        object_velocity: (B, 2) their mean velocity, m/s.
+    """
+
+    com: Tensor
+    velocity: Tensor
+    split: Tensor
+    object_com: Tensor | None = None
+    object_velocity: Tensor | None = None
+
+
+def measure(particles: ParticleState, num_robot_particles: int) -> Measurement:
+    """Averages over the robot, whose particles come first, and over the object if there is one."""
+    x, v = particles.x, particles.v
+    robot, other = slice(None, num_robot_particles), slice(num_robot_particles, None)
+    com = x[:, robot].mean(1)
+    variance = (x[:, robot] - com[:, None]).square().mean(1).sum(-1)  # several times faster than Tensor.var
+    single = variance == 0  # the square root of zero has no derivative
+    split = torch.where(single, 0.0, torch.where(single, 1.0, variance).sqrt())
+    if num_robot_particles == x.shape[1]:
+        return Measurement(com, v[:, robot].mean(1), split)
+    return Measurement(com, v[:, robot].mean(1), split, x[:, other].mean(1), v[:, other].mean(1))
+
+
+class Moment(NamedTuple):
+    """What a reward function may look at after a step.
+
+    Attributes:
+        particles: The state of all particles.
+        num_robot_particles: The robot's particles come first.
+        now: Averages after the step.
+        start: Averages right after the reset.
+        observation: (B, 3, 64, 64) uint8; the floating point image of
+            :func:`dittogym.core.soft_observation` where a smooth reward is wanted.
+        memory: What the task remembers, tensors with a leading B.
+        ops: Operations that have a smooth form, see :class:`dittogym.rewards.RewardOps`.
+    """
+
+    particles: ParticleState
+    num_robot_particles: int
+    now: Measurement
+    start: Measurement
+    observation: Tensor
+    memory: Mapping[str, Tensor]
+    ops: RewardOps
+
+    @property
+    def robot_x(self) -> Tensor:
+        """Positions (B, n, 2) of the robot's particles, m."""
+        return self.particles.x[:, : self.num_robot_particles]
+
+    @property
+    def object_com(self) -> Tensor:
+        """Mean position (B, 2) of the object's particles, m.
+
+        Raises:
+            ValueError: The task has no object.
+        """
+        if self.now.object_com is None:
+            raise ValueError("object_com needs a task with an object, got one without")
+        return self.now.object_com
+
+
+class Outcome(NamedTuple):
+    """What a reward function returns.
+
+    Attributes:
+        terms: Reward terms (B,) by name. The engine multiplies each by its weight in ``TaskSpec.weights`` and adds the
+            terms ``split``, ``action``, ``alive`` and ``failure``.
+        terminated: (B,) bool, the task's own reasons to end the episode; ``None`` for none.
+        success: (B,) bool; ``None`` where success is not defined.
+        info: Further quantities for ``info``, with a leading B.
+        memory: Replaces the memory, under the same names and with the same shapes; ``None`` keeps it.
+    """
+
+    terms: Mapping[str, Tensor]
+    terminated: Tensor | None = None
+    success: Tensor | None = None
+    info: Mapping[str, Tensor] | None = None
+    memory: Mapping[str, Tensor] | None = None
+
+
+Memory: TypeAlias = Mapping[str, Tensor]
+
+
+def check_memory(task: str, memory: object, stale: tuple[str, ...], batch: int) -> None:
+    """Refuse what a task must not return as its initial memory.
+
+    Raises:
+        ValueError: An entry has no leading B, or a name of ``stale`` is missing.
+        TypeError: It is not a mapping.
+    """
+    if not isinstance(memory, Mapping):
+        raise TypeError(f"initial_memory of task {task!r} must return tensors by name, got {_kind(memory)}")
+    _check_leading(f"initial_memory of task {task!r}", "memory", memory, batch)
+    if missing := [name for name in stale if name not in memory]:
+        raise ValueError(
+            f"stale_memory of task {task!r} must be names that initial_memory returns, {sorted(memory)}, got {missing}"
+        )
+
+
+def check_outcome(
+    task: str, outcome: object, memory: Memory, weights: Mapping[str, float], batch: int, checked: set[tuple[Any, ...]]
+) -> None:
+    """Refuse what a task must not return as the outcome of a step.
+
+    Types and shapes are checked when names appear for the first time, not in every step.
+
+    Args:
+        task: Name of the task.
+        outcome: What its reward function returned.
+        memory: What it remembered before.
+        weights: Of its terms.
+        batch: B.
+        checked: Names that were checked before; those of this outcome are added.
+
+    Raises:
+        ValueError: A term has no weight, a name belongs to the engine, something has another shape than (B, ...), or
+            the memory is unlike the one before.
+        TypeError: It is not an :class:`Outcome`, or a part is not a mapping.
+    """
+    who = f"reward_fn of task {task!r}"
+    if not isinstance(outcome, Outcome):
+        raise TypeError(f"{who} must return an Outcome, got {type(outcome).__name__}")
+    optional = tuple(part if part is None else tuple(part) for part in (outcome.info, outcome.memory))
+    names = (tuple(outcome.terms), *optional, outcome.terminated is None, outcome.success is None)
+    if names in checked:
+        return
+    for part in ("terms", "info", "memory"):
+        if (given := getattr(outcome, part)) is not None and not isinstance(given, Mapping):
+            raise TypeError(f"{who} must return {part} by name, got {_kind(given)}")
+    info = outcome.info or {}
+    for part, taken in (("terms", ENGINE_TERMS & outcome.terms.keys()), ("info", ENGINE_INFO & info.keys())):
+        if taken:
+            raise ValueError(f"{who} must not return the engine's own {part}, got {sorted(taken)}")
+    if missing := [name for name in outcome.terms if name not in weights]:
+        raise ValueError(f"weights of task {task!r} must hold every term of reward_fn, got none for {missing}")
+    _check_shapes(who, outcome, batch)
+    _check_leading(who, "info", info, batch)
+    if outcome.memory is not None:
+        before, after = ({name: _kind(value) for name, value in m.items()} for m in (memory, outcome.memory))
+        if before != after:
+            raise ValueError(f"{who} must return memory like that of initial_memory, {before}, got {after}")
+    checked.add(names)
+
+
+def _check_shapes(who: str, outcome: Outcome, batch: int) -> None:
+    for name, value in outcome.terms.items():
+        if not isinstance(value, Tensor) or value.shape != (batch,):
+            raise ValueError(f"{who} must return terms of shape (B,), got {_kind(value)} for {name!r}")
+    for name in ("terminated", "success"):
+        value = getattr(outcome, name)
+        if value is not None and not (isinstance(value, Tensor) and (value.dtype, *value.shape) == (torch.bool, batch)):
+            raise ValueError(f"{who} must return {name} as bool of shape (B,), got {_kind(value)}")
+
+
+def _check_leading(who: str, what: str, values: Mapping[str, object], batch: int) -> None:
+    for name, value in values.items():
+        if not isinstance(value, Tensor) or value.shape[:1] != (batch,):
+            raise ValueError(f"{who} must return {what} of shape (B, ...), got {_kind(value)} for {name!r}")
+
+
+def _kind(value: object) -> str:
+    return f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__

@@ -1,0 +1,152 @@
+"""The camera of a task: from positions and velocities to the observation."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from dittogym.geometry import Box
+from dittogym.observation import native
+from dittogym.observation.image import CLIP, encode, quantise
+from dittogym.observation.raster import (
+    Background,
+    RasterInput,
+    crop_corner,
+    draw_boxes,
+    draw_fixed_boxes,
+    pixel_means,
+    splat_means,
+)
+from dittogym.observation.smooth import box_fraction, smooth_crop_corner
+from dittogym.window import GRID, Centre, Window, centre_in_window
+from torchmpm.backends import transforming, warn_eager
+
+#: Draws images (B, 3, 64, 64) uint8 of x, v, origin and centre.
+Drawing = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """What a task's observations show, and how.
+
+    Its functions take arrays: ``x`` and ``v`` (B, N, 2) positions and velocities of all particles in the world, m and
+    m/s; ``origin`` (B, 2) the lower left corner of the window, m; ``centre`` (B, 2) the robot's centre, m.
+
+    Attributes:
+        view: Centre of the image.
+        window: Where the window lies.
+        boxes: What is shown besides particles.
+        counts: Particles of each body.
+        particle_weight: By body, the full-size particles that one particle stands for.
+        hidden_velocity: By body, whether the velocity channels leave it out.
+        pixels: Whether to use the reference's pixel raster instead of splats.
+        native: Whether to draw in C++ where that is possible.
+    """
+
+    view: Centre
+    window: Window
+    boxes: tuple[Box, ...]
+    counts: tuple[int, ...]
+    particle_weight: tuple[float, ...]
+    hidden_velocity: tuple[bool, ...]
+    pixels: bool
+    native: bool
+    _drawings: dict[tuple[torch.dtype, torch.device], Drawing] = field(default_factory=dict, repr=False)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Copies and pickles leave out the functions of the loaded library."""
+        return {**vars(self), "_drawings": {}}
+
+    def observe(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
+        """The image (B, 3, 64, 64) uint8; particles that are not finite are not drawn."""
+        arrays = (x.detach(), v.detach(), origin.detach(), centre.detach())
+        if transforming():  # torch.func does not go through the C++ function
+            return self.draw(*arrays)
+        kind = x.dtype, x.device
+        if kind not in self._drawings:
+            self._drawings[kind] = self._choose(*kind)
+        return self._drawings[kind](*arrays)
+
+    def _choose(self, dtype: torch.dtype, device: torch.device) -> Drawing:
+        if not self.native or device.type != "cpu":
+            return self.draw
+        try:
+            bodies = zip(self.counts, self.particle_weight, self.hidden_velocity, strict=True)
+            return native.drawing(self.view, self.boxes, tuple(bodies), self.pixels, dtype)
+        except ValueError as error:  # no compiler, or it failed
+            warn_eager(str(error))
+            return self.draw
+
+    def draw(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
+        """:meth:`observe` in torch operations."""
+        row, column = crop_corner(centre_in_window(self.view, centre, origin))
+        background = self._background(origin, row, column)
+        shown = self.raster_input(x, v, origin, row, column, background)
+        return quantise(pixel_means(shown) if self.pixels else splat_means(shown))
+
+    def observe_smoothly(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
+        """The image in the units of the uint8 one as a smooth function of its arguments.
+
+        Particles are spread over image pixels by quadratic B-splines at every tier, and crop and background move with
+        the robot without steps. Like in the uint8 image, occupancy lies between 0 and 255 and velocities saturate at 0
+        and 255, where their derivative is zero. The derivative is continuous except at these ends, at the cap on
+        velocities (5 m/s), for particles at the edge of the simulated window, and where edges of boxes meet edges of
+        pixels.
+
+        Returns:
+            (B, 3, 64, 64) occupancy and velocities (x, y); zero velocity at 132.
+        """
+        follows = (self.view[0] is None and not self.window.moves, self.view[1] is None)
+        row, column = smooth_crop_corner(centre_in_window(self.view, centre, origin), follows)
+        means = splat_means(self.raster_input(x, v, origin, row, column))
+        if self.boxes:
+            free = 1.0 - box_fraction(self.boxes, origin, row, column)
+            means = torch.cat((1.0 - free[:, None] * (1.0 - means[:, :1]), means[:, 1:]), dim=1)
+        return encode(means)
+
+    def raster_input(
+        self,
+        x: Tensor,
+        v: Tensor,
+        origin: Tensor,
+        row: Tensor,
+        column: Tensor,
+        background: Background | None = None,
+    ) -> RasterInput:
+        """What an image with its corner in a fine ``row`` and ``column`` (B, 1) shows."""
+        finite = torch.isfinite((x + v).detach().sum(-1))
+        visible = finite & GRID.contains(x[..., 0], origin[:, 0:1])
+        hidden = None
+        if any(self.hidden_velocity):
+            hidden = per_particle(self.counts, self.hidden_velocity, torch.bool, x.device)
+        moving = visible if hidden is None else visible & ~hidden
+        return RasterInput(
+            position=x - origin[:, None],
+            velocity=(2.0 * torch.where(moving[..., None], v, 0.0)).clamp(-CLIP, CLIP),
+            weight=per_particle(self.counts, self.particle_weight, origin.dtype, x.device),
+            visible=visible,
+            hidden_velocity=hidden,
+            row=row,
+            column=column,
+            background=background,
+        )
+
+    def _background(self, origin: Tensor, row: Tensor, column: Tensor) -> Background | None:
+        if not self.boxes or self.window.moves or None in self.view:
+            return draw_boxes(self.boxes, origin, row, column)
+        corner = int(row[0, 0]), int(column[0, 0])
+        return draw_fixed_boxes(self.boxes, (self.window.left, 0.0), *corner, origin.dtype, origin.device)
+
+
+@functools.lru_cache(maxsize=64)
+@torch.inference_mode(False)  # what is kept must serve gradients later
+def per_particle(
+    counts: tuple[int, ...], values: tuple[float, ...], dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """Values of the bodies as (N,) over all particles."""
+    repeats = torch.tensor(counts, device="cpu")
+    return torch.tensor(values, dtype=dtype, device="cpu").repeat_interleave(repeats).to(device)

@@ -1,0 +1,76 @@
+"""The simulated window of 1 m x 1 m: where it lies, what is inside, and where in it the robot looks and acts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import torch
+from torch import Tensor
+
+from dittogym.geometry import NODES
+from torchmpm import Grid, checks
+
+#: The grid of every task.
+GRID = Grid(NODES)
+#: Centre (x, y) in window coordinates, m; ``None`` stands for the robot's centre.
+Centre: TypeAlias = tuple[float | None, float | None]
+
+
+@dataclass(frozen=True)
+class Window:
+    """Where the window lies in the world.
+
+    Attributes:
+        left: Its left end for a fixed window, m.
+        follow: For a moving window the distance of the robot's centre from its left end, m; then ``left`` is unused.
+
+    Raises:
+        ValueError: A number is not finite.
+    """
+
+    left: float = 0.0
+    follow: float | None = None
+
+    def __post_init__(self) -> None:
+        checks.number("left", self.left)
+        if self.follow is not None:
+            checks.number("follow", self.follow)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the window follows the robot."""
+        return self.follow is not None
+
+    def origin(self, com: Tensor) -> Tensor:
+        """Lower left corner (B, 2) of the window for robots centred on ``com`` (B, 2), m."""
+        left = torch.full_like(com[:, 0], self.left) if self.follow is None else com[:, 0] - self.follow
+        return torch.stack((left, torch.zeros_like(left)), dim=1)
+
+
+#: The window between 0 and 1 m.
+FIXED = Window()
+
+
+def contains(x: Tensor, origin: Tensor) -> Tensor:
+    """Which of the points ``x`` (B, N, 2) lie in the windows at ``origin`` (B, 2): (B, N) bool; false for NaN."""
+    height = x[..., 1] - origin[:, 1:2]
+    return GRID.contains(x[..., 0], origin[:, 0:1]) & (height > 0) & (height < 1)
+
+
+def centre_in_window(centre: Centre, robot: Tensor, origin: Tensor) -> Tensor:
+    """A centre in window coordinates.
+
+    Args:
+        centre: Numbers, or ``None`` for the robot's centre.
+        robot: (B, 2) the robot's centre in the world, m.
+        origin: (B, 2) lower left corner of the window in the world, m.
+
+    Returns:
+        (B, 2), m.
+    """
+    relative = robot - origin
+    if centre == (None, None):
+        return relative
+    columns = [relative[:, i] if c is None else torch.full_like(relative[:, i], c) for i, c in enumerate(centre)]
+    return torch.stack(columns, dim=1)

@@ -1,0 +1,82 @@
+"""The runs of a comparison and their options."""
+
+from pathlib import Path
+
+import pytest
+from test_compare import PLAN, compare
+
+from baselines.compare.__main__ import main
+from baselines.compare.evaluations import Protocol
+from baselines.compare.jobs import make_jobs, resolve
+from baselines.compare.plan import Plan
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--algos alchemy", "algo must be one of cfp"),
+        ("--tasks swim --algos mpc", "task must be catch"),
+        ("--algos mpc mpc", "algos must be one or more different values, got mpc mpc"),
+        ("--seeds 9500 --algos mpc", "seeds must be between 0 and 8999, got 9500"),
+        ("--episodes 0", "episodes must be at least 1, got 0"),
+        ("--gpus-per-run 1", "gpus_per_run must be 0 without --executor ray, got 1.0"),
+        ("--algos mpc --seeds 0 --only 1", "only must be between 0 and 0, got 1"),
+        ("--only 0 --report-only", "only cannot be combined with --report-only"),
+        (
+            "--algos mpc other",
+            "target must be the same for all algorithms on shapematch, got 'M' for other and None for mpc",
+        ),
+    ],
+)
+def test_wrong_options_are_named(tmp_path, capsys, options, message):
+    plan = {"algos": {**PLAN["algos"], "other": {"algo": "mpc", "environment": {"target": "M"}}}}
+    assert compare(tmp_path / "out", *options.split(), plan=plan) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_algorithm_for_all_is_that_of_variants():
+    plan = Plan(common={"algo": "coarse"}, algos={"long": {"steps": 9600}, "shac": {"algo": "cem"}})
+    labels = ("zero", "gnn16", "long", "shac")
+    found = [resolve(plan, label, "run", "quick", 0, None, "cpu").algo for label in labels]
+    assert found == ["zero", "gnn-16", "coarse", "cem"]
+
+
+def test_names_in_a_plan_that_mean_nothing_are_reported(tmp_path, capsys):
+    algos = {"cfp": {"tasks": {"rnu": {"steps": 9600}, "run": {"steps": 6400}}}, "shac": {"tasks": {"kick": {}}}}
+    assert compare(tmp_path / "out", "--dry-run", "--algos", "cfp", "--tasks", "run", plan={"algos": algos}) == 0
+    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("plan")]
+    assert said == [
+        "plan: algos shac are not in this comparison",
+        "plan: algos.cfp.tasks rnu are not in this comparison",
+    ]
+
+
+def test_options_without_effect_are_refused_where_they_are_for_one_algorithm(tmp_path, capsys):
+    idle = {"learning": {"warm_critic": True}}
+    for algos in ({"gnn-16": idle}, {"gnn-16": {"tasks": {"run": idle}}}, {"gnn": {"algo": "gnn-16", **idle}}):
+        (label,) = algos
+        assert compare(tmp_path / "out", "--algos", label, "--tasks", "run", plan={"algos": algos}) == 2
+        error = capsys.readouterr().err
+        assert f"{label} on run: warm_critic requires " in error
+    plan = {"common": idle, "algos": {"gnn-16": {"learning": {"warm_critic": False}}}}
+    assert compare(tmp_path / "out", "--dry-run", "--algos", "cfp", "coarse", "gnn-16", plan=plan) == 0
+
+
+def test_default_of_a_task_is_the_same_task_by_name(tmp_path):
+    for task, option, default in (("shapematch", "target", "star"), ("slot", "variant", "registered")):
+        plan = {"algos": {"mpc": {"environment": {option: default}}}}
+        assert compare(tmp_path / "out", "--dry-run", "--algos", "zero", "mpc", "--tasks", task, plan=plan) == 0
+
+
+@pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "docs").glob("compare-plan*.json")), ids=str)
+def test_plans_of_the_documentation_hold(path, tmp_path):
+    plan = Plan.read(path)
+    assert make_jobs(plan, ["run"], list(plan.algos), [0], tmp_path, lambda _: Protocol(1))
+
+
+def test_plan_file_that_is_none_is_named(tmp_path, capsys):
+    assert compare(tmp_path / "out", plan={"runs": {}}) == 2
+    assert "must hold common, tasks and algos only, got runs" in capsys.readouterr().err
+    assert main(["--plan", str(tmp_path / "missing.json")]) == 2
+    assert "cannot be read as JSON" in capsys.readouterr().err
