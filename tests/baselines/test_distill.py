@@ -136,7 +136,7 @@ def test_actions_are_lost_on_the_grid_on_which_the_student_decides() -> None:
 
 def test_every_level_loses_actions_on_its_own_grid() -> None:
     first = Distill(make())
-    assert [model.collector.grid for model in (first, Distill(make(), 1, first.policy))] == [8, 16]
+    assert [model.collector.grid for model in (first, Distill(make(), 2, first.policy))] == [8, 16]
 
 
 def test_student_meets_faults_and_labels_do_not() -> None:
