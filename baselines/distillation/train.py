@@ -92,7 +92,6 @@ class Distill(Algorithm):
             grid=self.spec.resolutions[-1],
         )
         self.dataset, self.rounds = Dataset(config.capacity), 0
-        self.period = config.rollout_steps * self.env.num_envs
 
     def _make_teacher(self, training: RunConfig, path: Path | None) -> Teacher:
         config = self.config
@@ -129,7 +128,7 @@ class Distill(Algorithm):
             fresh_loss = self._fresh_loss(labels)
             losses = [self._gradient_step() for _ in range(config.updates)]
         self.rounds += 1
-        self.num_timesteps += self.period
+        self.num_timesteps += config.rollout_steps * self.env.num_envs
         return self.collector.episodes.scalars() | {
             "train/loss": sum(losses) / len(losses),
             "train/fresh_loss": fresh_loss,
@@ -232,7 +231,7 @@ class Distill(Algorithm):
         return Position()
 
     @classmethod
-    def prepare(cls, config: DistillConfig, folder: Path, signals: StopSignals | None) -> None:
+    def prepare(cls, config: DistillConfig, folder: Path, signals: StopSignals) -> None:
         """Train the teacher, if only its algorithm is named."""
         teacher_training.train_teacher(config, folder, signals)
 
@@ -249,14 +248,6 @@ class Distill(Algorithm):
     def warnings(cls, config: DistillConfig, folder: Path, first_stage: int) -> list[str]:
         """A warning if the teacher was planned for one start only."""
         return teacher_training.warnings(config, folder)
-
-    @classmethod
-    def not_estimated(cls, config: DistillConfig) -> list[str]:
-        """The teacher's own training."""
-        if config.teacher not in teacher_training.TRAINED:
-            return []
-        options = f"--algo {config.teacher} --task {config.task}"
-        return [f"the teacher's training, which comes first (python -m baselines.train {options} --dry-run)"]
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the policy, as one of CFP."""
