@@ -51,13 +51,13 @@ SHIPPED = Path(__file__).parent / "pretrained"
 """Folder of the policies that come with the package."""
 
 
-def origin(config: RunConfig, kind: str, level: int, steps: int) -> dict[str, Any]:
+def describe_run(config: RunConfig, kind: str, stage: int, steps: int) -> dict[str, Any]:
     """Description of a policy of any kind, as JSON values.
 
     Args:
         config: Options of the run that trained it.
         kind: Algorithm that can load it.
-        level: Index of its stage, counted from 0.
+        stage: Index of its stage, counted from 0.
         steps: Environment steps of the run so far.
     """
     return {
@@ -65,8 +65,8 @@ def origin(config: RunConfig, kind: str, level: int, steps: int) -> dict[str, An
         "version": VERSION,
         "kind": kind,
         "task": config.task,
-        "resolution": config.resolution(level),
-        "stage": level + 1,
+        "resolution": config.resolution(stage),
+        "stage": stage + 1,
         "steps": steps,
         "seed": config.seed,
         "deterministic": config.report.eval_deterministic,
@@ -80,9 +80,9 @@ def is_of_another_task(description: Mapping[str, Any], task: str) -> bool:
     return then is not None and now is not None and then != now
 
 
-def describe(config: Config, level: int, steps: int) -> dict[str, Any]:
-    """Description of an actor, see `origin`."""
-    return origin(config, KIND, level, steps) | {"network": dataclasses.asdict(config.actor_spec(level))}
+def describe(config: Config, stage: int, steps: int) -> dict[str, Any]:
+    """Description of an actor, see `describe_run`."""
+    return describe_run(config, KIND, stage, steps) | {"network": dataclasses.asdict(config.actor_spec(stage))}
 
 
 def write_policy(path: Path, tensors: Mapping[str, Tensor], description: dict[str, Any]) -> None:
@@ -93,7 +93,7 @@ def write_policy(path: Path, tensors: Mapping[str, Tensor], description: dict[st
     Args:
         path: The ``.safetensors`` file; the ``.json`` file gets the same name.
         tensors: Weights by name.
-        description: From `origin`, with further entries that its kind needs.
+        description: From `describe_run`, with further entries that its kind needs.
     """
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     content = safetensors.torch.save(plain, {FORMAT: json.dumps(description)})

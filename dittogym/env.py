@@ -8,9 +8,10 @@ import gymnasium
 import numpy as np
 import torch
 
+from dittogym.model import Snapshot
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
-from dittogym.torch_env import Snapshot, TorchEnv
+from dittogym.torch_env import TorchEnv
 from torchmpm import ParticleState
 
 RENDER_MODES = ("rgb_array", "human")

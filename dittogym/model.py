@@ -71,6 +71,34 @@ class EnvState:
 
 
 @dataclass(frozen=True, eq=False)
+class Snapshot:
+    """A moment of an environment, see :meth:`dittogym.TorchEnv.save`.
+
+    Attributes:
+        task: Name of the task.
+        counts: Particles of each body.
+        particle_weight: By body, the full-size particles that one particle stands for.
+        state: Everything that moves, leading B.
+        observation: (B, 3, 64, 64) uint8.
+    """
+
+    task: str
+    counts: tuple[int, ...]
+    particle_weight: tuple[float, ...]
+    state: EnvState
+    observation: Tensor
+
+    @property
+    def kind(self) -> tuple[object, ...]:
+        """What an environment must have in common with it."""
+        x = self.state.particles.x
+        return self.task, self.counts, self.particle_weight, x.dtype, x.device
+
+
+torch.serialization.add_safe_globals([Snapshot, EnvState, Measurement])  # tensors, numbers and a name
+
+
+@dataclass(frozen=True, eq=False)
 class Model:
     """A task at a certain fidelity: what turns one :class:`EnvState` into the next.
 

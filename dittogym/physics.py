@@ -18,8 +18,8 @@ Physics: TypeAlias = Mapping[str, Tensor]
 #: What can be set: Lame parameters of the robot and of objects without a material of their own, Pa; yield stress and
 #: muscle limit of the robot, Pa; gravity, m/s^2; and a factor on the mass of all particles.
 NAMES = ("mu", "lam", "yield_stress", "max_actuation", "gravity", "mass")
-_POSITIVE = ("mu", "mass")
-#: Of these, what particles may have values of their own of.
+_SIGNS = {"mu": "positive", "mass": "positive", "yield_stress": "not negative", "max_actuation": "not negative"}
+#: Those that may differ between the particles of a body.
 PER_PARTICLE = ("mu", "lam", "yield_stress", "mass")
 
 
@@ -30,7 +30,7 @@ def defaults(spec: TaskSpec, like: Tensor) -> dict[str, Tensor]:
 
 
 def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict[str, Tensor]:
-    """Check what a user asks for and bring it to one value per simulation or particle; gradients flow through.
+    """Check constants and bring them to one value per simulation or particle; gradients flow through.
 
     Args:
         given: Mapping from ``dittogym.physics.NAMES`` to a number, or a tensor or array of shape () or (B,); for
@@ -55,17 +55,17 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
         if tuple(tensor.shape) not in allowed_shapes:
             shapes = " or ".join(map(str, allowed_shapes))
             raise ValueError(f"physics[{name!r}] must have shape {shapes}, got {tuple(tensor.shape)}")
-        low = -torch.inf if name == "gravity" else 0.0
-        allowed = torch.isfinite(tensor) & ((tensor > low) if name in _POSITIVE else (tensor >= low))
+        sign = _SIGNS.get(name, "")
+        allowed = torch.isfinite(tensor) & ((tensor > 0) if sign == "positive" else (tensor >= 0) | (not sign))
         if not bool(allowed.all()):
-            kind = "finite" + (", positive" if name in _POSITIVE else "" if name == "gravity" else ", not negative")
+            kind = f"finite, {sign}" if sign else "finite"
             raise ValueError(f"physics[{name!r}] must be {kind}, got {tensor.detach()[~allowed].flatten()[0].item()}")
         values[name] = _expanded(tensor, name, batch)
     return values
 
 
 def real_tensor(name: str, given: Any) -> Tensor:
-    """What a user gives as numbers, arrays or tensors.
+    """Numbers, an array or a tensor as a tensor.
 
     Raises:
         ValueError: Not real numbers.

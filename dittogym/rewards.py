@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
@@ -19,14 +17,16 @@ RELATIVE_WIDTH = 0.05
 SELECTION_WIDTH = 0.005
 
 
-class RewardOps(Protocol):
-    """Operations that rewards need and that have no useful derivative: exact, or smooth for gradients.
+class RewardOps:
+    """Operations that rewards need and that have no useful derivative, as the task defines them.
+
+    :class:`SmoothOps` has a smooth form of each, for gradients.
 
     Attributes:
         smooth: Whether these are the smooth forms.
     """
 
-    smooth: bool
+    smooth = False
 
     def clamp(
         self, z: Tensor, low: float | None = None, high: float | None = None, *, width: float | None = None
@@ -45,9 +45,11 @@ class RewardOps(Protocol):
         Raises:
             ValueError: ``width`` is not positive, or all limits are 0 and it is not given (smooth form only).
         """
+        return z.clamp(low, high)
 
     def heaviside(self, z: Tensor, width: float) -> Tensor:
         """1 where ``z`` is positive, else 0; smooth, the sigmoid of ``z / width``."""
+        return (z > 0).to(z.dtype)
 
     def split_penalty(self, split: Tensor, limit: float) -> Tensor:
         """Penalty ``-(20 s)^2``, (B,), once the spread s (B,) exceeds ``limit``.
@@ -55,12 +57,13 @@ class RewardOps(Protocol):
         The exact form counts s up to :data:`SPLIT_CAP` only. The smooth form sets in over a width of ``limit / 20`` and
         keeps growing.
         """
+        return -(20.0 * split.clamp_max(SPLIT_CAP)).square() * self.heaviside(split - limit, 0.0)
 
     def mean_over_nearest(self, values: Tensor, x: Tensor, point: Tensor, fraction: float) -> Tensor:
-        """Mean of ``values`` over the particles nearest to a point.
+        """Mean of ``values`` over the particles nearest to a point, those that :func:`nearest` chooses.
 
-        The exact form chooses the particles as :func:`nearest` does. In the smooth form their weights fall off around
-        the distance within which there are as many, over :data:`SELECTION_WIDTH`, and no particle is left out.
+        In the smooth form the weights of particles fall off around the distance within which there are as many, over
+        :data:`SELECTION_WIDTH`, and no particle is left out.
 
         Args:
             values: (B, N, K).
@@ -71,49 +74,22 @@ class RewardOps(Protocol):
         Returns:
             (B, K).
         """
-
-    def silhouette(self, observation: Tensor) -> Tensor:
-        """Pixels (B, 64, 64) in which an observation shows matter: bool, or probabilities in the smooth form."""
-
-
-class ExactOps:
-    """The operations as the task defines them, see :class:`RewardOps`."""
-
-    smooth = False
-
-    def clamp(
-        self, z: Tensor, low: float | None = None, high: float | None = None, *, width: float | None = None
-    ) -> Tensor:
-        """Clamp."""
-        return z.clamp(low, high)
-
-    def heaviside(self, z: Tensor, width: float) -> Tensor:
-        """Step function."""
-        return (z > 0).to(z.dtype)
-
-    def split_penalty(self, split: Tensor, limit: float) -> Tensor:
-        """Penalty of a torn robot."""
-        return -(20.0 * split.clamp_max(SPLIT_CAP)).square() * (split > limit).to(split.dtype)
-
-    def mean_over_nearest(self, values: Tensor, x: Tensor, point: Tensor, fraction: float) -> Tensor:
-        """Mean over the nearest particles."""
         index = nearest(x.detach(), point.detach(), fraction)
         return values.gather(1, index[..., None].expand(-1, -1, values.shape[2])).mean(1)
 
     def silhouette(self, observation: Tensor) -> Tensor:
-        """Occupied pixels."""
+        """Pixels (B, 64, 64) in which an observation shows matter: bool, or probabilities in the smooth form."""
         return silhouette(observation)
 
 
-class SmoothOps:
-    """Smooth approximations of the operations, see :class:`RewardOps`."""
+class SmoothOps(RewardOps):
+    """The smooth forms of the operations."""
 
     smooth = True
 
-    def clamp(
+    def clamp(  # noqa: D102
         self, z: Tensor, low: float | None = None, high: float | None = None, *, width: float | None = None
     ) -> Tensor:
-        """Soft clamp."""
         if width is not None:
             checks.number("width", width, above=0.0)
         largest = max((abs(limit) for limit in (low, high) if limit is not None), default=0.0)
@@ -126,29 +102,26 @@ class SmoothOps:
             z = z - sign * w * softplus(sign * (z - limit) / w)
         return z
 
-    def heaviside(self, z: Tensor, width: float) -> Tensor:
-        """Sigmoid; it reaches 0.02 and 0.98 four widths from 0."""
+    def heaviside(self, z: Tensor, width: float) -> Tensor:  # noqa: D102
         return torch.sigmoid(z / width)
 
-    def split_penalty(self, split: Tensor, limit: float) -> Tensor:
-        """Penalty that sets in around the limit."""
+    def split_penalty(self, split: Tensor, limit: float) -> Tensor:  # noqa: D102
         return -(20.0 * split).square() * self.heaviside(split - limit, RELATIVE_WIDTH * limit)
 
-    def mean_over_nearest(self, values: Tensor, x: Tensor, point: Tensor, fraction: float) -> Tensor:
-        """Weighted mean, differentiable in the choice too."""
+    def mean_over_nearest(  # noqa: D102
+        self, values: Tensor, x: Tensor, point: Tensor, fraction: float
+    ) -> Tensor:
         squared = _squared_distance(x, point)
         edge = squared.topk(count_of(fraction, x), largest=False).values[:, -1:]
         width = 2.0 * SELECTION_WIDTH * edge.clamp_min(SELECTION_WIDTH**2).sqrt()
         weight = torch.sigmoid((edge - squared) / width)[..., None]
         return (weight * values).sum(1) / weight.sum(1)
 
-    def silhouette(self, observation: Tensor) -> Tensor:
-        """Probabilities of pixels to be occupied."""
+    def silhouette(self, observation: Tensor) -> Tensor:  # noqa: D102
         return soft_silhouette(observation)
 
 
-EXACT: RewardOps = ExactOps()
-SMOOTH: RewardOps = SmoothOps()
+EXACT, SMOOTH = RewardOps(), SmoothOps()
 
 
 def signed_quadratic(z: Tensor, k: float) -> Tensor:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from numbers import Integral
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,9 +12,10 @@ from torch import Tensor
 
 from dittogym import core
 from dittogym.action import ActionIndexing, to_grid_indexing
+from dittogym.arguments import DTYPES, choice, find_device, find_mask, find_resolution, reset_options
 from dittogym.bodies.positions import InitialPositions, Particles, Seed, particle_counts
-from dittogym.contract import ENGINE_INFO, Measurement, measure
-from dittogym.model import PARITIES, EnvState, ParityName, check_stability, make_model
+from dittogym.contract import ENGINE_INFO, measure
+from dittogym.model import PARITIES, EnvState, ParityName, Snapshot, check_stability, make_model
 from dittogym.observation.image import SHAPE
 from dittogym.physics import Physics, merged, physics_values
 from dittogym.render.frame import frame
@@ -23,31 +23,6 @@ from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
 from torchmpm import ParticleState, checks, tree
 from torchmpm.rollout import Segment, check_repetition
-
-_DTYPES = {"float32": torch.float32, "float64": torch.float64}
-_RESET_OPTIONS = ("physics", "positions", "reset_mask")
-
-
-@dataclass(frozen=True, eq=False)
-class Snapshot:
-    """A moment of an environment, see :meth:`dittogym.TorchEnv.save`.
-
-    Attributes:
-        task: Name of the task.
-        counts: Particles of each body.
-        particle_weight: By body, the full-size particles that one particle stands for.
-        state: Everything that moves, leading B.
-        observation: (B, 3, 64, 64) uint8.
-    """
-
-    task: str
-    counts: tuple[int, ...]
-    particle_weight: tuple[float, ...]
-    state: EnvState
-    observation: Tensor
-
-
-torch.serialization.add_safe_globals([Snapshot, EnvState, Measurement])  # tensors, numbers and a name
 
 
 class TorchEnv:
@@ -112,34 +87,26 @@ class TorchEnv:
         **task_options: Any,
     ) -> None:
         self.spec = make_spec(task, **task_options)
-        dtype = str(dtype).removeprefix("torch.")
-        for name, value, allowed in (
-            ("dtype", dtype, tuple(_DTYPES)),
-            ("parity", parity, tuple(PARITIES)),
-            ("action_layout", action_layout, ("image", "grid", None)),
-        ):
-            if value not in allowed:
-                raise ValueError(f"{name} must be one of {allowed}, got {value!r}")
-        for name, flag in (("resample", resample), ("deterministic", deterministic)):
-            checks.flag(name, flag)
         self.num_envs, substeps = checks.whole("num_envs", num_envs, 1), checks.whole("substeps", substeps, 1)
         check_repetition(substeps, segment)
-        self.dtype, self.device = _DTYPES[dtype], _device(device)
+        for name, flag in (("resample", resample), ("deterministic", deterministic)):
+            checks.flag(name, flag)
+        self.dtype, self.device = choice("dtype", str(dtype).removeprefix("torch."), DTYPES), find_device(device)
         if deterministic and (self.device.type != "cpu" or backend == "compile"):
             raise ValueError(
                 "deterministic=True needs device 'cpu' and a backend other than 'compile', "
                 f"got {device!r} and {backend!r}"
             )
-        self.action_resolution = self._resolution(resolution)
+        self.action_resolution = find_resolution(self.spec, resolution)
         self.action_shape = (2, self.action_resolution, self.action_resolution)
-        self._parity = PARITIES[parity]
-        self.action_layout: ActionIndexing = action_layout or self._parity.action_indexing
-        self._counts = counts = particle_counts(self.spec, particles)
+        self._parity = choice("parity", parity, PARITIES)
+        indexing = {"image": "image", "grid": "grid", None: self._parity.action_indexing}
+        self.action_layout: ActionIndexing = choice("action_layout", action_layout, indexing)
+        counts = particle_counts(self.spec, particles)
         self.model = make_model(
             self.spec, counts, substeps=substeps, backend=backend, parity=self._parity, segment=segment
         )
-        full = counts == tuple(body.count for body in self.spec.bodies)
-        random = full or self._parity.random_positions
+        random = self._parity.random_positions or counts == tuple(body.count for body in self.spec.bodies)
         self._initial_positions = InitialPositions(self.spec, counts, self.num_envs, random=random, resample=resample)
         self._like = torch.empty(self.num_envs, dtype=self.dtype, device=self.device)
         self.device = self._like.device  # with the number of what is the current device now
@@ -148,13 +115,6 @@ class TorchEnv:
         self._observation: Tensor | None = None
         self._info: dict[str, Tensor] | None = None
         self._actuation: Tensor | None = None
-
-    def _resolution(self, resolution: str | int) -> int:
-        named = {"coarse": self.spec.coarse, "fine": self.spec.fine}
-        size: Any = named.get(resolution) if isinstance(resolution, str) else resolution
-        if isinstance(size, bool) or not isinstance(size, Integral) or not 1 <= int(size) <= self.spec.patch:
-            raise ValueError(f"resolution must be 'coarse', 'fine' or 1 to {self.spec.patch}, got {resolution!r}")
-        return int(size)
 
     @property
     def num_particles(self) -> int:
@@ -227,7 +187,8 @@ class TorchEnv:
     def save(self) -> Snapshot:
         """A copy of the present moment, to which :meth:`load` returns; keeps the autograd graph."""
         state, observation = tree.map(Tensor.clone, (self.env_state, self._present()[0]))
-        return Snapshot(self.spec.name, self._counts, self.model.particle_weight, state, observation)
+        counts, weight = self.model.camera.counts, self.model.particle_weight
+        return Snapshot(self.spec.name, counts, weight, state, observation)
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Continue from a saved moment, to the last bit as if nothing had happened since.
@@ -247,12 +208,9 @@ class TorchEnv:
         """
         if not isinstance(snapshot, Snapshot):
             raise TypeError(f"snapshot must be what save() returned, got {type(snapshot).__name__}")
-        chosen = self._mask(mask, "mask")
-        theirs = snapshot.state
-        size = len(theirs.steps)
-        x = theirs.particles.x
-        kind = (snapshot.task, snapshot.counts, snapshot.particle_weight, x.dtype, x.device)
-        own = (self.spec.name, self._counts, self.model.particle_weight, self.dtype, self.device)
+        chosen = find_mask("mask", mask, self.num_envs, self.device)
+        theirs, size, counts = snapshot.state, len(snapshot.state.steps), self.model.camera.counts
+        kind, own = snapshot.kind, (self.spec.name, counts, self.model.particle_weight, self.dtype, self.device)
         if kind != own or size not in (1, self.num_envs):
             raise ValueError(
                 f"snapshot must hold 1 or {self.num_envs} simulations of {own}, got {size} of {kind} "
@@ -288,8 +246,8 @@ class TorchEnv:
             ValueError: An option is unknown, has the wrong shape, puts particles outside the window, or makes matter
                 too stiff for the substeps.
         """
-        options = _reset_options(options)
-        mask = self._mask(options.get("reset_mask"), "reset_mask")
+        options = reset_options(options)
+        mask = find_mask("reset_mask", options.get("reset_mask"), self.num_envs, self.device)
         if self._env_state is None and not bool(mask.all()):
             raise ValueError("reset_mask must reset all elements the first time")
         physics = self._next_physics(options.get("physics"), mask)
@@ -387,19 +345,6 @@ class TorchEnv:
         """
         return frame(self.model, self.env_state, index, self._actuation if muscles else None, size)
 
-    def _mask(self, given: Any, name: str) -> Tensor:
-        if given is None:
-            return torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        try:
-            mask = torch.as_tensor(given, device=self.device)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(f"{name} must be bool of shape ({self.num_envs},), got {given!r}") from error
-        if mask.dtype != torch.bool or mask.shape != (self.num_envs,):
-            raise ValueError(
-                f"{name} must be bool of shape ({self.num_envs},), got {mask.dtype} of shape {tuple(mask.shape)}"
-            )
-        return mask
-
     def _checked(self, action: Tensor) -> Tensor:
         if not isinstance(action, Tensor) or not action.is_floating_point():
             kind = action.dtype if isinstance(action, Tensor) else type(action).__name__
@@ -411,26 +356,3 @@ class TorchEnv:
             count = int((~torch.isfinite(action)).sum())
             raise ValueError(f"action must be finite, got {count} entries that are NaN or infinite")
         return action.to(self.device, self.dtype)
-
-
-def _device(device: str | torch.device) -> torch.device:
-    try:
-        found = torch.device(device)
-    except (TypeError, RuntimeError) as error:
-        raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}") from error
-    if found.type not in ("cpu", "cuda"):
-        raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
-    if found.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device must be available, got {device!r}, but torch finds no CUDA device")
-    if found.index is not None and found.index >= (count := max(1, torch.cuda.device_count())):
-        raise ValueError(f"device must be available, got {device!r}, but torch numbers its devices 0 to {count - 1}")
-    return found
-
-
-def _reset_options(options: Any) -> dict[str, Any]:
-    if options is not None and not isinstance(options, Mapping):
-        raise ValueError(f"options must be a mapping that may hold {', '.join(_RESET_OPTIONS)}, got {options!r}")
-    for name in options or {}:
-        if name not in _RESET_OPTIONS:
-            raise ValueError(f"options may hold {', '.join(_RESET_OPTIONS)}, got {name!r}")
-    return dict(options or {})

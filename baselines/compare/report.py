@@ -26,14 +26,7 @@ th.text, td.text { text-align: left; } td { font-variant-numeric: tabular-nums; 
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of the report.
-
-    Attributes:
-        file: Name of its file.
-        title: What it shows, in a word or two.
-        caption: What it shows, in full.
-        figure: The figure.
-    """
+    """A figure of the report, with the name of its file, a title, and a caption that explains it."""
 
     file: str
     title: str
@@ -86,11 +79,8 @@ def make_tables(runs: Sequence[RunResult], groups: Sequence[Group], protocol: Pr
 
 
 def _describe_protocol(protocol: Protocol) -> str:
-    noise = {
-        "paper": f"action noise as in the paper: none in {', '.join(paper.WITHOUT_NOISE)}, in all other tasks with it",
-        "with": "action noise",
-        "without": "no action noise",
-    }[protocol.noise]
+    rule = f"action noise as in the paper: none in {', '.join(paper.WITHOUT_NOISE)}, in all other tasks with it"
+    noise = {"paper": rule, "with": "action noise", "without": "no action noise"}[protocol.noise]
     text = f"Final evaluations with {protocol.tier} particles and {noise}."
     if protocol.tier != paper.TIER:
         text += (

@@ -49,13 +49,8 @@ class Cost:
 class RunResult:
     """A run of the comparison with all that is known of it.
 
-    Attributes:
-        job: The run.
-        state: See `Job.state`; ``unevaluated`` if training has ended but the final evaluation is not complete.
-        error: Why it failed.
-        curve: Mean returns of the evaluations during training.
-        cost: None if no session has ended in order.
-        evaluation: None if there is none.
+    ``state`` is that of `Job.state`, or ``unevaluated`` if training has ended but the final evaluation is not complete;
+    ``error`` tells why it failed; ``curve`` holds the mean returns of the evaluations during training.
     """
 
     job: Job
@@ -73,14 +68,7 @@ class RunResult:
 
 @dataclass(frozen=True)
 class Group:
-    """The runs of one algorithm on one task, one per seed.
-
-    Attributes:
-        task: Name of the task.
-        observes: What the policies observe.
-        label: Name of the algorithm in the report.
-        runs: All runs, finished or not.
-    """
+    """The runs of one algorithm on one task, one per seed, finished or not."""
 
     task: str
     observes: str
@@ -96,6 +84,11 @@ class Group:
     def evaluations(self) -> list[FinalEvaluation]:
         """Final evaluations of the runs that have one."""
         return [run.evaluation for run in self.runs if run.evaluation is not None]
+
+    @property
+    def own_layouts(self) -> list[float]:
+        """Returns on the only layout that policies were made for."""
+        return [each.own_layout for each in self.evaluations if each.own_layout is not None]
 
     @property
     def scores(self) -> list[float]:
@@ -125,13 +118,18 @@ class Group:
     @property
     def speed(self) -> float | None:
         """Environment steps per second of training, over all sessions; None without any."""
-        seconds = sum(cost.seconds for cost in self.costs)
-        return sum(cost.steps for cost in self.costs) / seconds if self.costs else None
+        costs = self.costs
+        return sum(cost.steps for cost in costs) / sum(cost.seconds for cost in costs) if costs else None
 
     @property
     def teacher_seconds(self) -> float:
         """Mean wall time of the training of the runs' teachers."""
         return float(np.mean([cost.teacher_seconds for cost in self.costs])) if self.costs else 0.0
+
+    @property
+    def evaluation_seconds(self) -> float:
+        """Mean wall time of the evaluations during training."""
+        return sum(cost.evaluation_seconds for cost in self.costs) / len(self.costs)
 
     @property
     def curves(self) -> list[Curve]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -14,17 +14,19 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Column:
-    """A column.
+    """A column of a table.
 
     Attributes:
         key: Key of its values in the rows, and its name in the CSV file.
         title: Heading; an empty one restricts the column to the CSV file.
         format: Format specification of numbers; columns without one hold text.
+        value: From the subject of a row to its value, for `make_row`.
     """
 
     key: str
     title: str = ""
     format: str = ""
+    value: Callable[[Any], Any] | None = None
 
     def text(self, row: Row) -> str:
         """The value of a row, for readers."""
@@ -39,16 +41,16 @@ def columns(format: str = "", /, **titles: str) -> tuple[Column, ...]:
     return tuple(Column(key, title, format) for key, title in titles.items())
 
 
+def make_row(columns: Sequence[Column], subject: Any) -> dict[str, Any]:
+    """The values of all columns that have a ``value`` function."""
+    return {column.key: column.value(subject) for column in columns if column.value is not None}
+
+
 @dataclass(frozen=True)
 class Table:
-    """Rows of plain values; None, or a missing key, is a value that does not exist.
+    """Rows of plain values by the key of their column; None, or a missing key, is a value that does not exist.
 
-    Attributes:
-        name: Name of the CSV file, without its suffix.
-        title: Heading.
-        description: What the table shows.
-        columns: All columns.
-        rows: Values by the key of their column.
+    ``name`` is that of the CSV file, without its suffix; ``title`` and ``description`` are for readers.
     """
 
     name: str

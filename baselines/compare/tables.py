@@ -8,59 +8,56 @@ from typing import Any
 import numpy as np
 
 from baselines.compare import paper
-from baselines.compare.results import Group, RunResult
+from baselines.compare.results import Cost, Group, RunResult
 from baselines.compare.stats import align_curves, first_step_at, interquartile_mean, score_interval, wilson_interval
-from baselines.compare.table import Column, Row, Table, columns
+from baselines.compare.table import Column, Row, Table, columns, make_row
 from cfp.sections import Particles
 from dittogym import make_spec
 
 MILESTONES = (0.5, 0.75, 0.9)
 """Fractions of the way from a resting robot to the best curve, for sample efficiency."""
-GROUP = columns(task="task", sees="observes", algo="algorithm")
+GROUP = (
+    Column("task", "task", value=lambda group: group.task),
+    Column("sees", "observes", value=lambda group: group.observes),
+    Column("algo", "algorithm", value=lambda group: group.label),
+)
 RANKING = (
     "Ranks are within a task and among policies that observe the same: image, state, simulator and nothing are never "
     "ranked together."
 )
 
 
-def _group(group: Group) -> dict[str, Any]:
-    return {"task": group.task, "sees": group.observes, "algo": group.label}
-
-
 def _rank(rows: Iterable[dict[str, Any]], within: tuple[str, ...]) -> None:
     """Add ``rank`` to rows with an ``iqm``, 1 for the highest, among those that agree in the columns ``within``."""
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    rows = [row for row in rows if row["iqm"] is not None]
     for row in rows:
-        if row["iqm"] is not None:
-            groups.setdefault(tuple(row[name] for name in within), []).append(row)
-    for members in groups.values():
-        for row in members:
-            row["rank"] = 1 + sum(other["iqm"] > row["iqm"] for other in members)
+        rivals = [other for other in rows if all(other[name] == row[name] for name in within)]
+        row["rank"] = 1 + sum(other["iqm"] > row["iqm"] for other in rivals)
 
 
-RUNS = columns(run="run", algo="", sees="", task="", seed="", state="state", score="", episodes="", error="error")
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None
+
+
+RUNS = (
+    Column("run", "run", value=lambda run: run.job.name),
+    Column("algo", value=lambda run: run.job.label),
+    Column("sees", value=lambda run: run.job.observes),
+    Column("task", value=lambda run: run.job.config.task),
+    Column("seed", value=lambda run: run.job.config.seed),
+    Column("state", "state", value=lambda run: run.state),
+    Column("score", value=lambda run: run.score),
+    Column("episodes", value=lambda run: len(run.evaluation.returns) if run.evaluation else 0),
+    Column("error", "error", value=lambda run: run.error),
+)
 
 
 def runs_table(runs: Sequence[RunResult]) -> Table:
     """Every run, and why it is not finished."""
-    rows = [
-        {
-            "run": run.job.name,
-            "algo": run.job.label,
-            "sees": run.job.observes,
-            "task": run.job.config.task,
-            "seed": run.job.config.seed,
-            "state": run.state,
-            "score": run.score,
-            "episodes": 0 if run.evaluation is None else len(run.evaluation.returns),
-            "error": run.error,
-        }
-        for run in runs
-    ]
+    rows = [make_row(RUNS, run) for run in runs]
     finished = len(rows) - len(unfinished(rows))
     description = f"{finished} of {len(rows)} runs are finished and evaluated"
-    description += "." if finished == len(rows) else "; the others:"
-    return Table("runs", "Runs", description, RUNS, rows)
+    return Table("runs", "Runs", description + ("." if finished == len(rows) else "; the others:"), RUNS, rows)
 
 
 def unfinished(rows: Sequence[Row]) -> list[Row]:
@@ -70,30 +67,21 @@ def unfinished(rows: Sequence[Row]) -> list[Row]:
 
 RETURNS = (
     *GROUP,
-    *columns("d", rank="rank", seeds="seeds", episodes="episodes"),
-    *columns(".1f", iqm="IQM", low="low", high="high", mean="mean", std="std", own="own layout"),
+    Column("rank", "rank", "d"),
+    Column("seeds", "seeds", "d", lambda group: len(group.scores)),
+    Column("episodes", "episodes", "d", lambda group: sum(len(each.returns) for each in group.evaluations)),
+    Column("iqm", "IQM", ".1f", lambda group: group.iqm),
+    Column("low", "low", ".1f", lambda group: group.interval[0]),
+    Column("high", "high", ".1f", lambda group: group.interval[1]),
+    Column("mean", "mean", ".1f", lambda group: _mean(group.scores)),
+    Column("std", "std", ".1f", lambda group: float(np.std(group.scores, ddof=1)) if len(group.scores) > 1 else None),
+    Column("own", "own layout", ".1f", lambda group: _mean(group.own_layouts)),
 )
 
 
 def returns_table(groups: Sequence[Group], episodes: int) -> Table:
     """Interquartile mean of the final evaluation over seeds."""
-    rows = []
-    for group in groups:
-        scores, (low, high) = group.scores, group.interval
-        own = [each.own_layout for each in group.evaluations if each.own_layout is not None]
-        rows.append(
-            _group(group)
-            | {
-                "seeds": len(scores),
-                "episodes": sum(len(each.returns) for each in group.evaluations),
-                "iqm": group.iqm,
-                "low": low,
-                "high": high,
-                "mean": float(np.mean(scores)) if scores else None,
-                "std": float(np.std(scores, ddof=1)) if len(scores) > 1 else None,
-                "own": float(np.mean(own)) if own else None,
-            }
-        )
+    rows = [make_row(RETURNS, group) for group in groups]
     _rank(rows, ("task", "sees"))
     untrained = ", ".join(dict.fromkeys(group.label for group in groups if group.job.untrained))
     description = (
@@ -107,10 +95,10 @@ def returns_table(groups: Sequence[Group], episodes: int) -> Table:
 
 
 AGGREGATE = (
-    *columns("", sees="observes", algo="algorithm"),
+    *columns(sees="observes", algo="algorithm"),
     *columns("d", rank="rank", tasks="tasks", runs="runs"),
     *columns(".3f", iqm="IQM", low="low", high="high"),
-    *columns("", all=""),
+    Column("all"),
 )
 
 
@@ -139,14 +127,12 @@ def aggregate_table(groups: Sequence[Group]) -> Table:
 EFFICIENCY = (
     *GROUP,
     *columns(".1f", rest="rest", best="best"),
-    *(
-        column
-        for part in MILESTONES
-        for column in (
-            Column(f"steps_{part:.0%}", f"steps to {part:.0%}", ",.0f"),
-            Column(f"reached_{part:.0%}", "seeds"),
-        )
-    ),
+    Column("steps_50%", "steps to 50%", ",.0f"),
+    Column("reached_50%", "seeds"),
+    Column("steps_75%", "steps to 75%", ",.0f"),
+    Column("reached_75%", "seeds"),
+    Column("steps_90%", "steps to 90%", ",.0f"),
+    Column("reached_90%", "seeds"),
     Column("seeds"),
 )
 
@@ -168,7 +154,7 @@ def efficiency_table(groups: Sequence[Group], tier: Particles) -> Table:
     rows = []
     for group in trained:
         low, high = rest.get(group.task), best[group.task, group.observes] if group.particles == tier else None
-        row = _group(group) | {"seeds": len(group.curves), "rest": low, "best": high}
+        row = make_row(GROUP, group) | {"seeds": len(group.curves), "rest": low, "best": high}
         if low is not None and high is not None and high > low:
             row |= _milestones(group, low, high)
         rows.append(row)
@@ -202,52 +188,46 @@ def highest_point(group: Group) -> float:
     return max(float(curve.max()) for _, curve in group.curves)
 
 
+def _peak_memory(costs: Sequence[Cost]) -> float | None:
+    return max((cost.memory / 2**20 for cost in costs if cost.memory), default=None)
+
+
+def _paper_cost(group: Group) -> tuple[float, float] | tuple[None, None]:
+    return paper.COST.get(group.label, (None, None)) if group.task == "run" else (None, None)
+
+
+def _train_particles(group: Group) -> str:
+    particles = getattr(group.job.config, "train_particles", None)
+    return str(group.particles if particles is None else particles)
+
+
 COST = (
     *GROUP,
-    *columns("", device="device", particles="particles"),
-    *columns("d", robots="robots"),
-    *columns(",d", steps="steps"),
-    *columns(".1f", minutes="minutes", teacher="teacher (min)"),
-    *columns("", teacher_steps=""),
-    *columns(".1f", judging="evaluations (min)", speed="steps/s", episode="s/episode"),
-    *columns(".0f", memory="MiB", paper_episode="paper s/episode", paper_memory="paper MB"),
+    Column("device", "device", value=lambda group: "/".join(sorted({cost.device for cost in group.costs}))),
+    Column("particles", "particles", value=_train_particles),
+    Column("robots", "robots", "d", lambda group: group.job.config.environment.num_envs),
+    Column("steps", "steps", ",d", lambda group: max(cost.last_step for cost in group.costs)),
+    Column("minutes", "minutes", ".1f", lambda group: sum(c.seconds for c in group.costs) / len(group.costs) / 60),
+    Column("teacher", "teacher (min)", ".1f", lambda group: group.teacher_seconds / 60 or None),
+    Column("teacher_steps", value=lambda group: max(cost.teacher_steps for cost in group.costs) or None),
+    Column("judging", "evaluations (min)", ".1f", lambda group: group.evaluation_seconds / 60),
+    Column("speed", "steps/s", ".1f", lambda group: group.speed),
+    Column("episode", "s/episode", ".1f", lambda group: make_spec(group.task).horizon / group.speed),
+    Column("memory", "MiB", ".0f", lambda group: _peak_memory(group.costs)),
+    Column("paper_episode", "paper s/episode", ".0f", lambda group: _paper_cost(group)[0]),
+    Column("paper_memory", "paper MB", ".0f", lambda group: _paper_cost(group)[1]),
 )
 
 
 def cost_table(groups: Sequence[Group]) -> Table:
     """Time and memory of training."""
-    rows = []
-    for group in groups:
-        costs, speed, config = group.costs, group.speed, group.job.config
-        if speed is None:
-            continue
-        tier = getattr(config, "train_particles", None)
-        seconds, memory = paper.COST.get(group.label, (None, None)) if group.task == "run" else (None, None)
-        rows.append(
-            _group(group)
-            | {
-                "device": "/".join(sorted({cost.device for cost in costs})),
-                "particles": str(config.environment.particles if tier is None else tier),
-                "robots": config.environment.num_envs,
-                "steps": max(cost.last_step for cost in costs),
-                "minutes": sum(cost.seconds for cost in costs) / len(costs) / 60,
-                "teacher": group.teacher_seconds / 60 or None,
-                "teacher_steps": max(cost.teacher_steps for cost in costs) or None,
-                "judging": sum(cost.evaluation_seconds for cost in costs) / len(costs) / 60,
-                "speed": speed,
-                "episode": make_spec(group.task).horizon / speed,
-                "memory": max((cost.memory / 2**20 for cost in costs if cost.memory), default=None),
-                "paper_episode": seconds,
-                "paper_memory": memory,
-            }
-        )
     description = (
         "Training without its evaluations and without that of a teacher that is trained first, which has columns of "
         "its own: mean over seeds. An episode is the task's whole length of steps; robots that train side by side "
         "share the time. Memory is the most that a run's process held, evaluations included. Right: the paper's Table "
         "4, one robot at full size on an RTX 4090."
     )
-    return Table("cost", "Cost", description, COST, rows)
+    return Table("cost", "Cost", description, COST, [make_row(COST, group) for group in groups if group.costs])
 
 
 SUCCESS = (
@@ -267,7 +247,7 @@ def success_table(groups: Sequence[Group]) -> Table:
         successes, episodes = (sum(values) for values in zip(*counts, strict=True))
         low, high = wilson_interval(successes, episodes)
         published = paper.SUCCESS.get(group.label) if group.task == "slot" else None
-        row = _group(group) | {"successes": successes, "episodes": episodes, "rate": successes / episodes}
+        row = make_row(GROUP, group) | {"successes": successes, "episodes": episodes, "rate": successes / episodes}
         rows.append(row | {"low": low, "high": high, "paper": published})
     description = (
         "Episodes that end in success as the task defines it, of all seeds together, with Wilson's 95 % interval, "
@@ -296,9 +276,9 @@ def robustness_table(groups: Sequence[Group]) -> Table:
                 continue
             pairs = [(cases[case], cases["unperturbed"]) for cases in results]
             ratios = [value / base for value, base in pairs if value is not None and base is not None and base > 0]
-            row = _group(group) | {"case": case, "seeds": len(ratios), "paper": _published_ratio(group, case)}
-            row |= {"ratio": float(np.mean(ratios)) if ratios else None}
-            rows.append(row | {"low": min(ratios, default=None), "high": max(ratios, default=None)})
+            row = make_row(GROUP, group) | {"case": case, "seeds": len(ratios), "paper": _published_ratio(group, case)}
+            row |= {"ratio": _mean(ratios), "low": min(ratios, default=None), "high": max(ratios, default=None)}
+            rows.append(row)
     description = (
         "Return in a disturbed case divided by the unperturbed one on the same layouts: mean, lowest and highest of "
         "the seeds whose unperturbed return is positive; no ratio where a case changes nothing, such as lost pixels "
@@ -333,7 +313,7 @@ def paper_table(groups: Sequence[Group]) -> Table:
         expert = paper.EXPERTS.get(group.task, {}).get(grid) if config.algo in ("coarse", "fine") else None
         if iqm is None or (published is None and expert is None and rest is None):
             continue
-        row = _group(group) | {"grid": grid, "ours": iqm, "ours_steps": config.ends()[-1], "rest": rest}
+        row = make_row(GROUP, group) | {"grid": grid, "ours": iqm, "ours_steps": config.ends()[-1], "rest": rest}
         if published is not None:
             row |= {"paper": published[0], "band": published[1], "paper_steps": paper.CURVES[group.task][0]}
         rows.append(row | {"expert": expert[0] if expert else None})

@@ -31,7 +31,7 @@ class SegmentPolicy(StateBasedPolicy):
     Args:
         actor: The network.
         nodes: Features and actions of segments.
-        description: What it is and where it comes from, see `cfp.weights.origin`.
+        description: What it is and where it comes from, see `cfp.weights.describe_run`.
     """
 
     change: Callable[[np.ndarray], np.ndarray] | None = None

@@ -101,7 +101,7 @@ class StatePolicy(StateBasedPolicy):
         actor: The network.
         features: Its inputs.
         noise: Standard deviation before tanh of actions that are not deterministic.
-        description: What it is and where it comes from, see `cfp.weights.origin`.
+        description: What it is and where it comes from, see `cfp.weights.describe_run`.
     """
 
     def __init__(

@@ -16,7 +16,7 @@ from torch import Tensor
 import dittogym.env
 from cfp.errors import NonFiniteError
 from dittogym import TorchEnv
-from dittogym.autoreset import autoreset_step
+from dittogym.vector import autoreset_step
 from torchmpm import tree
 
 

@@ -25,7 +25,7 @@ from cfp.experiment.folder import policy_path
 from cfp.experiment.loggers import Tracker
 from cfp.experiment.process import Stopped, StopSignals
 from cfp.tables import Table
-from cfp.weights import origin
+from cfp.weights import describe_run
 
 LOG_METRICS: dict[str, str] = {
     "stage": "stage in training, 1 is the first",
@@ -71,7 +71,7 @@ class Stage:
 
     def save_policy(self) -> None:
         """Write the present policy as ``policy.safetensors``."""
-        description = origin(self.config, self.config.algo, self.number - 1, self.step)
+        description = describe_run(self.config, self.config.algo, self.number - 1, self.step)
         self.algorithm.save_policy(policy_path(self.folder), description)
 
 

@@ -32,7 +32,7 @@ class Checkpoint:
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / "state.pt"
-        self.archive = ReplayArchive(folder / "replay", 0)
+        self.archive = ReplayArchive(folder / "replay", 1)
 
     def exists(self) -> bool:
         """Whether a whole checkpoint is there."""
@@ -55,8 +55,8 @@ class Checkpoint:
             "algorithm": algorithm.state_dict(),
         }
         if (buffer := algorithm.replay_buffer) is not None:
-            if position.stage != self.archive.level + 1:
-                self.archive = ReplayArchive(self.archive.folder, position.stage - 1)
+            if position.stage != self.archive.stage:
+                self.archive = ReplayArchive(self.archive.folder, position.stage)
             rows = algorithm.num_timesteps // buffer.n_envs
             state |= {"rows": rows, "chunks": self.archive.save(buffer, rows)}
         packed = BytesIO()  # when it writes into a file, torch reports a full disk as a fault of its own
@@ -98,7 +98,7 @@ class Checkpoint:
         """
         try:
             if algorithm.replay_buffer is not None:
-                self.archive = ReplayArchive(self.archive.folder, state["stage"] - 1)
+                self.archive = ReplayArchive(self.archive.folder, state["stage"])
                 self.archive.load(algorithm.replay_buffer, state["rows"], state["chunks"])
             algorithm.load_state_dict(state["algorithm"])
             algorithm.num_timesteps = state["num_timesteps"]

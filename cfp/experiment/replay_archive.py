@@ -35,12 +35,12 @@ class ReplayArchive:
 
     Args:
         folder: Where the chunks are.
-        level: Level of the ladder, part of the file names.
+        stage: Number of the stage, counted from 1; part of the file names.
     """
 
-    def __init__(self, folder: Path, level: int) -> None:
+    def __init__(self, folder: Path, stage: int) -> None:
         self.folder = folder
-        self.level = level
+        self.stage = stage
         self.chunks: list[Chunk] = []
 
     def save(self, buffer: ReplayBuffer, rows: int) -> list[dict[str, Any]]:
@@ -53,7 +53,7 @@ class ReplayArchive:
         oldest = max(0, rows - buffer.buffer_size)
         start = max(oldest, self.chunks[-1].stop if self.chunks else 0)
         if start < rows:
-            chunk = Chunk(f"level{self.level + 1}-{start:09d}-{rows:09d}.npz", start, rows)
+            chunk = Chunk(f"stage{self.stage}-{start:09d}-{rows:09d}.npz", start, rows)
             index = np.arange(start, rows) % buffer.buffer_size
             arrays = {name: getattr(buffer, name)[index] for name in FIELDS}
             write_atomically(self.folder / chunk.file, lambda file: _write_arrays(file, arrays))
@@ -66,7 +66,7 @@ class ReplayArchive:
         wanted = {chunk.file for chunk in self.chunks}
         if self.folder.is_dir():
             for path in self.folder.iterdir():
-                if path.name.startswith("level") and path.name not in wanted:
+                if path.name.startswith("stage") and path.name not in wanted:
                     path.unlink()
 
     def load(self, buffer: ReplayBuffer, rows: int, chunks: list[dict[str, Any]]) -> None:

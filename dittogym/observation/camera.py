@@ -57,11 +57,6 @@ class Camera:
     native: bool
     _drawings: dict[tuple[torch.dtype, torch.device], Drawing] = field(default_factory=dict, repr=False)
 
-    @property
-    def bodies(self) -> tuple[tuple[int, float, bool], ...]:
-        """By body, number of particles, full-size particles that one stands for, whether its velocity is hidden."""
-        return tuple(zip(self.counts, self.particle_weight, self.hidden_velocity, strict=True))
-
     def __getstate__(self) -> dict[str, object]:
         """Copies and pickles leave out the functions of the loaded library."""
         return {**vars(self), "_drawings": {}}
@@ -80,7 +75,8 @@ class Camera:
         if not self.native or device.type != "cpu":
             return self.draw
         try:
-            return native.drawing(self, dtype)
+            bodies = zip(self.counts, self.particle_weight, self.hidden_velocity, strict=True)
+            return native.drawing(self.view, self.boxes, tuple(bodies), self.pixels, dtype)
         except ValueError as error:  # no compiler, or it failed
             warn_eager(str(error))
             return self.draw
@@ -124,12 +120,14 @@ class Camera:
         """What an image with its corner in a fine ``row`` and ``column`` (B, 1) shows."""
         finite = torch.isfinite((x + v).detach().sum(-1))
         visible = finite & GRID.contains(x[..., 0], origin[:, 0:1])
-        hidden = self._per_particle(self.hidden_velocity, torch.bool, x.device) if any(self.hidden_velocity) else None
+        hidden = None
+        if any(self.hidden_velocity):
+            hidden = per_particle(self.counts, self.hidden_velocity, torch.bool, x.device)
         moving = visible if hidden is None else visible & ~hidden
         return RasterInput(
             position=x - origin[:, None],
             velocity=(2.0 * torch.where(moving[..., None], v, 0.0)).clamp(-CLIP, CLIP),
-            weight=self._per_particle(self.particle_weight, origin.dtype, x.device),
+            weight=per_particle(self.counts, self.particle_weight, origin.dtype, x.device),
             visible=visible,
             hidden_velocity=hidden,
             row=row,
@@ -142,9 +140,6 @@ class Camera:
             return draw_boxes(self.boxes, origin, row, column)
         corner = int(row[0, 0]), int(column[0, 0])
         return draw_fixed_boxes(self.boxes, (self.window.left, 0.0), *corner, origin.dtype, origin.device)
-
-    def _per_particle(self, values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-        return per_particle(self.counts, values, dtype, device)
 
 
 @functools.lru_cache(maxsize=64)

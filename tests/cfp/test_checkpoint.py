@@ -112,7 +112,7 @@ def test_next_level_replaces_the_replay_of_the_last(tmp_path):
     checkpoint.save(coarse, CONFIG, Position(1))
     fine.learn(8)
     checkpoint.save(fine, CONFIG, Position(2, 12))
-    assert [path.name for path in (tmp_path / "replay").iterdir()] == ["level2-000000000-000000004.npz"]
+    assert [path.name for path in (tmp_path / "replay").iterdir()] == ["stage2-000000000-000000004.npz"]
     state = Checkpoint(tmp_path).read()
     other = make(2)
     Checkpoint(tmp_path).restore(other, state)

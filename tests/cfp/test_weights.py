@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -110,3 +112,43 @@ def test_file_that_is_no_policy_is_refused(saved, damage):
         save_policy(path, actor, describe(replace(preset("shapematch"), resolutions=(8, 32)), 1, 0))
     with pytest.raises(CheckpointError, match=r"policy\.safetensors: "):
         cfp.load(path)
+
+
+def images(count=3):
+    return np.random.default_rng(0).integers(0, 256, (count, 3, 64, 64)).astype(np.uint8)
+
+
+def test_loaded_policy_acts_bit_for_bit_as_the_one_in_training(saved):
+    folder, actor = saved
+    policy = cfp.load(folder)
+    trained = CFPPolicy(policy.observation_space, policy.action_space, lambda _: 1e-3, policy.spec)
+    trained.actor.load_state_dict(actor.state_dict())
+    for observation in (images(), images()[0]):
+        for deterministic in (True, False):
+            actions = []
+            for each in (policy, trained):
+                torch.manual_seed(0)
+                actions.append(each.predict(observation, deterministic=deterministic)[0])
+            np.testing.assert_array_equal(*actions)
+
+
+@pytest.mark.parametrize(
+    ("name", "first", "total"),
+    [
+        ("catch", [-0.3005871, -0.2780790], -6.537447),
+        ("grow", [0.0042593, 0.8421199], 20.113045),
+        ("run", [-0.0860536, 0.0609695], 1.753389),
+        ("shapematch", [0.0462381, 0.0514195], -3.174450),
+    ],
+)
+def test_shipped_policies_act_as_when_they_were_shipped(name, first, total):
+    actions, _ = cfp.load(name).predict(images(), deterministic=True)
+    np.testing.assert_allclose(actions[0, 0, 0, :2], first, atol=1e-5)
+    assert actions.sum(dtype=np.float64) == pytest.approx(total, abs=1e-3)
+
+
+def test_loading_a_policy_imports_neither_tensorboard_nor_tyro():
+    program = "import sys, cfp; cfp.load('run'); print(*sys.modules)"
+    modules = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert "cfp.agent.actor_policy" in modules
+    assert not {"tensorboard", "torch.utils.tensorboard", "tyro", "stable_baselines3"} & set(modules)

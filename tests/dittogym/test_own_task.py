@@ -12,7 +12,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
-from tiny import SMALL, actions, tiny
+from tiny import SMALL, actions, assert_same_bits, everything, tiny
 
 import dittogym
 from dittogym.bodies.shapes import Disc, Rectangle
@@ -239,6 +239,74 @@ def test_memory_and_objects_of_a_task_of_ones_own() -> None:
     assert "is_success" not in info
 
 
+def test_an_outcome_without_info() -> None:
+    env = tiny(dataclasses.replace(hop(), reward_fn=lambda moment, spec: height(moment, spec)._replace(info=None)))
+    env.reset(seed=0)
+    assert set(env.step(actions(env, 1)[0])[-1]) == {"reward_terms", "com", "split", "finite", "is_success"}
+
+
+def test_a_reset_of_some_elements_leaves_the_others_alone() -> None:
+    """Only the positions and images of the elements that are reset are computed."""
+    sizes = []
+
+    def memory(moment: Moment, spec: TaskSpec) -> dict[str, torch.Tensor]:
+        sizes.append((len(moment.particles.x), len(moment.observation)))
+        return {"start": moment.now.com}
+
+    env = tiny(dataclasses.replace(hop(), initial_memory=memory), 3)
+    env.reset(seed=0)
+    env.reset(options={"reset_mask": [False, True, False]})
+    assert sizes == [(3, 3), (1, 1)]
+
+
+def test_a_reset_that_fails_changes_nothing() -> None:
+    working = True
+
+    def memory(moment: Moment, spec: TaskSpec) -> dict[str, torch.Tensor]:
+        return {"start": moment.now.com} if working else {}["missing"]
+
+    spec = dataclasses.replace(hop(), initial_memory=memory)
+    env, untouched = (tiny(spec, 2, resample=True) for _ in range(2))
+    env.reset(seed=0), untouched.reset(seed=0)
+    before, working = everything(env), False
+    for options in ({"physics": {"mu": 100.0}}, {"positions": env.state.x + 0.01}, {"reset_mask": [True, False]}):
+        with pytest.raises(KeyError):
+            env.reset(seed=[7, None], options=options)
+    assert_same_bits(everything(env), before)
+    working = True
+    env.reset(), untouched.reset()
+    assert_same_bits(everything(env), everything(untouched))
+
+
+def test_weights_name_every_term() -> None:
+    env = tiny(dataclasses.replace(hop(), weights={"heigth": 7.0}))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"weights of task 'hop' must hold every term .* got none for \['height'\]"):
+        env.step(actions(env, 1)[0])
+
+
+@pytest.mark.parametrize("task", ["grow", "dig", "catch"])
+def test_a_goal_that_is_replaced_is_rewarded_and_marked(task: str) -> None:
+    spec = dittogym.make_spec(task)
+    far = dataclasses.replace(spec, goal=(spec.goal[0] + 0.2, spec.goal[1]))
+    results = []
+    for each in (spec, far):
+        env = tiny(each)
+        observation = env.reset(seed=0)[0]
+        results.append((observation, env.step(torch.zeros(1, *env.action_shape, dtype=env.dtype))[1]))
+    assert not torch.equal(results[0][0], results[1][0]) and not torch.equal(results[0][1], results[1][1])
+
+
+def test_a_target_that_is_replaced_is_rewarded() -> None:
+    spec = dittogym.make_spec("shapematch")
+    envs = [tiny(each) for each in (dataclasses.replace(spec, target=~spec.target), spec)]
+    mismatch = []
+    for env in envs:
+        env.reset(seed=0)
+        mismatch.append(float(env.step(actions(env, 1)[0])[-1]["reward_terms"]["mismatch"]))
+    assert sum(mismatch) == pytest.approx(-0.1 * 64 * 64)  # each pixel differs from one of the two
+
+
 @pytest.mark.parametrize(
     ("remembered", "error", "message"),
     [
@@ -342,6 +410,7 @@ def test_a_longer_limit_than_the_horizon() -> None:
             {"memory": {"best": torch.zeros(2)}},
             r"memory like that of initial_memory, {'first': .*got {'best': 'torch.float32",
         ),
+        ({"memory": {}}, r"memory like that of initial_memory, {'first': .*, got {}"),
         ({"memory": {"first": torch.zeros(2)}}, r"{'first': 'torch.float64 of shape \(2, 2\)'}, got {'first': 'torch"),
     ],
 )

@@ -366,11 +366,11 @@ def test_gradients_stay_with_the_masked_elements() -> None:
         ({"mu": 0.0}, r"physics\['mu'\] must be finite, positive, got 0.0"),
         ({"mu": [1.0, -2.0]}, r"physics\['mu'\] must be finite, positive, got -2.0"),
         ({"mass": 0.0}, r"physics\['mass'\] must be finite, positive, got 0.0"),
-        ({"lam": -1.0}, r"physics\['lam'\] must be finite, not negative, got -1.0"),
         ({"yield_stress": -1.0}, r"physics\['yield_stress'\] must be finite, not negative"),
         ({"max_actuation": -1.0}, r"physics\['max_actuation'\] must be finite, not negative"),
         ({"mu": float("nan")}, r"physics\['mu'\] must be finite, positive, got nan"),
-        ({"lam": float("inf")}, r"physics\['lam'\] must be finite, not negative, got inf"),
+        ({"lam": float("inf")}, r"physics\['lam'\] must be finite, got inf"),
+        ({"lam": -1e6}, "stiffness not negative"),
         ({"gravity": (0.0, float("nan"))}, r"physics\['gravity'\] must be finite, got nan"),
     ],
 )
@@ -409,6 +409,16 @@ def test_matter_too_stiff_for_the_substeps_is_refused() -> None:
     env.reset(options={"physics": {"mu": 3000.0}})
     with pytest.raises(ValueError, match="got matter so stiff and light"):
         tiny(replace(dittogym.make_spec("run"), mu=9000.0))
+
+
+def test_a_negative_lame_parameter_is_that_of_the_task() -> None:
+    """A negative Poisson's ratio, as a task may have it too."""
+    env, auxetic = tiny("run"), tiny(replace(dittogym.make_spec("run"), lam=-60.0))
+    env.reset(seed=0, options={"physics": {"lam": -60.0}})
+    auxetic.reset(seed=0)
+    action = actions(env, 1)[0]
+    env.step(action), auxetic.step(action)
+    torch.testing.assert_close(env.state.x, auxetic.state.x, rtol=0, atol=1e-12)
 
 
 def test_zero_is_allowed_where_it_makes_sense() -> None:

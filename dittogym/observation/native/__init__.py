@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -43,45 +42,34 @@ class Picture(ctypes.Structure):
     ]
 
 
-class Camera(Protocol):
-    """What the function reads of a :class:`dittogym.observation.camera.Camera`."""
-
-    @property
-    def view(self) -> Centre:
-        """Centre of the image."""
-
-    @property
-    def boxes(self) -> tuple[Box, ...]:
-        """What is shown besides particles."""
-
-    @property
-    def bodies(self) -> tuple[tuple[int, float, bool], ...]:
-        """By body, number of particles, full-size particles that one stands for, whether its velocity is hidden."""
-
-    @property
-    def pixels(self) -> bool:
-        """Whether to use the pixel raster."""
-
-
-def drawing(camera: Camera, dtype: torch.dtype) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
-    """A function that draws what a camera sees, for tensors of one type on the CPU.
+def drawing(
+    view: Centre,
+    boxes: Sequence[Box],
+    bodies: Sequence[tuple[int, float, bool]],
+    pixels: bool,
+    dtype: torch.dtype,
+) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
+    """A function that draws what a :class:`dittogym.observation.camera.Camera` sees, for tensors on the CPU.
 
     Args:
-        camera: Its tables are made here, once.
+        view: Centre of the image.
+        boxes: What is shown besides particles.
+        bodies: By body, number of particles, full-size particles that one stands for, whether its velocity is hidden.
+        pixels: Whether to use the pixel raster.
         dtype: float32 or float64.
 
     Raises:
         ValueError: There is no compiler, or it failed.
     """
     function = getattr(build(_SOURCE, *_OPTIONS), _FUNCTIONS[dtype])
-    body = torch.tensor(camera.bodies, dtype=torch.float64, device="cpu")
-    boxes = [(b.left, b.right, b.bottom, b.top, b.closed) for b in camera.boxes]
-    box = torch.tensor(boxes, dtype=torch.float64, device="cpu")
+    body = torch.tensor(list(bodies), dtype=torch.float64, device="cpu")
+    edges = [(b.left, b.right, b.bottom, b.top, b.closed) for b in boxes]
+    box = torch.tensor(edges, dtype=torch.float64, device="cpu")
     constants = {
-        "pixels": camera.pixels,
-        "bodies": len(camera.bodies),
+        "pixels": pixels,
+        "bodies": len(bodies),
         "boxes": len(boxes),
-        "view": tuple(math.nan if c is None else c for c in camera.view),
+        "view": tuple(math.nan if c is None else c for c in view),
         "margin": GRID.margin,
         "extent": GRID.resolution * GRID.h - GRID.margin,
         "clip": CLIP,

@@ -1,0 +1,70 @@
+"""Arguments of :class:`dittogym.TorchEnv`: what they may be, and what they stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from numbers import Integral
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from dittogym.spec import TaskSpec
+
+Value = TypeVar("Value")
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+RESET_OPTIONS = ("physics", "positions", "reset_mask")
+
+
+def choice(name: str, given: Any, choices: Mapping[Any, Value]) -> Value:
+    """What one of a few choices stands for."""
+    if given not in tuple(choices):
+        raise ValueError(f"{name} must be one of {tuple(choices)}, got {given!r}")
+    return choices[given]
+
+
+def find_resolution(spec: TaskSpec, resolution: str | int) -> int:
+    """Action cells per axis."""
+    named = {"coarse": spec.coarse, "fine": spec.fine}
+    size: Any = named.get(resolution) if isinstance(resolution, str) else resolution
+    if isinstance(size, bool) or not isinstance(size, Integral) or not 1 <= int(size) <= spec.patch:
+        raise ValueError(f"resolution must be 'coarse', 'fine' or 1 to {spec.patch}, got {resolution!r}")
+    return int(size)
+
+
+def find_mask(name: str, given: Any, num_envs: int, device: torch.device) -> Tensor:
+    """A mask of elements, (B,) bool; ``None`` stands for all."""
+    if given is None:
+        return torch.ones(num_envs, dtype=torch.bool, device=device)
+    try:
+        mask = torch.as_tensor(given, device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{name} must be bool of shape ({num_envs},), got {given!r}") from error
+    if mask.dtype != torch.bool or mask.shape != (num_envs,):
+        raise ValueError(f"{name} must be bool of shape ({num_envs},), got {mask.dtype} of shape {tuple(mask.shape)}")
+    return mask
+
+
+def find_device(device: str | torch.device) -> torch.device:
+    """The device that the option ``device`` names."""
+    try:
+        found = torch.device(device)
+    except (TypeError, RuntimeError) as error:
+        raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}") from error
+    if found.type not in ("cpu", "cuda"):
+        raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
+    if found.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device must be available, got {device!r}, but torch finds no CUDA device")
+    if found.index is not None and found.index >= (count := max(1, torch.cuda.device_count())):
+        raise ValueError(f"device must be available, got {device!r}, but torch numbers its devices 0 to {count - 1}")
+    return found
+
+
+def reset_options(options: Any) -> dict[str, Any]:
+    """The options of a reset, of which there are :data:`RESET_OPTIONS`."""
+    if options is not None and not isinstance(options, Mapping):
+        raise ValueError(f"options must be a mapping that may hold {', '.join(RESET_OPTIONS)}, got {options!r}")
+    for name in options or {}:
+        if name not in RESET_OPTIONS:
+            raise ValueError(f"options may hold {', '.join(RESET_OPTIONS)}, got {name!r}")
+    return dict(options or {})
