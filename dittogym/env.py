@@ -28,11 +28,7 @@ def spaces(env: TorchEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
 
 
 def as_tensor(action: Any, env: TorchEnv, single: bool = False) -> torch.Tensor:
-    """A NumPy action batch as a tensor, or a clear error; ``single``: one action, which becomes a batch of one.
-
-    Raises:
-        ValueError: Not numbers, or not of shape (B, 2, R, R).
-    """
+    """A NumPy action batch as a tensor, or a clear error; ``single``: one action, which becomes a batch of one."""
     try:
         array = np.asarray(action)
     except ValueError:  # rows of different lengths

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dittogym import core
 from dittogym.action import ActionIndexing, to_grid_indexing
-from dittogym.arguments import DTYPES, choice, find_device, find_mask, find_resolution, reset_options
+from dittogym.arguments import DTYPES, check_action, choice, find_device, find_mask, find_resolution, reset_options
 from dittogym.bodies.positions import InitialPositions, Particles, Seed, particle_counts
 from dittogym.contract import ENGINE_INFO, measure
 from dittogym.model import PARITIES, EnvState, ParityName, Snapshot, check_stability, make_model
@@ -187,8 +187,7 @@ class TorchEnv:
     def save(self) -> Snapshot:
         """A copy of the present moment, to which :meth:`load` returns; keeps the autograd graph."""
         state, observation = tree.map(Tensor.clone, (self.env_state, self._present()[0]))
-        counts, weight = self.model.camera.counts, self.model.particle_weight
-        return Snapshot(self.spec.name, counts, weight, state, observation)
+        return Snapshot(self.spec.name, self.model.camera.counts, self.model.particle_weight, state, observation)
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Continue from a saved moment, to the last bit as if nothing had happened since.
@@ -308,7 +307,8 @@ class TorchEnv:
         Raises:
             ValueError: The action has the wrong shape or type or is not finite.
         """
-        action = to_grid_indexing(self._checked(action), self.action_layout)
+        action = check_action(action, (self.num_envs, *self.action_shape)).to(self.device, self.dtype)
+        action = to_grid_indexing(action, self.action_layout)
         result = core.step(self.model, self.env_state, action, soft=soft)
         info: dict[str, Any] = {"reward_terms": dict(result.terms), **result.info}
         if result.success is not None:
@@ -344,15 +344,3 @@ class TorchEnv:
             (S, S, 3) uint8 for S = ``size``.
         """
         return frame(self.model, self.env_state, index, self._actuation if muscles else None, size)
-
-    def _checked(self, action: Tensor) -> Tensor:
-        if not isinstance(action, Tensor) or not action.is_floating_point():
-            kind = action.dtype if isinstance(action, Tensor) else type(action).__name__
-            raise ValueError(f"action must be a floating point tensor, got {kind}")
-        expected = (self.num_envs, *self.action_shape)
-        if tuple(action.shape) != expected:
-            raise ValueError(f"action must have shape {expected}, got {tuple(action.shape)}")
-        if not bool(torch.isfinite(action).all()):
-            count = int((~torch.isfinite(action)).sum())
-            raise ValueError(f"action must be finite, got {count} entries that are NaN or infinite")
-        return action.to(self.device, self.dtype)

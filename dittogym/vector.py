@@ -45,13 +45,7 @@ class AutoresetStep(NamedTuple):
 
 
 def autoreset_step(env: Any, action: Tensor, max_episode_steps: float | None = None) -> AutoresetStep:
-    """Step all elements, and reset those whose episode has ended.
-
-    Args:
-        env: A :class:`dittogym.TorchEnv`, or another environment with its ``step`` and ``reset``.
-        action: (B, 2, R, R).
-        max_episode_steps: Steps after which an episode is truncated; ``None`` leaves it to the environment.
-    """
+    """Step all elements, and reset those whose episode has ended."""
     observation, reward, terminated, truncated, info = env.step(action)
     if max_episode_steps is not None:
         truncated = env.env_state.steps >= max_episode_steps

@@ -34,9 +34,6 @@ def particle_counts(spec: TaskSpec, particles: Particles) -> tuple[int, ...]:
 
     A single number keeps the full-size ratio between the bodies; so does ``"lite"``, unless a body of the task has a
     number of its own, ``BodySpec.lite``.
-
-    Raises:
-        ValueError: Not one of the allowed forms, or a count below 1.
     """
     full = tuple(body.count for body in spec.bodies)
     if particles == "full":
@@ -135,18 +132,7 @@ class InitialPositions:
     positions: Tensor | None = None
 
     def draw(self, seed: Seed, mask: np.ndarray, given: Any, like: Tensor) -> InitialPositions:
-        """The initial positions of the next episodes; elements outside ``mask`` (B,) keep theirs.
-
-        Args:
-            seed: Of the first element, the others follow, or one for each; ``None``, for all or for one, continues the
-                present sampler.
-            mask: Which elements are reset.
-            given: (N, 2) or (B, N, 2) positions, or ``None``.
-            like: Gives dtype and device.
-
-        Raises:
-            ValueError: Positions have the wrong shape or lie outside the window, or a seed is out of range.
-        """
+        """The initial positions of the next episodes; elements outside ``mask`` (B,) keep theirs."""
         seeds, samplers = self._seeds(seed), dict(self.samplers)
         # Every element has positions from the first draw on.
         mask = np.ones_like(mask) if self.positions is None else mask.copy()

@@ -96,9 +96,6 @@ class Camera:
         and 255, where their derivative is zero. The derivative is continuous except at these ends, at the cap on
         velocities (5 m/s), for particles at the edge of the simulated window, and where edges of boxes meet edges of
         pixels.
-
-        Returns:
-            (B, 3, 64, 64) occupancy and velocities (x, y); zero velocity at 132.
         """
         follows = (self.view[0] is None and not self.window.moves, self.view[1] is None)
         row, column = smooth_crop_corner(centre_in_window(self.view, centre, origin), follows)

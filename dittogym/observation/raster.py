@@ -97,11 +97,7 @@ def _between(value: Tensor, low: float, high: float, closed: bool) -> Tensor:
 
 
 def pixel_means(shown: RasterInput) -> Tensor:
-    """The reference's raster: a fine pixel is set by any particle in it and has the velocity of the last one.
-
-    Returns:
-        (B, 3, 64, 64) means over image pixels of occupancy and both velocities.
-    """
+    """The reference's raster, (B, 3, 64, 64): a particle sets its fine pixel, the last one in it gives its velocity."""
     position, velocity, _, visible, hidden, row, column, background = shown
     batch, count = visible.shape
     width = SIZE * BLOCK
@@ -131,13 +127,10 @@ def pixel_means(shown: RasterInput) -> Tensor:
 
 
 def splat_means(shown: RasterInput) -> Tensor:
-    """What the reference's raster of full-size bodies would show on average, from fewer particles.
+    """What the reference's raster of full-size bodies would show on average, (B, 3, 64, 64), from fewer particles.
 
     Particles are spread over image pixels by quadratic B-splines, which gives the number n of full-size particles to
     expect in a pixel; the fraction of its fine pixels that they hit is ``1 - exp(-n / SATURATION)``.
-
-    Returns:
-        (B, 3, 64, 64) means over image pixels of occupancy and both velocities.
     """
     hidden, background = shown.hidden_velocity, shown.background
     weight, ids = _splat_weights(shown)

@@ -47,20 +47,14 @@ def fingerprint(task: str) -> str | None:
 
 
 def allowed_instead(task: object) -> str | None:
-    """What is allowed in place of something that is no task; ``None`` where it is one.
-
-    Args:
-        task: A name from :data:`dittogym.TASKS`, or ``"MODULE:NAME"``: a module, which is imported, and a task that it
-            registers. The module's name has no dots: options from elsewhere shall not reach the files that came with
-            them in some folder below the current one.
-    """
+    """What is allowed in place of something that is not a task; ``None`` where it is one."""
     allowed = f"{', '.join(sorted(TASKS))} or MODULE:NAME"
     if not isinstance(task, str):
         return allowed
     module, colon, name = task.rpartition(":")
     if colon:
         try:
-            if not module.isidentifier():
+            if not module.isidentifier():  # options from elsewhere must not reach files below the current folder
                 raise ImportError("its name must be a word, without dots")
             if getattr(importlib.import_module(module), "__file__", None) is None:
                 raise ImportError("that is a folder, not a file")
