@@ -152,7 +152,7 @@ def _names_default(task: str, option: str, mine: Any, theirs: Any) -> bool:
 
 
 def check_folder(job: Job) -> None:
-    """Check that the run in a job's folder, if there is one, has the same options and the same task."""
+    """Check that the run in a job's folder, if there is one, has the same options and task."""
     if not holds_run(job.folder):
         return
     if not (job.folder / "config.json").exists():
@@ -174,6 +174,6 @@ def check_folder(job: Job) -> None:
 
 
 def read_sessions(folder: Path) -> dict[str, Any]:
-    """``sessions.json``: the step at which training ended or false, and a record of each session that ended in order."""
+    """``sessions.json``: the step at which training ended or false, and a record per session that ended in order."""
     path = folder / "sessions.json"
     return read_record(path, finished=int, sessions=list) if path.exists() else {"finished": False, "sessions": []}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from baselines.compare.executor import Executor, Resources
 from baselines.compare.jobs import Job
-from baselines.compare.worker import EXIT_CODES, Outcome, carry_out, encode
+from baselines.compare.worker import EXIT_CODES, Outcome, carry_out
 from cfp.experiment.process import StopSignals
 from cfp.files import write_text
 
@@ -109,7 +110,7 @@ def run_process(job: Job, threads: int, lock_timeout: float, urgency: Callable[[
         )
     assert process.stdin is not None
     try:
-        process.stdin.write(encode(job, lock_timeout))
+        pickle.dump((job, lock_timeout), process.stdin)
         process.stdin.flush()
     except BrokenPipeError:
         pass  # the process has ended already; its exit code says how
