@@ -30,8 +30,8 @@ class TorchEnv:
 
     Rewards and states keep their autograd graph as long as gradients are enabled: differentiate through
     :meth:`step`, cut the graph with :meth:`detach`, or run under ``torch.no_grad()``. The observation is an integer
-    image and has no gradient. Nothing is reset by itself: an element that has ended goes on until :meth:`reset` is
-    called with a mask. Element i of a batch reset with seed s is the single environment reset with seed s + i.
+    image and has no gradient. Elements are not reset automatically: one that has ended continues until :meth:`reset`
+    is called with a mask. Element i of a batch reset with seed s is the single environment reset with seed s + i.
 
     Args:
         task: A task name or a :class:`dittogym.spec.TaskSpec`.
@@ -46,7 +46,7 @@ class TorchEnv:
             ``"grid"``: (x, y), as in the reference implementation. ``None``: ``"grid"`` with reference parity, else
             ``"image"``.
         parity: ``"clean"``, or ``"reference"`` to bring back the reference's stale observation and action centre
-            after a reset, its random layout, unit particle volume and pixel raster at every particle count.
+            after a reset, its random positions, unit particle volume and pixel raster at every particle count.
         resample: Draw new particles at every reset, not only at a seeded one.
         deterministic: Accept only what repeats a trajectory bit by bit for one seed and number of threads: the CPU, and
             not the backend ``"compile"``.
@@ -123,11 +123,11 @@ class TorchEnv:
 
     @property
     def env_state(self) -> EnvState:
-        """Everything that moves, for :mod:`dittogym.core`; see also :meth:`save`. An assignment goes on from there.
+        """Everything that moves, for :mod:`dittogym.core`; see also :meth:`save`. Assign a state to continue from it.
 
         Raises:
-            RuntimeError: Neither reset nor assigned yet.
-            TypeError: What is assigned is something else.
+            RuntimeError: It was neither reset nor assigned.
+            TypeError: The assigned value is not an EnvState.
             ValueError: It has another number of simulations or particles, another dtype or device.
         """
         if self._env_state is None:
@@ -166,7 +166,7 @@ class TorchEnv:
         return self.env_state.particles
 
     def _present(self) -> tuple[Tensor, dict[str, Tensor]]:
-        """Observation and measured info of the present state, computed anew where the state was assigned."""
+        """Observation and measured info of the present state, computed again if the state was assigned."""
         if self._observation is None:
             self._observation = core.observe(self.model, self.env_state)
         if self._info is None:
@@ -230,7 +230,7 @@ class TorchEnv:
         """Start new episodes. A reset that raises an error changes nothing.
 
         Args:
-            seed: Seeds element i with ``seed + i``, or with ``seed[i]``, and draws its particles anew. Without it, or
+            seed: Seeds element i with ``seed + i``, or with ``seed[i]``, and draws new positions. Without it, or
                 where ``seed[i]`` is ``None``, the last positions are used again, unless ``resample`` was asked for.
             options: ``"positions"``: (N, 2) or (B, N, 2) world positions in m, robot first, used until the next seed,
                 with ``resample`` until the next reset;

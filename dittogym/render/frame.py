@@ -60,12 +60,7 @@ def frame(model: Model, state: EnvState, index: int, actuation: Tensor | None, s
 
 
 class Canvas:
-    """An image of the window that is drawn into by world coordinates.
-
-    Args:
-        pixels: Pixels per side.
-        origin: Lower left corner of the window in the world, m.
-    """
+    """An image of the window at ``origin`` (2,), m, that is drawn into by world coordinates."""
 
     def __init__(self, pixels: int, origin: np.ndarray) -> None:
         self.pixels, self.origin = pixels, origin
