@@ -137,7 +137,7 @@ class Shac(Algorithm):
     def __init__(self, config: ShacConfig, stage: int = 1, start: Policy | None = None) -> None:
         self.config = config
         own = replace(config, environment=config.environment.for_training(config.train_particles))
-        self.env = make_torch_env(own, config.resolution(stage - 1))
+        self.env = make_torch_env(own, config.resolution(stage))
         self.features = StateFeatures(config.deformation, config.clock, config.displacement)
         with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             torch.manual_seed(config.seed)
@@ -196,7 +196,7 @@ class Shac(Algorithm):
         """The policy that the actor begins with, if the options name one."""
         if config.start_from is None:
             return None
-        policy, wanted = policy_for(config, config.start_from), (config.resolution(0),)
+        policy, wanted = policy_for(config, config.start_from), (config.resolution(1),)
         if policy.spec.resolutions != wanted:
             raise ConfigError(f"start_from: got a policy of levels {policy.spec.resolutions}, allowed {wanted}")
         return policy
