@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from baselines.distillation.config import DistillConfig
-from baselines.distillation.teachers import is_record_of_another_start, read_teacher
+from baselines.distillation.teachers import is_record_of_one_start, read_teacher
 from baselines.registry import configure, find
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.folder import copy_policy, policy_path
@@ -46,12 +46,12 @@ def copy_teacher(config: DistillConfig, folder: Path) -> None:
     write_policy(teacher_path(folder), *read_policy(teacher))
 
 
-def warn_of_recorded_teacher(config: DistillConfig, folder: Path) -> list[str]:
-    """A line if the teacher is the record of one episode, in a task whose episodes start differently."""
+def warnings(config: DistillConfig, folder: Path) -> list[str]:
+    """A warning if the teacher is the record of one episode, in a task whose episodes start differently."""
     if config.teacher in ("mpc", *TRAINED):
         return []
     teacher = read_teacher(teacher_path(folder), config.task, config.environment)
-    if not is_record_of_another_start(teacher, config.task, config.environment):
+    if not is_record_of_one_start(teacher, config.task, config.environment):
         return []
     return [
         f"teacher: the record of one planned episode, while every episode of {config.task} starts differently; "

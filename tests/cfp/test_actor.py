@@ -124,7 +124,7 @@ def test_closed_gates_leave_the_coarsest_field(task):
                 env = make_torch_env(shut, shut.action_size(stage))
                 observation, _ = env.reset(seed=0)
                 env.step(actor(observation, deterministic=True))
-                fields.append(env._field)
+                fields.append(env._actuation)
         share = (fields[0].abs() == fields[0].abs().max()).float().mean()
         assert 0 < share < 0.9
         for field in fields[1:]:

@@ -213,7 +213,7 @@ def test_layout_of_actions_can_be_chosen():
         env = make_env(config, 2, 1)
         env.reset()
         env.step(np.array([[[[0.0, 1.0], [0.0, 0.0]]] * 2], np.float32))  # row 0, column 1
-        pull = env.venv.torch_env._field[0, 0]
+        pull = env.venv.torch_env._actuation[0, 0]
         return (pull > 0.9 * pull.max()).nonzero().float().mean(0).tolist()  # to the right, upwards
 
     image, grid, reference = field(), field("--action-layout", "grid"), field("--parity", "reference")
