@@ -1,7 +1,7 @@
-"""What a training step costs and where its time goes: `python benchmarks/training.py`.
+"""Cost of a training step and its parts: `python benchmarks/training.py`.
 
-Prints seconds an update (batches of the quick and the paper preset, float32 and bfloat16 in turn), training steps a
-second of the quick preset with the shares of simulation, updates and the rest, and environment steps a second alone.
+Prints seconds per update (batches of the quick and the paper preset, float32 and bfloat16 in turn), training steps per
+second of the quick preset with the shares of simulation, updates and the rest, and environment steps per second alone.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from cfp.experiment.process import keep_memory
 
 
 def make_model(config: Config, level: int, num_envs: int) -> CFP:
-    """The model of one level of a configuration, with updates from the first steps on."""
+    """The model of one stage of a configuration, with updates from the first steps on."""
     hyperparameters = replace(
         config.hyperparameters(level), buffer_size=2_000, update_start=config.learning.batch_size, random_steps=0
     )
@@ -50,9 +50,9 @@ def make_batch(size: int, resolution: int) -> ReplayBufferSamples:
 
 
 def in_turn(cases: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Least seconds of each case; the cases take turns, so that other programs disturb all of them alike."""
+    """Minimum seconds of each case; the cases take turns, so that other programs slow down all of them alike."""
     least = dict.fromkeys(cases, float("inf"))
-    for number in range(rounds + 2):  # the first two are thrown away
+    for number in range(rounds + 2):  # two rounds for warming up
         for name, run in cases.items():
             start = time.perf_counter()
             run()
@@ -62,8 +62,8 @@ def in_turn(cases: dict[str, Callable[[], object]], rounds: int) -> dict[str, fl
 
 
 def updates(config: Config, modes: list[str], rounds: int) -> None:
-    """Print seconds an update."""
-    print("| level | batch | " + " | ".join(modes) + f" | {modes[-1]} : {modes[0]} |")
+    """Print seconds per update."""
+    print("| stage | batch | " + " | ".join(modes) + f" | {modes[-1]} : {modes[0]} |")
     print("| --- " * (3 + len(modes)) + "|")
     for level in (0, 1):
         for size in (64, 256):
@@ -96,8 +96,8 @@ def timed(owner: object, name: str, clock: dict[str, float]) -> Iterator[None]:
 
 
 def training(config: Config, steps: int) -> None:
-    """Print training steps a second and their shares."""
-    print("| level | robots | updates a step | precision | training steps/s | simulation | updates | rest |")
+    """Print training steps per second and the shares of their parts."""
+    print("| stage | robots | updates per step | precision | training steps/s | simulation | updates | rest |")
     print("| --- " * 8 + "|")
     for level in (0, 1):
         for num_envs, gradient_steps in ((1, 1), (config.environment.num_envs, config.learning.gradient_steps)):
@@ -116,7 +116,7 @@ def training(config: Config, steps: int) -> None:
 
 
 def environments(steps: int) -> None:
-    """Print environment steps a second of RUN under Gymnasium's vector interface."""
+    """Print environment steps per second of RUN under Gymnasium's vector interface."""
     for count in (16, 64):
         env = gymnasium.make_vec(
             "dittogym/run-coarse-v0", num_envs=count, vectorization_mode="vector_entry_point", particles="lite"

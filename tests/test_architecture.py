@@ -33,16 +33,7 @@ UNSAFE_MODULES = {"cloudpickle", "dill", "joblib", "marshal", "pickle", "shelve"
 HARMLESS = {"PickleError", "PicklingError", "UnpicklingError"}
 
 OWN_GENERATORS = {
-    "numpy.random": {
-        "BitGenerator",
-        "Generator",
-        "MT19937",
-        "PCG64",
-        "Philox",
-        "RandomState",
-        "SeedSequence",
-        "default_rng",
-    },
+    "numpy.random": set("BitGenerator Generator MT19937 PCG64 Philox RandomState SeedSequence default_rng".split()),
     "random": {"Random", "SystemRandom"},
 }
 GLOBAL_STATE = {
@@ -60,14 +51,7 @@ GLOBAL_STATE = {
 DRAWS = {f"torch.{name}" for name in ("bernoulli", "multinomial", "normal", "rand", "randint", "randn", "randperm")}
 DRAWS |= {f"torch.{name}_like" for name in ("rand", "randint", "randn")}
 DRAWING_METHODS = {
-    "bernoulli_",
-    "cauchy_",
-    "exponential_",
-    "geometric_",
-    "log_normal_",
-    "normal_",
-    "random_",
-    "uniform_",
+    f"{name}_" for name in "bernoulli cauchy exponential geometric log_normal normal random uniform".split()
 }
 
 

@@ -1,4 +1,4 @@
-"""Policies that act on the state of a simulation instead of the image."""
+"""Policies that act on the state of a simulation instead of the image, and copies of actors as policies."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from cfp.agent.actor_policy import ActorPolicy
+from cfp.agent.spec import ActorSpec
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
 
@@ -96,6 +98,19 @@ class StateBasedPolicy(ABC):
         self, env: TorchEnv, state: tuple[np.ndarray, ...] | None, deterministic: bool
     ) -> tuple[Tensor, tuple[np.ndarray, ...] | None]:
         """Actions (B, 2, R, R) for the state of an environment, and the memory for the next step."""
+
+
+def image_policy(spec: ActorSpec, actor: nn.Module, deterministic: bool) -> ActorPolicy:
+    """Policy of the image with a copy of an actor's weights, on the actor's device.
+
+    Args:
+        spec: Networks of the actor.
+        actor: The actor.
+        deterministic: Whether it is evaluated without noise by default.
+    """
+    policy = ActorPolicy(spec, deterministic)
+    policy.actor.load_state_dict(actor.state_dict())
+    return policy.to(next(actor.parameters()).device)
 
 
 def load_network(build: Callable[[], Network], tensors: Mapping[str, Tensor], device: str) -> Network:

@@ -25,7 +25,7 @@ from cfp.config import to_json
 from cfp.envs.make import choose_device
 from cfp.experiment.process import Stopped, StopSignals, keep_memory, peak_memory
 from cfp.experiment.run import Run
-from cfp.experiment.run_lock import Claimed, claim
+from cfp.experiment.run_lock import FolderInUse, run_lock
 from cfp.files import write_json, write_text
 
 Outcome = Literal["finished", "failed", "busy", "stopped"]
@@ -58,7 +58,7 @@ def carry_out(job: Job, signals: StopSignals, lock_timeout: float, *, own_proces
         own_process: Whether this process does nothing else, so that its memory is that of the run.
     """
     try:
-        with claim(job.folder, lock_timeout):
+        with run_lock(job.folder, lock_timeout):
             (job.folder / "error.txt").unlink(missing_ok=True)
             try:
                 _train_and_evaluate(job, signals, own_process)
@@ -68,7 +68,7 @@ def carry_out(job: Job, signals: StopSignals, lock_timeout: float, *, own_proces
                 traceback.print_exc()
                 write_text(job.folder / "error.txt", f"{type(error).__name__}: {error}\n")
                 return "failed"
-    except Claimed as error:
+    except FolderInUse as error:
         print(error)
         return "busy"
     except (Stopped, KeyboardInterrupt) as stopped:

@@ -16,7 +16,7 @@ from cfp.validation import check_at_least, check_fraction, check_positive
 class DistillConfig(LadderConfig):
     """A distillation; num_envs robots move side by side. Levels are listed coarsest first.
 
-    The environment options say how the result is judged; train_particles, where it is taught.
+    The environment options say where the student is evaluated; train_particles, where it is taught.
     """
 
     algo: str = "distill"
@@ -24,54 +24,47 @@ class DistillConfig(LadderConfig):
     teacher: str = "shac"
     """mpc (plans from every state), shac or gradient (trained first), or a policy: a run folder, policy.safetensors."""
     train_particles: Particles = "lite"
-    """Particles of the simulations that are taught in."""
+    """Particles of the simulations in training."""
     rollout_steps: int = 64
-    """Control steps between two lessons."""
+    """Control steps of a round, after which the student is updated."""
     updates: int = 48
-    """Gradient steps in a lesson."""
+    """Gradient steps after a round."""
     batch_size: int = 256
     """Labels in a gradient step."""
     student_noise: bool = True
-    """The student moves with the noise of its policy."""
+    """The student acts with the noise of its policy."""
     student_learning_rate: float = 1e-3
     """Adam's step size at the beginning of each level; it falls to a tenth."""
     max_grad_norm: float = 1.0
     """Largest norm of the gradient."""
     beta_decay: float = 0.7
-    """Factor by which the share of legs that the teacher leads falls from round to round; it begins at 1."""
+    """Factor by which beta, the probability that the teacher acts, falls from round to round; it starts at 1."""
     switch_every: int = 8
-    """Control steps after which it is drawn anew who leads a robot."""
+    """Control steps after which it is drawn anew whether teacher or student acts on a robot."""
     dropout: float = 0.0
-    """Share of entries that become 0 in half of the images that the student sees and of the actions that it takes, so
-    that it learns to do without them."""
+    """Probability with which entries of the student's observations and actions are set to 0, in half of them, so that
+    it learns to do without."""
     capacity: int = 100_000
     """Labels that are kept; an image takes 12 KiB, an action on the smaller grid of teacher and student 8 R R bytes."""
     max_episode_steps: int = 400
-    """Control steps after which an episode is cut; the first ones are cut at staggered ages."""
+    """Control steps after which a training episode is truncated; the first ones are truncated at staggered ages."""
     num_layouts: int = 64
-    """Particle layouts that are gone through."""
+    """Particle layouts that training episodes start from in turn."""
     planner: GradientPlannerConfig = field(default_factory=GradientPlannerConfig)
     planner_grid: int | Literal["coarse", "fine"] = "coarse"
     """Action grid of the teacher mpc."""
 
     def ineffective(self) -> dict[str, str]:
-        """What concerns plans; layouts are counted from the seed."""
-        plans = {} if self.teacher == "mpc" else dict.fromkeys(("planner.", "planner_grid"), "teacher mpc")
-        return super().ineffective() | plans | SEEDED
+        """Options of the planner have no effect with other teachers; layouts are counted from the seed."""
+        planner = {} if self.teacher == "mpc" else dict.fromkeys(("planner.", "planner_grid"), "teacher mpc")
+        return super().ineffective() | planner | SEEDED
 
     def check(self) -> None:
         """Check what the types cannot, see `LadderConfig.check`."""
         super().check()
-        check_at_least(
-            1,
-            rollout_steps=self.rollout_steps,
-            updates=self.updates,
-            batch_size=self.batch_size,
-            switch_every=self.switch_every,
-            capacity=self.capacity,
-            max_episode_steps=self.max_episode_steps,
-            num_layouts=self.num_layouts,
-        )
+        check_at_least(1, rollout_steps=self.rollout_steps, updates=self.updates, batch_size=self.batch_size)
+        check_at_least(1, switch_every=self.switch_every, capacity=self.capacity)
+        check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
         check_training_layouts("num_layouts", self.num_layouts * len(self.resolutions), self.environment.num_envs)
         check_positive(student_learning_rate=self.student_learning_rate, max_grad_norm=self.max_grad_norm)
         check_fraction(beta_decay=self.beta_decay, dropout=self.dropout)

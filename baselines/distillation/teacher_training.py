@@ -7,10 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from baselines.distillation.config import DistillConfig
-from baselines.distillation.teachers import is_record_of_another_start, read_teacher
+from baselines.distillation.teachers import is_record_of_one_start, read_teacher
 from baselines.registry import configure, find
 from cfp.errors import CheckpointError, ConfigError
-from cfp.experiment.callbacks import Stage
 from cfp.experiment.folder import copy_policy, policy_path
 from cfp.experiment.process import StopSignals
 from cfp.experiment.run import Run
@@ -47,12 +46,12 @@ def copy_teacher(config: DistillConfig, folder: Path) -> None:
     write_policy(teacher_path(folder), *read_policy(teacher))
 
 
-def warn_of_recorded_teacher(config: DistillConfig, folder: Path) -> list[str]:
-    """A line if the teacher is the record of one episode, in a task whose episodes start differently."""
+def warnings(config: DistillConfig, folder: Path) -> list[str]:
+    """A warning if the teacher is the record of one episode, in a task whose episodes start differently."""
     if config.teacher in ("mpc", *TRAINED):
         return []
     teacher = read_teacher(teacher_path(folder), config.task, config.environment)
-    if not is_record_of_another_start(teacher, config.task, config.environment):
+    if not is_record_of_one_start(teacher, config.task, config.environment):
         return []
     return [
         f"teacher: the record of one planned episode, while every episode of {config.task} starts differently; "
@@ -60,7 +59,7 @@ def warn_of_recorded_teacher(config: DistillConfig, folder: Path) -> list[str]:
     ]
 
 
-def train_teacher(config: DistillConfig, folder: Path, signals: StopSignals | None) -> None:
+def train_teacher(config: DistillConfig, folder: Path, signals: StopSignals) -> None:
     """Train the teacher with the defaults of its algorithm, if only that is named and it is not there yet.
 
     What this took is added up in ``teacher/cost.json``.
@@ -68,7 +67,7 @@ def train_teacher(config: DistillConfig, folder: Path, signals: StopSignals | No
     Args:
         config: Options of the distillation.
         folder: Of its run.
-        signals: Whether the user wants to stop; None: an untrained teacher will do.
+        signals: Whether the user wants to stop.
     """
     if config.teacher not in TRAINED or teacher_path(folder).exists():
         return
@@ -77,19 +76,15 @@ def train_teacher(config: DistillConfig, folder: Path, signals: StopSignals | No
     environment = replace(chosen.environment, **same)
     chosen = replace(chosen, seed=config.seed, device=config.device, environment=environment)
     algorithm, own = find(config.teacher), folder / "teacher"
-    run = Run(algorithm, chosen, own, True, signals or StopSignals())
-    if signals is None:
-        Stage(chosen, own, run.position, algorithm.create(chosen, 1, own)).save_policy()
-        run.logger.close()
-    else:
-        print(f"training the teacher first: {config.teacher} -> {own}")
-        start, begin = run.step, time.perf_counter()
-        try:
-            run.train()
-        finally:
-            cost = {"steps": run.step - start, "seconds": time.perf_counter() - begin}
-            cost["evaluation_seconds"] = run.evaluation_seconds
-            path = own / "cost.json"
-            before = read_json(path) if path.exists() else {}
-            write_json(path, {name: value + before.get(name, 0) for name, value in cost.items()})
+    run = Run(algorithm, chosen, own, True, signals)
+    print(f"training the teacher first: {config.teacher} -> {own}")
+    start, begin = run.step, time.perf_counter()
+    try:
+        run.train()
+    finally:
+        cost = {"steps": run.step - start, "seconds": time.perf_counter() - begin}
+        cost["evaluation_seconds"] = run.evaluation_seconds
+        path = own / "cost.json"
+        before = read_json(path) if path.exists() else {}
+        write_json(path, {name: value + before.get(name, 0) for name, value in cost.items()})
     copy_policy(policy_path(own), teacher_path(folder))

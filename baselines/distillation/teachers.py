@@ -1,4 +1,4 @@
-"""What a policy of images is taught by: a policy of any other kind, or the planner."""
+"""Teachers of a distillation: a trained policy of any kind, or the gradient planner."""
 
 from __future__ import annotations
 
@@ -22,74 +22,74 @@ from dittogym.action import ActionIndexing, bicubic_matrix, from_grid_indexing, 
 
 
 class Teacher(ABC):
-    """Says what should be done in the present states of an environment.
+    """Labels the present states of an environment with actions.
 
     Attributes:
-        resolution: Its action grid R.
-        fresh: Whether its last answer came from the states themselves; otherwise it is right only for robots that have
-            done as they were told since it last did.
+        resolution: Action grid R.
+        fresh: Whether the last actions were computed from the states themselves. Otherwise they are part of a plan and
+            right only for robots that have followed it.
     """
 
     resolution: int
     fresh: bool = True
 
     @abstractmethod
-    def act(self, env: TorchEnv, seen: Tensor) -> Tensor:
-        """Actions (B, 2, R, R) for the present states, which are seen as images (B, 3, 64, 64)."""
+    def act(self, env: TorchEnv, observation: Tensor) -> Tensor:
+        """Actions (B, 2, R, R) for the present states, whose images are (B, 3, 64, 64)."""
 
     def state_dict(self) -> dict[str, Any]:
-        """What its next answer depends on beside the environment."""
+        """Everything besides the environment that the next actions depend on."""
         return {}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:  # noqa: B027  (most remember nothing)
-        """Undo `state_dict`."""
+    def load_state_dict(self, state: dict[str, Any]) -> None:  # noqa: B027  (most have no state)
+        """Restore a state of `state_dict`."""
 
 
 class PolicyTeacher(Teacher):
-    """A trained policy, without noise. A sequence of actions is read at the step that an episode has come to.
+    """A trained policy, without noise.
 
-    What other policies remember is handed back to them, and begins anew where an episode does.
+    An open-loop policy plays the action of the step that each episode is at. Other policies get their memory back, and
+    start anew where an episode does.
 
     Args:
         policy: Of any kind.
-        theirs: ActionIndexing of its actions, see `dittogym.TorchEnv`.
-        layout: The one that is wanted.
+        policy_layout: Orientation of the policy's actions, see `dittogym.TorchEnv`.
+        layout: Orientation of the returned actions.
     """
 
-    def __init__(self, policy: Policy, theirs: ActionIndexing, layout: ActionIndexing) -> None:
-        self.policy, self.theirs, self.layout = policy, theirs, layout
+    def __init__(self, policy: Policy, policy_layout: ActionIndexing, layout: ActionIndexing) -> None:
+        self.policy, self.policy_layout, self.layout = policy, policy_layout, layout
         self.resolution = policy.resolution
         self._memory: tuple[np.ndarray, ...] | None = None
 
     @torch.no_grad()
-    def act(self, env: TorchEnv, seen: Tensor) -> Tensor:
-        """Its mean actions."""
+    def act(self, env: TorchEnv, observation: Tensor) -> Tensor:
+        """Mean actions (B, 2, R, R) of the policy."""
         policy = self.policy.attached(env) if isinstance(self.policy, SeesState) else self.policy
         steps = env.env_state.steps.cpu().numpy()
         memory = (steps,) if isinstance(policy, OpenLoop) else self._memory
-        array, self._memory = policy.predict(seen.cpu().numpy(), memory, steps == 0, deterministic=True)
+        array, self._memory = policy.predict(observation.cpu().numpy(), memory, steps == 0, deterministic=True)
         action = torch.as_tensor(array, device=env.device)
-        return from_grid_indexing(to_grid_indexing(action, self.theirs), self.layout)
+        return from_grid_indexing(to_grid_indexing(action, self.policy_layout), self.layout)
 
     def state_dict(self) -> dict[str, Any]:
-        """What the policy remembers."""
+        """The policy's memory."""
         return {"memory": [torch.from_numpy(array) for array in self._memory or ()]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Undo `state_dict`."""
-        arrays = state.get("memory")  # checkpoints from before have none
-        self._memory = tuple(array.numpy() for array in arrays) if arrays else None
+        """Restore a state of `state_dict`."""
+        self._memory = tuple(array.numpy() for array in state["memory"]) or None
 
 
 class PlannerTeacher(Teacher):
-    """The gradient planner, from wherever the student has got to.
+    """The gradient planner, which plans from the states that the student has reached.
 
-    It plans for all robots at once, every `PlannerConfig.commit` steps, each plan from what is left of the one before.
+    It plans for all robots at once, every `PlannerConfig.commit` steps, each plan from what is left of the last one.
 
     Args:
-        env: Of its own, with its action grid; it follows the one that it is asked about.
-        config: How to plan.
-        seed: Of the plans' noise.
+        env: An environment of its own, with its action grid; it takes over the states of the one that is labelled.
+        config: Options of the planner.
+        seed: Seed of the planner's noise.
     """
 
     def __init__(self, env: TorchEnv, config: GradientPlannerConfig, seed: int) -> None:
@@ -97,11 +97,10 @@ class PlannerTeacher(Teacher):
         self.env, self.resolution = env, env.action_resolution
         self.planner = GradientPlanner(env, config, seed=seed)
 
-    def act(self, env: TorchEnv, seen: Tensor) -> Tensor:
-        """The next actions of its plans."""
+    def act(self, env: TorchEnv, observation: Tensor) -> Tensor:
+        """The next actions (B, 2, R, R) of the plans."""
         self.env.env_state = env.env_state
-        with torch.enable_grad():
-            action = self.planner.act()
+        action = self.planner.act()
         self.fresh = self.planner.has_replanned
         return action.float()
 
@@ -110,20 +109,20 @@ class PlannerTeacher(Teacher):
         return self.planner.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Undo `state_dict`."""
+        """Restore a state of `state_dict`."""
         self.planner.load_state_dict(state)
 
 
 def project(actions: Tensor, resolution: int, patch: int) -> Tensor:
-    """Actions on another grid that drive the muscles as much alike as they can.
+    """Actions on another grid that drive the muscles as similarly as possible.
 
-    The environment enlarges a grid to the patch by half-pixel bicubic interpolation, ``U``. What is returned has the
-    least squared difference from ``U a U^T`` there, cut to [-1, 1]: exact wherever the wanted grid can follow, such as
-    for R itself and for the patch.
+    The environment enlarges a grid to the patch by half-pixel bicubic interpolation, ``U``. The result has the least
+    squared difference from ``U a U^T`` there, clipped to [-1, 1]. It is exact wherever the new grid can represent the
+    field, such as for the same grid and for the patch.
 
     Args:
         actions: (..., R, R).
-        resolution: The wanted grid S.
+        resolution: The new grid S.
         patch: Width of the environment's patch in nodes.
 
     Returns:
@@ -134,11 +133,11 @@ def project(actions: Tensor, resolution: int, patch: int) -> Tensor:
 
 
 @functools.lru_cache(maxsize=64)
-def _projection(before: int, after: int, patch: int) -> Tensor:
-    """Matrix (after, before): enlarge, then the least-squares inverse of enlarging."""
+def _projection(size: int, new_size: int, patch: int) -> Tensor:
+    """Matrix (new_size, size) that enlarges to the patch, then applies the pseudo-inverse of enlarging."""
     cpu = torch.device("cpu")
-    given, wanted = (bicubic_matrix(size, patch, False, torch.float64, cpu) for size in (before, after))
-    return torch.linalg.pinv(wanted) @ given
+    enlarge, enlarge_new = (bicubic_matrix(n, patch, False, torch.float64, cpu) for n in (size, new_size))
+    return torch.linalg.pinv(enlarge_new) @ enlarge
 
 
 def read_teacher(path: str | Path, task: str, environment: EnvironmentConfig) -> Policy:
@@ -146,18 +145,18 @@ def read_teacher(path: str | Path, task: str, environment: EnvironmentConfig) ->
 
     Args:
         path: A run folder, a ``.safetensors`` file, or the ``.json`` beside one.
-        task: What the student shall do.
-        environment: Where it shall do it.
+        task: The student's task.
+        environment: The student's environment.
 
     Raises:
-        ConfigError: It was trained for something else, or cannot be asked about other states than its own.
+        ConfigError: The policy was trained for something else.
         CheckpointError: There is no such policy, or it is damaged.
     """
     check_trained_for("teacher", read_policy(path)[1], task, environment)
     return load(path)
 
 
-def is_record_of_another_start(teacher: Policy, task: str, environment: EnvironmentConfig) -> bool:
-    """Whether a teacher plays what was planned for one episode, in a task whose episodes start differently."""
-    drawn = any(body.shape.draws for body in make_spec(task, **environment.task_options()).bodies)
-    return drawn and "layout" in teacher.description
+def is_record_of_one_start(teacher: Policy, task: str, environment: EnvironmentConfig) -> bool:
+    """Whether a teacher was planned for a single layout, in a task whose episodes start from different ones."""
+    varies = any(body.shape.draws for body in make_spec(task, **environment.task_options()).bodies)
+    return varies and "layout" in teacher.description

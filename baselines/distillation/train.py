@@ -1,4 +1,4 @@
-"""Distillation: the image networks of the coarse-to-fine policy learn what a policy or planner that sees more does."""
+"""Distillation: the image networks of the coarse-to-fine policy imitate a policy or planner that sees more."""
 
 from __future__ import annotations
 
@@ -12,20 +12,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 import cfp
 from baselines.common.episodes import Episodes
 from baselines.common.grid import grid_size
+from baselines.common.policies import image_policy
+from baselines.common.schedules import linear_decay, stage_progress
+from baselines.distillation import teacher_training
 from baselines.distillation.config import DistillConfig
 from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entries
-from baselines.distillation.teacher_training import (
-    TRAINED,
-    copy_teacher,
-    teacher_path,
-    train_teacher,
-    warn_of_recorded_teacher,
-)
 from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
 from baselines.planning.gradient import GradientPlannerConfig
 from baselines.shac.networks import fix_std
@@ -41,33 +37,30 @@ from cfp.sections import EnvironmentConfig
 from cfp.weights import KIND, load, save_policy
 from dittogym import make_spec
 
-FINAL_RATE = 0.1
-"""Share of the learning rate that is left at the end of its straight decay."""
-
 METRICS: dict[str, str] = {
     "rollout/return": "mean undiscounted return of the episodes that ended in the last round, None for none",
-    "train/loss": "mean square by which actions differ from the teacher's, mean over the round's updates",
-    "train/fresh_loss": "the same on the labels of the round before anything was learned from them, None for no labels",
-    "train/share": "share of the round that the teacher led",
+    "train/loss": "mean squared difference from the teacher's actions, mean over the round's updates",
+    "train/fresh_loss": "the same on the labels of the round before the student learned from them, None for no labels",
+    "train/share": "beta, the probability with which the teacher acted in the round",
     "train/labels": "labels in the data set",
     "train/learning_rate": "Adam's step size",
     "train/episodes": "episodes ended in this stage",
-    "train/terminated": "those that ended before their time",
+    "train/terminated": "those that the task ended early",
     "train/nonfinite": "simulations that were not finite and were reset",
 }
 """Every scalar that `Distill.update` logs, and what it means."""
 
 
 class Distill(Algorithm):
-    """Supervised learning of the teacher's actions in the states that the student gets into.
+    """Supervised learning of the teacher's actions in the states that the student visits, by DAgger.
 
-    The mean action is learned, by least squares after tanh: what differs little in the muscles costs little. The width
-    stays about 0.1 before tanh, so that the policy can be evaluated with noise, and refined by soft actor-critic.
+    The mean action is learned, by least squares after tanh: small differences in the muscles cost little. The standard
+    deviation stays 0.105 before tanh, so that the policy can be evaluated with noise, and refined by soft actor-critic.
 
     Args:
-        config: The run's options.
+        config: Options of the run.
         stage: Which level, 1 is the coarsest.
-        start: Policy of the levels before, which are frozen.
+        start: Policy of the coarser levels, which are frozen.
         teacher: File of the teacher's policy, if it is not the one that the options name.
     """
 
@@ -77,175 +70,101 @@ class Distill(Algorithm):
         self, config: DistillConfig, stage: int = 1, start: ActorPolicy | None = None, teacher: Path | None = None
     ) -> None:
         self.config, self.stage = config, stage
-        own = replace(config, environment=config.environment.for_training(config.train_particles))
-        self.env = make_torch_env(own, make_spec(config.task).patch)
+        training = replace(config, environment=config.environment.for_training(config.train_particles))
+        self.env = make_torch_env(training, make_spec(config.task).patch)
         self.spec = config.actor_spec(stage - 1)
-        with self._luck():
+        with self._seeded():
             self.actor = build_actor(self.spec)
         fix_std(self.actor)
         if start is not None:
             self.actor.get_submodule("coarse").load_state_dict(start.actor.state_dict())
         self.actor.to(self.env.device)
-        learning = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
-        self.adam = torch.optim.Adam(learning, config.student_learning_rate)
-        episodes = Episodes(
-            self.env, config.seed + (stage - 1) * config.num_layouts, config.max_episode_steps, config.num_layouts
-        )
-        grid = self.spec.resolutions[-1]
+        trained = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
+        self.adam = torch.optim.Adam(trained, config.student_learning_rate)
+        seed = config.seed + (stage - 1) * config.num_layouts
+        episodes = Episodes(self.env, seed, config.max_episode_steps, config.num_layouts)
         self.collector = Collector(
-            self.env, self._teacher(own, teacher), episodes, config.switch_every, config.dropout, grid
+            self.env,
+            self._make_teacher(training, teacher),
+            episodes,
+            config.switch_every,
+            config.dropout,
+            grid=self.spec.resolutions[-1],
         )
         self.dataset, self.rounds = Dataset(config.capacity), 0
-        self.period = config.rollout_steps * self.env.num_envs
 
-    @staticmethod
-    def preset(task: str, name: str) -> DistillConfig:
-        """Defaults of a task, with the networks of the same preset of the coarse-to-fine policy.
-
-        Both teach at the lite tier; ``quick`` is judged there, ``paper`` in the paper's environment. SHAPE MATCH, whose
-        episodes are alike and whose actions are fine, gets fewer labels and more, smaller updates.
-
-        Raises:
-            ConfigError: No such task or preset.
-        """
-        base, silhouette = cfp.preset(task, name), task == "shapematch"
-        steps = 24_000 if silhouette else 48_000
-        return DistillConfig(
-            task=task,
-            preset=base.preset,
-            environment=replace(base.environment, num_envs=16),
-            report=replace(base.report, eval_every=steps // 8, checkpoint_every=steps // 16, log_every=1),
-            steps=steps,
-            handover=(steps // 2,),
-            resolutions=base.resolutions,
-            gate_bias=base.gate_bias,
-            network=base.network,
-            teacher="gradient" if silhouette else "shac",
-            rollout_steps=30 if silhouette else 64,
-            updates=160 if silhouette else 48,
-            batch_size=64 if silhouette else 256,
-            student_noise=not base.report.eval_deterministic,
-            student_learning_rate=2e-3 if silhouette else 1e-3,
-            beta_decay=0.8 if silhouette else 0.7,
-            dropout=0.2,
-            planner=GradientPlannerConfig(iterations=30, learning_rate=0.1) if silhouette else GradientPlannerConfig(),
-            planner_grid=16 if silhouette else "coarse",
-        )
-
-    @classmethod
-    def initialize(cls, config: DistillConfig, folder: Path) -> Position:
-        """Copy the teacher into the folder, if it is a policy."""
-        copy_teacher(config, folder)
-        return Position()
-
-    @classmethod
-    def prepare(cls, config: DistillConfig, folder: Path, signals: StopSignals | None) -> None:
-        """Train the teacher, if only its algorithm is named."""
-        train_teacher(config, folder, signals)
-
-    @classmethod
-    def create(cls, config: DistillConfig, stage: int, folder: Path, resumed: bool = False) -> Distill:
-        """The student at the beginning of a stage."""
-        start = load(policy_path(folder, stage - 1), choose_device(config.device)) if stage > 1 else None
-        algorithm = cls(config, stage, start, None if config.teacher == "mpc" else teacher_path(folder))
-        algorithm.starts_trained = stage > 1
-        return algorithm
-
-    @classmethod
-    def warnings(cls, config: DistillConfig, folder: Path, first_stage: int) -> list[str]:
-        """A teacher that may know one start only."""
-        return warn_of_recorded_teacher(config, folder)
-
-    @classmethod
-    def not_estimated(cls, config: DistillConfig) -> list[str]:
-        """The teacher's own training."""
-        if config.teacher not in TRAINED:
-            return []
-        options = f"--algo {config.teacher} --task {config.task}"
-        return [f"the teacher's training, which comes first (python -m baselines.train {options} --dry-run)"]
+    def _make_teacher(self, training: RunConfig, path: Path | None) -> Teacher:
+        config = self.config
+        if path is None and config.teacher == "mpc":
+            size = grid_size(config.task, config.planner_grid)
+            return PlannerTeacher(make_torch_env(training, size), config.planner, config.seed)
+        policy = read_teacher(path or config.teacher, config.task, config.environment)
+        trained_in = EnvironmentConfig(**policy.description["environment"])
+        return PolicyTeacher(policy, trained_in.action_indexing, config.environment.action_indexing)
 
     @contextmanager
-    def _luck(self) -> Iterator[None]:
-        """Torch's generator, seeded for what happens next and put back afterwards."""
+    def _seeded(self) -> Iterator[None]:
+        """Seed torch's generator by run, stage and step, and restore it afterwards."""
         with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             source = np.random.SeedSequence((self.config.seed, self.stage - 1, self.num_timesteps))
             torch.manual_seed(int(source.generate_state(1)[0]))
             yield
 
-    def _teacher(self, own: RunConfig, path: Path | None) -> Teacher:
-        config = self.config
-        if path is None and config.teacher == "mpc":
-            size = grid_size(config.task, config.planner_grid)
-            return PlannerTeacher(make_torch_env(own, size), config.planner, config.seed)
-        policy = read_teacher(path or config.teacher, config.task, config.environment)
-        theirs = EnvironmentConfig(**policy.description["environment"])
-        return PolicyTeacher(policy, theirs.action_indexing, config.environment.action_indexing)
-
-    @property
-    def policy(self) -> ActorPolicy:
-        """What has been learned so far."""
-        policy = ActorPolicy(self.spec, self.config.report.eval_deterministic)
-        policy.actor.load_state_dict(self.actor.state_dict())
-        return policy.to(self.env.device)
-
-    def attached(self, env: Any) -> ActorPolicy:
-        """What has been learned so far; it looks at images only, whatever ``env`` is. Built once, not in every step."""
-        return self.policy
-
     def update(self) -> Scalars:
-        """Do one round: collect labels, and learn from all that are kept.
+        """Do one round of DAgger: collect labels, and learn from all that are kept.
 
         Raises:
             NonFiniteError: The loss is not finite.
         """
-        with self._luck():
-            scalars = self._round()
-        self.num_timesteps += self.period
-        return scalars
-
-    def _round(self) -> dict[str, float | None]:
-        config, share = self.config, self.config.beta_decay**self.rounds
-        student = partial(self.actor, deterministic=not config.student_noise)
-        labels = self._kept(self.collector.collect(config.rollout_steps, share, student))
-        self.dataset.add(labels)
+        config, beta = self.config, self.config.beta_decay**self.rounds
+        learning_rate = config.student_learning_rate * linear_decay(
+            stage_progress(config, self.stage, self.num_timesteps)
+        )
+        self.adam.param_groups[0]["lr"] = learning_rate
+        with self._seeded():
+            student = partial(self.actor, deterministic=not config.student_noise)
+            labels = self._on_smaller_grid(self.collector.collect(config.rollout_steps, beta, student))
+            self.dataset.add(labels)
+            fresh_loss = self._fresh_loss(labels)
+            losses = [self._gradient_step() for _ in range(config.updates)]
         self.rounds += 1
-        with torch.no_grad():
-            part = slice(0, None, max(1, len(labels.actions) // config.batch_size))
-            # A round may lie within a plan that the student does not follow: then nothing in it was labelled.
-            labelled = len(labels.actions) > 0
-            fresh = float(self._loss(labels.observations[part], labels.actions[part])) if labelled else None
-        rate = self._rate()
-        self.adam.param_groups[0]["lr"] = rate
-        losses = [self._improve() for _ in range(config.updates)]
+        self.num_timesteps += config.rollout_steps * self.env.num_envs
         return self.collector.episodes.scalars() | {
             "train/loss": sum(losses) / len(losses),
-            "train/fresh_loss": fresh,
-            "train/share": share,
+            "train/fresh_loss": fresh_loss,
+            "train/share": beta,
             "train/labels": float(len(self.dataset)),
-            "train/learning_rate": rate,
+            "train/learning_rate": learning_rate,
         }
 
-    def _kept(self, labels: Labels) -> Labels:
-        """Labels as they are kept: on the whole patch an action takes more than an image."""
+    def _on_smaller_grid(self, labels: Labels) -> Labels:
+        """Labels on the student's grid where that is smaller: on the whole patch an action is larger than an image."""
         size = self.spec.action_size
         if labels.actions.shape[-1] <= size:
             return labels
         return labels._replace(actions=project(labels.actions, size, self.env.spec.patch))
 
-    def _rate(self) -> float:
-        bounds = (0, *self.config.ends())
-        done = self.num_timesteps / (bounds[self.stage] - bounds[self.stage - 1])
-        return self.config.student_learning_rate * (1.0 - (1.0 - FINAL_RATE) * min(done, 1.0))
+    @torch.no_grad()
+    def _fresh_loss(self, labels: Labels) -> float | None:
+        """Loss on about a batch of new labels; None in a round within a plan that no robot followed."""
+        if len(labels.actions) == 0:
+            return None
+        part = slice(0, None, max(1, len(labels.actions) // self.config.batch_size))
+        return float(self.loss(labels.observations[part], labels.actions[part]))
 
-    def _loss(self, observations: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        """Mean square difference of the mean action from the teacher's, both on the grid that is carried out."""
-        device, size = self.env.device, self.spec.action_size
-        wanted = project(actions.to(device), size, self.env.spec.patch)
-        return (self.actor(observations.to(device), deterministic=True) - wanted).square().mean()
+    def loss(self, observations: Tensor, actions: Tensor) -> Tensor:
+        """Mean squared difference of the student's mean actions from the teacher's, on the grid that is carried out.
 
-    def _improve(self) -> float:
+        Args:
+            observations: (B, 3, 64, 64) uint8.
+            actions: (B, 2, R, R) of the teacher, on any grid.
+        """
+        target = project(actions.to(self.env.device), self.spec.action_size, self.env.spec.patch)
+        return (self.actor(observations.to(self.env.device), deterministic=True) - target).square().mean()
+
+    def _gradient_step(self) -> float:
         labels = self.dataset.sample(self.config.batch_size)
-        loss = self._loss(drop_entries(labels.observations, self.config.dropout), labels.actions)
+        loss = self.loss(drop_entries(labels.observations, self.config.dropout), labels.actions)
         if not math.isfinite(value := float(loss.detach())):
             raise NonFiniteError(
                 f"the loss became {value} after {self.num_timesteps} environment steps of the stage; "
@@ -257,11 +176,83 @@ class Distill(Algorithm):
         self.adam.step()
         return value
 
+    @property
+    def policy(self) -> ActorPolicy:
+        """What has been learned so far."""
+        return image_policy(self.spec, self.actor, self.config.report.eval_deterministic)
+
+    def attached(self, env: Any) -> ActorPolicy:
+        """The present policy, copied once for an evaluation instead of in every step; it ignores ``env``."""
+        return self.policy
+
+    @staticmethod
+    def preset(task: str, name: str) -> DistillConfig:
+        """Defaults of a task, with the networks of the same preset of the coarse-to-fine policy.
+
+        Both presets teach at the lite tier; ``quick`` is evaluated there, ``paper`` in the paper's environment. SHAPE
+        MATCH, whose episodes are alike and whose actions are fine, gets fewer labels and more, smaller updates.
+
+        Raises:
+            ConfigError: No such task or preset.
+        """
+        base, shape_match = cfp.preset(task, name), task == "shapematch"
+        steps = 24_000 if shape_match else 48_000
+        config = DistillConfig(
+            task=task,
+            preset=base.preset,
+            environment=replace(base.environment, num_envs=16),
+            report=replace(base.report, eval_every=steps // 8, checkpoint_every=steps // 16, log_every=1),
+            steps=steps,
+            handover=(steps // 2,),
+            resolutions=base.resolutions,
+            gate_bias=base.gate_bias,
+            network=base.network,
+            student_noise=not base.report.eval_deterministic,
+            dropout=0.2,
+        )
+        if not shape_match:
+            return config
+        return replace(
+            config,
+            teacher="gradient",
+            rollout_steps=30,
+            updates=160,
+            batch_size=64,
+            student_learning_rate=2e-3,
+            beta_decay=0.8,
+            planner=GradientPlannerConfig(iterations=30, learning_rate=0.1),
+            planner_grid=16,
+        )
+
+    @classmethod
+    def initialize(cls, config: DistillConfig, folder: Path) -> Position:
+        """Copy the teacher into the folder, if it is a policy."""
+        teacher_training.copy_teacher(config, folder)
+        return Position()
+
+    @classmethod
+    def prepare(cls, config: DistillConfig, folder: Path, signals: StopSignals) -> None:
+        """Train the teacher, if only its algorithm is named."""
+        teacher_training.train_teacher(config, folder, signals)
+
+    @classmethod
+    def create(cls, config: DistillConfig, stage: int, folder: Path, resumed: bool = False) -> Distill:
+        """The student at the beginning of a stage."""
+        start = load(policy_path(folder, stage - 1), choose_device(config.device)) if stage > 1 else None
+        teacher = None if config.teacher == "mpc" else teacher_training.teacher_path(folder)
+        algorithm = cls(config, stage, start, teacher)
+        algorithm.starts_trained = stage > 1
+        return algorithm
+
+    @classmethod
+    def warnings(cls, config: DistillConfig, folder: Path, first_stage: int) -> list[str]:
+        """A warning if the teacher was planned for one start only."""
+        return teacher_training.warnings(config, folder)
+
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the policy, as one of CFP."""
-        save_policy(
-            path, self.actor, description | {"kind": KIND, "network": asdict(self.spec), "trained_by": self.config.algo}
-        )
+        own = {"kind": KIND, "network": asdict(self.spec), "trained_by": self.config.algo}
+        save_policy(path, self.actor, description | own)
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu") -> ActorPolicy:
@@ -269,17 +260,12 @@ class Distill(Algorithm):
         return load(path, device)
 
     def state_dict(self) -> dict[str, Any]:
-        """Networks, optimiser, labels, episodes in progress and the teacher's plans."""
-        return {
-            "actor": self.actor.state_dict(),
-            "adam": self.adam.state_dict(),
-            "dataset": self.dataset.state_dict(),
-            "collector": self.collector.state_dict(),
-            "rounds": self.rounds,
-        }
+        """Networks, optimiser, labels, episodes in progress and the teacher's state."""
+        parts = ("actor", "adam", "dataset", "collector")
+        return {name: getattr(self, name).state_dict() for name in parts} | {"rounds": self.rounds}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Undo `state_dict`."""
+        """Restore a state of `state_dict`."""
         for name in ("actor", "adam", "dataset", "collector"):
             getattr(self, name).load_state_dict(state[name])
         self.rounds = state["rounds"]

@@ -117,7 +117,6 @@ class MPC(Algorithm):
         self.surrogate = None if config.train_particles is None else self._make_surrogate(config.train_particles)
         planning_env = self.surrogate.env if self.surrogate else self.env
         self.planner = self.planner_type(planning_env, config.planner, seed=config.seed)
-        self.period = config.planner.commit  # all planning happens in the first of these steps
         self.actions = torch.zeros(0, *self.env.action_shape)
         self.total_reward, self.reward, self.is_done = 0.0, 0.0, False
 

@@ -32,6 +32,34 @@ def attached(policy: PolicyPredictor, env: VecEnv) -> PolicyPredictor:
 
 
 @dataclass(frozen=True)
+class SingleThreaded:
+    """A policy that acts with one thread, so that its actions do not depend on how many torch uses.
+
+    With several threads torch adds up convolutions in another order, and long episodes amplify the last bit.
+
+    Attributes:
+        policy: Acts.
+    """
+
+    policy: PolicyPredictor
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Actions of the policy."""
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            return self.policy.predict(observation, state, episode_start, deterministic)
+        finally:
+            torch.set_num_threads(threads)
+
+
+@dataclass(frozen=True)
 class Result:
     """Undiscounted returns of some episodes.
 
@@ -117,9 +145,9 @@ def evaluate(
 ) -> Result:
     """Run episodes without learning.
 
-    Neither the environments of a training run nor torch's generator are touched. The same seed gives the same episodes,
-    element i of the batch starts from layout ``seed + i``; with reference parity, whose resets show what was before,
-    only in environments that have just been made.
+    Neither the environments of a training run nor torch's generator are touched. The same seed gives the same episodes
+    with any number of threads; element i of the batch starts from layout ``seed + i``. With reference parity, whose
+    resets show what was before, this holds only in environments that have just been made.
 
     Args:
         name: Of the policy, for the result.
@@ -139,13 +167,13 @@ def evaluate(
         if "is_success" in local["info"]:
             successes.append(bool(local["info"]["is_success"]))
 
-    watching = attached(policy, env)
+    acting = SingleThreaded(attached(policy, env))
     env.seed(seed)
     cuda = list(range(torch.cuda.device_count()))
     with torch.random.fork_rng(devices=cuda):
         torch.manual_seed(seed)
         returns, _ = evaluate_policy(
-            watching,
+            acting,
             env,
             episodes,
             deterministic=deterministic,

@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.envs.make import make_env
 from cfp.envs.vec_env import TorchVecEnv
-from cfp.evaluation.evaluate import attached
+from cfp.evaluation.evaluate import SingleThreaded, attached
 from cfp.policy import Policy
 
 FRAMES_PER_SECOND = 10
@@ -58,7 +58,7 @@ def film_episode(
     """
     venv = make_env(config, size, 1).venv
     assert isinstance(venv, TorchVecEnv)
-    watching = attached(policy, venv)
+    acting = SingleThreaded(attached(policy, venv))
     venv.seed(seed)
     observation = venv.reset()
     yield venv.torch_env.render(0)
@@ -72,7 +72,7 @@ def film_episode(
         with torch.random.fork_rng(devices=devices), torch.no_grad():  # over before the caller goes on with a picture
             torch.set_rng_state(states[0])
             torch.cuda.set_rng_state_all(states[1])
-            action, memory = watching.predict(observation, memory, start, deterministic)
+            action, memory = acting.predict(observation, memory, start, deterministic)
             states = _generator_states()
             tensors = venv.torch_env.step(torch.as_tensor(action, device=venv.torch_env.device))
         observation, _, terminated, truncated, _ = (_numpy(value) for value in tensors)

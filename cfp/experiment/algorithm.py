@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, cast
@@ -42,19 +41,6 @@ class Position:
     offset: int = 0
 
 
-@dataclass(frozen=True)
-class Cost:
-    """What one stage costs.
-
-    Attributes:
-        seconds_per_step: Seconds of one environment step of one robot, its share of the updates included.
-        memory: Bytes that the stage will hold beyond what it holds as it begins (a replay memory).
-    """
-
-    seconds_per_step: float
-    memory: int = 0
-
-
 class Algorithm(ABC):
     """Trains a policy through one stage of a run; method names are those of stable-baselines3.
 
@@ -69,7 +55,6 @@ class Algorithm(ABC):
     Attributes:
         sees: What its policies look at; their training may use more.
         num_timesteps: Environment steps taken in this stage.
-        period: Environment steps after which the work of learning repeats, for estimates of time.
         starts_trained: Whether the stage begins with a trained policy, which is then evaluated before the first step.
         replay_buffer: Transitions to keep in checkpoints.
         logger: Receives scalars.
@@ -78,7 +63,6 @@ class Algorithm(ABC):
 
     sees: ClassVar[Sees] = "image"
     num_timesteps: int = 0
-    period: int = 1
     starts_trained: bool = False
     replay_buffer: ReplayBuffer | None = None
     logger: Logger
@@ -111,13 +95,13 @@ class Algorithm(ABC):
         return Position()
 
     @classmethod  # noqa: B027  (most algorithms need nothing)
-    def prepare(cls, config: Any, folder: Path, signals: StopSignals | None) -> None:
+    def prepare(cls, config: Any, folder: Path, signals: StopSignals) -> None:
         """Do what must be done before the first stage, such as training a teacher.
 
         Args:
             config: Options of the run.
             folder: Of the run.
-            signals: Whether the user wants to stop; None: an untrained stand-in will do, to estimate costs.
+            signals: Whether the user wants to stop.
         """
 
     @classmethod
@@ -150,11 +134,6 @@ class Algorithm(ABC):
     @classmethod
     def warnings(cls, config: Any, folder: Path, first_stage: int) -> list[str]:
         """What the user may not expect of the stages from ``first_stage`` on, a line each."""
-        return []
-
-    @classmethod
-    def not_estimated(cls, config: Any) -> list[str]:
-        """Work that estimates of costs leave out, a line each."""
         return []
 
     @classmethod
@@ -249,19 +228,3 @@ class Algorithm(ABC):
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from the ``state`` of `state_dict`, in an algorithm made with the same options."""
-
-    def measure(self) -> Cost:
-        """Time the work of one `period`; what has been learned is spoiled."""
-        start = time.perf_counter()
-        while self.num_timesteps < self.period and not self.finished:
-            self.update()
-        return Cost((time.perf_counter() - start) / max(1, self.num_timesteps))
-
-
-def mean_seconds(action: Callable[[], object], repeats: int = 3) -> float:
-    """Mean duration of an action, after a first time that is not measured."""
-    action()
-    start = time.perf_counter()
-    for _ in range(repeats):
-        action()
-    return (time.perf_counter() - start) / repeats

@@ -20,9 +20,8 @@ from cfp.config import Config, RunConfig
 from cfp.envs.make import choose_device, make_env
 from cfp.errors import ConfigError
 from cfp.evaluation.pictures import policy_pictures
-from cfp.experiment.algorithm import Algorithm, Cost, Position, Scalars, mean_seconds
+from cfp.experiment.algorithm import Algorithm, Position, Scalars
 from cfp.experiment.folder import policy_path
-from cfp.experiment.replay_archive import FIELDS
 from cfp.experiment.sac_state import load_model_state_dict, model_state_dict
 from cfp.presets import preset
 from cfp.weights import KIND, fitting, load, policy_for, read_policy, save_policy, write_policy
@@ -49,7 +48,6 @@ class SACAlgorithm(Algorithm):
         self.config, self.stage, self.model = config, stage, model
         assert model.replay_buffer is not None
         self.replay_buffer = model.replay_buffer
-        self.period = 1
 
     @property
     def num_timesteps(self) -> int:
@@ -147,22 +145,6 @@ class SACAlgorithm(Algorithm):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Undo `state_dict`."""
         load_model_state_dict(self.model, state)
-
-    def measure(self) -> Cost:
-        """Time a few steps and updates."""
-        model, env, buffer = self.model, self.model.get_env(), self.model.replay_buffer
-        assert env is not None and buffer is not None
-        observation, count = env.reset(), env.num_envs
-        assert isinstance(observation, np.ndarray)
-        model._last_obs = observation
-        _, stored = model._sample_action(0, None, count)
-        for _ in range(-(-model.batch_size // count)):
-            buffer.add(observation, observation, stored, np.zeros(count), np.zeros(count), [{}] * count)
-        acting = mean_seconds(lambda: env.step(model.predict(observation)[0]))
-        model.num_timesteps = model.hyperparameters.actor_start  # from here on an update is a whole one
-        updating = mean_seconds(lambda: model.train(1, model.batch_size)) * self.config.learning.gradient_steps
-        arrays = (getattr(buffer, name) for name in FIELDS)
-        return Cost((acting + updating) / count, sum(array.nbytes for array in arrays))
 
 
 class CoarseToFine(SACAlgorithm):

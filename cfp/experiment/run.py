@@ -39,6 +39,18 @@ from cfp.tables import Table
 from cfp.weights import is_of_another_task, read_policy
 
 
+def check_options(config: RunConfig) -> None:
+    """Check all that can be checked before anything is written.
+
+    Raises:
+        ConfigError: An option is wrong, or needs a package that is not installed.
+    """
+    config.check()
+    check_trackers(config)
+    for stage in range(len(config.ends())):
+        make_env(config, config.action_size(stage), 1)
+
+
 class Run:
     """Trains all stages of a run in its folder.
 
@@ -65,11 +77,7 @@ class Run:
     def __init__(
         self, algorithm: type[Algorithm], config: RunConfig, folder: Path, resume: bool, signals: StopSignals
     ) -> None:
-        config.check()
-        choose_device(config.device)
-        check_trackers(config)
-        for level in range(len(config.ends())):
-            make_env(config, config.action_size(level), 1)  # refuses bad options before anything is written
+        check_options(config)
         if holds_run(folder) and not resume:
             raise ConfigError(f"out: {folder} already holds a run, allowed with --resume; or name another folder")
         self.algorithm, self.config, self.folder, self.signals = algorithm, config, folder, signals

@@ -16,11 +16,10 @@ from cfp.config import RunConfig, to_json
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm
 from cfp.experiment.cli import program_name, run_command
-from cfp.experiment.estimate import estimate
 from cfp.experiment.folder import holds_run, read_config
 from cfp.experiment.process import Stopped, StopSignals
-from cfp.experiment.run import Run
-from cfp.experiment.run_lock import claim
+from cfp.experiment.run import Run, check_options
+from cfp.experiment.run_lock import run_lock
 from cfp.files import read_json
 from cfp.from_dict import update_from_dict
 from cfp.policy import Policy
@@ -60,7 +59,7 @@ class Command:
     config: Path | None = None
     """JSON file with options, in the form of a run's config.json; it may hold only some of them."""
     dry_run: bool = False
-    """Only print the options and an estimate of time and memory; write nothing."""
+    """Only print the options as JSON; write nothing."""
 
 
 @dataclass(frozen=True)
@@ -156,11 +155,11 @@ def _train(program: Program, arguments: Sequence[str], started: str) -> None:
     if command.resume and not holds_run(folder):
         print(f"{folder} holds no run yet: starting afresh")
     if command.dry_run:
+        check_options(config)
         print(json.dumps(to_json(config), indent=2))
-        print(estimate(program.find(config.algo), config, folder if command.resume else None))
         return
     print(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed} -> {folder}")
-    with claim(folder):
+    with run_lock(folder):
         with StopSignals() as signals:
             run = Run(program.find(config.algo), config, folder, command.resume, signals)
             if config.environment.backend == "compile":

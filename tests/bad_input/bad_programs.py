@@ -123,9 +123,7 @@ OTHERS = [
     learning("mpc", "a horizon before its end", "--horizon 2 --commit 3", "commit", "got 3"),
     learning("cem", "one elite", "--elites 1", "elites", "got 1"),
     learning("shac", "an endless discount", "--gamma nan", "gamma must be finite, got nan"),
-    learning(
-        "shac", "a policy of the state", "--start-from run", "start_from: got a policy, allowed with sees 'image'"
-    ),
+    learning("shac", "a policy of the state", "--start-from run", "start_from", "sees 'image'"),
     learning("gnn-16", "a layout of images", "--action-layout grid", "action_layout requires algo"),
     learning("coarse", "an anchor", "--anchor 3", "anchor requires refine"),
     learning("shac", "an image without a clock", "--sees image --no-clock", "clock requires sees state"),

@@ -16,7 +16,7 @@ from baselines.registry import configure, load
 from cfp.envs.disturbances import make_cases
 from cfp.errors import CheckpointError
 from cfp.experiment.process import StopSignals
-from cfp.experiment.run_lock import claim
+from cfp.experiment.run_lock import run_lock
 
 ENVIRONMENT = {"particles": 100, "substeps": 1, "num_envs": 1}
 MPC = {"grid": 8, "planner": {"horizon": 3, "commit": 2, "iterations": 1}}
@@ -233,6 +233,6 @@ def test_folder_in_use_is_left_alone(finished):
     folder = finished / "runs" / "mpc-shapematch-quick-0"
     before = (folder / "final_evaluation.json").read_bytes()
     config = configure(json.loads((folder / "config.json").read_text()))
-    with claim(folder):
+    with run_lock(folder):
         assert carry_out(Job("mpc", config, folder, Protocol(9, 100, "none")), StopSignals(), 0.0) == "busy"
     assert (folder / "final_evaluation.json").read_bytes() == before

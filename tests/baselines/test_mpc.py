@@ -114,10 +114,3 @@ def test_state_goes_on_the_same() -> None:
 def test_bad_options_are_named(change: dict, named: str) -> None:
     with pytest.raises(ConfigError, match=named):
         replace(CONFIG, **change).check()
-
-
-def test_estimate_covers_a_whole_plan() -> None:
-    """Only the first step of a commitment plans: timed alone it would make a run look several times longer."""
-    model = MPC(CONFIG)
-    assert model.measure().seconds_per_step > 0
-    assert model.num_timesteps == CONFIG.planner.commit == 2

@@ -56,11 +56,11 @@ def matmul(a, b, c, d, e, f, g, h):
 
 @triton.jit
 def at_least(value, floor):
-    """The larger of two; a value that is no number stays."""
+    """The larger of two; NaN in ``value`` is propagated."""
     return tl.where(value < floor, floor, value)
 
 
 @triton.jit
 def clamp(value, low, high):
-    """Value within [low, high]; one that is no number stays."""
+    """Value within [low, high]; NaN is propagated."""
     return tl.where(value < low, low, tl.where(value > high, high, value))

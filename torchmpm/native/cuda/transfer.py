@@ -41,7 +41,7 @@ def locate_axis(u, on, resolution):
     """First node and distance from it in cells, 0 for particles that take no part."""
     base = truncated(u - 0.5)
     f = tl.where(on, u - base, 0.0)
-    # Clamped before the conversion, which is undefined for large numbers; what is no number ends at the low end.
+    # Clamped before the conversion, which is undefined for large numbers; NaN goes to the low end.
     base = tl.where(base > -PAD, base, -PAD)
     base = tl.where(base < resolution, base, resolution)
     return base.to(tl.int32) + PAD, f

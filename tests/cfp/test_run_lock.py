@@ -3,13 +3,13 @@ import sys
 
 import pytest
 
-from cfp.experiment.run_lock import Claimed, claim
+from cfp.experiment.run_lock import FolderInUse, run_lock
 
 HOLD = """
 import sys
 from pathlib import Path
-from cfp.experiment.run_lock import claim
-with claim(Path(sys.argv[1])):
+from cfp.experiment.run_lock import run_lock
+with run_lock(Path(sys.argv[1])):
     print(1, flush=True)
     input()
 """
@@ -27,30 +27,30 @@ def test_folder_is_held_by_one_process(tmp_path):
     folder = tmp_path / "run"
     process = holder(folder)
     try:
-        with pytest.raises(Claimed, match=f"out: {folder} is in use by process {process.pid} on"), claim(folder):
+        with pytest.raises(FolderInUse, match=f"out: {folder} is in use by process {process.pid} on"), run_lock(folder):
             pass
     finally:
         process.kill()
         process.communicate()
-    with claim(folder):  # what a killed process held is free
+    with run_lock(folder):  # what a killed process held is free
         assert (folder / ".lock").exists()
     assert folder.exists() and not list(folder.iterdir())
 
 
 def test_patience_outlasts_another_process(tmp_path):
     process = holder(tmp_path)
-    with pytest.raises(Claimed), claim(tmp_path, 0.1):
+    with pytest.raises(FolderInUse), run_lock(tmp_path, 0.1):
         pass
     process.communicate("go\n")
-    with claim(tmp_path, 60):
+    with run_lock(tmp_path, 60):
         pass
 
 
 def test_new_folder_goes_again_if_nothing_was_written(tmp_path):
-    with claim(tmp_path / "a" / "empty"):
+    with run_lock(tmp_path / "a" / "empty"):
         pass
     assert not (tmp_path / "a" / "empty").exists()
-    with claim(tmp_path / "full"):
+    with run_lock(tmp_path / "full"):
         (tmp_path / "full" / "file").touch()
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["file"]
 
@@ -60,6 +60,6 @@ def test_lock_that_is_a_link_is_not_written_through(tmp_path):
     mine.write_text("precious")
     folder.mkdir()
     (folder / ".lock").symlink_to(mine)
-    with pytest.raises(OSError, match=r"\.lock"), claim(folder):
+    with pytest.raises(OSError, match=r"\.lock"), run_lock(folder):
         pass
     assert mine.read_text() == "precious"

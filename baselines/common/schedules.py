@@ -1,0 +1,31 @@
+"""Schedules of learning rates over a stage of a run."""
+
+from __future__ import annotations
+
+import math
+
+from cfp.config import RunConfig
+
+FINAL_FRACTION = 0.1
+"""Fraction of the learning rate that is left at the end of a stage."""
+
+
+def stage_progress(config: RunConfig, stage: int, num_timesteps: int) -> float:
+    """Fraction of a stage that is done, 0 to 1; a stage after one that ended early is longer, and stays at 1.
+
+    Args:
+        config: Options of the run.
+        stage: Which stage, 1 is the first.
+        num_timesteps: Environment steps taken in the stage.
+    """
+    return min(num_timesteps / config.stage_steps(stage - 1), 1.0)
+
+
+def linear_decay(progress: float) -> float:
+    """Factor that falls from 1 to `FINAL_FRACTION` along a line as ``progress`` goes from 0 to 1."""
+    return 1.0 - (1.0 - FINAL_FRACTION) * progress
+
+
+def cosine_decay(progress: float) -> float:
+    """Factor that falls from 1 to `FINAL_FRACTION` along a cosine as ``progress`` goes from 0 to 1."""
+    return FINAL_FRACTION + (1.0 - FINAL_FRACTION) * 0.5 * (1.0 + math.cos(math.pi * progress))

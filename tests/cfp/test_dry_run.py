@@ -1,0 +1,41 @@
+"""``--dry-run`` prints options; a run warns of stages that learn nothing."""
+
+import json
+
+from cfp import train
+from cfp.config import Config
+from cfp.experiment.coarse_to_fine import CoarseToFine
+from cfp.experiment.training import parse
+from cfp.from_dict import update_from_dict
+from cfp.presets import preset
+
+TINY = "--particles 100 --substeps 1 --num-envs 2 --device cpu --steps 400 --batch-size 4".split()
+
+
+def test_dry_run_prints_the_options_and_writes_nothing(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert train.main([*TINY, "--dry-run"]) == 0
+    assert not list(tmp_path.iterdir())
+    config: Config = update_from_dict(preset("shapematch"), json.loads(capsys.readouterr().out))
+    assert (config.steps, config.handover, config.environment.particles) == (400, (267,), 100)
+
+
+def test_dry_run_refuses_what_the_run_would(capsys):
+    assert train.main(["--particles", "0", "--dry-run"]) == 2
+    assert "particles" in capsys.readouterr().err
+
+
+def test_stages_that_learn_nothing_are_named(tmp_path):
+    def warnings(*options, first_stage=1):
+        config = parse(train.PROGRAM, [*TINY, "--task", "run", *options]).run
+        return CoarseToFine.warnings(config, tmp_path, first_stage)
+
+    assert warnings() == [
+        "stage 1: all its 267 steps are random (--random-steps 480)",
+        "stage 2: no update in its 133 steps (--update-start 256)",
+    ]
+    assert warnings(first_stage=2) == warnings()[1:]
+    learns = "--random-steps 9 0 --update-start 50".split()
+    assert warnings(*learns) == []
+    late = "stage 2: no actor update in its 133 steps (--actor-start 200)"
+    assert warnings(*learns, "--actor-start", "200") == [late]
