@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fakes import record_fields
 
 import dittogym
 from cfp.config import to_json
@@ -207,13 +208,15 @@ def test_matter_of_the_published_run_of_slot_can_be_chosen():
         matter("--task", "run", "--variant", "published")
 
 
-def test_layout_of_actions_can_be_chosen():
+def test_layout_of_actions_can_be_chosen(monkeypatch):
+    fields = record_fields(monkeypatch)
+
     def field(*arguments):
         config = parse(PROGRAM, ["--task", "run", "--particles", "100", "--substeps", "1", *arguments]).run
         env = make_env(config, 2, 1)
         env.reset()
         env.step(np.array([[[[0.0, 1.0], [0.0, 0.0]]] * 2], np.float32))  # row 0, column 1
-        pull = env.venv.torch_env._field[0, 0]
+        pull = fields[-1][0, 0]
         return (pull > 0.9 * pull.max()).nonzero().float().mean(0).tolist()  # to the right, upwards
 
     image, grid, reference = field(), field("--action-layout", "grid"), field("--parity", "reference")
