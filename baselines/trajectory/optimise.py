@@ -81,13 +81,13 @@ class GradientConfig(GridConfig):
         first = self.iterations * horizon * self.environment.num_envs
         return (first, first + self.polish * horizon) if self.polish else (first,)
 
-    def resolution(self, level: int) -> int:
+    def resolution(self, stage: int) -> int:
         """Action grid R of a stage."""
-        return grid_size(self.task, self.polish_grid if level else self.grid)
+        return grid_size(self.task, self.polish_grid if stage > 1 else self.grid)
 
-    def evaluation(self, level: int) -> tuple[int, int]:
+    def evaluation(self, stage: int) -> tuple[int, int]:
         """A polished policy is judged on its own layout while it is polished."""
-        return (self.seed, 1) if level else super().evaluation(level)
+        return (self.seed, 1) if stage > 1 else super().evaluation(stage)
 
     def ineffective(self) -> dict[str, str]:
         """What concerns the second stage, or a picture to become."""
@@ -137,7 +137,7 @@ class Gradient(Algorithm):
         self.config, self.stage, polishes = config, stage, stage > 1
         environment = config.environment if polishes else config.environment.for_training(config.train_particles)
         own = replace(config, environment=environment)
-        self.env = make_torch_env(own, config.resolution(stage - 1), 1 if polishes else None)
+        self.env = make_torch_env(own, config.resolution(stage), 1 if polishes else None)
         self.env.reset(seed=config.seed)
         self.beginning = self.env.save()  # with reference parity, another reset would keep where the last episode ended
         self.horizon = self.env.spec.horizon

@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dittogym.action import patch_field
 from torchmpm import tree
 
 
@@ -17,13 +16,6 @@ class FakeState:
 
     height: Tensor
     steps: Tensor
-
-
-def record_fields(monkeypatch):
-    """List that receives the muscle stress (B, 2, P, P) of every environment step from now on."""
-    fields = []
-    monkeypatch.setattr("dittogym.core.patch_field", lambda *given: fields.append(patch_field(*given)) or fields[-1])
-    return fields
 
 
 class FakeEnv:
