@@ -1,4 +1,4 @@
-"""Collects milliseconds a substep and prints them as one table at the end."""
+"""Collect milliseconds per substep and print them as one table at the end."""
 
 import pytest
 import torch
@@ -12,13 +12,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(autouse=True)
 def fresh_compiler() -> None:
-    """A process compiles only so many combinations before it runs eagerly: let no benchmark use up another's share."""
+    """A process compiles a limited number of combinations before it runs eagerly: each benchmark starts at zero."""
     torch.compiler.reset()
 
 
 @pytest.fixture
 def per_substep(request: pytest.FixtureRequest, benchmark):
-    """Time ``run``, which advances ``particles`` particles by ``substeps`` substeps; note the cost of one."""
+    """Time ``run``, which advances ``particles`` particles by ``substeps`` substeps, and record the cost of one."""
 
     def measure(run, *, particles: int, substeps: int, rounds: int) -> None:
         # On CUDA the first call compiles, the second records a graph.
@@ -43,7 +43,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
     rows = config.stash[ROWS]
     if not rows:
         return
-    terminalreporter.section("milliseconds a substep")
+    terminalreporter.section("milliseconds per substep")
     terminalreporter.line(f"torch {torch.__version__}, {torch.get_num_threads()} threads")
     terminalreporter.line(f"{'':32}{'min':>10}{'median':>10}{'ns/particle (min)':>20}")
     for name, least, median, nanoseconds in rows:

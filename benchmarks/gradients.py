@@ -1,6 +1,6 @@
 """Time and memory of a gradient through one step of RUN: the table in docs/concepts/gradients.md.
 
-Run `python benchmarks/gradients.py`; each size has a process of its own, so that memory can be read off it (Linux).
+Run `python benchmarks/gradients.py`; each size runs in a process of its own, whose peak memory is measured (Linux).
 """
 
 import gc
@@ -19,13 +19,13 @@ REPEATS = 7
 
 
 def resident(name: str) -> int:
-    """Bytes of memory that this process has (``"VmRSS"``) or had at most (``"VmHWM"``)."""
+    """Current (``"VmRSS"``) or peak (``"VmHWM"``) memory of this process in bytes."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(name))
 
 
 def step(env: dittogym.TorchEnv, gradients: bool) -> float:
-    """Seconds for one step, with a backward pass from the reward to the action if asked for."""
+    """Seconds of one step; ``gradients`` adds a backward pass from the reward to the action."""
     action = torch.zeros(1, *env.action_shape, requires_grad=gradients)
     env.reset()
     begin = time.perf_counter()

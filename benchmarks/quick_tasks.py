@@ -1,8 +1,8 @@
-"""What every task costs: ``python benchmarks/quick_tasks.py --out FOLDER --table TABLE.csv``.
+"""Training speed and memory of every task: ``python benchmarks/quick_tasks.py --out FOLDER --table TABLE.csv``.
 
-Trains each task of the quick preset through both stages, in a process of its own, and writes a row for it: training
-steps a second of each stage (median of the points that TensorBoard gets), the most memory the process held, and the
-mean returns of the final table. A task that the table has already is left out; options after these go to the training.
+Trains each task with the quick preset through both stages, in a process of its own, and adds a row to the table:
+training steps per second of each stage (median of the values in TensorBoard), peak memory of the process, and the mean
+returns of the final evaluation. Tasks that the table already holds are skipped. Further options go to the training.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from dittogym import TASKS
 
 
 def train(task: str, folder: Path, steps: int, options: list[str]) -> int:
-    """Train in a process of its own; returns the most bytes that it held."""
+    """Train in a process of its own; returns its peak memory in bytes."""
     command = [sys.executable, "-m", "cfp.train", "--task", task, "--steps", str(steps), "--out", str(folder)]
     process = subprocess.Popen([*command, "--no-video", *options])
     _, status, usage = os.wait4(process.pid, 0)
@@ -30,7 +30,7 @@ def train(task: str, folder: Path, steps: int, options: list[str]) -> int:
 
 
 def speeds(folder: Path) -> list[float]:
-    """Median training steps a second of each stage."""
+    """Median training steps per second of each stage."""
     events = EventAccumulator(str(folder / "tensorboard"))
     events.Reload()
     stages = {event.step: int(event.value) for event in events.Scalars("stage")}
@@ -41,7 +41,7 @@ def speeds(folder: Path) -> list[float]:
 
 
 def row(task: str, folder: Path, memory: int) -> dict[str, object]:
-    """One line of the table."""
+    """A row of the table."""
     first, second = speeds(folder)
     cells: dict[str, object] = {"task": task, "step": int(read_table(folder / "progress.csv")[-1]["step"])}
     cells |= {"steps/s, stage 1": f"{first:.1f}", "steps/s, stage 2": f"{second:.1f}"}

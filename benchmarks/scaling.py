@@ -1,6 +1,6 @@
-"""How the cost of a step grows with particles, batch and threads: one Markdown table.
+"""Cost of a step by number of particles, batch size and threads, as a Markdown table.
 
-Run it as ``python benchmarks/scaling.py [--backend native] [--rounds 8]``.
+Run ``python benchmarks/scaling.py [--backend native] [--rounds 8]``.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ SIZES = ((1, 500), (1, 2_000), (1, 8_000), (1, 22_000), (1, 88_000), (4, 2_000),
 
 @dataclass(frozen=True)
 class Options:
-    """Time steps of 100 substeps in the scene of RUN; the least of some rounds counts."""
+    """Time steps of 100 substeps in the scene of RUN; the minimum over the rounds is printed."""
 
     backend: str = "auto"
-    """Of the solver."""
+    """Backend of the solver."""
     rounds: int = 8
-    """Timed steps of each case, after one that does not count."""
+    """Timed steps of each case, after one for warming up."""
     threads: tuple[int, ...] = tuple(sorted({1, torch.get_num_threads()}))
     """Numbers of threads."""
 
 
 def seconds(run, rounds: int) -> float:
-    """Least time of some calls, after one."""
+    """Minimum time of a call in seconds, after one for warming up."""
     run()
     times = []
     for _ in range(rounds):

@@ -1,7 +1,7 @@
-"""How well open-loop gradient descent matches shapes, at full size: the table and the picture of docs/results.md.
+"""Open-loop gradient descent in SHAPE MATCH at full size: the table and the picture of docs/results.md.
 
-Run `OMP_NUM_THREADS=1 python benchmarks/shape_matching.py --out runs/shapes`; what the folder holds already is not
-trained again. A target is a name, the path of an image, or a letter other than I, M and T, which is drawn here.
+Run `OMP_NUM_THREADS=1 python benchmarks/shape_matching.py --out runs/shapes`; results that the folder already holds are
+kept. A target is a name, the path of an image, or a letter other than I, M and T, which is drawn here.
 """
 
 import argparse
@@ -21,8 +21,8 @@ from dittogym.observation.image import silhouette
 from dittogym.tasks.targets import load_target
 
 LAYOUTS = 3
-#: Pixels that a drawn letter gets: a robot at rest has 355.
 AREA = 380
+"""Pixels of a drawn letter; a robot at rest has 355."""
 SCALE = 5
 
 
@@ -41,7 +41,7 @@ def letter(character: str) -> np.ndarray:
 
 
 def play(policy: baselines.OpenLoop, target: str) -> dict[str, list]:
-    """Return, intersection over union and final silhouette on layouts that the training did not know."""
+    """Return, intersection over union and final silhouette on layouts that were not trained on."""
     env = TorchEnv("shapematch", LAYOUTS, policy.resolution, target=target)
     observation, _ = env.reset(seed=2 * EVALUATION_SEED)
     memory, total = None, 0
@@ -54,7 +54,7 @@ def play(policy: baselines.OpenLoop, target: str) -> dict[str, list]:
 
 
 def measure(target: str, out: Path, polish: int) -> dict:
-    """Train for one target, unless it is done, and judge the result."""
+    """Train for one target, unless that is done, and evaluate the result."""
     name, kept = Path(target).stem, out / f"{Path(target).stem}.json"
     if kept.exists():
         return json.loads(kept.read_text())
@@ -72,26 +72,24 @@ def measure(target: str, out: Path, polish: int) -> dict:
 
 
 def row(result: dict) -> str:
-    """A line of the table: means over the layouts."""
+    """A row of the table: means over the layouts."""
     returns, iou = np.array(result["returns"]), np.array(result["iou"])
-    wanted = int(load_target(result["target"]).sum())
+    pixels = int(load_target(result["target"]).sum())
     name = Path(result["target"]).stem
     spread = f"{returns.mean():.0f} ± {returns.std():.0f}"
-    return f"| {name} | {wanted} | {spread} | {iou.mean():.2f} | {result['minutes']:.1f} |"
+    return f"| {name} | {pixels} | {spread} | {iou.mean():.2f} | {result['minutes']:.1f} |"
 
 
 def picture(results: list[dict]) -> np.ndarray:
-    """Targets above last silhouettes, on the first layout: what matches teal, what misses orange, what exceeds grey."""
+    """Targets above final silhouettes on the first layout: covered pixels teal, missing orange, excess grey."""
     columns = []
     for result in results:
-        wanted, found = load_target(result["target"]), np.array(result["silhouette"])
+        target, found = load_target(result["target"]), np.array(result["silhouette"])
         top, bottom = (np.full((64, 64, 3), 255, np.uint8) for _ in range(2))
-        top[wanted] = (40, 40, 40)
-        bottom[wanted & found], bottom[wanted & ~found], bottom[~wanted & found] = (
-            (128, 128, 0),
-            (40, 140, 240),
-            (170,) * 3,
-        )
+        top[target] = (40, 40, 40)
+        bottom[target & found] = (128, 128, 0)
+        bottom[target & ~found] = (40, 140, 240)
+        bottom[~target & found] = (170, 170, 170)
         columns.append(np.pad(np.vstack((top, bottom)), ((2, 2), (2, 2), (0, 0)), constant_values=225))
     return np.kron(np.hstack(columns), np.ones((SCALE, SCALE, 1), np.uint8))
 
@@ -106,7 +104,7 @@ if __name__ == "__main__":
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     found = [measure(target, arguments.out, arguments.polish) for target in arguments.targets]
-    head = f"| target | its pixels | return, {LAYOUTS} layouts | IoU at the end | minutes of one core |"
+    head = f"| target | pixels | return, {LAYOUTS} layouts | IoU at the end | minutes of one core |"
     lines = [head, "| --- | --- | --- | --- | --- |", *map(row, found)]
     (arguments.out / "table.md").write_text("\n".join(lines) + "\n")
     cv2.imwrite(str(arguments.out / "picture.png"), picture(found))

@@ -1,8 +1,9 @@
-"""Long runs under random actions: memory, speed, and whether numbers stay numbers, as a CSV file.
+"""Memory, speed and NaNs of long runs with random actions, as a CSV file.
 
 `OMP_NUM_THREADS=1 python benchmarks/soak.py --out soak.csv` takes 100,000 environment steps of RUN's lite tier in a
-batch of 16; ended episodes start anew. With `--endless --robots 1 --particles 20 --substeps 10000 --steps 86400` one
-episode goes on for 24 hours of simulated time. Speed is per second of processor time: other programs count for little.
+batch of 16 and resets episodes that have ended. With `--endless --robots 1 --particles 20 --substeps 10000 --steps
+86400` one episode lasts 24 hours of simulated time. Speed is given per second of processor time, which other programs
+hardly affect.
 """
 
 from __future__ import annotations
@@ -35,13 +36,13 @@ class Options:
     particles: str = "lite"
     """"lite", "full", or the number of the robot's particles."""
     substeps: int = 100
-    """Of 0.1 ms, in a step."""
+    """Physics steps of 0.1 ms in an environment step."""
     steps: int = 100_000
     """Steps of all robots together."""
     rows: int = 50
-    """Lines of the table."""
+    """Rows of the table."""
     endless: bool = False
-    """Nothing is ever reset: one episode."""
+    """Never reset the environment: one single episode."""
 
 
 def resident() -> float:
@@ -51,7 +52,7 @@ def resident() -> float:
 
 
 def main(options: Options) -> None:
-    """Step, count, and write a row now and then."""
+    """Take all steps, and write a row at regular intervals."""
     env = gymnasium.make_vec(
         f"dittogym/{options.task}-coarse-v0",
         num_envs=options.robots,
@@ -61,7 +62,7 @@ def main(options: Options) -> None:
         substeps=options.substeps,
     )
     env.reset(seed=0)
-    env.step(np.zeros(env.action_space.shape, np.float32))  # compiles and loads
+    env.step(np.zeros(env.action_space.shape, np.float32))  # compiles the kernels
     env.reset(seed=0)
     draw, table = np.random.default_rng(0), Table(options.out)
     calls = -(-options.steps // options.robots)

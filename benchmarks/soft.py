@@ -1,4 +1,4 @@
-"""How far the soft observation and the soft rewards are from the true ones: the tables in docs/concepts/gradients.md.
+"""Error of the soft observation and the soft rewards: the tables of docs/concepts/gradients.md.
 
 Run `python benchmarks/soft.py`; `--tasks run,kick` for some tasks only.
 """
@@ -16,7 +16,7 @@ STEPS = 30
 
 @torch.no_grad()
 def gaps(task: str, tier: str, policy) -> list[float]:
-    """Averages over an episode of 30 steps (or until it ends) from seed 0; at full size beside a second layout."""
+    """Mean differences over 30 steps (or until the episode ends) from seed 0, and those to another layout."""
     env, other = (dittogym.TorchEnv(task, particles=p, action_layout="grid") for p in (tier, "full"))
     env.reset(seed=0)
     other.reset(seed=1)

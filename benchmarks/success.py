@@ -1,8 +1,7 @@
-"""How often a policy succeeds within the first steps of an episode, while its actions are shaken.
+"""Success rate of a policy within the first steps of an episode, under Gaussian noise on its actions.
 
-``python -m baselines.robustness --cases noise`` tells the same of whole episodes. Where success comes early or
-never, as in GROW under the record of a plan (``python benchmarks/success.py POLICY``),
-most of their time tells nothing.
+Run ``python benchmarks/success.py POLICY``. ``python -m baselines.robustness --cases noise`` measures whole episodes;
+this is faster where a policy succeeds early or never, as the recorded plan of GROW does.
 """
 
 import argparse
@@ -23,7 +22,7 @@ BATCH = 20
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("policy", help="a policy file, or the name of one that comes with the package")
-    parser.add_argument("--steps", type=int, default=45, help="control steps after which an episode is cut")
+    parser.add_argument("--steps", type=int, default=45, help="control steps after which an episode is truncated")
     parser.add_argument("--noise", type=float, default=0.1, help="standard deviation on every action entry")
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--particles", default="full")
@@ -50,7 +49,7 @@ def main() -> None:
             deterministic=policy.deterministic_by_default, seed=seed,
         )  # fmt: skip
         if result.success is None:
-            parser.error(f"policy: got one of {config.task}, allowed of a task that defines success")
+            parser.error(f"policy must be for a task that defines success, got one for {config.task}")
         done, successes = done + count, successes + round(result.success * count)
         low, high = wilson_interval(successes, done)
         print(f"{successes} of {done} episodes, 95 % interval {low:.0%} to {high:.0%}", flush=True)

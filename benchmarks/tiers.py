@@ -1,4 +1,4 @@
-"""How close the lite tier is to full size: returns under the same actions, and the ranking of random policies.
+"""The lite tier compared with full size: returns under the same actions, and the ranking of random policies.
 
 Run `python benchmarks/tiers.py` for the table of returns, with `--policies 20` for rankings as well.
 """
@@ -23,7 +23,7 @@ def sine(env: dittogym.TorchEnv, t: int) -> torch.Tensor:
 
 
 def zeros(env: dittogym.TorchEnv, t: int) -> torch.Tensor:
-    """No muscle does anything."""
+    """No muscle acts."""
     return torch.zeros(1, *env.action_shape, dtype=env.dtype)
 
 
@@ -61,7 +61,7 @@ def rewards(task: str, particles: str, policy, steps: int, backend: str) -> tupl
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--policies", type=int, default=0, help="random policies to rank in each of five tasks")
-    parser.add_argument("--backend", default="auto", help="of the solver")
+    parser.add_argument("--backend", default="auto", help="backend of the solver")
     arguments = parser.parse_args()
     print("| task | actions | return full | return lite | difference a step | centre of mass, at most (m) |")
     print("| --- " * 6 + "|")

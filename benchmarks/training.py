@@ -1,7 +1,7 @@
-"""What a training step costs and where its time goes: `python benchmarks/training.py`.
+"""Cost of a training step and its parts: `python benchmarks/training.py`.
 
-Prints seconds an update (batches of the quick and the paper preset, float32 and bfloat16 in turn), training steps a
-second of the quick preset with the shares of simulation, updates and the rest, and environment steps a second alone.
+Prints seconds per update (batches of the quick and the paper preset, float32 and bfloat16 in turn), training steps per
+second of the quick preset with the shares of simulation, updates and the rest, and environment steps per second alone.
 """
 
 import argparse
@@ -23,16 +23,16 @@ from cfp.envs.make import make_env
 from cfp.experiment.process import keep_memory
 
 
-def make_model(config: Config, level: int, num_envs: int) -> CFP:
-    """The model of one level of a configuration, with updates from the first steps on."""
+def make_model(config: Config, stage: int, num_envs: int) -> CFP:
+    """The model of one stage of a configuration, with updates from the first steps on."""
     hyperparameters = replace(
-        config.hyperparameters(level), buffer_size=2_000, update_start=config.learning.batch_size, random_steps=0
+        config.hyperparameters(stage), buffer_size=2_000, update_start=config.learning.batch_size, random_steps=0
     )
     model = CFP(
         CFPPolicy,
-        make_env(config, config.action_size(level), num_envs),
+        make_env(config, config.action_size(stage), num_envs),
         hyperparameters,
-        policy_kwargs={"spec": config.actor_spec(level)},
+        policy_kwargs={"spec": config.actor_spec(stage)},
         seed=0,
         device="cpu",
     )
@@ -50,9 +50,9 @@ def make_batch(size: int, resolution: int) -> ReplayBufferSamples:
 
 
 def in_turn(cases: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Least seconds of each case; the cases take turns, so that other programs disturb all of them alike."""
+    """Minimum seconds of each case; the cases take turns, so that other programs slow down all of them alike."""
     least = dict.fromkeys(cases, float("inf"))
-    for number in range(rounds + 2):  # the first two are thrown away
+    for number in range(rounds + 2):  # two rounds for warming up
         for name, run in cases.items():
             start = time.perf_counter()
             run()
@@ -62,20 +62,20 @@ def in_turn(cases: dict[str, Callable[[], object]], rounds: int) -> dict[str, fl
 
 
 def updates(config: Config, modes: list[str], rounds: int) -> None:
-    """Print seconds an update."""
-    print("| level | batch | " + " | ".join(modes) + f" | {modes[-1]} : {modes[0]} |")
+    """Print seconds per update."""
+    print("| stage | batch | " + " | ".join(modes) + f" | {modes[-1]} : {modes[0]} |")
     print("| --- " * (3 + len(modes)) + "|")
-    for level in (0, 1):
+    for stage in (1, 2):
         for size in (64, 256):
-            batch, cases = make_batch(size, config.resolutions[level]), {}
+            batch, cases = make_batch(size, config.resolution(stage)), {}
             for mode in modes:
                 precision, _, compiled = mode.partition("+")
                 learning = replace(config.learning, precision=precision, compile=bool(compiled))
-                model = make_model(replace(config, learning=learning), level, 1)
+                model = make_model(replace(config, learning=learning), stage, 1)
                 cases[mode] = partial(model.update, batch)
             least = list(in_turn(cases, rounds).values())
             numbers = " | ".join(f"{value:.4f}" for value in least)
-            print(f"| {level + 1} | {size} | {numbers} | {least[-1] / least[0]:.2f} |", flush=True)
+            print(f"| {stage} | {size} | {numbers} | {least[-1] / least[0]:.2f} |", flush=True)
 
 
 @contextmanager
@@ -96,13 +96,13 @@ def timed(owner: object, name: str, clock: dict[str, float]) -> Iterator[None]:
 
 
 def training(config: Config, steps: int) -> None:
-    """Print training steps a second and their shares."""
-    print("| level | robots | updates a step | precision | training steps/s | simulation | updates | rest |")
+    """Print training steps per second and the shares of their parts."""
+    print("| stage | robots | updates per step | precision | training steps/s | simulation | updates | rest |")
     print("| --- " * 8 + "|")
-    for level in (0, 1):
+    for stage in (1, 2):
         for num_envs, gradient_steps in ((1, 1), (config.environment.num_envs, config.learning.gradient_steps)):
             learning = replace(config.learning, gradient_steps=gradient_steps)
-            model, clock = make_model(replace(config, learning=learning), level, num_envs), dict[str, float]()
+            model, clock = make_model(replace(config, learning=learning), stage, num_envs), dict[str, float]()
             model.learn(config.learning.batch_size + 2 * num_envs)
             with timed(model.env, "step", clock), timed(model, "train", clock):
                 start = time.perf_counter()
@@ -111,12 +111,12 @@ def training(config: Config, steps: int) -> None:
             simulation, update = clock["step"] / total, clock["train"] / total
             shares = " | ".join(f"{100 * share:.0f} %" for share in (simulation, update, 1 - simulation - update))
             precision = "bfloat16" if model.losses.bfloat16 else "float32"
-            head = f"| {level + 1} | {num_envs} | {gradient_steps} | {precision}"
+            head = f"| {stage} | {num_envs} | {gradient_steps} | {precision}"
             print(f"{head} | {steps * num_envs / total:.1f} | {shares} |", flush=True)
 
 
 def environments(steps: int) -> None:
-    """Print environment steps a second of RUN under Gymnasium's vector interface."""
+    """Print environment steps per second of RUN under Gymnasium's vector interface."""
     for count in (16, 64):
         env = gymnasium.make_vec(
             "dittogym/run-coarse-v0", num_envs=count, vectorization_mode="vector_entry_point", particles="lite"

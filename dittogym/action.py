@@ -29,18 +29,10 @@ def from_grid_indexing(action: Tensor, indexing: ActionIndexing) -> Tensor:
 
 
 def patch_field(action: Tensor, patch: int, max_actuation: float | Tensor) -> Tensor:
-    """Upsample an action to the patch and scale it to muscle stress.
+    """Upsample an action (B, 2, R, R) to the patch and scale it to muscle stress (B, 2, P, P), Pa.
 
     Bicubic interpolation (a = -0.75) with half-pixel centres; the result is clipped to the muscles' limit, because the
     interpolation overshoots.
-
-    Args:
-        action: (B, 2, R, R) in grid indexing, 1 is the full actuation.
-        patch: Width P of the patch in nodes.
-        max_actuation: Muscle stress limit, Pa; a number or (B,).
-
-    Returns:
-        (B, 2, P, P), Pa.
     """
     upsampled = bicubic(action, patch)
     scale = max_actuation.view(-1, 1, 1, 1) if isinstance(max_actuation, Tensor) else max_actuation
@@ -68,28 +60,13 @@ def bicubic_matrix(before: int, after: int, align_corners: bool, dtype: torch.dt
 
 
 def patch_corner(centre: Tensor, patch: int, nodes: int) -> Tensor:
-    """First node along x and y, (B, 2) int64, of a patch that is kept whole inside the window.
-
-    Args:
-        centre: (B, 2) where its centre belongs, in window coordinates, m (the window is 1 m wide).
-        patch: Its width in nodes.
-        nodes: Nodes per axis of the window.
-    """
+    """First node (B, 2) int64 of a patch around ``centre`` (B, 2) in the window, m, kept whole inside the window."""
     # The conversion truncates, as in the reference.
     return (nodes * centre.detach() - patch / 2).to(torch.int64).clamp(0, nodes - patch)
 
 
 def place(actuation: Tensor, centre: Tensor, nodes: int) -> Tensor:
-    """Put the actuation of patches on the nodes of the window.
-
-    Args:
-        actuation: (B, 2, P, P) on the patch, Pa.
-        centre: (B, 2) where its centre belongs, in window coordinates, m (the window is 1 m wide).
-        nodes: Nodes per axis of the window.
-
-    Returns:
-        (B, 2, nodes, nodes); zero off the patch, which is kept whole inside the window.
-    """
+    """Put the actuation (B, 2, P, P) of patches around ``centre`` (B, 2) on all nodes of the window, (B, 2, G, G)."""
     batch, _, patch, _ = actuation.shape
     i, j = patch_corner(centre, patch, nodes).split(1, dim=1)
     ids = i * nodes + j + _patch_ids(patch, nodes, actuation.device)

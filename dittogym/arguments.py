@@ -68,3 +68,16 @@ def reset_options(options: Any) -> dict[str, Any]:
         if name not in RESET_OPTIONS:
             raise ValueError(f"options may hold {', '.join(RESET_OPTIONS)}, got {name!r}")
     return dict(options or {})
+
+
+def check_action(action: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """The action, if it is a finite floating point tensor of this shape."""
+    if not isinstance(action, Tensor) or not action.is_floating_point():
+        kind = action.dtype if isinstance(action, Tensor) else type(action).__name__
+        raise ValueError(f"action must be a floating point tensor, got {kind}")
+    if tuple(action.shape) != shape:
+        raise ValueError(f"action must have shape {shape}, got {tuple(action.shape)}")
+    if not bool(torch.isfinite(action).all()):
+        count = int((~torch.isfinite(action)).sum())
+        raise ValueError(f"action must be finite, got {count} entries that are NaN or infinite")
+    return action

@@ -96,7 +96,7 @@ class Outcome(NamedTuple):
         terminated: (B,) bool, the task's own reasons to end the episode; ``None`` for none.
         success: (B,) bool; ``None`` where success is not defined.
         info: Further quantities for ``info``, with a leading B.
-        memory: Replaces the memory, under the same names and with the same shapes; ``None`` keeps it.
+        memory: Replaces the memory, leading B, with the same names and shapes; ``None`` keeps it.
     """
 
     terms: Mapping[str, Tensor]
@@ -110,12 +110,7 @@ Memory: TypeAlias = Mapping[str, Tensor]
 
 
 def check_memory(task: str, memory: object, stale: tuple[str, ...], batch: int) -> None:
-    """Refuse what a task must not return as its initial memory.
-
-    Raises:
-        ValueError: An entry has no leading B, or a name of ``stale`` is missing.
-        TypeError: It is not a mapping.
-    """
+    """Refuse what a task must not return as its initial memory."""
     if not isinstance(memory, Mapping):
         raise TypeError(f"initial_memory of task {task!r} must return tensors by name, got {_kind(memory)}")
     _check_leading(f"initial_memory of task {task!r}", "memory", memory, batch)
@@ -131,19 +126,6 @@ def check_outcome(
     """Refuse what a task must not return as the outcome of a step.
 
     Types and shapes are checked when names appear for the first time, not in every step.
-
-    Args:
-        task: Name of the task.
-        outcome: What its reward function returned.
-        memory: What it remembered before.
-        weights: Of its terms.
-        batch: B.
-        checked: Names that were checked before; those of this outcome are added.
-
-    Raises:
-        ValueError: A term has no weight, a name belongs to the engine, something has another shape than (B, ...), or
-            the memory is unlike the one before.
-        TypeError: It is not an :class:`Outcome`, or a part is not a mapping.
     """
     who = f"reward_fn of task {task!r}"
     if not isinstance(outcome, Outcome):

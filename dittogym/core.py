@@ -106,7 +106,7 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
     guard = _GradientGuard()
     if torch.is_grad_enabled():
         guarded, action = tree.map(guard, state), guard(action)
-        state = guarded if guard.used else state  # whose planes need not be stacked anew
+        state = guarded if guard.used else state  # without a copy of its planes
     spec, solver = model.spec, model.solver_for(state.physics)
     actuation = patch_field(action, spec.patch, state.physics.get("max_actuation", spec.max_actuation))
     on_nodes = place(actuation, centre_in_window(spec.reach, state.centre, state.origin), solver.grid.resolution)

@@ -28,11 +28,7 @@ def spaces(env: TorchEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
 
 
 def as_tensor(action: Any, env: TorchEnv, single: bool = False) -> torch.Tensor:
-    """A NumPy action batch as a tensor, or a clear error; ``single``: one action, which becomes a batch of one.
-
-    Raises:
-        ValueError: Not numbers, or not of shape (B, 2, R, R).
-    """
+    """An array of actions as a tensor; ``single``: one action, which becomes a batch of one."""
     try:
         array = np.asarray(action)
     except ValueError:  # rows of different lengths
@@ -53,7 +49,7 @@ def as_image(observation: torch.Tensor) -> np.ndarray:
 
 
 def as_numpy(info: dict[str, Any]) -> dict[str, Any]:
-    """Tensors of an ``info`` as arrays of their own with a leading B, nested dictionaries included."""
+    """Copies of the tensors of an ``info`` as arrays, nested dictionaries included."""
     return {k: as_numpy(v) if isinstance(v, dict) else v.detach().cpu().numpy().copy() for k, v in info.items()}
 
 
@@ -124,7 +120,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         """Start a new episode; see :meth:`dittogym.TorchEnv.reset`.
 
         Args:
-            seed: Draws the particles anew.
+            seed: Draws new positions.
             options: As there.
 
         Returns:
@@ -159,7 +155,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         return self.torch_env.save()
 
     def load(self, snapshot: Snapshot) -> np.ndarray:
-        """Go on from the moment ``snapshot``, and return its observation (3, 64, 64) uint8.
+        """Continue from a saved moment, and return its observation (3, 64, 64) uint8.
 
         See :meth:`dittogym.TorchEnv.load`.
         """

@@ -65,11 +65,7 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
 
 
 def real_tensor(name: str, given: Any) -> Tensor:
-    """Numbers, an array or a tensor as a tensor.
-
-    Raises:
-        ValueError: Not real numbers.
-    """
+    """Numbers, an array or a tensor as a tensor."""
     try:
         if isinstance(given, np.ndarray) and given.dtype.kind in "biuf":
             # A copy: torch takes neither negative strides nor foreign byte orders.

@@ -15,20 +15,20 @@ ENTRY_POINT = "dittogym.env:Env"
 
 
 def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "dittogym", version: int = 0) -> None:
-    """Make a task known by name: to :class:`dittogym.TorchEnv`, and to Gymnasium in both resolutions.
+    """Register a task by name for :class:`dittogym.TorchEnv` and, in both resolutions, for Gymnasium.
 
     Args:
         task: Its name; the ids are ``{namespace}/{task}-coarse-v{version}`` and ``{namespace}/{task}-fine-v{version}``.
         make: Returns the specification; its keyword arguments, which need defaults, become options of the environment.
-            Where one of them lengthens the horizon, ``gymnasium.make`` needs ``max_episode_steps`` beside it.
+            Where one of them lengthens the horizon, ``gymnasium.make`` needs ``max_episode_steps`` too.
         namespace: Of the ids.
-        version: To be raised with every change of behaviour. Where a function is written anew, as in a notebook, the
-            ids of the one before are taken back.
+        version: Increase it with every change of behaviour. If a function is defined again, as in a notebook, the ids
+            of the old one are removed.
 
     Raises:
-        ValueError: Another function's task has this name, the specification has another one, a name is not one word, or
+        ValueError: The name belongs to another function, differs from that in the specification or is not one word, or
             the version is negative.
-        TypeError: ``make`` is no function, or does not return a :class:`dittogym.TaskSpec`.
+        TypeError: ``make`` is not a function, or does not return a :class:`dittogym.TaskSpec`.
     """
     if not isinstance(task, str) or re.fullmatch(r"\w+", task) is None:
         raise ValueError(f"task must be a name of letters, digits and underscores, got {task!r}")
@@ -63,7 +63,7 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
 
 
 def _source(make: Callable[..., TaskSpec]) -> object:
-    """Where a function was written: one that a notebook's cell defines anew is the same."""
+    """Where a function was defined, which stays the same if a notebook's cell defines it again."""
     name = getattr(make, "__qualname__", "<")
     return make if "<" in name else (make.__module__, name)
 

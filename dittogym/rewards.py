@@ -142,16 +142,7 @@ def _squared_distance(x: Tensor, point: Tensor) -> Tensor:
 
 
 def nearest(x: Tensor, point: Tensor, fraction: float) -> Tensor:
-    """The particles nearest to a point, without the one of them with the largest absolute x.
-
-    Args:
-        x: (B, N, 2) positions of the particles, m.
-        point: (B, 2), m.
-        fraction: How many to choose, as a fraction of all.
-
-    Returns:
-        Indices (B, K).
-    """
+    """Indices (B, K) of a fraction of ``x`` (B, N, 2) nearest to ``point`` (B, 2), but for the largest absolute x."""
     return drop_widest(_squared_distance(x, point).topk(count_of(fraction, x), largest=False).indices, x)
 
 

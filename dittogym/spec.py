@@ -72,7 +72,7 @@ class TaskSpec:
         weights: Weights of the reward terms by name: one for each term of ``reward_fn``, and any of ``split`` (a torn
             robot, where there is a ``split_limit``), ``action`` (norm of the actuation field) and ``alive`` (every
             step).
-        objects: Bodies beside the robot, at most one.
+        objects: Bodies besides the robot, at most one.
         gravity: (x, y), m/s^2.
         damping: Factor on node velocities in every substep.
         window: Fixed or moving window.
@@ -89,7 +89,7 @@ class TaskSpec:
 
     Raises:
         ValueError: A number is out of range, or there is more than one object.
-        TypeError: A body, an obstacle or a group of numbers is something else, or a function cannot be called.
+        TypeError: A value has another type, or a function cannot be called.
     """
 
     name: str
@@ -118,7 +118,7 @@ class TaskSpec:
     target: np.ndarray | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
-        """Check what would otherwise fail late or silently."""
+        """Check all values, some of which would otherwise fail late or silently."""
         checks.instance("name", self.name, str)
         self._check_numbers()
         self._check_weights()
@@ -173,7 +173,7 @@ class TaskSpec:
         """The goal (2,) with the type and device of ``x``, m.
 
         Raises:
-            ValueError: There is none.
+            ValueError: The task has no goal.
         """
         if self.goal is None:
             raise ValueError(f"goal of task {self.name!r} must be a point (x, y), got None")

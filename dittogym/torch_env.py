@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dittogym import core
 from dittogym.action import ActionIndexing, to_grid_indexing
-from dittogym.arguments import DTYPES, choice, find_device, find_mask, find_resolution, reset_options
+from dittogym.arguments import DTYPES, check_action, choice, find_device, find_mask, find_resolution, reset_options
 from dittogym.bodies.positions import InitialPositions, Particles, Seed, particle_counts
 from dittogym.contract import ENGINE_INFO, measure
 from dittogym.model import PARITIES, EnvState, ParityName, Snapshot, check_stability, make_model
@@ -30,8 +30,8 @@ class TorchEnv:
 
     Rewards and states keep their autograd graph as long as gradients are enabled: differentiate through
     :meth:`step`, cut the graph with :meth:`detach`, or run under ``torch.no_grad()``. The observation is an integer
-    image and has no gradient. Nothing is reset by itself: an element that has ended goes on until :meth:`reset` is
-    called with a mask. Element i of a batch reset with seed s is the single environment reset with seed s + i.
+    image and has no gradient. Elements are not reset automatically: one that has ended continues until :meth:`reset`
+    is called with a mask. Element i of a batch reset with seed s is the single environment reset with seed s + i.
 
     Args:
         task: A task name or a :class:`dittogym.spec.TaskSpec`.
@@ -46,7 +46,7 @@ class TorchEnv:
             ``"grid"``: (x, y), as in the reference implementation. ``None``: ``"grid"`` with reference parity, else
             ``"image"``.
         parity: ``"clean"``, or ``"reference"`` to bring back the reference's stale observation and action centre
-            after a reset, its random layout, unit particle volume and pixel raster at every particle count.
+            after a reset, its random positions, unit particle volume and pixel raster at every particle count.
         resample: Draw new particles at every reset, not only at a seeded one.
         deterministic: Accept only what repeats a trajectory bit by bit for one seed and number of threads: the CPU, and
             not the backend ``"compile"``.
@@ -123,11 +123,11 @@ class TorchEnv:
 
     @property
     def env_state(self) -> EnvState:
-        """Everything that moves, for :mod:`dittogym.core`; see also :meth:`save`. An assignment goes on from there.
+        """Everything that moves, for :mod:`dittogym.core`; see also :meth:`save`. Assign a state to continue from it.
 
         Raises:
-            RuntimeError: Neither reset nor assigned yet.
-            TypeError: What is assigned is something else.
+            RuntimeError: It was neither reset nor assigned.
+            TypeError: The assigned value is not an EnvState.
             ValueError: It has another number of simulations or particles, another dtype or device.
         """
         if self._env_state is None:
@@ -166,7 +166,7 @@ class TorchEnv:
         return self.env_state.particles
 
     def _present(self) -> tuple[Tensor, dict[str, Tensor]]:
-        """Observation and measured info of the present state, computed anew where the state was assigned."""
+        """Observation and measured info of the present state, computed again if the state was assigned."""
         if self._observation is None:
             self._observation = core.observe(self.model, self.env_state)
         if self._info is None:
@@ -187,8 +187,7 @@ class TorchEnv:
     def save(self) -> Snapshot:
         """A copy of the present moment, to which :meth:`load` returns; keeps the autograd graph."""
         state, observation = tree.map(Tensor.clone, (self.env_state, self._present()[0]))
-        counts, weight = self.model.camera.counts, self.model.particle_weight
-        return Snapshot(self.spec.name, counts, weight, state, observation)
+        return Snapshot(self.spec.name, self.model.camera.counts, self.model.particle_weight, state, observation)
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Continue from a saved moment, to the last bit as if nothing had happened since.
@@ -231,7 +230,7 @@ class TorchEnv:
         """Start new episodes. A reset that raises an error changes nothing.
 
         Args:
-            seed: Seeds element i with ``seed + i``, or with ``seed[i]``, and draws its particles anew. Without it, or
+            seed: Seeds element i with ``seed + i``, or with ``seed[i]``, and draws new positions. Without it, or
                 where ``seed[i]`` is ``None``, the last positions are used again, unless ``resample`` was asked for.
             options: ``"positions"``: (N, 2) or (B, N, 2) world positions in m, robot first, used until the next seed,
                 with ``resample`` until the next reset;
@@ -308,7 +307,8 @@ class TorchEnv:
         Raises:
             ValueError: The action has the wrong shape or type or is not finite.
         """
-        action = to_grid_indexing(self._checked(action), self.action_layout)
+        action = check_action(action, (self.num_envs, *self.action_shape)).to(self.device, self.dtype)
+        action = to_grid_indexing(action, self.action_layout)
         result = core.step(self.model, self.env_state, action, soft=soft)
         info: dict[str, Any] = {"reward_terms": dict(result.terms), **result.info}
         if result.success is not None:
@@ -344,15 +344,3 @@ class TorchEnv:
             (S, S, 3) uint8 for S = ``size``.
         """
         return frame(self.model, self.env_state, index, self._actuation if muscles else None, size)
-
-    def _checked(self, action: Tensor) -> Tensor:
-        if not isinstance(action, Tensor) or not action.is_floating_point():
-            kind = action.dtype if isinstance(action, Tensor) else type(action).__name__
-            raise ValueError(f"action must be a floating point tensor, got {kind}")
-        expected = (self.num_envs, *self.action_shape)
-        if tuple(action.shape) != expected:
-            raise ValueError(f"action must have shape {expected}, got {tuple(action.shape)}")
-        if not bool(torch.isfinite(action).all()):
-            count = int((~torch.isfinite(action)).sum())
-            raise ValueError(f"action must be finite, got {count} entries that are NaN or infinite")
-        return action.to(self.device, self.dtype)

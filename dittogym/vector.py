@@ -21,37 +21,20 @@ from torchmpm import ParticleState, checks
 
 
 class AutoresetStep(NamedTuple):
-    """A step of a batch with a leading B throughout.
+    """A step of a batch with a leading B throughout."""
 
-    Attributes:
-        observation: Of new episodes where ``done``.
-        final_observation: After the step, before any reset.
-        reward: (B,).
-        terminated: (B,) bool.
-        truncated: (B,) bool.
-        done: (B,) bool, elements whose episode ended and that were reset.
-        info: Of the step.
-        reset_info: Of all elements after the reset; ``None`` if no episode ended.
-    """
-
-    observation: Tensor
-    final_observation: Tensor
-    reward: Tensor
-    terminated: Tensor
-    truncated: Tensor
-    done: Tensor
-    info: dict[str, Any]
-    reset_info: dict[str, Any] | None
+    observation: Tensor  # Of new episodes where done
+    final_observation: Tensor  # After the step, before any reset
+    reward: Tensor  # (B,)
+    terminated: Tensor  # (B,) bool
+    truncated: Tensor  # (B,) bool
+    done: Tensor  # (B,) bool, elements whose episode ended and that were reset
+    info: dict[str, Any]  # Of the step
+    reset_info: dict[str, Any] | None  # Of all elements after the reset; None if no episode ended
 
 
 def autoreset_step(env: Any, action: Tensor, max_episode_steps: float | None = None) -> AutoresetStep:
-    """Step all elements, and reset those whose episode has ended.
-
-    Args:
-        env: A :class:`dittogym.TorchEnv`, or another environment with its ``step`` and ``reset``.
-        action: (B, 2, R, R).
-        max_episode_steps: Steps after which an episode is truncated; ``None`` leaves it to the environment.
-    """
+    """Step all elements, and reset those whose episode has ended."""
     observation, reward, terminated, truncated, info = env.step(action)
     if max_episode_steps is not None:
         truncated = env.env_state.steps >= max_episode_steps
@@ -68,12 +51,12 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     Args:
         task: Task name or specification.
         num_envs: Number of simulations.
-        autoreset_mode: ``SAME_STEP`` (an ended episode starts anew in the same call; the last observation and info are
+        autoreset_mode: ``SAME_STEP`` (an ended episode is reset in the same call; the last observation and info are
             in ``info["final_obs"]`` and ``info["final_info"]``), ``NEXT_STEP`` (in the next call, whose action it
             ignores), or ``DISABLED`` (``reset(options={"reset_mask": ...})``).
         render_mode: ``None`` or ``"rgb_array"``.
         render_muscles: Colour the robots by their muscles in pictures.
-        max_episode_steps: Horizon if it is to differ from the task's; -1 for none.
+        max_episode_steps: Horizon instead of the task's; -1 for none.
         options: All other arguments of :class:`dittogym.TorchEnv`.
 
     Raises:
@@ -106,7 +89,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.torch_env = TorchEnv(task, num_envs, **options)
         self.num_envs, self.render_mode, self.render_muscles = num_envs, render_mode, render_muscles
         own, usual = self.torch_env.spec.horizon, registered_horizon(task)
-        # Gymnasium hands on the limit of the id, whatever the options say.
+        # Gymnasium passes the limit of the id, whatever the task's options say.
         limit = own if max_episode_steps in (None, usual) else max_episode_steps
         self._horizon = math.inf if limit == -1 else limit
         self.single_observation_space, self.single_action_space = spaces(self.torch_env)
@@ -124,8 +107,8 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Start new episodes, of all elements or of ``options["reset_mask"]``; see :meth:`dittogym.TorchEnv.reset`.
 
         Args:
-            seed: Seeds element i with ``seed + i``, or with ``seed[i]`` if that is no ``None``, and draws its particles
-                anew.
+            seed: Seeds element i with ``seed + i``, or with ``seed[i]`` unless that is ``None``, and draws new
+                positions.
             options: As there.
 
         Returns:
@@ -171,7 +154,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """A step in which elements that have ended before are reset instead; their actions do not count."""
         fresh = self._ended.copy()
         ended = torch.as_tensor(fresh, device=action.device)
-        action = action.masked_fill(ended[:, None, None, None], 0.0)  # whatever they hold
+        action = action.masked_fill(ended[:, None, None, None], 0.0)  # which may hold NaN
         observation, reward, terminated, _, raw = self.torch_env.step(action)
         limits = _array(self.torch_env.env_state.steps >= self._horizon) & ~fresh
         rewards, ends, info = _array(reward.double()) * ~fresh, _array(terminated) & ~fresh, as_numpy(raw)
@@ -186,9 +169,9 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self.torch_env.save()
 
     def load(self, snapshot: Snapshot, mask: np.ndarray | None = None) -> np.ndarray:
-        """Go on from a saved moment; see :meth:`dittogym.TorchEnv.load`.
+        """Continue from a saved moment; see :meth:`dittogym.TorchEnv.load`.
 
-        An element that had ended and was to be reset goes on instead.
+        An element that had ended and was to be reset continues instead.
 
         Args:
             snapshot: Of this environment or one like it; one of a single simulation goes into every element.
@@ -213,7 +196,7 @@ def _array(values: Any) -> np.ndarray:
 
 
 def _restarted(info: dict[str, Any], start: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
-    """Info of a step in which some elements (B,) began anew: theirs is that of the reset, without what a step adds."""
+    """Info of a step in which some elements (B,) were reset: theirs is that of the reset, without a step's entries."""
     result = _with_masks(info, ~mask)
     for name, value in start.items():
         result[name] = np.where(mask.reshape(-1, *[1] * (value.ndim - 1)), value, info[name])
@@ -222,7 +205,7 @@ def _restarted(info: dict[str, Any], start: dict[str, Any], mask: np.ndarray) ->
 
 
 def _with_masks(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
-    """Gymnasium's form: beside each entry, under ``_name``, for which elements it holds."""
+    """Info in Gymnasium's form: for each entry, ``_name`` says for which elements it holds."""
     result: dict[str, Any] = {}
     for name, value in info.items():
         result[name] = _with_masks(value, mask) if isinstance(value, dict) else value

@@ -59,16 +59,7 @@ def contains(x: Tensor, origin: Tensor) -> Tensor:
 
 
 def centre_in_window(centre: Centre, robot: Tensor, origin: Tensor) -> Tensor:
-    """A centre in window coordinates.
-
-    Args:
-        centre: Numbers, or ``None`` for the robot's centre.
-        robot: (B, 2) the robot's centre in the world, m.
-        origin: (B, 2) lower left corner of the window in the world, m.
-
-    Returns:
-        (B, 2), m.
-    """
+    """A centre in window coordinates."""
     relative = robot - origin
     if centre == (None, None):
         return relative

@@ -45,9 +45,9 @@ class Package:
 
 
 def summary(file: Path) -> str:
-    """First line of a module's docstring, without the markup of references."""
+    """First line of a module's docstring; references become code."""
     line = (ast.get_docstring(ast.parse(file.read_text())) or "").partition("\n")[0]
-    return re.sub(r":\w+:`~?([^`]+)`", r"\1", line)
+    return re.sub(r":\w+:`~?([^`]+)`", r"`\1`", line)
 
 
 def imported(file: Path) -> set[str]:
@@ -94,8 +94,13 @@ def diagram() -> str:
 
 def group(folder: Folder) -> str:
     """A folder and its modules as HTML."""
-    modules = "".join(f'<li title="{escape(text)}">{escape(name)}</li>' for name, text in folder.modules.items())
-    return f"<p><strong>{escape(folder.path)}/</strong> {escape(folder.summary)}</p><ul>{modules}</ul>"
+    modules = "".join(f'<li title="{plain(text)}">{escape(name)}</li>' for name, text in folder.modules.items())
+    return f"<p><strong>{escape(folder.path)}/</strong> {plain(folder.summary)}</p><ul>{modules}</ul>"
+
+
+def plain(text: str) -> str:
+    """Escape a docstring for HTML, without its quotes of code."""
+    return escape(text.replace("`", ""))
 
 
 def module_table(name: str) -> dict[str, str]:

@@ -309,7 +309,7 @@ def paper_table(groups: Sequence[Group]) -> Table:
     rows = []
     for group in groups:
         config, iqm, rest = group.job.config, group.iqm, paper.REST.get(group.task)
-        grid, published = config.resolution(len(config.ends()) - 1), paper.curve(group.label, group.task)
+        grid, published = config.resolution(len(config.ends())), paper.curve(group.label, group.task)
         expert = paper.EXPERTS.get(group.task, {}).get(grid) if config.algo in ("coarse", "fine") else None
         if iqm is None or (published is None and expert is None and rest is None):
             continue

@@ -45,7 +45,7 @@ class PlannedConfig(GridConfig):
         """Environment steps after which the only stage ends, at the latest."""
         return (make_spec(self.task).horizon,)
 
-    def evaluation(self, level: int) -> tuple[int, int]:
+    def evaluation(self, stage: int) -> tuple[int, int]:
         """The episode is evaluated on the layout that it was planned on."""
         return self.seed, 1
 
@@ -111,7 +111,7 @@ class MPC(OpenLoopAlgorithm):
 
     def __init__(self, config: PlannedConfig, stage: int = 1, start: Any = None) -> None:
         self.config = config
-        self.env = make_torch_env(config, config.resolution(0), 1)
+        self.env = make_torch_env(config, config.resolution(1), 1)
         self.env.reset(seed=config.seed)
         self.surrogate = None if config.train_particles is None else self._make_surrogate(config.train_particles)
         planning_env = self.surrogate.env if self.surrogate else self.env
@@ -121,7 +121,7 @@ class MPC(OpenLoopAlgorithm):
 
     def _make_surrogate(self, particles: Particles) -> Surrogate:
         config = replace(self.config, environment=self.config.environment.for_training(particles))
-        small = make_torch_env(config, config.resolution(0), 1)
+        small = make_torch_env(config, config.resolution(1), 1)
         small.reset(seed=config.seed)
         try:
             return Surrogate(self.env, small)

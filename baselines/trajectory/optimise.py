@@ -80,13 +80,13 @@ class GradientConfig(GridConfig):
         first = self.iterations * horizon * self.environment.num_envs
         return (first, first + self.polish * horizon) if self.polish else (first,)
 
-    def resolution(self, level: int) -> int:
+    def resolution(self, stage: int) -> int:
         """Action grid R of a stage."""
-        return grid_size(self.task, self.polish_grid if level else self.grid)
+        return grid_size(self.task, self.polish_grid if stage > 1 else self.grid)
 
-    def evaluation(self, level: int) -> tuple[int, int]:
+    def evaluation(self, stage: int) -> tuple[int, int]:
         """The second stage is evaluated on its own layout."""
-        return (self.seed, 1) if level else super().evaluation(level)
+        return (self.seed, 1) if stage > 1 else super().evaluation(stage)
 
     def ineffective(self) -> dict[str, str]:
         """Options of the second stage have no effect without one, the blur none in tasks without a target."""
@@ -135,7 +135,7 @@ class Gradient(OpenLoopAlgorithm):
         self.config, self.stage, polishes = config, stage, stage > 1
         environment = config.environment if polishes else config.environment.for_training(config.train_particles)
         training = replace(config, environment=environment)
-        self.env = make_torch_env(training, config.resolution(stage - 1), 1 if polishes else None)
+        self.env = make_torch_env(training, config.resolution(stage), 1 if polishes else None)
         self.env.reset(seed=config.seed)
         self.initial = self.env.save()  # with reference parity, another reset would keep the last episode's end
         self.horizon = self.env.spec.horizon

@@ -1,4 +1,4 @@
-"""Robots of one's own: from a picture, an outline or any shape, put in the place of a task's robot."""
+"""Custom robots: a picture, an outline or any shape in the place of a task's robot."""
 
 from __future__ import annotations
 

@@ -17,17 +17,7 @@ PictureLike: TypeAlias = "str | os.PathLike[str] | np.ndarray"
 
 
 def read_grey(picture: PictureLike, name: str, others: str = "") -> np.ndarray:
-    """A picture as grey values (H, W) uint8, row 0 at the top; what is transparent is black.
-
-    Args:
-        picture: The path of an image that OpenCV and Pillow read, or an array (H, W), (H, W, 3) or (H, W, 4): bool,
-            uint8, uint16, or floating point 0..1; colours in the order blue, green, red.
-        name: What error messages call it.
-        others: What else would have been allowed, for the message about a path that does not exist.
-
-    Raises:
-        ValueError: No such file, not an image, one of more than `LARGEST` pixels, or an array of another kind.
-    """
+    """A picture as grey values (H, W) uint8, row 0 at the top; what is transparent is black."""
     if isinstance(picture, np.ndarray):
         return _grey(picture, name)
     if not isinstance(picture, (str, os.PathLike)):

@@ -34,9 +34,6 @@ def particle_counts(spec: TaskSpec, particles: Particles) -> tuple[int, ...]:
 
     A single number keeps the full-size ratio between the bodies; so does ``"lite"``, unless a body of the task has a
     number of its own, ``BodySpec.lite``.
-
-    Raises:
-        ValueError: Not one of the allowed forms, or a count below 1.
     """
     full = tuple(body.count for body in spec.bodies)
     if particles == "full":
@@ -64,15 +61,7 @@ class PositionSampler:
     At full size particles are placed at random as in the reference implementation: the positions of seed s are those
     that it draws after ``numpy.random.seed(s)``. With fewer particles random positions would leave holes in the body,
     so there they come from a scrambled Sobol sequence.
-
-    Args:
-        spec: The task.
-        counts: Particles of each body.
-        seed: 0 to 2**32 - 1; ``None`` takes one from the operating system.
-        random: Random positions instead of evenly spread ones.
-
-    Raises:
-        ValueError: The seed is out of range.
+    A seed of ``None`` is taken from the operating system.
     """
 
     def __init__(self, spec: TaskSpec, counts: tuple[int, ...], seed: int | None, *, random: bool) -> None:
@@ -115,38 +104,18 @@ class InitialPositions:
     """Initial positions of a batch: drawn at a seeded reset, kept until the next, or given by the user.
 
     A draw returns a new object and leaves this one as it was, so that a reset that fails changes nothing.
-
-    Attributes:
-        spec: The task.
-        counts: Particles of each body.
-        num_envs: Number B of simulations.
-        random: Random positions instead of evenly spread ones, see :class:`PositionSampler`.
-        resample: Draw anew at every reset.
-        samplers: By element.
-        positions: (B, N, 2) in the world, m; ``None`` before the first draw.
     """
 
-    spec: TaskSpec
-    counts: tuple[int, ...]
-    num_envs: int
-    random: bool
-    resample: bool
-    samplers: Mapping[int, PositionSampler] = field(default_factory=dict)
-    positions: Tensor | None = None
+    spec: TaskSpec  # The task
+    counts: tuple[int, ...]  # Particles of each body
+    num_envs: int  # Number B of simulations
+    random: bool  # Random positions instead of evenly spread ones, see :class:`PositionSampler`
+    resample: bool  # Draw anew at every reset
+    samplers: Mapping[int, PositionSampler] = field(default_factory=dict)  # By element
+    positions: Tensor | None = None  # (B, N, 2) in the world, m; None before the first draw
 
     def draw(self, seed: Seed, mask: np.ndarray, given: Any, like: Tensor) -> InitialPositions:
-        """The initial positions of the next episodes; elements outside ``mask`` (B,) keep theirs.
-
-        Args:
-            seed: Of the first element, the others follow, or one for each; ``None``, for all or for one, continues the
-                present sampler.
-            mask: Which elements are reset.
-            given: (N, 2) or (B, N, 2) positions, or ``None``.
-            like: Gives dtype and device.
-
-        Raises:
-            ValueError: Positions have the wrong shape or lie outside the window, or a seed is out of range.
-        """
+        """The initial positions of the next episodes; elements outside ``mask`` (B,) keep theirs."""
         seeds, samplers = self._seeds(seed), dict(self.samplers)
         # Every element has positions from the first draw on.
         mask = np.ones_like(mask) if self.positions is None else mask.copy()

@@ -35,26 +35,16 @@ class Camera:
 
     Its functions take arrays: ``x`` and ``v`` (B, N, 2) positions and velocities of all particles in the world, m and
     m/s; ``origin`` (B, 2) the lower left corner of the window, m; ``centre`` (B, 2) the robot's centre, m.
-
-    Attributes:
-        view: Centre of the image.
-        window: Where the window lies.
-        boxes: What is shown besides particles.
-        counts: Particles of each body.
-        particle_weight: By body, the full-size particles that one particle stands for.
-        hidden_velocity: By body, whether the velocity channels leave it out.
-        pixels: Whether to use the reference's pixel raster instead of splats.
-        native: Whether to draw in C++ where that is possible.
     """
 
-    view: Centre
-    window: Window
-    boxes: tuple[Box, ...]
-    counts: tuple[int, ...]
-    particle_weight: tuple[float, ...]
-    hidden_velocity: tuple[bool, ...]
-    pixels: bool
-    native: bool
+    view: Centre  # Centre of the image
+    window: Window  # Where the window lies
+    boxes: tuple[Box, ...]  # What is shown besides particles
+    counts: tuple[int, ...]  # Particles of each body
+    particle_weight: tuple[float, ...]  # By body, the full-size particles that one particle stands for
+    hidden_velocity: tuple[bool, ...]  # By body, whether the velocity channels leave it out
+    pixels: bool  # Whether to use the reference's pixel raster instead of splats
+    native: bool  # Whether to draw in C++ where that is possible
     _drawings: dict[tuple[torch.dtype, torch.device], Drawing] = field(default_factory=dict, repr=False)
 
     def __getstate__(self) -> dict[str, object]:
@@ -96,9 +86,6 @@ class Camera:
         and 255, where their derivative is zero. The derivative is continuous except at these ends, at the cap on
         velocities (5 m/s), for particles at the edge of the simulated window, and where edges of boxes meet edges of
         pixels.
-
-        Returns:
-            (B, 3, 64, 64) occupancy and velocities (x, y); zero velocity at 132.
         """
         follows = (self.view[0] is None and not self.window.moves, self.view[1] is None)
         row, column = smooth_crop_corner(centre_in_window(self.view, centre, origin), follows)

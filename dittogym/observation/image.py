@@ -23,8 +23,8 @@ CLIP = 10.0
 SATURATION = 66.4
 #: A pixel belongs to the silhouette if its occupancy code reaches this (21 of 64 fine pixels hit).
 OCCUPIED = 80
-#: Expected full-size particles in a pixel at which it belongs to the silhouette of every other random layout, and the
-#: width of the transition.
+#: Expected full-size particles in a pixel at which it belongs to the silhouette with probability 1/2, and the width of
+#: the transition.
 OCCUPIED_COUNT, OCCUPIED_WIDTH = 24.8, 3.3
 
 
@@ -48,8 +48,8 @@ def silhouette(observation: Tensor) -> Tensor:
 def soft_silhouette(observation: Tensor) -> Tensor:
     """Probability of each pixel to belong to the :func:`silhouette` at full size.
 
-    ``sigmoid((n - 24.8) / 3.3)`` for n expected full-size particles, fitted to random layouts; written in the occupancy
-    ``1 - exp(-n / SATURATION)``, which includes the background.
+    ``sigmoid((n - 24.8) / 3.3)`` for n expected full-size particles, fitted to random positions, as a function of the
+    occupancy ``1 - exp(-n / SATURATION)``, which includes the background.
 
     Args:
         observation: (B, 3, 64, 64) from :func:`dittogym.core.soft_observation`.

@@ -30,39 +30,23 @@ def crop_corner(centre: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Background(NamedTuple):
-    """What is drawn besides particles.
+    """What is drawn besides particles."""
 
-    Attributes:
-        mask: (1 or B, 512, 512) bool, fine pixels of the crop that are set.
-        fraction: (1 or B, 64, 64) fraction of an image pixel that is set.
-    """
-
-    mask: Tensor
-    fraction: Tensor
+    mask: Tensor  # (1 or B, 512, 512) bool, fine pixels of the crop that are set
+    fraction: Tensor  # (1 or B, 64, 64) fraction of an image pixel that is set
 
 
 class RasterInput(NamedTuple):
-    """What an image is made from.
+    """What an image is made from."""
 
-    Attributes:
-        position: (B, N, 2) window coordinates, m.
-        velocity: (B, N, 2) doubled, clipped velocities; zero where hidden.
-        weight: (N,) full-size particles that each particle stands for.
-        visible: (B, N) bool, particles that are drawn.
-        hidden_velocity: (N,) bool, particles that only the occupancy channel shows; ``None`` for none.
-        row: First fine row of the crop, (B, 1).
-        column: First fine column of the crop, (B, 1).
-        background: What obstacles and goals set; ``None`` for nothing.
-    """
-
-    position: Tensor
-    velocity: Tensor
-    weight: Tensor
-    visible: Tensor
-    hidden_velocity: Tensor | None
-    row: Tensor
-    column: Tensor
-    background: Background | None
+    position: Tensor  # (B, N, 2) window coordinates, m
+    velocity: Tensor  # (B, N, 2) doubled, clipped velocities; zero where hidden
+    weight: Tensor  # (N,) full-size particles that each particle stands for
+    visible: Tensor  # (B, N) bool, particles that are drawn
+    hidden_velocity: Tensor | None  # (N,) bool, particles that only the occupancy channel shows; None for none
+    row: Tensor  # First fine row of the crop, (B, 1)
+    column: Tensor  # First fine column of the crop, (B, 1)
+    background: Background | None  # What obstacles and goals set; None for nothing
 
 
 def draw_boxes(boxes: Sequence[Box], origin: Tensor, row: Tensor, column: Tensor) -> Background | None:
@@ -97,11 +81,7 @@ def _between(value: Tensor, low: float, high: float, closed: bool) -> Tensor:
 
 
 def pixel_means(shown: RasterInput) -> Tensor:
-    """The reference's raster: a fine pixel is set by any particle in it and has the velocity of the last one.
-
-    Returns:
-        (B, 3, 64, 64) means over image pixels of occupancy and both velocities.
-    """
+    """The reference's raster, (B, 3, 64, 64): a particle sets its fine pixel, the last one in it gives its velocity."""
     position, velocity, _, visible, hidden, row, column, background = shown
     batch, count = visible.shape
     width = SIZE * BLOCK
@@ -131,13 +111,10 @@ def pixel_means(shown: RasterInput) -> Tensor:
 
 
 def splat_means(shown: RasterInput) -> Tensor:
-    """What the reference's raster of full-size bodies would show on average, from fewer particles.
+    """What the reference's raster of full-size bodies would show on average, (B, 3, 64, 64), from fewer particles.
 
     Particles are spread over image pixels by quadratic B-splines, which gives the number n of full-size particles to
     expect in a pixel; the fraction of its fine pixels that they hit is ``1 - exp(-n / SATURATION)``.
-
-    Returns:
-        (B, 3, 64, 64) means over image pixels of occupancy and both velocities.
     """
     hidden, background = shown.hidden_velocity, shown.background
     weight, ids = _splat_weights(shown)

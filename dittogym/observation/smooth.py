@@ -22,16 +22,7 @@ HALF = 0.5
 
 
 def smooth_crop_corner(centre: Tensor, follows: tuple[bool, bool]) -> tuple[Tensor, Tensor]:
-    """First fine row and column of the crop, without truncation where it follows the robot through the window.
-
-    Args:
-        centre: (B, 2) of the crop, in window coordinates, m.
-        follows: Whether the crop moves in the window, in x and in y; else see
-            :func:`dittogym.observation.raster.crop_corner`.
-
-    Returns:
-        Row and column (B, 1).
-    """
+    """First fine row and column (B, 1) of a crop, not truncated along axes on which it ``follows`` the robot."""
     half = SIZE * BLOCK // 2
     row, column = (corner.to(centre.dtype) for corner in crop_corner(centre))
     first = (RASTER * centre - HALF - half).clamp(0.0, RASTER - 2.0 * half)

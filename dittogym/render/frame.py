@@ -30,22 +30,7 @@ LARGEST = 8192
 
 
 def frame(model: Model, state: EnvState, index: int, actuation: Tensor | None, size: int) -> np.ndarray:
-    """Draw one element of a batch: the whole window, obstacles, target and particles coloured by body.
-
-    Args:
-        model: The task.
-        state: The batch.
-        index: Which element.
-        actuation: (B, 2, P, P) on the patch, to colour the robot by, Pa; ``None`` for plain colours.
-        size: Pixels per side.
-
-    Returns:
-        (size, size, 3) uint8 RGB.
-
-    Raises:
-        IndexError: ``index`` is not in the batch.
-        ValueError: ``size`` is below 16 or above 8192.
-    """
+    """Draw one element of a batch, (size, size, 3) uint8 RGB: window, obstacles, target and particles by body."""
     if not isinstance(index, (int, np.integer)) or not 0 <= index < len(state.steps):
         raise IndexError(f"index must be between 0 and {len(state.steps) - 1}, got {index!r}")
     index = int(index)
@@ -75,12 +60,7 @@ def frame(model: Model, state: EnvState, index: int, actuation: Tensor | None, s
 
 
 class Canvas:
-    """An image of the window that is drawn into by world coordinates.
-
-    Args:
-        pixels: Pixels per side.
-        origin: Lower left corner of the window in the world, m.
-    """
+    """An image of the window at ``origin`` (2,), m, that is drawn into by world coordinates."""
 
     def __init__(self, pixels: int, origin: np.ndarray) -> None:
         self.pixels, self.origin = pixels, origin

@@ -11,12 +11,7 @@ except ImportError as error:
 
 
 class Screen:
-    """A window that shows pictures at a steady rate.
-
-    Args:
-        title: Of the window.
-        fps: Pictures per second at most.
-    """
+    """A window that shows at most ``fps`` pictures per second."""
 
     def __init__(self, title: str, fps: int) -> None:
         pygame.display.init()

@@ -33,9 +33,9 @@ def task_name(task: str) -> str:
 
 
 def fingerprint(task: str) -> str | None:
-    """SHA-256 of the file that a task of one's own was written in; ``None`` for the library's, or where there is none.
+    """SHA-256 of the file that defines a custom task; ``None`` for a task of the library, or if there is no file.
 
-    What that file imports is not part of it.
+    Files that it imports do not count.
     """
     try:
         file = Path(inspect.getsourcefile(TASKS[task_name(task)]) or "")
@@ -47,20 +47,14 @@ def fingerprint(task: str) -> str | None:
 
 
 def allowed_instead(task: object) -> str | None:
-    """What is allowed in place of something that is no task; ``None`` where it is one.
-
-    Args:
-        task: A name from :data:`dittogym.TASKS`, or ``"MODULE:NAME"``: a module, which is imported, and a task that it
-            registers. The module's name has no dots: options from elsewhere shall not reach the files that came with
-            them in some folder below the current one.
-    """
+    """What is allowed in place of something that is not a task; ``None`` where it is one."""
     allowed = f"{', '.join(sorted(TASKS))} or MODULE:NAME"
     if not isinstance(task, str):
         return allowed
     module, colon, name = task.rpartition(":")
     if colon:
         try:
-            if not module.isidentifier():
+            if not module.isidentifier():  # options from elsewhere must not reach files below the current folder
                 raise ImportError("its name must be a word, without dots")
             if getattr(importlib.import_module(module), "__file__", None) is None:
                 raise ImportError("that is a folder, not a file")
@@ -83,13 +77,13 @@ def make_spec(
     Args:
         task: A name from :data:`dittogym.TASKS`, ``"MODULE:NAME"`` with a module that registers it on import, or a
             specification.
-        body: A robot of one's own, see :func:`dittogym.bodies.drawings.with_body`.
+        body: Another robot, see :func:`dittogym.bodies.drawings.with_body`.
         obstacles: Static geometry in place of the task's own, see :mod:`dittogym.geometry`.
         options: Options of that task, such as ``target`` of SHAPE MATCH.
 
     Raises:
-        ValueError: No such task, or a body that does not fit into it.
-        TypeError: The task has no such option, or the obstacles are something else.
+        ValueError: There is no such task, or the body does not fit into it.
+        TypeError: The task has no such option, or the obstacles are not a sequence of Obstacle.
     """
     if isinstance(task, TaskSpec):
         if options:
@@ -104,7 +98,7 @@ def make_spec(
             if name not in known:
                 names = ", ".join(("body", "obstacles", *known))
                 raise TypeError(
-                    f"task {task!r} has no option {name!r}; its options, beside the arguments of TorchEnv, are: {names}"
+                    f"task {task!r} has no option {name!r}; besides the arguments of TorchEnv it has: {names}"
                 )
         spec = make(**options)
     if obstacles is not None:

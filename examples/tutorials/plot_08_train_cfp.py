@@ -7,8 +7,7 @@ minute. For a useful policy leave these options out, as ``make demo`` does; trai
 """
 
 # %%
-# ``--dry-run`` prints the options that result from the preset and the command line, and estimates the cost of the
-# run.
+# ``--dry-run`` prints the options that result from the preset and the command line; here are the last ones.
 
 import subprocess
 import sys

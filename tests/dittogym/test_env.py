@@ -51,21 +51,6 @@ def test_step_and_info() -> None:
     assert env.unwrapped.state.x.shape == (1, 200, 2)
 
 
-@pytest.mark.parametrize(
-    ("action", "message"),
-    [
-        (np.zeros((2, 8, 9)), r"action must be numbers of shape \(2, 8, 8\), got float64 of shape"),
-        (np.full((2, 8, 8), "a"), "action must be numbers"),
-        (np.full((2, 8, 8), np.nan), "action must be finite"),
-    ],
-)
-def test_bad_actions(action: np.ndarray, message: str) -> None:
-    env = gymnasium.make("dittogym/run-coarse-v0", disable_env_checker=True, **SMALL)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match=message):
-        env.step(action)
-
-
 def test_unknown_task_names_the_tasks() -> None:
     with pytest.raises(ValueError, match=r"task must be one of catch, dig, .*, slot or MODULE:NAME, got 'swim'"):
         dittogym.Env("swim")
@@ -149,18 +134,6 @@ def test_disabled_autoreset_with_a_mask() -> None:
     assert np.array_equal(seen[0], rows[0][0][0]) and np.array_equal(seen[1], rows[2][0][1])
 
 
-def test_record_video_and_statistics_wrappers(tmp_path) -> None:
-    pytest.importorskip("imageio_ffmpeg")
-    env = gymnasium.make("dittogym/run-coarse-v0", render_mode="rgb_array", max_episode_steps=3, **SMALL)
-    env = gymnasium.wrappers.RecordEpisodeStatistics(env)
-    env.reset(seed=0)
-    ended, info = False, {}
-    while not ended:
-        *_, ended, info = env.step(env.action_space.sample())
-    assert info["episode"]["l"] == 3
-    assert env.render().shape == (512, 512, 3)
-
-
 def test_render_modes(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="render_mode must be None or one of"):
         dittogym.Env("run", render_mode="ansi")
@@ -170,16 +143,3 @@ def test_render_modes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "dittogym.render.screen", raising=False)
     with pytest.raises(ImportError, match=r"needs pygame: pip install 'torchmpm\[human\]'"):
         dittogym.Env("run", render_mode="human")
-
-
-def test_human_window(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # pygame's own imports
-        pytest.importorskip("pygame")
-        env = dittogym.Env("run", render_mode="human", **SMALL)
-    env.reset(seed=0)
-    env.step(np.zeros((2, 8, 8), np.float32))
-    assert env.render() is None
-    env.close()
-    env.close()

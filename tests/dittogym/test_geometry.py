@@ -37,7 +37,3 @@ def test_bad_geometry() -> None:
 def test_specifications_take_no_options() -> None:
     with pytest.raises(TypeError, match="takes no options"):
         dittogym.make_spec(dittogym.make_spec("run"), target="star")
-
-
-def test_a_solid_keeps_its_name() -> None:
-    assert solid("step", (40, 60), (None, 24)).name == "step"

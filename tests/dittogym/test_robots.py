@@ -183,19 +183,6 @@ def test_bad_bodies(task: str, body: object, message: str) -> None:
         tiny(task, body=body)
 
 
-def test_a_file_that_is_not_a_picture(tmp_path: Path) -> None:
-    path = tmp_path / "notes.png"
-    path.write_text("hello")
-    with pytest.raises(ValueError, match=r"body .*notes.png' cannot be read as an image"):
-        dittogym.make_spec("run", body=path)
-
-
-def test_what_fits_is_not_refused() -> None:
-    """Just beside the cube; long where the task does not end by it."""
-    tiny("kick", body=Rectangle((0.19, 0.16), (0.11, 0.1)))
-    tiny("shapematch", body=[(0, 0), (6, 0), (6, 1), (0, 1)])
-
-
 def test_a_dark_robot_on_bright_ground_is_pointed_out() -> None:
     with pytest.warns(UserWarning, match="bright pixels are the robot"):
         dittogym.make_spec("shapematch", body=~np.pad(ELL, 3))
@@ -260,21 +247,6 @@ def test_a_lattice_of_any_number_of_particles(count: int, size: tuple[float, flo
     assert np.array_equal(x, shape.positions(np.random.default_rng(0).random((count, 2))))
 
 
-def test_a_square_number_makes_a_square_lattice() -> None:
-    for count in (1, 4, 300**2 // 100, 14400, 19600):
-        side = round(count**0.5)
-        x = Lattice((0.0, 0.16), (0.16, 0.16)).positions(np.empty((count, 2)))
-        across, up = np.meshgrid((np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side)
-        assert x == pytest.approx(np.stack((across.ravel() * 0.16, 0.16 + up.ravel() * 0.16), axis=1))
-
-
-@pytest.mark.parametrize("count", [1, 2, 17])
-def test_a_lattice_task_with_hardly_any_particles(count: int) -> None:
-    env = tiny("grow", particles=count)
-    env.reset(seed=0)
-    assert env.step(torch.zeros(1, *env.action_shape, dtype=env.dtype))[-1]["finite"].all()
-
-
 #: Particles of robot and object in the lite tier; of DIG's soil more than in proportion, which would be 1,333.
 LITE = {
     "shapematch": (2000,),
@@ -296,13 +268,6 @@ def test_lite_counts() -> None:
         assert tiny(task, particles="lite").num_particles == sum(counts)
 
 
-def test_lite_counts_of_other_bodies() -> None:
-    few = BodySpec(Disc((0.0, 0.16), 0.1), count=500)
-    assert layout.particle_counts(dittogym.make_spec("run", body=few), "lite") == (500,)
-    assert layout.particle_counts(dittogym.make_spec("kick", body=few), "lite") == (500, 2000)
-    assert layout.particle_counts(dittogym.make_spec("kick", body=SQUARE), "lite") == (2000, 164)
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_mass_and_volume_are_the_same_with_any_number_of_particles(task: str) -> None:
     totals = []
@@ -310,22 +275,3 @@ def test_mass_and_volume_are_the_same_with_any_number_of_particles(task: str) ->
         bodies = tiny(task, particles=particles).model.solver.bodies
         totals.append([(body.count * body.mass, body.count * body.volume) for body in bodies])
     assert totals[1] == pytest.approx(np.array(totals[0])) and totals[2] == pytest.approx(np.array(totals[0]))
-
-
-@pytest.mark.parametrize("body", [42, {"a": 1}, [(0, 0), (1, 0, 3)]])
-def test_bodies_of_the_wrong_kind(body: object) -> None:
-    with pytest.raises(
-        ValueError, match=r"body must be a path, an array, an outline \(K, 2\), a Shape or a BodySpec, got"
-    ):
-        dittogym.make_spec("run", body=body)
-
-
-def test_an_outline_may_cross_itself() -> None:
-    spec = dittogym.make_spec("run", body=[(0, 0), (4, 4), (4, 0), (0, 4)])
-    assert spec.robot.shape.area == pytest.approx(dittogym.make_spec("run").robot.shape.area)
-
-
-@pytest.mark.parametrize("obstacles", [3, [3], "wall"])
-def test_obstacles_of_the_wrong_kind(obstacles: object) -> None:
-    with pytest.raises(TypeError, match="obstacles must be a sequence of Obstacle, got"):
-        dittogym.make_spec("run", obstacles=obstacles)

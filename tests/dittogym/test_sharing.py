@@ -42,16 +42,6 @@ def test_constants_that_are_changed_afterwards() -> None:
     assert env.env_state.physics["mu"].tolist() == [500, 600]
 
 
-def test_gradients_still_reach_positions_and_constants() -> None:
-    env = tiny("run", 1)
-    env.reset(seed=0)
-    x, mu = env.state.x[0].clone().requires_grad_(), torch.tensor(500.0, requires_grad=True)
-    env.reset(options={"positions": x, "physics": {"mu": mu}})
-    reward = env.step(torch.full((1, *env.action_shape), 0.5))[1]
-    for gradient in torch.autograd.grad(reward.sum(), (x, mu)):
-        assert gradient.isfinite().all() and gradient.abs().max() > 0
-
-
 def test_images_and_infos_that_are_written_to() -> None:
     batch = BatchEnv("catch", 2, **SMALL)
     image, _ = batch.reset(seed=0)

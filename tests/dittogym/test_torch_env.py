@@ -10,7 +10,6 @@ import torch
 
 import dittogym
 from dittogym import TorchEnv
-from dittogym.bodies import positions as layout
 from dittogym.core import FAILURE_REWARD
 from dittogym.observation.camera import per_particle
 
@@ -25,32 +24,6 @@ def small(task: str = "run", num_envs: int = 1, **options) -> TorchEnv:
 def actions(env: TorchEnv, steps: int, seed: int = 0) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
     return 2 * torch.rand(steps, env.num_envs, *env.action_shape, generator=generator, dtype=env.dtype) - 1
-
-
-@pytest.mark.parametrize("task", TASKS)
-@torch.no_grad()
-def test_batch_equals_single_environments_with_a_partial_reset(task: str) -> None:
-    batch = small(task, 3)
-    singles = [small(task) for _ in range(3)]
-    drive = actions(batch, 6)
-    seen, _ = batch.reset(seed=7)
-    single_seen = [env.reset(seed=7 + i)[0] for i, env in enumerate(singles)]
-    assert torch.equal(seen, torch.cat(single_seen))
-    for t in range(6):
-        if t == 3:
-            batch.reset(options={"reset_mask": torch.tensor([False, True, False])})
-            singles[1].reset()
-        seen, reward, terminated, truncated, info = batch.step(drive[t])
-        for i, env in enumerate(singles):
-            one_seen, one_reward, one_end, one_limit, one_info = env.step(drive[t, i : i + 1])
-            for name in ("x", "v", "C", "F"):
-                ours, theirs = getattr(batch.state, name)[i], getattr(env.state, name)[0]
-                assert (ours - theirs).abs().max() <= 1e-12 * max(1.0, float(theirs.abs().max())), name
-            assert torch.equal(seen[i], one_seen[0])
-            assert float(reward[i]) == pytest.approx(float(one_reward), abs=1e-12)
-            assert terminated[i] == one_end[0] and truncated[i] == one_limit[0]
-            assert info["com"][i].tolist() == pytest.approx(one_info["com"][0].tolist(), abs=1e-13)
-    assert batch.env_state.steps.tolist() == [6, 3, 6]
 
 
 def test_layouts_follow_seeds() -> None:
@@ -98,19 +71,6 @@ def test_masked_seed_draws_only_the_masked_elements() -> None:
     reference = small(num_envs=3)
     reference.reset(seed=50)
     assert torch.equal(env.state.x[2], reference.state.x[2])
-
-
-def test_global_generators_are_left_alone() -> None:
-    np.random.seed(5)
-    torch.manual_seed(5)
-    wanted = np.random.rand(), torch.rand(1)
-    np.random.seed(5)
-    torch.manual_seed(5)
-    for particles in ("lite", 300):
-        env = small(particles=particles)
-        env.reset(seed=0)
-        env.step(torch.zeros(1, *env.action_shape))
-    assert (np.random.rand(), torch.rand(1)) == wanted
 
 
 def test_reset_is_fresh_and_reference_parity_is_stale() -> None:
@@ -213,30 +173,6 @@ def test_bad_actions(action: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         env.step(action)
     assert env.state is before
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"task": "fly"}, ValueError, r"task must be one of catch, .* got 'fly'"),
-        ({"target": "star"}, TypeError, "task 'run' has no option 'target'"),
-        ({"particles": 0}, ValueError, "particles must be at least 1"),
-        ({"particles": -3}, ValueError, "particles must be at least 1"),
-        ({"particles": "huge"}, ValueError, "particles must be 'full', 'lite'"),
-        ({"particles": (10, 10)}, ValueError, "1 number"),
-        ({"num_envs": 0}, ValueError, "num_envs must be at least 1"),
-        ({"substeps": 0}, ValueError, "substeps must be at least 1"),
-        ({"dtype": "float16"}, ValueError, "dtype must be one of"),
-        ({"parity": "exact"}, ValueError, "parity must be one of"),
-        ({"action_layout": "xy"}, ValueError, "action_layout must be one of"),
-        ({"resolution": "finest"}, ValueError, "resolution must be"),
-        ({"resolution": 65}, ValueError, "resolution must be"),
-        ({"backend": "magic"}, ValueError, "backend must be one of"),
-    ],
-)
-def test_bad_arguments(arguments: dict, error: type, message: str) -> None:
-    with pytest.raises(error, match=message):
-        TorchEnv(**{"task": "run", **arguments})
 
 
 def test_bad_resets() -> None:
@@ -390,18 +326,3 @@ def test_run_displacement_is_the_same_at_every_tier() -> None:
     assert (results["full"][0] - results["lite"][0]).abs().max() < 1e-3
     assert results["full"][1] == pytest.approx(results["lite"][1], abs=0.15)
     assert results["full"][2] == pytest.approx(results["lite"][2], abs=1e-3)
-
-
-def test_particle_counts() -> None:
-    spec = dittogym.make_spec("run")
-    assert layout.particle_counts(spec, "full") == (22000,)
-    assert layout.particle_counts(spec, "lite") == (2000,)
-    assert layout.particle_counts(spec, (123,)) == (123,)
-
-
-def test_density_is_the_same_at_every_tier() -> None:
-    totals = []
-    for particles in ("full", "lite", 777):
-        body = small(particles=particles).model.solver.bodies[0]
-        totals.append((body.count * body.mass, body.count * body.volume))
-    assert totals[0] == pytest.approx(totals[1]) and totals[0] == pytest.approx(totals[2])

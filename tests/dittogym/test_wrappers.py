@@ -79,22 +79,6 @@ def test_actions_are_enlarged_by_bicubic_interpolation(size: int) -> None:
         assert np.abs(ours[0].astype(int) - theirs[0]).max() <= 1 and ours[1] == pytest.approx(theirs[1], abs=1e-4)
 
 
-def test_actions_of_the_own_size_stay_as_they_are() -> None:
-    for env in (action_resolution(single(), 8), action_resolution(batch(), 8)):
-        env.action_space.seed(3)
-        action = env.action_space.sample()
-        assert np.array_equal(env.func(action), action)
-
-
-@pytest.mark.parametrize("size", [1, 2, 5, 8])
-@pytest.mark.parametrize("level", [-1.0, 0.0, 0.3, 1.0])
-def test_constant_actions_stay_constant(size: int, level: float) -> None:
-    env = action_resolution(single(), size)
-    large = env.action(np.full((2, size, size), level, np.float32))
-    assert large.shape == (2, 8, 8) and large == pytest.approx(np.full((2, 8, 8), level), abs=1e-6)
-    assert np.abs(large).max() <= 1.0
-
-
 def test_enlarged_actions_do_not_leave_the_space() -> None:
     """Bicubic interpolation overshoots at edges."""
     env = action_resolution(single(), 4)
@@ -116,18 +100,6 @@ def test_observations_are_area_means(size: int) -> None:
         assert ours[0].std() > 0
 
 
-def test_observations_of_the_own_size_stay_as_they_are() -> None:
-    for make in (single, batch):
-        assert np.array_equal(observation_resolution(make(), 64).reset(seed=1)[0], make().reset(seed=1)[0])
-
-
-@pytest.mark.parametrize("size", [3, 24, 50])
-def test_observations_of_sizes_that_do_not_divide(size: int) -> None:
-    """The mean of every channel is kept, up to the rounding of pixels."""
-    small, whole = observation_resolution(single(), size).reset(seed=1)[0], single().reset(seed=1)[0]
-    assert small.mean((1, 2)) == pytest.approx(whole.mean((1, 2)), abs=0.5)
-
-
 def test_both_together() -> None:
     for make in (single, batch):
         env = observation_resolution(action_resolution(make(), 4), 16)
@@ -142,25 +114,10 @@ def test_both_together() -> None:
 
 
 @pytest.mark.parametrize("make", [single, batch])
-@pytest.mark.parametrize("size", [0, -1, 9])
-def test_bad_action_sizes(make, size: int) -> None:
-    with pytest.raises(ValueError, match=f"size must be at (least 1|most 8), got {size}"):
-        action_resolution(make(), size)
-
-
-@pytest.mark.parametrize("make", [single, batch])
 @pytest.mark.parametrize("size", [0, -1, 65])
 def test_bad_observation_sizes(make, size: int) -> None:
     with pytest.raises(ValueError, match=f"size must be at (least 1|most 64), got {size}"):
         observation_resolution(make(), size)
-
-
-def test_sizes_are_whole_numbers_of_any_kind() -> None:
-    assert action_resolution(single(), np.int64(4)).action_space.shape == (2, 4, 4)
-    assert observation_resolution(single(), np.int64(16)).observation_space.shape == (3, 16, 16)
-    for size in (4.0, True, "4"):
-        with pytest.raises(ValueError, match=f"size must be a whole number, got {size!r}"):
-            action_resolution(single(), size)
 
 
 def test_the_limit_is_that_of_what_is_wrapped() -> None:
@@ -228,22 +185,6 @@ def test_record_video_of_a_batch(recorded: dict, tmp_path: Path) -> None:
     assert fps == 30 and len(frames) == 3 and frames[0].ndim == 3 and frames[0].std() > 0
 
 
-def test_record_video_needs_pictures(recorded: dict, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="incompatible with RecordVideo"):
-        wrappers.RecordVideo(single(), str(tmp_path / "videos"))
-
-
-def test_record_episode_statistics() -> None:
-    env = wrappers.RecordEpisodeStatistics(single(max_episode_steps=4))
-    env.reset(seed=0)
-    rewards, info = [], {}
-    while "episode" not in info:
-        _, reward, _, _, info = env.step(np.zeros((2, 8, 8), np.float32))
-        rewards.append(reward)
-    assert info["episode"]["l"] == len(rewards) == 4
-    assert info["episode"]["r"] == pytest.approx(sum(rewards), abs=1e-4)
-
-
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
 def test_record_episode_statistics_of_a_batch(mode: str) -> None:
     env = wrappers.vector.RecordEpisodeStatistics(batch(max_episode_steps=3, autoreset_mode=mode))
@@ -255,23 +196,6 @@ def test_record_episode_statistics_of_a_batch(mode: str) -> None:
     assert truncated.all() and info["_episode"].all()
     assert info["episode"]["l"].tolist() == [3, 3]
     assert info["episode"]["r"] == pytest.approx(np.sum(rewards, axis=0), abs=1e-4)
-
-
-def test_time_limit() -> None:
-    for env in (wrappers.TimeLimit(single(), 2), single(max_episode_steps=2)):
-        env.reset(seed=0)
-        ends = [env.step(np.zeros((2, 8, 8), np.float32))[2:4] for _ in range(2)]
-        assert ends == [(False, False), (False, True)]
-
-
-def test_stacked_frames_and_rescaled_actions() -> None:
-    env = wrappers.FrameStackObservation(wrappers.RescaleAction(single(), np.float32(0), np.float32(1)), 3)
-    observation, _ = env.reset(seed=0)
-    assert observation.shape == (3, 3, 64, 64)
-    observation = env.step(np.full((2, 8, 8), 0.5, np.float32))[0]
-    bare = single()
-    bare.reset(seed=0)
-    assert np.array_equal(observation[-1], bare.step(np.zeros((2, 8, 8), np.float32))[0])
 
 
 def test_gymnasiums_own_vector_environments() -> None:

@@ -67,10 +67,12 @@ def orthogonal(F: Mat2) -> Mat2:
     For det F < 0 it is a reflection, so singular values stay non-negative; F = 0 gives R = I. The longer part is never
     shorter than the Frobenius norm of F, so the derivative is bounded on either side of det F = 0 (where R jumps).
     """
-    parts = split(F)
-    _, cos, sin = direction(parts)
-    zero = torch.zeros_like(cos)
-    return join(Parts(cos, sin, zero, zero, parts.proper))
+    m1, m2, _, _, proper = split(F)
+    square = m1.square() + m2.square()
+    empty = square == 0
+    inverse = torch.rsqrt(torch.where(empty, 1.0, square))
+    cos, sin = torch.where(empty, 1.0, m1 * inverse), m2 * inverse
+    return cos, torch.where(proper, -sin, sin), sin, torch.where(proper, cos, -cos)
 
 
 def det(F: Mat2) -> Tensor:

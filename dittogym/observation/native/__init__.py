@@ -49,18 +49,7 @@ def drawing(
     pixels: bool,
     dtype: torch.dtype,
 ) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
-    """A function that draws what a :class:`dittogym.observation.camera.Camera` sees, for tensors on the CPU.
-
-    Args:
-        view: Centre of the image.
-        boxes: What is shown besides particles.
-        bodies: By body, number of particles, full-size particles that one stands for, whether its velocity is hidden.
-        pixels: Whether to use the pixel raster.
-        dtype: float32 or float64.
-
-    Raises:
-        ValueError: There is no compiler, or it failed.
-    """
+    """A function that draws what a :class:`dittogym.observation.camera.Camera` sees, for tensors on the CPU."""
     function = getattr(build(_SOURCE, *_OPTIONS), _FUNCTIONS[dtype])
     body = torch.tensor(list(bodies), dtype=torch.float64, device="cpu")
     edges = [(b.left, b.right, b.bottom, b.top, b.closed) for b in boxes]
