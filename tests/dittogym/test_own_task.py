@@ -105,9 +105,7 @@ def test_options_of_the_function_arrive() -> None:
     assert env.action_space.shape == (2, 6, 6)
     assert env.unwrapped.torch_env.spec.robot.shape.size == (0.1, 0.1)
     assert tiny("hop", pull=-2.0).spec.gravity == (0.0, -2.0)
-    message = (
-        "task 'hop' has no option 'push'; its options, beside the arguments of TorchEnv, are: body, obstacles, pull"
-    )
+    message = "task 'hop' has no option 'push'; besides the arguments of TorchEnv it has: body, obstacles, pull"
     with pytest.raises(TypeError, match=message):
         gymnasium.make("dittogym/hop-coarse-v0", push=1.0)
     with pytest.raises(ValueError, match=r"task must be one of catch, .*, hop, .* got 'hope'"):
