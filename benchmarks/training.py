@@ -23,16 +23,16 @@ from cfp.envs.make import make_env
 from cfp.experiment.process import keep_memory
 
 
-def make_model(config: Config, level: int, num_envs: int) -> CFP:
+def make_model(config: Config, stage: int, num_envs: int) -> CFP:
     """The model of one stage of a configuration, with updates from the first steps on."""
     hyperparameters = replace(
-        config.hyperparameters(level), buffer_size=2_000, update_start=config.learning.batch_size, random_steps=0
+        config.hyperparameters(stage), buffer_size=2_000, update_start=config.learning.batch_size, random_steps=0
     )
     model = CFP(
         CFPPolicy,
-        make_env(config, config.action_size(level), num_envs),
+        make_env(config, config.action_size(stage), num_envs),
         hyperparameters,
-        policy_kwargs={"spec": config.actor_spec(level)},
+        policy_kwargs={"spec": config.actor_spec(stage)},
         seed=0,
         device="cpu",
     )
@@ -65,17 +65,17 @@ def updates(config: Config, modes: list[str], rounds: int) -> None:
     """Print seconds per update."""
     print("| stage | batch | " + " | ".join(modes) + f" | {modes[-1]} : {modes[0]} |")
     print("| --- " * (3 + len(modes)) + "|")
-    for level in (0, 1):
+    for stage in (1, 2):
         for size in (64, 256):
-            batch, cases = make_batch(size, config.resolutions[level]), {}
+            batch, cases = make_batch(size, config.resolution(stage)), {}
             for mode in modes:
                 precision, _, compiled = mode.partition("+")
                 learning = replace(config.learning, precision=precision, compile=bool(compiled))
-                model = make_model(replace(config, learning=learning), level, 1)
+                model = make_model(replace(config, learning=learning), stage, 1)
                 cases[mode] = partial(model.update, batch)
             least = list(in_turn(cases, rounds).values())
             numbers = " | ".join(f"{value:.4f}" for value in least)
-            print(f"| {level + 1} | {size} | {numbers} | {least[-1] / least[0]:.2f} |", flush=True)
+            print(f"| {stage} | {size} | {numbers} | {least[-1] / least[0]:.2f} |", flush=True)
 
 
 @contextmanager
@@ -99,10 +99,10 @@ def training(config: Config, steps: int) -> None:
     """Print training steps per second and the shares of their parts."""
     print("| stage | robots | updates per step | precision | training steps/s | simulation | updates | rest |")
     print("| --- " * 8 + "|")
-    for level in (0, 1):
+    for stage in (1, 2):
         for num_envs, gradient_steps in ((1, 1), (config.environment.num_envs, config.learning.gradient_steps)):
             learning = replace(config.learning, gradient_steps=gradient_steps)
-            model, clock = make_model(replace(config, learning=learning), level, num_envs), dict[str, float]()
+            model, clock = make_model(replace(config, learning=learning), stage, num_envs), dict[str, float]()
             model.learn(config.learning.batch_size + 2 * num_envs)
             with timed(model.env, "step", clock), timed(model, "train", clock):
                 start = time.perf_counter()
@@ -111,7 +111,7 @@ def training(config: Config, steps: int) -> None:
             simulation, update = clock["step"] / total, clock["train"] / total
             shares = " | ".join(f"{100 * share:.0f} %" for share in (simulation, update, 1 - simulation - update))
             precision = "bfloat16" if model.losses.bfloat16 else "float32"
-            head = f"| {level + 1} | {num_envs} | {gradient_steps} | {precision}"
+            head = f"| {stage} | {num_envs} | {gradient_steps} | {precision}"
             print(f"{head} | {steps * num_envs / total:.1f} | {shares} |", flush=True)
 
 

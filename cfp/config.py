@@ -59,9 +59,9 @@ class RunConfig:
         raise NotImplementedError
 
     def stage_steps(self, stage: int) -> int:
-        """Environment steps of a stage."""
+        """Environment steps of a stage; 1 is the first."""
         bounds = (0, *self.ends())
-        return bounds[stage + 1] - bounds[stage]
+        return bounds[stage] - bounds[stage - 1]
 
     def resolution(self, stage: int) -> int:
         """Action grid R of a stage."""
@@ -147,7 +147,7 @@ class LadderConfig(RunConfig):
 
     def resolution(self, stage: int) -> int:
         """Action grid R of a stage."""
-        return self.resolutions[stage]
+        return self.resolutions[stage - 1]
 
     def action_size(self, stage: int) -> int:
         """Rows and columns of the actions that the environment of a stage takes, see `ActorSpec.patch`."""
@@ -156,8 +156,8 @@ class LadderConfig(RunConfig):
     def actor_spec(self, stage: int) -> ActorSpec:
         """Structure of the actor of a stage, including all coarser ones."""
         return ActorSpec(
-            self.resolutions[: stage + 1],
-            self.gate_bias[:stage],
+            self.resolutions[:stage],
+            self.gate_bias[: stage - 1],
             self.network.split,
             self.network.gate_scale,
             self.network.interpolation,
@@ -236,9 +236,9 @@ class Config(LadderConfig):
         """Hyperparameters of a stage."""
         return Hyperparameters(
             **vars(self.learning),
-            alpha=self.alpha[stage],
-            gate_penalty=self.gate_penalty[stage - 1] if stage else 0.0,
-            random_steps=self.random_steps[stage],
+            alpha=self.alpha[stage - 1],
+            gate_penalty=self.gate_penalty[stage - 2] if stage > 1 else 0.0,
+            random_steps=self.random_steps[stage - 1],
         )
 
     def ineffective(self) -> dict[str, str]:

@@ -114,7 +114,7 @@ def open_run(
         found, stage = (policy.description["task"], policy.description["resolution"]), policy.description["stage"]
         if stage > len(config.ends()):
             raise CheckpointError(f"{path}: got a policy of stage {stage}, allowed 1 to {len(config.ends())}")
-        wanted = config.task, config.resolution(stage - 1)
+        wanted = config.task, config.resolution(stage)
         if found != wanted:
             given, allowed = (f"{task} on a grid of {grid}" for task, grid in (found, wanted))
             raise CheckpointError(f"{path}: got a policy for {given}, allowed in {name} of this run is {allowed}")

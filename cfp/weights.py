@@ -57,7 +57,7 @@ def describe_run(config: RunConfig, kind: str, stage: int, steps: int) -> dict[s
     Args:
         config: Options of the run that trained it.
         kind: Algorithm that can load it.
-        stage: Index of its stage, counted from 0.
+        stage: Number of its stage, 1 is the first.
         steps: Environment steps of the run so far.
     """
     return {
@@ -66,7 +66,7 @@ def describe_run(config: RunConfig, kind: str, stage: int, steps: int) -> dict[s
         "kind": kind,
         "task": config.task,
         "resolution": config.resolution(stage),
-        "stage": stage + 1,
+        "stage": stage,
         "steps": steps,
         "seed": config.seed,
         "deterministic": config.report.eval_deterministic,

@@ -28,7 +28,7 @@ class GridConfig(RunConfig):
     grid: Grid = "coarse"
     """Action grid R: coarse, fine (the task's), or a number."""
 
-    def resolution(self, level: int) -> int:
+    def resolution(self, stage: int) -> int:
         """Action grid R."""
         return grid_size(self.task, self.grid)
 

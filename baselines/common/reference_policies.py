@@ -50,18 +50,18 @@ def reference_preset(algo: str, task: str, name: str) -> ReferenceConfig:
 
 def zero(config: ReferenceConfig) -> OpenLoop:
     """Leaves every muscle slack."""
-    size = config.resolution(0)
+    size = config.resolution(1)
     return OpenLoop(torch.zeros(0, 2, size, size))
 
 
 def scripted(config: ReferenceConfig) -> OpenLoop:
     """Drives every muscle by a moving wave, see `wave`, for as long as an episode lasts."""
-    return OpenLoop(wave(make_spec(config.task).horizon, config.resolution(0), config.environment.action_indexing))
+    return OpenLoop(wave(make_spec(config.task).horizon, config.resolution(1), config.environment.action_indexing))
 
 
 def random(config: ReferenceConfig) -> RandomActions:
     """Acts at random, see `RandomActions`."""
-    return RandomActions(config.resolution(0))
+    return RandomActions(config.resolution(1))
 
 
 REFERENCE_POLICIES: dict[str, Callable[[ReferenceConfig], Policy]] = {

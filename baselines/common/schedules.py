@@ -18,7 +18,7 @@ def stage_progress(config: RunConfig, stage: int, num_timesteps: int) -> float:
         stage: Which stage, 1 is the first.
         num_timesteps: Environment steps taken in the stage.
     """
-    return min(num_timesteps / config.stage_steps(stage - 1), 1.0)
+    return min(num_timesteps / config.stage_steps(stage), 1.0)
 
 
 def linear_decay(progress: float) -> float:

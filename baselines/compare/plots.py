@@ -76,13 +76,7 @@ def _bar_names(axes: Axes, names: Sequence[str]) -> None:
 
 
 def learning_curves(groups: Sequence[Group], *, minutes: bool = False) -> Figure:
-    """Evaluations during training: interquartile mean over seeds and its 95 % bootstrap band.
-
-    Args:
-        groups: All groups.
-        minutes: Draw them over the time of training at each group's mean speed, that of a teacher first, instead of
-            environment steps.
-    """
+    """Evaluations during training: interquartile mean over seeds and its 95 % band, over steps or time."""
     styles = _styles(groups)
     shown = [group for group in groups if group.curves and (group.speed or not minutes)]
     figure, panels = _panels(list(dict.fromkeys(group.task for group in shown)), 3.4, _legend(styles))
@@ -125,12 +119,7 @@ def final_returns(groups: Sequence[Group]) -> Figure:
 
 
 def robustness_ratios(groups: Sequence[Group], rows: Sequence[Row]) -> Figure:
-    """Ratio in each disturbed case: a bar for each algorithm with the range of its seeds; the paper's as a line.
-
-    Args:
-        groups: All groups, for their colours.
-        rows: Rows of the robustness table.
-    """
+    """Ratio in each disturbed case: a bar for each algorithm with the range of its seeds; the paper's as a line."""
     styles, rows = _styles(groups), [row for row in rows if row["ratio"] is not None]
     names = list(dict.fromkeys((row["algo"], row["sees"]) for row in rows))
     cases: dict[str, list[str]] = {}

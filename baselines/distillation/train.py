@@ -72,7 +72,7 @@ class Distill(Algorithm):
         self.config, self.stage = config, stage
         training = replace(config, environment=config.environment.for_training(config.train_particles))
         self.env = make_torch_env(training, make_spec(config.task).patch)
-        self.spec = config.actor_spec(stage - 1)
+        self.spec = config.actor_spec(stage)
         with self._seeded():
             self.actor = build_actor(self.spec)
         fix_std(self.actor)

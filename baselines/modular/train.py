@@ -63,7 +63,7 @@ class ModularConfig(RunConfig):
         """Environment steps after which the only stage ends."""
         return (self.steps,)
 
-    def resolution(self, level: int) -> int:
+    def resolution(self, stage: int) -> int:
         """Action grid R: the task's whole patch, so that segments write to its nodes."""
         return make_spec(self.task).patch
 
@@ -159,7 +159,7 @@ class Modular(SACAlgorithm):
     @classmethod
     def create(cls, config: ModularConfig, stage: int, folder: Path, resumed: bool = False) -> Modular:
         """Networks, replay memory and environment."""
-        env = SegmentedEnv(make_torch_env(config, config.resolution(stage - 1)), config.nodes)
+        env = SegmentedEnv(make_torch_env(config, config.resolution(stage)), config.nodes)
         networks = {"kind": config.kind, "features": config.nodes.num_features(env.env.spec)}
         monitor = VecMonitor(TorchVecEnv(env, env.spaces))
         model = cls.make_model(config, monitor, ModularPolicy, networks, cls.hyperparameters(config, stage, folder))

@@ -132,7 +132,7 @@ class Shac(Algorithm):
     def __init__(self, config: ShacConfig, stage: int = 1, start: Policy | None = None) -> None:
         self.config = config
         training = replace(config, environment=config.environment.for_training(config.train_particles))
-        self.env = make_torch_env(training, config.resolution(stage - 1))
+        self.env = make_torch_env(training, config.resolution(stage))
         self.features = StateFeatures(config.deformation, config.clock, config.displacement)
         with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             torch.manual_seed(config.seed)
@@ -276,7 +276,7 @@ class Shac(Algorithm):
         """The policy from which the actor starts, if the options name one."""
         if config.start_from is None:
             return None
-        policy, resolutions = policy_for(config, config.start_from), (config.resolution(0),)
+        policy, resolutions = policy_for(config, config.start_from), (config.resolution(1),)
         if policy.spec.resolutions != resolutions:
             raise ConfigError(f"start_from must have the resolutions {resolutions}, got {policy.spec.resolutions}")
         return policy

@@ -200,7 +200,7 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, no
         episodes: Episodes of each.
         noise: Whether trained policies act with their noise; ``"both"`` gives each a row with and one without.
     """
-    coarsest = config.resolution(0)
+    coarsest = config.resolution(1)
     seed = evaluation_seed(config)
     untrained = {"zero action": ZeroPolicy(coarsest), "random action": RandomPolicy(coarsest, config.seed)}
 

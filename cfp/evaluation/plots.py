@@ -42,7 +42,7 @@ def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Pat
     for (name, value), style in zip(baselines.items(), ("--", ":", "-."), strict=False):
         axes.axhline(value, color="black", linestyle=style, linewidth=1, label=name)
     for stage, step in _handovers(training):
-        before, after = config.resolution(stage - 1), config.resolution(stage)
+        before, after = config.resolution(stage), config.resolution(stage + 1)
         axes.axvline(step, color="tab:green", linewidth=1)
         label = f" {before}x{before} → {after}x{after}"
         axes.text(step, 0.01, label, color="tab:green", fontsize=8, transform=axes.get_xaxis_transform())

@@ -71,7 +71,7 @@ class Stage:
 
     def save_policy(self) -> None:
         """Write the present policy as ``policy.safetensors``."""
-        description = describe_run(self.config, self.config.algo, self.number - 1, self.step)
+        description = describe_run(self.config, self.config.algo, self.number, self.step)
         self.algorithm.save_policy(policy_path(self.folder), description)
 
 
@@ -216,9 +216,9 @@ class EvaluationCallback(StageCallback):
     def act(self) -> None:
         """Evaluate the policy on layouts that are not trained on."""
         start, stage, config = time.perf_counter(), self.stage, self.stage.config
-        seed, episodes = config.evaluation(stage.number - 1)
+        seed, episodes = config.evaluation(stage.number)
         deterministic = config.report.eval_deterministic
-        env = make_env(config, config.action_size(stage.number - 1), episodes)
+        env = make_env(config, config.action_size(stage.number), episodes)
         result = evaluate("", stage.algorithm, env, episodes, deterministic=deterministic, seed=seed)
         row: dict[str, Any] = {"step": stage.step, "stage": stage.number, "episodes": episodes}
         row |= {"mean": result.mean, "std": result.std}
@@ -258,7 +258,7 @@ class FilmCallback(StageCallback):
         """Film the present policy."""
         stage, config = self.stage, self.stage.config
         path = stage.folder / "videos" / f"step{stage.step:09d}.mp4"
-        size, (seed, _) = config.action_size(stage.number - 1), config.evaluation(stage.number - 1)
+        size, (seed, _) = config.action_size(stage.number), config.evaluation(stage.number)
         write_video(path, film_episode(config, stage.algorithm, size, config.report.eval_deterministic, seed))
         self.tracker.film(stage.step, path)
 

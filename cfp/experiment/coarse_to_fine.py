@@ -93,7 +93,7 @@ class SACAlgorithm(Algorithm):
     @classmethod
     def hyperparameters(cls, config: Any, stage: int, folder: Path) -> Hyperparameters:
         """Hyperparameters of a stage."""
-        hyperparameters: Hyperparameters = config.hyperparameters(stage - 1)
+        hyperparameters: Hyperparameters = config.hyperparameters(stage)
         return hyperparameters
 
     @classmethod
@@ -101,7 +101,7 @@ class SACAlgorithm(Algorithm):
         """Stages that end before they act by their policy, or before they learn."""
         lines, (starts, waits) = [], (config.learning.update_start, config.learning.actor_start)
         for stage in range(first_stage, len(config.ends()) + 1):
-            steps, random = config.stage_steps(stage - 1), cls.hyperparameters(config, stage, folder).random_steps
+            steps, random = config.stage_steps(stage), cls.hyperparameters(config, stage, folder).random_steps
             if steps <= random:
                 lines.append(f"stage {stage}: all its {steps:,} steps are random (--random-steps {random})")
             elif steps <= starts:
@@ -172,7 +172,7 @@ class CoarseToFine(SACAlgorithm):
         if policy.spec.resolutions != resolutions[:levels] or (levels == len(resolutions) and not refine):
             allowed = f"the first of {resolutions}" + ("" if refine else " but the last")
             raise ConfigError(f"start_from: got a policy of levels {policy.spec.resolutions}, allowed {allowed}")
-        if levels > 1 and policy.spec != (allowed_spec := config.actor_spec(levels - 1)):
+        if levels > 1 and policy.spec != (allowed_spec := config.actor_spec(levels)):
             raise ConfigError(f"start_from: got networks {policy.spec}, allowed {allowed_spec}")
         stage = levels if refine else levels + 1
         copy = _start_path(folder) if refine else policy_path(folder, levels)
@@ -188,7 +188,7 @@ class CoarseToFine(SACAlgorithm):
     @classmethod
     def create(cls, config: Config, stage: int, folder: Path, resumed: bool = False) -> CoarseToFine:
         """Networks, replay memory and environment of a stage."""
-        env, spec = make_env(config, config.action_size(stage - 1)), config.actor_spec(stage - 1)
+        env, spec = make_env(config, config.action_size(stage)), config.actor_spec(stage)
         refines = _refines(config, folder, stage)
         model = cls.make_model(config, env, CFPPolicy, {"spec": spec}, cls.hyperparameters(config, stage, folder))
         actor = model.networks()[0]
@@ -226,7 +226,7 @@ class CoarseToFine(SACAlgorithm):
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the actor."""
-        network = asdict(self.config.actor_spec(self.stage - 1))
+        network = asdict(self.config.actor_spec(self.stage))
         save_policy(path, self.model.networks()[0], description | {"kind": KIND, "network": network})
 
 

@@ -47,7 +47,7 @@ def check_options(config: RunConfig) -> None:
     """
     config.check()
     check_trackers(config)
-    for stage in range(len(config.ends())):
+    for stage in range(1, len(config.ends()) + 1):
         make_env(config, config.action_size(stage), 1)
 
 

@@ -42,12 +42,14 @@ def run_lock(folder: Path, timeout: float = 0.0) -> Iterator[None]:
     except Timeout:
         owner = path.read_text().strip() if path.exists() else ""
         raise FolderInUse(f"out: {folder} is in use by {owner or 'another process'}") from None
-    with lock:
-        path.write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
-        try:
-            yield
-        finally:
-            path.unlink(missing_ok=True)
-    if is_new:
-        with suppress(OSError):  # something is in it
-            folder.rmdir()
+    try:
+        with lock:
+            path.write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
+            try:
+                yield
+            finally:
+                path.unlink(missing_ok=True)
+    finally:
+        if is_new:
+            with suppress(OSError):  # something is in it
+                folder.rmdir()

@@ -120,13 +120,13 @@ def test_pictures_of_any_bytes(kind, tmp_path_factory, cuts, changes):
 
 CONFIG = replace(preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,))
 OF_OTHERS = {"inputs": 10, "noise": 0.1, "features": {}, "nodes": {"count": 16, "graph": True}}
-DESCRIPTION = json.loads(json.dumps(describe(CONFIG, 0, 7))) | OF_OTHERS
+DESCRIPTION = json.loads(json.dumps(describe(CONFIG, 1, 7))) | OF_OTHERS
 
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
     """A valid policy: path, bytes, weights."""
-    actor = build_actor(CONFIG.actor_spec(0))
+    actor = build_actor(CONFIG.actor_spec(1))
     path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
     save_policy(path, actor, DESCRIPTION)
     return path, path.read_bytes(), actor

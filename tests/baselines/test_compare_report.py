@@ -49,7 +49,7 @@ def write_run(job, scores, curve, *, successes=0, seconds=100.0, cases=(0.8, 0.5
     """A folder as a run that was trained to step 1000 and evaluated leaves it."""
     write_json(job.folder / "config.json", to_json(job.config))
     newest = job.folder / "policy.safetensors"
-    write_policy(newest, {}, describe_run(job.config, job.config.algo, 0, 0))
+    write_policy(newest, {}, describe_run(job.config, job.config.algo, 1, 0))
     lines = [f"{step},{value}" for step, value in curve.items()]
     write_text(job.folder / "evaluations.csv", "\n".join(["step,mean", *lines]) + "\n")
     session = {"from": 0, "to": 1000, "seconds": seconds + 7, "evaluation_seconds": 7.0, "memory": 2**30}
@@ -259,7 +259,7 @@ def test_page_shows_only_files_beside_it(report):
 def test_evaluations_of_another_policy_do_not_count(report, tmp_path):
     (job,) = plan_jobs(tmp_path / "runs", ["run"], ["cfp"], [0], lambda _: Protocol(2))
     write_run(job, [1.0, 2.0], {1000: 5.0})
-    write_policy(job.folder / "policy.safetensors", {"more": torch.zeros(1)}, describe_run(job.config, "cfp", 0, 0))
+    write_policy(job.folder / "policy.safetensors", {"more": torch.zeros(1)}, describe_run(job.config, "cfp", 1, 0))
     assert main(f"--tasks run --algos cfp --seeds 0 --out {tmp_path} --episodes 2 --report-only".split()) == 1
     assert find(rows(tmp_path, "returns"), task="run")["iqm"] == ""
     assert find(rows(tmp_path, "runs"), task="run")["state"] == "unevaluated"

@@ -53,7 +53,7 @@ def privileged(tmp_path_factory):
     paths = {task: tmp_path_factory.mktemp(task) / "policy.safetensors" for task in ("run", "shapematch")}
     for task, path in paths.items():
         config = replace(Shac.preset(task, "quick"), environment=EnvironmentConfig(2, 300, 4), train_particles=300)
-        Shac(config).save_policy(path, describe_run(config, "shac", 0, 0))
+        Shac(config).save_policy(path, describe_run(config, "shac", 1, 0))
     return paths
 
 
@@ -62,7 +62,7 @@ def segments(tmp_path_factory):
     """An untrained policy of segments, on file."""
     path = tmp_path_factory.mktemp("segments") / "policy.safetensors"
     config = configure({"algo": "gnn-16", "task": "run", "environment": {"particles": 300, "substeps": 4}})
-    SegmentPolicy(ModularActor("gnn", 10), Nodes(16, True), describe_run(config, "gnn-16", 0, 0)).save(path)
+    SegmentPolicy(ModularActor("gnn", 10), Nodes(16, True), describe_run(config, "gnn-16", 1, 0)).save(path)
     return path
 
 
@@ -96,8 +96,8 @@ def test_every_preset_is_valid_and_survives_json(task, preset):
     config = Distill.preset(task, preset)
     config.check()
     assert configure(json.loads(json.dumps(to_json(config)))) == config
-    for level in (0, 1):
-        assert config.actor_spec(level) == cfp.preset(task, preset).actor_spec(level)
+    for stage in (1, 2):
+        assert config.actor_spec(stage) == cfp.preset(task, preset).actor_spec(stage)
 
 
 @pytest.mark.parametrize(
@@ -383,7 +383,7 @@ def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, kind, targ
     path = tmp_path / "policy.safetensors"
     if task:
         config = replace(Distill.preset(task, "quick"), environment=EnvironmentConfig(1, 100, 4, target=target))
-        write_policy(path, {"actions": torch.zeros(3, 2, 8, 8)}, describe_run(config, kind, 0, 0))
+        write_policy(path, {"actions": torch.zeros(3, 2, 8, 8)}, describe_run(config, kind, 1, 0))
     folder = tmp_path / "run"
     student = ["--target", "star"] if task == "shapematch" else ["--task", "run"]
     assert distill.main([*TINY, *LESSONS, *student, "--teacher", str(path), "--out", str(folder)]) == 2
@@ -394,8 +394,8 @@ def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, kind, targ
 @pytest.mark.parametrize(("task", "alike"), [("grow", True), ("shapematch", False)])
 def test_record_of_one_episode_teaches(tmp_path, capsys, task, alike):
     config = replace(Distill.preset(task, "quick"), environment=EnvironmentConfig(1, 100, 1))
-    path, size = tmp_path / "record.safetensors", config.resolution(0)
-    write_policy(path, {"actions": torch.ones(3, 2, size, size)}, describe_run(config, "mpc", 0, 0) | {"layout": 0})
+    path, size = tmp_path / "record.safetensors", config.resolution(1)
+    write_policy(path, {"actions": torch.ones(3, 2, size, size)}, describe_run(config, "mpc", 1, 0) | {"layout": 0})
     teacher = read_teacher(path, task, config.environment)
     assert isinstance(teacher, OpenLoop) and len(teacher.actions) == 3
     student = ["--task", task, "--teacher", str(path), "--substeps", "1", "--backend", "auto"]

@@ -130,7 +130,7 @@ def test_policy_of_a_file_acts_like_the_one_in_training(tmp_path):
     """In the training environment and attached to one of its own, step by step."""
     model = model_of("gnn-16", tmp_path / "run")
     nodes = Nodes(16, True)
-    description = describe_run(preset("gnn-16", "run", "quick"), "gnn-16", 0, 0)
+    description = describe_run(preset("gnn-16", "run", "quick"), "gnn-16", 1, 0)
     SegmentPolicy(model.networks()[0], nodes, description).save(tmp_path / "a.safetensors")
     policy = baselines.load(tmp_path / "a.safetensors")
     env = TorchEnv("run", 2, 64, particles=200, substeps=2)

@@ -12,7 +12,7 @@ from cfp.weights import describe_run
 @pytest.fixture
 def policy():
     actions = torch.arange(3 * 2 * 4 * 4).reshape(3, 2, 4, 4) / 100.0
-    return OpenLoop(actions, describe_run(configure({"algo": "gradient", "task": "run"}), "gradient", 0, 0))
+    return OpenLoop(actions, describe_run(configure({"algo": "gradient", "task": "run"}), "gradient", 1, 0))
 
 
 def test_each_element_plays_from_its_own_beginning(policy):
@@ -44,7 +44,7 @@ def test_file_holds_what_was_saved(policy, tmp_path):
 
 
 def test_file_without_actions_is_refused(tmp_path):
-    wrong = OpenLoop(torch.zeros(1, 2, 4, 4), describe_run(configure({}), "cfp", 0, 0))
+    wrong = OpenLoop(torch.zeros(1, 2, 4, 4), describe_run(configure({}), "cfp", 1, 0))
     wrong.save(tmp_path / "policy.safetensors")
     with pytest.raises(CheckpointError, match="weights and description do not match"):
         baselines.load(tmp_path)  # says that it is an actor

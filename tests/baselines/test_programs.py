@@ -192,7 +192,7 @@ def test_algorithm_is_asked_for_its_scalars_when_a_row_is_written(tmp_path, monk
 def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, monkeypatch, stop_at):
     config = baselines.registry.configure({"algo": "coarse", "resolutions": [8], "environment": {"substeps": 1}})
     start = tmp_path / "start.safetensors"
-    save_policy(start, build_actor(config.actor_spec(0)), describe(config, 0, 5))
+    save_policy(start, build_actor(config.actor_spec(1)), describe(config, 1, 5))
     words = ["--sees", "image", "--start-from", str(start), "--steps", "24", "--eval-every", "24"]
     stop_at(12)
     assert run("shac", tmp_path / "run", *words) == 128 + signal.SIGINT

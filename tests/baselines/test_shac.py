@@ -268,7 +268,7 @@ def test_policy_goes_through_its_file(sees, tmp_path):
     algorithm = Shac(make("shapematch", sees=sees, grid=8))
     algorithm.learn(8)
     path = tmp_path / "policy.safetensors"
-    algorithm.save_policy(path, describe_run(algorithm.config, "shac", 0, 8))
+    algorithm.save_policy(path, describe_run(algorithm.config, "shac", 1, 8))
     policy = baselines.load(path)
     assert policy.description["sees"] == sees and policy.resolution == 8
     env = make_env(algorithm.config, 8, 2)
@@ -283,7 +283,7 @@ def test_policy_goes_through_its_file(sees, tmp_path):
 def test_policy_of_the_image_is_one_of_cfp(tmp_path):
     algorithm = Shac(make(sees="image"))
     path = tmp_path / "policy.safetensors"
-    algorithm.save_policy(path, describe_run(algorithm.config, "shac", 0, 0))
+    algorithm.save_policy(path, describe_run(algorithm.config, "shac", 1, 0))
     policy = cfp.load(path)
     torch.manual_seed(0)
     images = torch.randint(0, 256, (40, 3, 64, 64), dtype=torch.uint8)
@@ -293,10 +293,10 @@ def test_policy_of_the_image_is_one_of_cfp(tmp_path):
 
 def test_actor_on_the_image_begins_with_a_policy_of_any_algorithm(tmp_path):
     config = make(sees="image")
-    actor, path = build_actor(ActorSpec((config.resolution(0),))), tmp_path / "policy.safetensors"
+    actor, path = build_actor(ActorSpec((config.resolution(1),))), tmp_path / "policy.safetensors"
     trained = configure({"algo": "coarse", "task": "run"})
-    origins = replace(trained, environment=config.environment, resolutions=(config.resolution(0),))
-    save_policy(path, actor, describe(origins, 0, 5))
+    origins = replace(trained, environment=config.environment, resolutions=(config.resolution(1),))
+    save_policy(path, actor, describe(origins, 1, 5))
     warm = replace(config, start_from=str(path))
     algorithm = Shac(warm, 1, Shac.initial_policy(warm))
     for name, value in actor.state_dict().items():
@@ -322,7 +322,7 @@ def test_policy_of_the_state_says_what_it_needs(tmp_path):
     with pytest.raises(ValueError, match="got 'kick'"):
         policy.attached(kick)
     path = tmp_path / "policy.safetensors"
-    algorithm.save_policy(path, describe_run(algorithm.config, "shac", 0, 0))
+    algorithm.save_policy(path, describe_run(algorithm.config, "shac", 1, 0))
     path.write_bytes(path.read_bytes().replace(b"inputs", b"outputs"[:6]))
     with pytest.raises(CheckpointError):
         StatePolicy.load(path)

@@ -113,18 +113,18 @@ def test_closed_gates_leave_the_coarsest_field(task):
     for ladder in ladders:
         shut = replace(config, resolutions=ladder, gate_bias=(-100.0,) * (len(ladder) - 1))
         torch.manual_seed(0)
-        finest, fields = build_actor(shut.actor_spec(len(ladder) - 1)), []
+        finest, fields = build_actor(shut.actor_spec(len(ladder))), []
         levels = [finest]
         while hasattr(levels[0], "coarse"):
             levels.insert(0, levels[0].coarse)
         drawn = Sample(3 * torch.rand(2, 2, ladder[0], ladder[0]) - 1.5, torch.zeros(2), None)
         levels[0].sample = lambda observation, deterministic, drawn=drawn: drawn  # some of the field is clipped
         with torch.no_grad():
-            for level, actor in enumerate(levels):
-                env = make_torch_env(shut, shut.action_size(level))
+            for stage, actor in enumerate(levels, 1):
+                env = make_torch_env(shut, shut.action_size(stage))
                 observation, _ = env.reset(seed=0)
                 env.step(actor(observation, deterministic=True))
-                fields.append(env._field)
+                fields.append(env._actuation)
         share = (fields[0].abs() == fields[0].abs().max()).float().mean()
         assert 0 < share < 0.9
         for field in fields[1:]:

@@ -21,8 +21,8 @@ CONFIG = replace(preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,))
 
 def make(stage=2):
     # The ring (20 rows) wraps around, and 7 does not divide anything: episodes are in progress at every checkpoint.
-    env = monitored(FakeEnv(num_envs=2, resolution=CONFIG.action_size(stage - 1), horizon=7))
-    spec = CONFIG.actor_spec(stage - 1)
+    env = monitored(FakeEnv(num_envs=2, resolution=CONFIG.action_size(stage), horizon=7))
+    spec = CONFIG.actor_spec(stage)
     hyperparameters = Hyperparameters(
         buffer_size=40, batch_size=4, update_start=6, random_steps=10, precision="bfloat16", gate_penalty=0.1
     )

@@ -22,9 +22,9 @@ def test_every_preset_is_valid_and_survives_json(task, name):
     config = preset(task, name)
     config.check()
     assert from_json(json.loads(json.dumps(to_json(config)))) == config
-    levels = range(len(config.resolutions))
-    assert sum(config.stage_steps(level) for level in levels) == config.steps
-    assert [config.actor_spec(level).resolutions[-1] for level in levels] == list(config.resolutions)
+    stages = range(1, len(config.resolutions) + 1)
+    assert sum(config.stage_steps(stage) for stage in stages) == config.steps
+    assert [config.actor_spec(stage).resolutions[-1] for stage in stages] == list(config.resolutions)
 
 
 def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):
@@ -175,9 +175,9 @@ def test_the_rest_follows_a_file_as_it_follows_the_command_line(tmp_path, option
 def test_ladder_of_any_length_can_be_asked_for():
     arguments = "--resolutions 4 8 16 --handover 1000 2000 --alpha 0 0 0 --random-steps 9 9 9"
     command = parse(PROGRAM, [*arguments.split(), "--gate-bias", "-1", "-2", "--gate-penalty", "0", "0.5"])
-    assert command.run.actor_spec(2).gate_bias == (-1.0, -2.0)
+    assert command.run.actor_spec(3).gate_bias == (-1.0, -2.0)
     one = parse(PROGRAM, "--resolutions 16 --handover --alpha 0 --random-steps 9 --gate-bias --gate-penalty".split())
-    assert one.run.stage_steps(0) == one.run.steps
+    assert one.run.stage_steps(1) == one.run.steps
 
 
 def test_another_number_of_levels_stretches_what_each_has_one_of():
@@ -213,7 +213,7 @@ def test_layout_of_actions_can_be_chosen():
         env = make_env(config, 2, 1)
         env.reset()
         env.step(np.array([[[[0.0, 1.0], [0.0, 0.0]]] * 2], np.float32))  # row 0, column 1
-        pull = env.venv.torch_env._field[0, 0]
+        pull = env.venv.torch_env._actuation[0, 0]
         return (pull > 0.9 * pull.max()).nonzero().float().mean(0).tolist()  # to the right, upwards
 
     image, grid, reference = field(), field("--action-layout", "grid"), field("--parity", "reference")

@@ -78,7 +78,7 @@ def test_blended_actions_are_disturbed_on_the_grid_that_they_were_decided_on():
 
 def test_policy_of_two_levels_is_disturbed_on_its_finer_grid(tmp_path, monkeypatch):
     config, grids = preset("run"), []
-    save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(1)), describe(config, 1, 0))
+    save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(2)), describe(config, 2, 0))
     monkeypatch.setattr(robustness, "disturbed_env", lambda *given: grids.append(given[1:2] + given[5:]) or given)
     monkeypatch.setattr(robustness, "evaluate", lambda *_, **__: None)
     robustness.report(config, cfp.load(tmp_path), make_cases()[:1], 1)
@@ -146,7 +146,7 @@ def folder(tmp_path):
     environment = replace(config.environment, particles=1000, substeps=10)
     config = replace(config, environment=environment)
     write_json(tmp_path / "config.json", to_json(config))
-    save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(1)), describe(config, 1, 0))
+    save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(2)), describe(config, 2, 0))
     return tmp_path
 
 

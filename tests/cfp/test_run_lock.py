@@ -47,8 +47,8 @@ def test_patience_outlasts_another_process(tmp_path):
 
 
 def test_new_folder_goes_again_if_nothing_was_written(tmp_path):
-    with run_lock(tmp_path / "a" / "empty"):
-        pass
+    with pytest.raises(ValueError, match="refused"), run_lock(tmp_path / "a" / "empty"):
+        raise ValueError("refused")
     assert not (tmp_path / "a" / "empty").exists()
     with run_lock(tmp_path / "full"):
         (tmp_path / "full" / "file").touch()

@@ -22,8 +22,8 @@ from cfp.weights import check_trained_for, describe, save_policy
 @pytest.fixture
 def saved(tmp_path):
     config = replace(preset("shapematch"), resolutions=(8, 16), gate_bias=(-1.0,))
-    actor = build_actor(config.actor_spec(1))
-    save_policy(tmp_path / "policy.safetensors", actor, describe(config, 1, 123))
+    actor = build_actor(config.actor_spec(2))
+    save_policy(tmp_path / "policy.safetensors", actor, describe(config, 2, 123))
     return tmp_path, actor
 
 
@@ -109,7 +109,7 @@ def test_file_that_is_no_policy_is_refused(saved, damage):
     elif damage == "foreign":
         save_policy(path, actor, {"format": "other"})
     else:
-        save_policy(path, actor, describe(replace(preset("shapematch"), resolutions=(8, 32)), 1, 0))
+        save_policy(path, actor, describe(replace(preset("shapematch"), resolutions=(8, 32)), 2, 0))
     with pytest.raises(CheckpointError, match=r"policy\.safetensors: "):
         cfp.load(path)
 
