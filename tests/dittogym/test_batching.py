@@ -96,12 +96,6 @@ def test_what_cannot_be_deterministic_is_refused() -> None:
         assert tiny("run", deterministic=True, backend=backend).num_particles == 120
 
 
-def test_deterministic_refuses_a_cuda_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    with pytest.raises(ValueError, match="deterministic=True needs device 'cpu'"):
-        tiny("run", deterministic=True, device="cuda")
-
-
 def spoil(env: TorchEnv, how: str) -> None:
     """Make element 1 unable to go on."""
     state = env.state
