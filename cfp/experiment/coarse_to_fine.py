@@ -76,8 +76,6 @@ class SACAlgorithm(Algorithm):
             networks: Options of the networks.
             hyperparameters: Of the stage.
         """
-        if hyperparameters.compile:
-            print("compiling the updates; the first time on a machine this takes minutes ...", flush=True)
         model = CFP(
             policy,
             env,
