@@ -163,6 +163,7 @@ class TaskSpec:
         checks.instance("weights", self.weights, Mapping)
         for name, value in self.weights.items():
             checks.number(f"weights[{name!r}]", value)
+        object.__setattr__(self, "weights", dict(self.weights))  # later changes of the caller's do not reach it
 
     @property
     def bodies(self) -> tuple[BodySpec, ...]:

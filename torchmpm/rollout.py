@@ -43,11 +43,6 @@ def _checkpointed(function: Callable[[State], State], state: State, reads: Mappi
     ``torch.utils.checkpoint`` does not notice when a tensor is changed in place before the replay, which would give a
     wrong gradient; this raises an error. The transforms of ``torch.func`` do not support checkpoints: under them the
     whole graph is kept.
-
-    Args:
-        function: The function.
-        state: Its argument.
-        reads: What else it reads, by name.
     """
     if not torch.is_grad_enabled() or transforming():
         return function(state)

@@ -75,15 +75,7 @@ class Scattered(NamedTuple):
 
 
 def substep(scene: Scene, planes: Planes) -> Planes:
-    """Advance all particles by one substep.
-
-    Args:
-        scene: What the substeps of a step share.
-        planes: The 13 component planes, (B, N) each.
-
-    Returns:
-        The new planes, (B, N) each.
-    """
+    """Advance all particles by one substep: from planes (B, N) to planes (B, N)."""
     scattered = particles_to_grid(scene, planes)
     velocity = grid_velocity(scene, scattered.momentum)
     velocity = constrain(scene.faces, velocity)
@@ -94,12 +86,7 @@ def substep(scene: Scene, planes: Planes) -> Planes:
 
 
 def particles_to_grid(scene: Scene, planes: Planes) -> Scattered:
-    """First half of a substep: deform the particles, evaluate their stress, collect mass and momentum on the nodes.
-
-    Args:
-        scene: What the substeps of a step share.
-        planes: The 13 component planes, (B, N) each.
-    """
+    """First half of a substep: deform the particles, evaluate their stress, collect mass and momentum on the nodes."""
     x, y, vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, Jp = planes
     dt, grid = scene.dt, scene.grid
     inside = grid.contains(x, scene.origin[:, 0:1])
@@ -133,12 +120,7 @@ def _deform(scene: Scene, nodes: Stencil, trial: Mat2, Jp: Tensor) -> tuple[Mat2
 def grid_velocity(scene: Scene, momentum: Tensor) -> Tensor:
     """Velocity of the nodes before the boundary: normalise, accelerate, damp.
 
-    Args:
-        scene: What the substeps of a step share.
-        momentum: (3, B, cells) mass and momentum.
-
-    Returns:
-        (2, B, cells) velocities, m/s; zero on padding nodes.
+    From mass and momentum (3, B, cells) to (2, B, cells), m/s; zero on padding nodes.
     """
     velocity = free_velocity(scene, momentum) + scene.gravity
     return velocity * scene.damping if scene.damping != 1.0 else velocity

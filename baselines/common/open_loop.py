@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from torch import Tensor
 
+from cfp.experiment.algorithm import Algorithm
 from cfp.weights import fitting, read_policy, write_policy
 
 
@@ -78,3 +80,22 @@ class OpenLoop:
         tensors, description = read_policy(path)
         with fitting(path):
             return cls(tensors["actions"], description)
+
+
+class OpenLoopAlgorithm(Algorithm):
+    """An algorithm whose policy is a sequence of actions."""
+
+    @property
+    @abstractmethod
+    def policy(self) -> OpenLoop:
+        """The actions so far."""
+
+    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
+        """Write the actions; those made for one layout name it."""
+        policy = self.policy
+        OpenLoop(policy.actions, description | policy.description).save(path)
+
+    @classmethod
+    def load(cls, path: Path, device: str = "cpu") -> OpenLoop:
+        """Load actions."""
+        return OpenLoop.load(path)

@@ -88,11 +88,7 @@ class Command:
     """Only list the runs and their states."""
 
     def check(self) -> None:
-        """Check what the types cannot.
-
-        Raises:
-            ConfigError: Naming the option, what was given and what is allowed.
-        """
+        """Check what the types cannot."""
         check_at_least(1, episodes=self.episodes, slot_episodes=self.slot_episodes, cpus_per_run=self.cpus_per_run or 1)
         check_at_least(0, workers=self.workers, gpus_per_run=self.gpus_per_run, retries=self.retries)
         if self.gpus_per_run and self.executor == "local":
@@ -113,11 +109,7 @@ class Command:
         return replace(self.protocol, episodes=max(self.episodes, -(-self.slot_episodes // runs)))
 
     def make_executor(self, signals: StopSignals) -> Executor:
-        """What carries out the runs.
-
-        Raises:
-            ConfigError: Ray is not installed, or the cluster cannot be reached.
-        """
+        """What carries out the runs."""
         one_machine = self.executor == "local" and self.only is None
         lock_timeout = LOCK_TIMEOUT if one_machine else CLUSTER_LOCK_TIMEOUT
         resources = Resources(self.cpus_per_run, self.gpus_per_run, self.retries, lock_timeout)
@@ -127,12 +119,7 @@ class Command:
 
 
 def compare(command: Command) -> int:
-    """Carry out a comparison; returns the exit code.
-
-    Raises:
-        CFPError: An option is wrong, or a run folder holds something else.
-        Stopped: A signal stopped the comparison; all runs have saved their work.
-    """
+    """Carry out a comparison; returns the exit code."""
     command.check()
     plan = Plan.read(command.plan)
     for part, names in plan.unused(command.tasks, command.algos).items():

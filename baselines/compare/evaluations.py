@@ -74,34 +74,17 @@ class Protocol:
 
 @dataclass(frozen=True)
 class FinalEvaluation:
-    """What the evaluation of a policy has found so far.
+    """What the evaluation of a policy has found so far."""
 
-    Attributes:
-        returns: One per episode on the common layouts; fewer than asked for while the evaluation is incomplete.
-        successes: Number of successful episodes, None if the task does not define success.
-        own_layout: Return on the one layout that the policy was made for, if there is one.
-        cases: Mean return by case, the unperturbed one first; None if a case changes nothing for the policy, or has not
-            been tried on all layouts yet.
-        complete: Whether nothing is left to do.
-    """
-
-    returns: tuple[float, ...]
-    successes: int | None
-    own_layout: float | None
-    cases: dict[str, float | None]
+    returns: tuple[float, ...]  # one per episode on the common layouts
+    successes: int | None  # number of episodes; None if the task does not define success
+    own_layout: float | None  # return on the one layout that the policy was made for, if there is one
+    cases: dict[str, float | None]  # mean returns; None if a case has no effect or is not complete
     complete: bool
 
 
 class Record:
-    """The entries in ``final_evaluation.json`` of a run folder that belong to the policy that is there now.
-
-    Args:
-        config: Options of the run.
-        folder: The run folder.
-
-    Raises:
-        CheckpointError: The record is damaged.
-    """
+    """The entries in ``final_evaluation.json`` of a run folder that belong to the policy that is there now."""
 
     def __init__(self, config: RunConfig, folder: Path) -> None:
         self.path, policy = folder / RECORD, folder / "policy.safetensors"
@@ -119,15 +102,7 @@ class Record:
 
 
 def read_record(path: Path, **types: type) -> dict[str, Any]:
-    """Read a JSON object that a comparison has written into a run folder.
-
-    Args:
-        path: The file.
-        types: Names of values that it must hold, and their types.
-
-    Raises:
-        CheckpointError: The file cannot be read, or a value is missing or of another type.
-    """
+    """Read a JSON object from a run folder; ``types`` are those of the values that it must hold."""
     try:
         record: dict[str, Any] = parse_json(path.read_text())
         for name, kind in types.items():
@@ -147,18 +122,7 @@ def evaluation_config(config: RunConfig, tier: Particles) -> RunConfig:
 
 
 def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop: Callable[[], None]) -> None:
-    """Evaluate the policy of a run as far as that has not been done.
-
-    Args:
-        config: Options of the run.
-        folder: The run folder.
-        protocol: How to evaluate.
-        check_stop: Called between two batches of episodes; raises to stop.
-
-    Raises:
-        CheckpointError: There is no policy, or it is damaged.
-        ConfigError: The environment refuses an option.
-    """
+    """Evaluate the policy of a run as far as that has not been done; ``check_stop`` is called between two batches."""
     record, task, deterministic = Record(config, folder), config.task, protocol.deterministic(config.task)
     if config.algo in REFERENCE_POLICIES:
         policy = reference_policy(config)
@@ -186,11 +150,7 @@ def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop
 
 
 def read_evaluation(config: RunConfig, folder: Path, protocol: Protocol) -> FinalEvaluation | None:
-    """What has been found so far; None without a whole batch of episodes.
-
-    Raises:
-        CheckpointError: The record is damaged.
-    """
+    """What has been found so far; None without a whole batch of episodes."""
     task = config.task
     entries, cases, batches = Record(config, folder).entries, protocol.cases(), len(protocol.batches())
 

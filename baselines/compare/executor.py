@@ -17,19 +17,12 @@ POLL = 0.5
 
 @dataclass(frozen=True)
 class Resources:
-    """What a run gets.
+    """What a run gets."""
 
-    Attributes:
-        cpus: Number of cores; None: an equal share of this machine's, or one on a cluster.
-        gpus: Number of GPUs, also a fraction of one; on a cluster only.
-        retries: How many more times a run is started whose process or node was lost, over all causes together.
-        lock_timeout: Seconds to wait for another process that holds the run folder.
-    """
-
-    cpus: int | None = None
-    gpus: float = 0.0
-    retries: int = 2
-    lock_timeout: float = 30.0
+    cpus: int | None = None  # None: an equal share of this machine's cores, or one on a cluster
+    gpus: float = 0.0  # also a fraction of one; on a cluster only
+    retries: int = 2  # further attempts after the process or the node was lost, over all causes together
+    lock_timeout: float = 30.0  # seconds to wait for another process that holds the run folder
 
 
 class Executor(ABC):
@@ -51,14 +44,7 @@ class Executor(ABC):
 def execute(
     executor: Executor, jobs: Sequence[Job], signals: StopSignals, on_outcome: Callable[[Job, Outcome], None]
 ) -> None:
-    """Carry out runs, until all are over or have stopped.
-
-    Args:
-        executor: Carries them out; shut down at the end.
-        jobs: The runs.
-        signals: Whether the user wants to stop.
-        on_outcome: Called as each run ends, with how it ended.
-    """
+    """Carry out runs until all are over or have stopped, and shut down the executor."""
     pending: dict[Future[Outcome], Job] = {}
     stopping, complete = False, False
 

@@ -30,14 +30,7 @@ TASK_DEFINING_OPTIONS = ("substeps", "dtype", "parity", "resample", "target", "v
 
 @dataclass(frozen=True)
 class Job:
-    """A run of the comparison.
-
-    Attributes:
-        label: Name of the algorithm in the report: its own, or that of a variant in the plan file.
-        config: Options of the run.
-        folder: Run folder.
-        protocol: How its policy is evaluated.
-    """
+    """A run of the comparison; ``label`` is the name of its algorithm, or of a variant in the plan file."""
 
     label: str
     config: RunConfig
@@ -92,20 +85,6 @@ def make_jobs(
     """All runs of a comparison, ordered by seed, so that a comparison that is stopped early has something to compare.
 
     Reference policies have one run, that of the first seed.
-
-    Args:
-        plan: Options beyond the presets.
-        tasks: Names of tasks.
-        labels: Algorithms and variants.
-        seeds: Seeds of the runs.
-        folder: Folder of the run folders.
-        protocol: From the options of a run to how its policy is evaluated.
-        preset: Preset of all runs.
-        steps: Environment steps of algorithms that have this option, unless the plan gives it.
-        device: Device of all runs.
-
-    Raises:
-        ConfigError: An option is wrong, or two algorithms would not solve the same task.
     """
     for name, values in (("tasks", tasks), ("algos", labels), ("seeds", seeds)):
         if not values or len(set(values)) < len(values):
@@ -128,11 +107,7 @@ def make_jobs(
 
 
 def resolve(plan: Plan, label: str, task: str, preset: str, seed: int, steps: int | None, device: str) -> RunConfig:
-    """Options of a run: from the preset, then the plan file, then the command line.
-
-    Raises:
-        ConfigError: An option is wrong.
-    """
+    """Options of a run: from the preset, then the plan file, then the command line."""
     values = plan.options(label, task)
     variant_of = values.pop("algo", label)
     algo = label if label in {*ALGORITHMS, *ALIASES, *REFERENCE_POLICIES} else variant_of
@@ -177,12 +152,7 @@ def _names_default(task: str, option: str, mine: Any, theirs: Any) -> bool:
 
 
 def check_folder(job: Job) -> None:
-    """Check that the run in a job's folder, if there is one, has the job's options.
-
-    Raises:
-        ConfigError: It has other options, of which the message names the first, or its custom task has changed since.
-        CheckpointError: A file of the run is damaged.
-    """
+    """Check that the run in a job's folder, if there is one, has the same options and task."""
     if not holds_run(job.folder):
         return
     if not (job.folder / "config.json").exists():
@@ -204,10 +174,6 @@ def check_folder(job: Job) -> None:
 
 
 def read_sessions(folder: Path) -> dict[str, Any]:
-    """``sessions.json``: the step at which training ended or false, and a record of each session that ended in order.
-
-    Raises:
-        CheckpointError: The file is damaged.
-    """
+    """``sessions.json``: the step at which training ended or false, and a record per session that ended in order."""
     path = folder / "sessions.json"
     return read_record(path, finished=int, sessions=list) if path.exists() else {"finished": False, "sessions": []}

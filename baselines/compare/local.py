@@ -22,11 +22,7 @@ POLL = 0.2
 
 
 class ProcessKilled(Exception):
-    """The process of a run was killed by a signal.
-
-    Args:
-        number: The signal.
-    """
+    """The process of a run was killed by a signal."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -37,12 +33,7 @@ class ProcessKilled(Exception):
 
 
 class InProcessExecutor(Executor):
-    """Carries out each run in this process when it is submitted.
-
-    Args:
-        signals: Whether the user wants to stop.
-        resources: What a run gets.
-    """
+    """Carries out each run in this process when it is submitted."""
 
     def __init__(self, signals: StopSignals, resources: Resources) -> None:
         self.signals, self.lock_timeout = signals, resources.lock_timeout
@@ -62,12 +53,7 @@ class InProcessExecutor(Executor):
 
 
 class LocalExecutor(Executor):
-    """Carries out runs in processes of this machine.
-
-    Args:
-        workers: Number of processes at a time.
-        resources: What a run gets.
-    """
+    """Carries out runs in processes of this machine."""
 
     def __init__(self, workers: int, resources: Resources) -> None:
         self.threads = resources.cpus or max(1, (os.cpu_count() or 1) // workers)
@@ -109,15 +95,8 @@ def run_process(job: Job, threads: int, lock_timeout: float, urgency: Callable[[
     """Carry out a run in a process of its own, whose output is appended to ``log.txt`` in the run folder.
 
     The process is in a session of its own: Ctrl-C reaches this process only, which then asks it to stop, once.
-
-    Args:
-        job: The run.
-        threads: Number of threads of its numerical libraries.
-        lock_timeout: Seconds to wait for another process that holds the run folder.
-        urgency: Whether to stop the process: 0 not, 1 with a checkpoint, 2 at once.
-
-    Raises:
-        ProcessKilled: A signal that was not sent from here ended the process.
+    ``urgency`` tells whether to stop it: 0 not, 1 with a checkpoint, 2 at once. If something else kills it, this raises
+    `ProcessKilled`.
     """
     folder = job.folder
     folder.mkdir(parents=True, exist_ok=True)

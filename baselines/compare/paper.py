@@ -87,9 +87,5 @@ def curve(algo: str, task: str) -> tuple[float, float] | None:
 
 
 def normalised(task: str, value: float) -> float:
-    """A return on a scale where a resting robot has 0 and the paper's CFP 1.
-
-    Raises:
-        KeyError: The paper has no such task.
-    """
+    """A return on a scale where a resting robot has 0 and the paper's CFP 1."""
     return (value - REST[task]) / (CURVES[task][1][0][0] - REST[task])

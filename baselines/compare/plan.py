@@ -34,11 +34,7 @@ class Plan:
 
     @classmethod
     def read(cls, path: Path | None) -> Plan:
-        """Read a JSON file; no file is an empty plan.
-
-        Raises:
-            ConfigError: The file cannot be read, or holds something else.
-        """
+        """Read a JSON file; no file is an empty plan."""
         if path is None:
             return cls()
         try:

@@ -21,14 +21,6 @@ class RayExecutor(Executor):
     The run folders must be on a file system that all nodes share, and all nodes must have this package. A run whose
     node is lost continues on another one from its last checkpoint; the lock on its folder keeps two nodes from working
     on it at once. Ray counts lost nodes and killed processes together, so that ``retries`` bounds their sum.
-
-    Args:
-        address: Address of the cluster; None: what ``RAY_ADDRESS`` names, else the cluster last started on this
-            machine, else a new one.
-        resources: What a run gets.
-
-    Raises:
-        ConfigError: Ray is not installed, or the cluster cannot be reached.
     """
 
     def __init__(self, address: str | None, resources: Resources) -> None:

@@ -35,17 +35,7 @@ class Picture:
 
 
 def write_report(folder: Path, runs: Sequence[RunResult], protocol: Protocol, description: str) -> Path:
-    """Write all files of the report, over those of an earlier one.
-
-    Args:
-        folder: Where they go: ``index.html``, ``report.md``, ``*.csv``, ``*.png``.
-        runs: The runs of the comparison.
-        protocol: How policies were evaluated.
-        description: What was compared, for the head of the report.
-
-    Returns:
-        The path of the page.
-    """
+    """Write all files of the report, over those of an earlier one."""
     groups = group_results(runs)
     complete = make_tables(runs, groups, protocol)
     for table in complete:

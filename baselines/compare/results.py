@@ -22,26 +22,15 @@ OBSERVATIONS = ("image", "state", "simulator", "nothing")
 
 @dataclass(frozen=True)
 class Cost:
-    """What training took, over the sessions that ended in order.
+    """What training took, over the sessions that ended in order."""
 
-    Attributes:
-        last_step: Environment steps of the run at the end of the last session.
-        steps: Environment steps in these sessions.
-        seconds: Wall time, without evaluations and without the training of a teacher.
-        evaluation_seconds: Wall time of the evaluations in between, those of a teacher included.
-        teacher_seconds: Wall time of the training of a teacher that came first, 0 for none.
-        teacher_steps: Environment steps of that training.
-        memory: Most bytes that a process held, None if not measured.
-        device: Where it ran.
-    """
-
-    last_step: int
-    steps: int
-    seconds: float
-    evaluation_seconds: float
-    teacher_seconds: float
+    last_step: int  # environment steps of the run at the end of the last session
+    steps: int  # environment steps in these sessions
+    seconds: float  # without evaluations and without the training of a teacher
+    evaluation_seconds: float  # those of a teacher included
+    teacher_seconds: float  # training of a teacher that came first
     teacher_steps: int
-    memory: int | None
+    memory: int | None  # peak memory of a process in bytes, if measured
     device: str
 
 
@@ -138,11 +127,7 @@ class Group:
 
 
 def read_result(job: Job) -> RunResult:
-    """Read the folder of a run.
-
-    Raises:
-        CheckpointError: A file in it is damaged.
-    """
+    """Read the folder of a run."""
     evaluation, state, error = read_evaluation(job.config, job.folder, job.protocol), job.state, ""
     if state == "finished" and (evaluation is None or not evaluation.complete):
         state = "unevaluated"

@@ -26,15 +26,8 @@ def bootstrap_interval(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Percentile 95 % interval of the interquartile mean, by stratified bootstrap over runs.
 
-    With two or three runs the interval is hardly wider than their range, and too narrow.
-
-    Args:
-        strata: Scores (N_i,) of the runs of each task; a single stratum may hold curves (N, T), resampled as wholes.
-        resamples: Number of bootstrap resamples.
-        seed: Seed of the generator.
-
-    Returns:
-        Lower and upper end, scalars or (T,); None if no stratum has two runs.
+    With two or three runs it is hardly wider than their range, and too narrow. The strata hold the scores (N_i,) of the
+    runs of each task; a single stratum may hold curves (N, T), resampled as wholes. None if no stratum has two runs.
     """
     resampled = [np.asarray(scores, float) for scores in strata if len(scores) > 1]
     if not resampled:
@@ -60,11 +53,7 @@ def score_interval(strata: Sequence[Sequence[float]]) -> tuple[float, float] | t
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson's 95 % score interval of a probability.
-
-    Raises:
-        ValueError: No trials, or more successes than trials.
-    """
+    """Wilson's 95 % score interval of a probability."""
     low, high = scipy.stats.binomtest(successes, trials).proportion_ci(method="wilson")
     return float(low), float(high)
 
@@ -77,11 +66,7 @@ def first_step_at(curve: Curve, value: float) -> float | None:
 
 
 def align_curves(curves: Sequence[Curve]) -> Curve:
-    """Interpolate the curves of several runs linearly onto the steps that all of them cover.
-
-    Returns:
-        Steps (T,) and values (runs, T); T is 0 if the runs have no step in common.
-    """
+    """Interpolate curves linearly onto the steps (T,) that all of them cover, if any: values (runs, T)."""
     first, last = max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves)
     grid = np.unique(np.concatenate([steps for steps, _ in curves]))
     grid = grid[(grid >= first) & (grid <= last)]

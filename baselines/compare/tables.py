@@ -138,12 +138,7 @@ EFFICIENCY = (
 
 
 def efficiency_table(groups: Sequence[Group], tier: Particles) -> Table:
-    """Steps until the evaluations of a run reach the milestones between a resting robot and the best curve.
-
-    Args:
-        groups: All groups; those of ``zero`` are the resting robots.
-        tier: Particles of the final evaluation; only curves with the same particles can be compared with it.
-    """
+    """Steps until evaluations with ``tier`` particles reach the milestones between rest and the best curve."""
     rest = {group.task: group.iqm for group in groups if group.job.config.algo == "zero" and group.scores}
     trained = [group for group in groups if group.curves and not group.job.untrained]
     best: dict[tuple[str, str], float] = {}

@@ -49,14 +49,7 @@ def decode(line: str) -> tuple[Job, float]:
 
 
 def carry_out(job: Job, signals: StopSignals, lock_timeout: float, *, own_process: bool = True) -> Outcome:
-    """Do what is left of a run; an error is written to ``error.txt`` in its folder.
-
-    Args:
-        job: The run.
-        signals: Whether the user wants to stop.
-        lock_timeout: Seconds to wait for another process that holds the folder.
-        own_process: Whether this process does nothing else, so that its memory is that of the run.
-    """
+    """Do what is left of a run; an error is written to ``error.txt`` in its folder."""
     try:
         with run_lock(job.folder, lock_timeout):
             (job.folder / "error.txt").unlink(missing_ok=True)

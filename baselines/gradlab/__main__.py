@@ -15,7 +15,7 @@ import tyro
 from torch import Tensor
 
 from baselines.gradlab.measure import ReturnFunction, measure
-from baselines.gradlab.report import format_table, write
+from baselines.gradlab.report import write
 from cfp.envs.make import choose_device
 from cfp.errors import ConfigError
 from cfp.experiment.cli import run_command
@@ -91,33 +91,20 @@ def parse(arguments: Sequence[str]) -> GradLabConfig:
 
 
 def make_env(config: GradLabConfig) -> TorchEnv:
-    """Build and reset the task in float64.
-
-    Raises:
-        ConfigError: The environment refuses an option, or the episode is shorter than the first horizon.
-    """
-    names = ("resolution", "particles", "substeps", "backend")
-    options = {name: getattr(config, name) for name in names}
+    """Build and reset the task in float64; a `ConfigError` if it refuses an option or the episode is too short."""
+    options = {name: getattr(config, name) for name in ("resolution", "particles", "substeps", "backend")}
     try:
         env = TorchEnv(config.task, dtype="float64", device=choose_device(config.device), **options)
         env.reset(seed=config.seed)
     except (ValueError, TypeError) as error:
         raise ConfigError(" ".join(str(error).split())) from error
     if (most := env.spec.horizon - config.horizons[0]) < config.warmup:
-        raise ConfigError(
-            f"warmup must be at most {most} (an episode has {env.spec.horizon} steps and the first horizon is "
-            f"{config.horizons[0]}), got {config.warmup}"
-        )
+        raise ConfigError(f"warmup must be at most {most} in an episode of {env.spec.horizon}, got {config.warmup}")
     return env
 
 
 def run(config: GradLabConfig) -> str:
-    """Measure, write the folder, and return the text to print.
-
-    Raises:
-        ConfigError: See `make_env`, or the task's reward has no gradient.
-        OSError: The folder cannot be made.
-    """
+    """Measure, write the folder, and return the text to print."""
     assert config.out is not None
     env = make_env(config)
     config.out.mkdir(parents=True, exist_ok=True)  # before the long measurement, not after it
@@ -136,9 +123,7 @@ def run(config: GradLabConfig) -> str:
     function = ReturnFunction(env.model, env.env_state)
     directions, noise = normal(DIRECTIONS), normal(config.samples)
     results, errors = measure(function, actions[config.warmup :], horizons, directions, noise)
-    options = dataclasses.asdict(config) | {"out": str(config.out)}
-    sentence = write(config.out, options, results, errors.tolist())
-    return f"{format_table(results)}\n\n{sentence}\nwritten to {config.out}"
+    return write(config.out, dataclasses.asdict(config) | {"out": str(config.out)}, results, errors.tolist())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

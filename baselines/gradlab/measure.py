@@ -18,24 +18,35 @@ from dittogym.model import EnvState, Model
 STEP_SIZES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 """Step sizes of the finite differences, root mean square per action value."""
 NOISE_STD = 0.1
-"""Standard deviation of the noise on the actions under which first- and zeroth-order estimates are compared."""
+"""Standard deviation of the action noise under which first- and zeroth-order estimates are compared."""
+BATCH_SIZE = 16
+"""Largest number of simulations at a time; it bounds the memory."""
+
+Result = dict[str, Any]
+"""Measurements at one horizon, by the names of `COLUMNS`."""
+COLUMNS = {
+    "horizon": "control steps",
+    "norm": "norm of the gradient in all actions",
+    "first_norm": "norm of the gradient in the first action",
+    "difference_error": "smallest relative error of finite differences over all step sizes",
+    "difference_step": "the step size at which it was reached",
+    "cosine": "cosine similarity of the float32 and the float64 gradient",
+    "relative_error": "norm of their difference over the norm of the float64 gradient",
+    "first_variance": "total variance of the mean of the first-order samples",
+    "zeroth_variance": "total variance of the mean of the zeroth-order samples, from as many simulations",
+    "promised": "gain of a step along the first-order mean if the return were linear",
+    "first_gain": "actual gain of that step",
+    "zeroth_gain": "actual gain of a step of the same length along the zeroth-order mean",
+    "failed": "samples that were not finite, which are left out of the means",
+}
 
 
 @dataclass(frozen=True)
 class ReturnFunction:
-    """Return of action sequences (T, 2, R, R) from one initial state, and its gradient.
-
-    The return at horizon h is the sum of the first h smooth rewards.
-
-    Attributes:
-        model: The task.
-        state: Initial state of one simulation; its dtype is that of the computation.
-        batch_size: Largest number of simulations at a time; it bounds the memory.
-    """
+    """Return of action sequences (T, 2, R, R) from one initial state: at horizon h, the sum of h smooth rewards."""
 
     model: Model
     state: EnvState
-    batch_size: int = 16
 
     def to(self, dtype: torch.dtype) -> ReturnFunction:
         """Return the same function computed in another precision."""
@@ -47,11 +58,7 @@ class ReturnFunction:
         return torch.cat([self._rewards(batch).T.cumsum(1) for batch in self._batches(actions)])
 
     def gradients(self, actions: Tensor) -> Tensor:
-        """Gradients (S, T, 2, R, R) of the returns at horizon T of action sequences of the same shape.
-
-        Raises:
-            ConfigError: The task's reward has no gradient.
-        """
+        """Gradients (S, T, 2, R, R) of the returns at horizon T; a `ConfigError` if the reward has none."""
         gradients = []
         for batch in self._batches(actions):
             rewards = self._rewards(batch.requires_grad_())
@@ -64,60 +71,17 @@ class ReturnFunction:
         return rollout(self.model, repeat(self.state, batch.shape[1]), batch).rewards
 
     def _batches(self, actions: Tensor) -> list[Tensor]:
-        """Time-major batches (T, B, 2, R, R)."""
         like = self.state.particles.x
-        return [part.to(like).detach().transpose(0, 1).contiguous() for part in actions.split(self.batch_size)]
-
-
-@dataclass(frozen=True)
-class HorizonResult:
-    """Measurements at one horizon.
-
-    Attributes:
-        horizon: Control steps.
-        norm: Norm of its gradient with respect to all actions.
-        first_norm: Norm of its gradient with respect to the first action.
-        difference_error: Smallest error of finite differences over all step sizes, see `finite_difference_errors`.
-        difference_step: The step size at which it was reached.
-        cosine: Cosine similarity of the float32 and the float64 gradient.
-        relative_error: Norm of their difference over the norm of the float64 gradient.
-        first_variance: Total variance of the mean of the first-order samples.
-        zeroth_variance: Total variance of the mean of the zeroth-order samples, from as many simulations.
-        promised: Gain of a step along the first-order mean if the return were linear.
-        first_gain: Actual gain of that step.
-        zeroth_gain: Actual gain of a step of the same length along the zeroth-order mean.
-        failed: Number of samples that were not finite; they are left out of the means.
-    """
-
-    horizon: int
-    norm: float
-    first_norm: float
-    difference_error: float
-    difference_step: float
-    cosine: float
-    relative_error: float
-    first_variance: float
-    zeroth_variance: float
-    promised: float
-    first_gain: float
-    zeroth_gain: float
-    failed: int
+        return [part.to(like).detach().transpose(0, 1).contiguous() for part in actions.split(BATCH_SIZE)]
 
 
 def finite_difference_errors(
     function: ReturnFunction, actions: Tensor, gradients: Sequence[Tensor], directions: Tensor
 ) -> Tensor:
-    """Compare gradients with central differences at every step size of `STEP_SIZES`.
+    """Errors (horizons, step sizes) of central differences along directions (D, T, 2, R, R) against gradients.
 
-    Args:
-        function: In float64.
-        actions: (T, 2, R, R), where the gradients were taken.
-        gradients: Of the returns at some horizons h, (h, 2, R, R) each.
-        directions: (D, T, 2, R, R), standard normal.
-
-    Returns:
-        Errors (horizons, step sizes): root mean square over the directions of the difference between the two
-        directional derivatives, relative to the gradient's norm, which is the expected size of such a derivative.
+    The root mean square difference of the directional derivatives, relative to the gradient's norm, which is the
+    expected size of a derivative in a standard normal direction.
     """
     count = len(directions)
     errors = torch.empty(len(gradients), len(STEP_SIZES), dtype=actions.dtype)
@@ -133,19 +97,12 @@ def finite_difference_errors(
 
 def measure(
     function: ReturnFunction, actions: Tensor, horizons: Sequence[int], directions: Tensor, noise: Tensor
-) -> tuple[list[HorizonResult], Tensor]:
-    """Take all measurements at several horizons.
+) -> tuple[list[Result], Tensor]:
+    """Take all measurements around actions (T, 2, R, R), float64, at increasing horizons, the last of which is T.
 
-    Args:
-        function: In float64; first and zeroth order are compared in float32.
-        actions: (T, 2, R, R) float64, where everything is measured.
-        horizons: Increasing; the last is T.
-        directions: (D, T, 2, R, R), standard normal, of the finite differences.
-        noise: (S, T, 2, R, R), standard normal, S even. The first half serves the zeroth-order estimate in
-            antithetic pairs, so both estimates cost S simulations.
-
-    Returns:
-        One result per horizon, and the errors of finite differences (horizons, step sizes).
+    The first half of the noise (S, T, 2, R, R), standard normal, serves the zeroth-order estimate in antithetic pairs,
+    so both estimates cost S simulations. They are compared in float32. Returns one result for each horizon, and the
+    errors of finite differences (horizons, step sizes).
     """
     gradients = [
         function.gradients(actions[None, :horizon])[0] for horizon in tqdm(horizons, "gradients", disable=None)
@@ -159,23 +116,22 @@ def measure(
         horizon = len(gradient)
         best = int(torch.where(error.isfinite(), error, torch.inf).argmin())
         rounded = single.gradients(actions[None, :horizon])[0].to(gradient)
-        results.append(
-            HorizonResult(
-                horizon=horizon,
-                norm=float(gradient.norm()),
-                first_norm=float(gradient[0].norm()),
-                difference_error=float(error[best]),
-                difference_step=STEP_SIZES[best],
-                cosine=float(cosine_similarity(gradient.flatten(), rounded.flatten(), dim=0)),
-                relative_error=float((rounded - gradient).norm() / gradient.norm()),
-                **_compare_orders(single, actions[:horizon], paired_returns[:, horizon - 1], noise[:, :horizon]),
-            )
-        )
+        result: Result = {
+            "horizon": horizon,
+            "norm": float(gradient.norm()),
+            "first_norm": float(gradient[0].norm()),
+            "difference_error": float(error[best]),
+            "difference_step": STEP_SIZES[best],
+            "cosine": float(cosine_similarity(gradient.flatten(), rounded.flatten(), dim=0)),
+            "relative_error": float((rounded - gradient).norm() / gradient.norm()),
+        }
+        orders = _compare_orders(single, actions[:horizon], paired_returns[:, horizon - 1], noise[:, :horizon])
+        results.append(result | orders)
     return results, errors
 
 
-def _compare_orders(function: ReturnFunction, actions: Tensor, paired_returns: Tensor, noise: Tensor) -> dict[str, Any]:
-    """Fields of a `HorizonResult` about first- and zeroth-order estimates of the gradient under noise."""
+def _compare_orders(function: ReturnFunction, actions: Tensor, paired_returns: Tensor, noise: Tensor) -> Result:
+    """First- and zeroth-order estimates of the gradient of the return under action noise."""
     first, first_variance, first_failed = _mean_and_variance(function.gradients(actions + NOISE_STD * noise))
     ahead, behind = paired_returns.chunk(2)
     slopes = (ahead - behind) / (2 * NOISE_STD)

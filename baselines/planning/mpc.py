@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -11,14 +10,14 @@ from torch import Tensor
 
 import cfp
 from baselines.common.grid import GridConfig
-from baselines.common.open_loop import OpenLoop
+from baselines.common.open_loop import OpenLoop, OpenLoopAlgorithm
 from baselines.planning.base import Planner, PlannerConfig
 from baselines.planning.cem import CEMPlanner, CEMPlannerConfig
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.planning.surrogate import Surrogate
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
-from cfp.experiment.algorithm import Algorithm, Scalars, Sees
+from cfp.experiment.algorithm import Scalars, Sees
 from cfp.sections import EnvironmentConfig, Particles, ReportConfig
 from dittogym import make_spec
 
@@ -99,7 +98,7 @@ def episode_preset(task: str, name: str) -> dict[str, Any]:
     }
 
 
-class MPC(Algorithm):
+class MPC(OpenLoopAlgorithm):
     """Model predictive control by gradients, see `GradientPlanner`.
 
     There is nothing to learn: `update` carries out a planned step of a single episode, and the policy is the record of
@@ -141,8 +140,8 @@ class MPC(Algorithm):
 
     @property
     def policy(self) -> OpenLoop:
-        """The record so far."""
-        return OpenLoop(self.actions)
+        """The record so far, with its layout."""
+        return OpenLoop(self.actions, {"layout": self.config.seed})
 
     @property
     def finished(self) -> bool:
@@ -170,15 +169,6 @@ class MPC(Algorithm):
         self.reward = float(reward)
         self.total_reward += self.reward
         self.is_done = bool(terminated)
-
-    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
-        """Write the record, with its layout."""
-        OpenLoop(self.actions, description | {"layout": self.config.seed}).save(path)
-
-    @classmethod
-    def load(cls, path: Path, device: str = "cpu") -> OpenLoop:
-        """Load a record."""
-        return OpenLoop.load(path)
 
     def state_dict(self) -> dict[str, Any]:
         """Actions and planner; the state of the robot is restored by repeating its actions."""

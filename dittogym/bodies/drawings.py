@@ -11,10 +11,12 @@ from typing import TypeAlias
 
 import cv2
 import numpy as np
+import torch
 
 from dittogym.bodies.images import read_grey
 from dittogym.bodies.shapes import Figure, Shape
 from dittogym.spec import BodySpec, TaskSpec
+from dittogym.window import contains
 from torchmpm import sampling
 
 #: A path or an array (picture), (K, 2) corners (outline), a shape, or a body.
@@ -108,7 +110,8 @@ def _check_place(spec: TaskSpec) -> None:
     (left, bottom), (width, height) = shape.corner, shape.size
     points = shape.positions(sampling.sobol(PROBE, seed=0))
     window = spec.window.left if spec.window.follow is None else float(points[:, 0].mean()) - spec.window.follow
-    if left <= window or left + width >= window + 1.0 or bottom <= 0.0 or bottom + height >= 1.0:
+    corners = torch.tensor([[(left, bottom), (left + width, bottom + height)]], dtype=torch.float64, device="cpu")
+    if not bool(contains(corners, corners.new_tensor([[window, 0.0]])).all()):
         raise ValueError(
             f"body must lie inside the window ({window:.3f} < x < {window + 1:.3f}, 0 < y < 1), got "
             f"{left:.3f} < x < {left + width:.3f}, {bottom:.3f} < y < {bottom + height:.3f}"

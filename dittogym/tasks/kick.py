@@ -20,14 +20,14 @@ GAP_CAP = 0.3
 def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
     """Displacement and speed of cube and robot, and the distance between them."""
     now, start = moment.now, moment.start
-    assert now.object_com is not None and now.object_velocity is not None and start.object_com is not None
-    kicked = now.object_com[:, 0] - start.object_com[:, 0]
+    assert now.object_velocity is not None and start.object_com is not None
+    kicked = moment.object_com[:, 0] - start.object_com[:, 0]
     travelled = now.com[:, 0] - start.com[:, 0]
     clamp = moment.ops.clamp
     object_location, location = (clamp(signed_quadratic(z, 4.0), -20.0, 30.0) for z in (kicked, travelled))
     speeds = (now.velocity[:, 0], now.object_velocity[:, 0])
     velocity, object_velocity = (clamp(signed_quadratic(v, 5.0), -20.0, 20.0) for v in speeds)
-    gap = (now.com[:, 0] - now.object_com[:, 0]).abs()
+    gap = (now.com[:, 0] - moment.object_com[:, 0]).abs()
     return Outcome(
         terms={
             "object_location": object_location,

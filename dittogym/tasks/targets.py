@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 
 from dittogym.bodies.images import PictureLike, read_grey
+from dittogym.observation.image import SIZE
 
 #: The name of a drawn target, the path of an image file, or an array.
 TargetLike: TypeAlias = PictureLike
 
-#: Pixels per axis of a target.
-SIZE = 64
 #: Grey values from this on belong to the shape.
 THRESHOLD = 125
 #: A centroid further than this from the middle is worth a warning, pixels.

@@ -1,6 +1,5 @@
 """Open-loop gradient descent, on robots of a few hundred particles."""
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -8,12 +7,9 @@ import torch
 from updates import EachUpdate
 
 from baselines import Gradient, OpenLoop
-from baselines.registry import configure
 from baselines.trajectory.optimise import Episode
-from cfp.config import to_json
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.sections import EnvironmentConfig
-from dittogym import make_spec
 
 TASKS = ("shapematch", "run", "grow", "kick", "dig", "obstacle", "catch", "slot")
 
@@ -28,17 +24,6 @@ def shorten(algorithm, horizon):
     algorithm.horizon = horizon
     algorithm.theta = algorithm.theta.detach()[:horizon].clone().requires_grad_()
     return algorithm
-
-
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("preset", ["quick", "paper"])
-def test_every_preset_is_valid_and_survives_json(task, preset):
-    config = Gradient.preset(task, preset)
-    config.check()
-    assert configure(json.loads(json.dumps(to_json(config)))) == config
-    assert config.ends() == (config.iterations * make_spec(task).horizon,)
-    assert replace(config, polish=2).ends()[1] - config.ends()[0] == 2 * make_spec(task).horizon
-    assert config.resolution(2) == make_spec(task).fine
 
 
 @pytest.mark.parametrize(
@@ -71,7 +56,7 @@ def numerical(algorithm, index, width):
     losses = []
     for sign in (1, -1):
         algorithm.theta.data[index] += sign * width
-        losses.append(algorithm._episode(0.9)[0])
+        losses.append(algorithm.play(0.9)[0])
         algorithm.theta.data[index] -= sign * width
     return (losses[0] - losses[1]) / (2 * width)
 
@@ -83,14 +68,14 @@ def test_gradient_is_that_of_the_loss(task):
     with torch.no_grad():
         algorithm.theta += 0.3
     algorithm.theta = algorithm.theta.detach().double().requires_grad_()
-    gradient = algorithm._episode(0.9).gradient
+    gradient = algorithm.play(0.9).gradient
     index = (1, 0, 2, 2)
     assert gradient[index].item() == pytest.approx(numerical(algorithm, index, 1e-5), rel=1e-4)
 
 
 def test_windows_cut_the_gradient_but_not_the_loss():
-    whole = shorten(Gradient(make(window=0)), 6)._episode(0.9)
-    halves = shorten(Gradient(make(window=3)), 6)._episode(0.9)
+    whole = shorten(Gradient(make(window=0)), 6).play(0.9)
+    halves = shorten(Gradient(make(window=3)), 6).play(0.9)
     assert halves.loss == pytest.approx(whole.loss, rel=1e-6)
     assert torch.allclose(halves.gradient[3:], whole.gradient[3:], rtol=1e-4, atol=1e-9)
     assert not torch.allclose(halves.gradient[:3], whole.gradient[:3], rtol=0.1, atol=1e-9)
@@ -101,9 +86,9 @@ def test_iterations_do_not_depend_on_those_before_even_with_reference_parity():
     algorithm = shorten(Gradient(make("run", environment=environment, polish=1, polish_grid=4), 1), 4)
     with torch.no_grad():
         algorithm.theta += torch.linspace(0.0, 1.0, 4)
-    first, state = algorithm._episode(0.0), algorithm.env.env_state
+    first, state = algorithm.play(0.0), algorithm.env.env_state
     algorithm.env.env_state = replace(state, centre=state.centre + 0.1)  # as after a longer way
-    second = algorithm._episode(0.0)
+    second = algorithm.play(0.0)
     assert first.loss == second.loss and torch.equal(first.gradient, second.gradient)
 
 
@@ -117,7 +102,7 @@ def test_steps_after_the_end_of_an_episode_do_not_count(monkeypatch):
         return observation, reward, terminated | (len(calls) == 3), truncated, info
 
     monkeypatch.setattr(algorithm.env, "step", end_at_third)
-    gradient = algorithm._episode(0.0).gradient
+    gradient = algorithm.play(0.0).gradient
     assert len(calls) == 3
     assert gradient[:3].abs().amax((1, 2, 3)).gt(0).all() and not gradient[3:].any()
 
@@ -135,7 +120,7 @@ def test_robot_whose_episode_is_over_may_break(monkeypatch):
         return observation, torch.where(broken, torch.nan, reward), terminated | first, truncated, info
 
     monkeypatch.setattr(algorithm.env, "step", first_breaks_after_its_end)
-    loss, size, total, gradient = algorithm._episode(0.0)
+    loss, size, total, gradient = algorithm.play(0.0)
     assert len(calls) == 4 and size >= abs(loss) > 0 and total == pytest.approx(-4 * loss)
     assert gradient.isfinite().all() and gradient.abs().amax((1, 2, 3)).gt(0).all()
 
@@ -156,16 +141,16 @@ def test_unusual_gradients_are_clipped():
 def test_iteration_that_breaks_the_robot_is_undone(monkeypatch, loss):
     algorithm = Gradient(make(substeps=1, blur=(1.0,)))
     algorithm.learn(30)
-    good = algorithm._episode
+    good = algorithm.play
     fail = lambda progress: Episode(loss, loss, 0.0, torch.zeros_like(algorithm.theta))  # noqa: E731
-    monkeypatch.setattr(algorithm, "_episode", fail)
+    monkeypatch.setattr(algorithm, "play", fail)
     scalars = algorithm.update()
     assert not algorithm.theta.any() and scalars["train/failed"] == 1  # back to the start, the best so far
-    monkeypatch.setattr(algorithm, "_episode", good)
+    monkeypatch.setattr(algorithm, "play", good)
     algorithm.num_timesteps = 30  # the same place in the schedule
     assert algorithm.update()["train/learning_rate"] == pytest.approx(0.7 * scalars["train/learning_rate"])
     assert algorithm.theta.any() and algorithm.failed_in_a_row == 0
-    monkeypatch.setattr(algorithm, "_episode", fail)
+    monkeypatch.setattr(algorithm, "play", fail)
     with pytest.raises(NonFiniteError, match="10 iterations in a row"):
         algorithm.learn(30 * 20)
 
@@ -176,11 +161,11 @@ def test_iteration_that_breaks_the_robot_is_undone(monkeypatch, loss):
 def test_better_losses_below_zero_are_kept(monkeypatch, sequence, size):
     algorithm, losses = Gradient(make("run", substeps=1)), iter(sequence)
     found = lambda progress: Episode(next(losses), size, 0.0, torch.ones_like(algorithm.theta))  # noqa: E731
-    monkeypatch.setattr(algorithm, "_episode", found)
+    monkeypatch.setattr(algorithm, "play", found)
     assert [algorithm.update()["train/failed"] for _ in range(4)] == [0, 0, 0, 0]
     resumed = Gradient(algorithm.config)
     resumed.load_state_dict(algorithm.state_dict())
-    monkeypatch.setattr(resumed, "_episode", found)
+    monkeypatch.setattr(resumed, "play", found)
     assert resumed.update()["train/failed"] == 1 and resumed.best_loss == min(sequence)
 
 
@@ -193,7 +178,7 @@ def test_only_another_blur_begins_anew(task, stage, phases):
 def test_schedule_of_a_stage_that_gets_the_steps_of_an_earlier_one_does_not_rise_again(monkeypatch):
     algorithm = Gradient(make(polish=2, polish_grid=4, substeps=1), 2)
     found = Episode(1.0, 1.0, 0.0, torch.zeros_like(algorithm.theta))
-    monkeypatch.setattr(algorithm, "_episode", lambda progress: found)
+    monkeypatch.setattr(algorithm, "play", lambda progress: found)
     rates = []
     algorithm.learn(4 * 30, EachUpdate(lambda scalars: rates.append(scalars["train/learning_rate"])))
     assert rates == pytest.approx([0.05, 0.0275, 0.005, 0.005])
@@ -223,5 +208,5 @@ def test_only_polish_takes_place_where_the_result_is_judged():
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_has_a_gradient(task):
     algorithm = shorten(Gradient(make(task, substeps=20, particles=100, train_particles=100)), 3)
-    loss, _, _, gradient = algorithm._episode(0.0)
+    loss, _, _, gradient = algorithm.play(0.0)
     assert gradient.isfinite().all() and gradient.abs().sum() > 0 and loss == loss

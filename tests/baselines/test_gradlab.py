@@ -2,17 +2,17 @@
 
 import json
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 
 import dittogym
 from baselines.gradlab import __main__ as command
-from baselines.gradlab.measure import STEP_SIZES, HorizonResult, finite_difference_errors, measure
+from baselines.gradlab.measure import COLUMNS, STEP_SIZES, finite_difference_errors, measure
 from baselines.gradlab.report import conclude, objections, write
 
-GOOD = HorizonResult(8, 2.0, 1.0, 1e-8, 1e-5, 1.0, 1e-6, 0.1, 30.0, 4.0, 3.0, 0.5, 0)
+GOOD = dict(zip(COLUMNS, (8, 2.0, 1.0, 1e-8, 1e-5, 1.0, 1e-6, 0.1, 30.0, 4.0, 3.0, 0.5, 0), strict=True))
 SHAPE = (4, 2, 3, 3)
 
 
@@ -45,16 +45,16 @@ def test_measurements_of_a_linear_return() -> None:
     for result, horizon in zip(results, (2, 4), strict=True):
         part = slope[:horizon]
         count = part.numel()
-        assert result.horizon == horizon and result.failed == 0
-        assert result.norm == pytest.approx(float(part.norm()))
-        assert result.first_norm == pytest.approx(float(slope[0].norm()))
-        assert result.cosine == pytest.approx(1.0) and 0 < result.relative_error < 1e-6
+        assert result["horizon"] == horizon and result["failed"] == 0
+        assert result["norm"] == pytest.approx(float(part.norm()))
+        assert result["first_norm"] == pytest.approx(float(slope[0].norm()))
+        assert result["cosine"] == pytest.approx(1.0) and 0 < result["relative_error"] < 1e-6
         # Of a pair's sample (c . e) e: E |.|^2 = (n + 2) |c|^2, less |c|^2 of the mean; half as many pairs as samples.
-        assert result.zeroth_variance == pytest.approx(float((count + 1) * part.square().sum()) / 4000, rel=0.1)
-        assert result.first_variance < 1e-9 * result.zeroth_variance
-        assert result.promised == pytest.approx(0.1 * count**0.5 * result.norm, rel=1e-5)
-        assert result.first_gain == pytest.approx(result.promised, rel=1e-4)
-        assert 0.9 * result.promised < result.zeroth_gain < result.promised
+        assert result["zeroth_variance"] == pytest.approx(float((count + 1) * part.square().sum()) / 4000, rel=0.1)
+        assert result["first_variance"] < 1e-9 * result["zeroth_variance"]
+        assert result["promised"] == pytest.approx(0.1 * count**0.5 * result["norm"], rel=1e-5)
+        assert result["first_gain"] == pytest.approx(result["promised"], rel=1e-4)
+        assert 0.9 * result["promised"] < result["zeroth_gain"] < result["promised"]
 
 
 def test_difference_error_of_a_wrong_gradient() -> None:
@@ -69,9 +69,9 @@ def test_samples_that_are_not_finite_are_counted_and_left_out() -> None:
     noise[2] = torch.nan  # also in the second pair
     actions = torch.zeros(SHAPE, dtype=torch.float64)
     (result,), _ = measure(LinearReturn(normal(*SHAPE)), actions, (4,), normal(1, *SHAPE), noise)
-    assert result.failed == 2 and "2 samples are not finite" in objections(result)
-    assert result.first_gain == pytest.approx(result.promised, rel=1e-4)
-    assert result.zeroth_variance > 0
+    assert result["failed"] == 2 and "2 samples are not finite" in objections(result)
+    assert result["first_gain"] == pytest.approx(result["promised"], rel=1e-4)
+    assert result["zeroth_variance"] > 0
 
 
 @pytest.mark.parametrize(
@@ -88,17 +88,17 @@ def test_samples_that_are_not_finite_are_counted_and_left_out() -> None:
 )
 def test_conclusion_stops_at_the_first_objection(change: dict) -> None:
     assert objections(GOOD) == []
-    bad = replace(GOOD, horizon=16, **change)
+    bad = GOOD | {"horizon": 16} | change
     (objection,) = objections(bad)
-    reach, sentence = conclude("run", [GOOD, bad, replace(GOOD, horizon=32)])
+    reach, sentence = conclude("run", [GOOD, bad, GOOD | {"horizon": 32}])
     assert reach == 8 and f"At 16, {objection}." in sentence
     assert conclude("run", [bad])[0] == 0
     assert conclude("run", [GOOD])[0] == 8
 
 
 def test_report_without_a_finite_sample_is_valid_json(tmp_path) -> None:
-    nothing = {field.name: math.nan for field in fields(HorizonResult)} | {"horizon": 8, "failed": 32}
-    write(tmp_path, {"task": "run"}, [HorizonResult(**nothing)], [[math.nan] * len(STEP_SIZES)])
+    nothing = dict.fromkeys(COLUMNS, math.nan) | {"horizon": 8, "failed": 32}
+    write(tmp_path, {"task": "run"}, [nothing], [[math.nan] * len(STEP_SIZES)])
     text = (tmp_path / "report.json").read_text()
     report = json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is not valid JSON"))
     assert report["horizons"][0] == dict.fromkeys(nothing) | {"horizon": 8, "failed": 32}

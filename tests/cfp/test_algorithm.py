@@ -92,7 +92,7 @@ def act(weights, image, noises: Iterator[torch.Tensor], kind):
     return weight * lift(action, size, aligned) + (1 - weight) * coarse, density, gate
 
 
-def judge(weights, image, action, aligned):
+def q_values(weights, image, action, aligned):
     values = []
     for index in range(2):
         prefix = f"critics.{index}"
@@ -135,15 +135,15 @@ def test_one_update_equals_the_float64_computation(kind, monkeypatch):
     monkeypatch.setattr("cfp.agent.actor.torch.randn_like", lambda like: next(queue).to(like))
 
     weights, values, targets = doubles(actor, True), doubles(critic, True), doubles(target, False)
-    now, later = (image.double() / 255 * 2 - 1 for image in (batch.observations, batch.next_observations))
+    obs, next_obs = (image.double() / 255 * 2 - 1 for image in (batch.observations, batch.next_observations))
     mean, variance = 0.01 * batch.rewards.double().mean(), 0.99 + 0.01 * batch.rewards.double().var()
     reward = (batch.rewards.double() - mean) / (variance.sqrt() + 1e-8)
     source = iter(noises)
-    action, density, _ = act(weights, later, source, kind)
-    smaller = torch.minimum(*judge(targets, later, action, aligned))
+    action, density, _ = act(weights, next_obs, source, kind)
+    smaller = torch.minimum(*q_values(targets, next_obs, action, aligned))
     wanted = (reward + (1 - batch.dones.double()) * GAMMA * (smaller - ALPHA * density[:, None])).detach()
     stored = batch.actions.double().view(-1, 2, resolution, resolution)
-    critic_loss = sum(((value - wanted) ** 2).mean() for value in judge(values, now, stored, aligned))
+    critic_loss = sum(((value - wanted) ** 2).mean() for value in q_values(values, obs, stored, aligned))
     critic_gradients = dict(zip(values, torch.autograd.grad(critic_loss, list(values.values())), strict=True))
 
     scalars = model.update(batch)
@@ -155,8 +155,8 @@ def test_one_update_equals_the_float64_computation(kind, monkeypatch):
     compare_gradients(critic, critic_gradients)
 
     # The actor sees the critics after their step.
-    action, density, gate = act(weights, now, source, kind)
-    smaller = torch.minimum(*judge(doubles(critic, False), now, action, aligned))
+    action, density, gate = act(weights, obs, source, kind)
+    smaller = torch.minimum(*q_values(doubles(critic, False), obs, action, aligned))
     actor_loss = (ALPHA * density[:, None] - smaller).mean()
     if residual:
         actor_loss = actor_loss + RHO * gate.flatten(1).norm(dim=1).mean() / 16

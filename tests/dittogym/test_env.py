@@ -51,29 +51,6 @@ def test_step_and_info() -> None:
     assert env.unwrapped.state.x.shape == (1, 200, 2)
 
 
-def test_unknown_task_names_the_tasks() -> None:
-    with pytest.raises(ValueError, match=r"task must be one of catch, dig, .*, slot or MODULE:NAME, got 'swim'"):
-        dittogym.Env("swim")
-
-
-def test_vector_environment_equals_single_ones() -> None:
-    vector = make_vec(3)
-    singles = [gymnasium.make(IDS[0], **SMALL) for _ in range(3)]
-    seen, _ = vector.reset(seed=11)
-    vector.action_space.seed(0)
-    for i, env in enumerate(singles):
-        assert np.array_equal(env.reset(seed=11 + i)[0], seen[i])
-    actions = vector.action_space.sample()
-    seen, reward, terminated, truncated, info = vector.step(actions)
-    for i, env in enumerate(singles):
-        one = env.step(actions[i])
-        assert np.array_equal(one[0], seen[i])
-        assert one[1] == pytest.approx(reward[i], abs=1e-5)
-        assert one[4]["com"] == pytest.approx(info["com"][i], abs=1e-6)
-    assert not terminated.any() and not truncated.any()
-    assert vector.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-
-
 def episode(vector: gymnasium.vector.VectorEnv, steps: int) -> list[tuple]:
     first, _ = vector.reset(seed=0)
     action = np.zeros(vector.action_space.shape, np.float32)

@@ -86,16 +86,6 @@ def test_particles_fill_the_mask_evenly(body, particles) -> None:
     assert cells[ELL] == pytest.approx(np.full(ELL.sum(), share), rel=0.07 if particles == 2000 else 0.15)
 
 
-def test_an_outline_and_its_picture_are_nearly_the_same() -> None:
-    shapes = [dittogym.make_spec("run", body=body).robot.shape for body in (ELL_OUTLINE, large())]
-    first, second = (points(shape) for shape in shapes)
-    assert first.mean(0) == pytest.approx(second.mean(0), abs=1e-3)
-    assert first.std(0) == pytest.approx(second.std(0), abs=1e-3)
-    tip = points(dittogym.make_spec("run", body=[(0, 0), (2, 0), (1, 2)]).robot.shape)
-    low, high = tip[:, 1].min(), tip[:, 1].max()
-    assert tip[:, 1].mean() == pytest.approx(low + (high - low) / 3, abs=2e-3)  # y is upwards
-
-
 def test_particle_positions_of_a_picture_pixel_by_pixel() -> None:
     """Speckle, with a random share of the pixels set: every particle lies in one of them."""
     mask = np.random.default_rng(0).random((40, 30)) < 0.5
@@ -153,26 +143,16 @@ def test_a_square_robot_in_every_task(task: str) -> None:
     ("task", "body", "message"),
     [
         ("run", np.zeros((8, 8), bool), "body must have pixels brighter than 127, got none"),
-        ("run", np.full((8, 8), 127, np.uint8), "brighter than 127, got none"),
         ("run", [(0, 0), (1, 0)], "at least 3 finite corners"),
-        ("run", np.zeros((0, 2)), "at least 3 finite corners"),
         ("run", [(0, 0), (1, 0), (0, np.nan)], "at least 3 finite corners"),
         ("run", [(0, 0), (1, 1), (2, 2), (5, 5)], "corners that enclose an area"),
-        ("run", [(3, 3)] * 4, "corners that enclose an area"),
         ("run", Rectangle((-0.45, 0.2), (0.1, 0.9)), "inside the window"),
-        ("run", Rectangle((0.0, -0.01), (0.1, 0.1)), "inside the window"),
         ("grow", Rectangle((0.45, 0.2), (0.1, 0.1)), r"inside the window \(-0.500 < x < 0.500"),
-        ("shapematch", [(0, 0), (50, 0), (50, 1), (0, 1)], "inside the window"),
         ("kick", Rectangle((0.25, 0.16), (0.1, 0.1)), r"place of the object free, \[0.3, 0.16\] to \[0.35"),
-        ("catch", Disc((-0.1, 0.14), 0.1), "place of the object free"),
-        ("dig", Rectangle((-0.2, 0.45), (0.1, 0.1)), "place of the object free"),
         ("kick", BodySpec(Disc((0.28, 0.16), 0.1), count=10), "place of the object free"),
         ("run", [(0, 0), (6, 0), (6, 1), (0, 1)], "more compact: its spread is 0.11. m, and run ends at 0.1 m"),
-        ("run", Rectangle((0.0, 0.16), (0.36, 0.05)), "more compact"),
         ("run", "no/such/file.png", "body must be an outline .* no such file: 'no/such/file.png'"),
-        ("run", Path("no_file.png"), "no such file: 'no_file.png'"),
         ("run", 42, "body"),
-        ("run", {"corners": SQUARE}, "body"),
         ("run", np.zeros((5, 5), np.int64), "body array must be bool, uint8, uint16 or floating point, got int64"),
         ("run", np.zeros((5, 5, 2), np.uint8), "body array must have shape"),
         ("run", np.full((5, 5), 2.0), r"body array of floating point numbers must lie in \[0, 1\]"),

@@ -266,26 +266,6 @@ def test_gradients_flow_through_a_saved_moment(task: str) -> None:
     assert torch.allclose(ours, wanted, rtol=1e-10, atol=1e-12) and ours[1].abs().max() == 0
 
 
-def test_gradients_of_branches_add_up_in_their_stem() -> None:
-    """One moment in every element of a batch: the stem's gradient is that of the sum over branches."""
-    single, batch = tiny("slot"), tiny("slot", 2)
-    stem = actions(single, 1)[0].requires_grad_()
-    twigs = actions(batch, 1, seed=1)[0]
-
-    def total(first: torch.Tensor) -> torch.Tensor:
-        single.reset(seed=0)
-        single.step(first)
-        batch.load(single.save())
-        return batch.step(twigs)[1].sum()
-
-    (gradient,) = torch.autograd.grad(total(stem), stem)
-    direction = actions(single, 1, seed=2)[0]
-    with torch.no_grad():
-        difference = (total(stem + 1e-4 * direction) - total(stem - 1e-4 * direction)) / 2e-4
-    assert abs(float(difference)) > 1e-6
-    assert float((gradient * direction).sum()) == pytest.approx(float(difference), rel=1e-5)
-
-
 @pytest.mark.parametrize("resample", [False, True])
 @torch.no_grad()
 def test_elements_that_were_only_ever_loaded_can_be_reset(resample: bool) -> None:

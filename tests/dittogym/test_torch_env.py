@@ -62,17 +62,6 @@ def test_a_seed_for_each_element() -> None:
             env.reset(seed=wrong)
 
 
-def test_masked_seed_draws_only_the_masked_elements() -> None:
-    env = small(num_envs=3)
-    env.reset(seed=0)
-    before = env.state.x
-    env.reset(seed=50, options={"reset_mask": torch.tensor([False, False, True])})
-    assert torch.equal(env.state.x[:2], before[:2])
-    reference = small(num_envs=3)
-    reference.reset(seed=50)
-    assert torch.equal(env.state.x[2], reference.state.x[2])
-
-
 def test_reset_is_fresh_and_reference_parity_is_stale() -> None:
     for parity in ("clean", "reference"):
         env = small(parity=parity, action_layout="grid")
@@ -210,44 +199,6 @@ def test_a_failed_element_leaves_shared_gradients_alone(task: str, backend: str)
     for alone, beside in zip(*found, strict=True):
         torch.testing.assert_close(beside, alone, rtol=1e-12, atol=1e-15)
         assert alone.abs().max() > 0
-
-
-def test_failed_element_ends_alone() -> None:
-    env, twin = small(num_envs=3), small(num_envs=3)
-    for e in (env, twin):
-        e.reset(seed=0)
-    env.state.v[1, 5] = torch.inf
-    drive = actions(env, 2)
-    for t in range(2):
-        observation, reward, terminated, _, info = env.step(drive[t])
-        other, other_reward, *_ = twin.step(drive[t])
-    assert info["finite"].tolist() == [True, False, True]
-    assert terminated.tolist() == [False, True, False]
-    assert float(reward[1]) == FAILURE_REWARD
-    assert torch.isfinite(torch.stack(tuple(info["reward_terms"].values()))).all()
-    for i in (0, 2):
-        assert torch.equal(observation[i], other[i]) and reward[i] == other_reward[i]
-        assert torch.equal(env.state.x[i], twin.state.x[i])
-    env.reset(options={"reset_mask": ~info["finite"]})
-    assert env.step(drive[0])[-1]["finite"].all()
-
-
-def test_reward_is_differentiable_in_actions_of_all_steps() -> None:
-    env = small(substeps=20)
-    drive = (0.5 * actions(env, 3)).requires_grad_()
-
-    def total(drive: torch.Tensor) -> torch.Tensor:
-        env.reset(seed=0)
-        return torch.stack([env.step(action)[1] for action in drive]).sum()
-
-    (gradient,) = torch.autograd.grad(total(drive), drive)
-    direction = actions(env, 3, seed=1)
-    with torch.no_grad():
-        step = 1e-5
-        difference = (total(drive + step * direction) - total(drive - step * direction)) / (2 * step)
-    assert float((gradient * direction).sum()) == pytest.approx(float(difference), rel=1e-5)
-    assert all(g.abs().max() > 0 for g in gradient)
-    assert env.state.x.grad_fn is None  # the last two rollouts ran without gradients
 
 
 def test_detach_cuts_the_graph() -> None:

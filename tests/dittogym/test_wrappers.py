@@ -1,7 +1,5 @@
 """Wrappers: ours for other resolutions, and Gymnasium's own around our environments."""
 
-import sys
-import types
 import warnings
 from pathlib import Path
 
@@ -120,69 +118,7 @@ def test_bad_observation_sizes(make, size: int) -> None:
         observation_resolution(make(), size)
 
 
-def test_the_limit_is_that_of_what_is_wrapped() -> None:
-    assert action_resolution(single(resolution=32), 32).action_space.shape == (2, 32, 32)
-    with pytest.raises(ValueError, match="size must be at most 16, got 17"):
-        observation_resolution(observation_resolution(single(), 16), 17)
-
-
-def test_actions_that_are_not_finite_are_noticed_behind_the_wrapper() -> None:
-    env = action_resolution(single(disable_env_checker=True), 4)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="action must be finite"):
-        env.step(np.full((2, 4, 4), np.nan, np.float32))
-
-
 # Gymnasium's wrappers.
-
-
-@pytest.fixture
-def recorded(monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[list[np.ndarray], float]]:
-    """Stands in for moviepy, which Gymnasium encodes videos with and we do without: files, their frames and rate."""
-    files: dict[str, tuple[list[np.ndarray], float]] = {}
-
-    class ImageSequenceClip:
-        def __init__(self, frames: list[np.ndarray], fps: float) -> None:
-            self.frames, self.fps = list(frames), fps
-
-        def write_videofile(self, path: str, logger: object = None) -> None:
-            Path(path).write_bytes(b"video")
-            files[Path(path).name] = self.frames, self.fps
-
-    names = ["moviepy", "moviepy.video", "moviepy.video.io", "moviepy.video.io.ImageSequenceClip"]
-    modules = [types.ModuleType(name) for name in names]
-    modules[-1].ImageSequenceClip = ImageSequenceClip
-    for name, module in zip(names, modules, strict=True):
-        monkeypatch.setitem(sys.modules, name, module)
-    return files
-
-
-def test_record_video(recorded: dict, tmp_path: Path) -> None:
-    env = single(render_mode="rgb_array", render_muscles=True, max_episode_steps=3)
-    env = wrappers.RecordVideo(env, str(tmp_path / "videos"), episode_trigger=lambda episode: True)
-    for _ in range(2):
-        env.reset(seed=0)
-        truncated = False
-        while not truncated:
-            truncated = env.step(np.ones(env.action_space.shape, np.float32))[3]
-    env.close()
-    assert sorted(path.name for path in (tmp_path / "videos").iterdir()) == sorted(recorded)
-    assert sorted(recorded) == ["rl-video-episode-0.mp4", "rl-video-episode-1.mp4"]
-    for frames, fps in recorded.values():
-        assert fps == 30 and len(frames) == 4
-        assert all(frame.shape == (512, 512, 3) and frame.dtype == np.uint8 for frame in frames)
-        assert not np.array_equal(frames[0], frames[1])  # muscles are coloured from the first step on
-
-
-def test_record_video_of_a_batch(recorded: dict, tmp_path: Path) -> None:
-    env = batch(render_mode="rgb_array", max_episode_steps=3)
-    env = wrappers.vector.RecordVideo(env, str(tmp_path / "videos"), step_trigger=lambda step: step == 0)
-    env.reset(seed=0)
-    for _ in range(3):
-        env.step(np.zeros(env.action_space.shape, np.float32))
-    env.close()
-    ((frames, fps),) = recorded.values()
-    assert fps == 30 and len(frames) == 3 and frames[0].ndim == 3 and frames[0].std() > 0
 
 
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep"])

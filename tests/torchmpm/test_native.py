@@ -59,13 +59,6 @@ def test_sizes(batch: int, count: int) -> None:
     assert_close(native, eager, 1e-12)
 
 
-def test_muscles_without_actuation_and_actuation_without_muscles() -> None:
-    state = lively(30)
-    assert_close(*both(robot(30), state, substeps=10), 1e-12)
-    passive = robot(30, bodies=(Body(30, VonMises(500.0, 50.0, 60.0)),))
-    assert_close(*both(passive, state, normal(1, 2, 16, 16, seed=1), substeps=10), 1e-12)
-
-
 def test_state_in_other_strides() -> None:
     """Fields as users build them, not as planes."""
     state, field, origin = moving(60, 2)

@@ -128,17 +128,6 @@ def test_in_one_thing_alone(wanted: str) -> None:
     assert_gradients_close(found, expected, 1e-10)
 
 
-def test_value_of_one_simulation_shared_by_many() -> None:
-    """Numbers of shape (1, N) and () belong to the whole batch."""
-    given = state_leaves(30, 3) | {"mu": 500.0 * values(1, 30, seed=1), "gravity": torch.tensor([0.5, -9.0]).double()}
-
-    def solver(leaves: Leaves) -> Solver:
-        return robot(30, bodies=(Body(30, Elastic(leaves["mu"], 50.0)),), gravity=leaves["gravity"])
-
-    found, expected = (gradients(solver, given, ("mu", "gravity"), 5, backend) for backend in ("native", "eager"))
-    assert_gradients_close(found, expected, 1e-10)
-
-
 @pytest.mark.parametrize("name", ["von Mises", "elastic"])
 def test_single_precision(name: str) -> None:
     given = state_leaves(COUNT, 2)

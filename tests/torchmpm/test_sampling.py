@@ -76,11 +76,6 @@ def test_box(numbers: np.ndarray) -> None:
     np.testing.assert_allclose(points.var(0), (0.25 / 12, 0.01 / 12), rtol=0.1)
 
 
-def test_box_corners() -> None:
-    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    np.testing.assert_allclose(sampling.box(corners, (1.0, 2.0), (3.0, 4.0)), [[1, 2], [4, 2], [1, 6]])
-
-
 def test_disc_is_uniform(numbers: np.ndarray) -> None:
     """Uniform density: mean r^2 = R^2/2, and a disc of half the radius holds a quarter."""
     offset = sampling.disc(numbers, (0.4, 0.6), 0.2) - (0.4, 0.6)

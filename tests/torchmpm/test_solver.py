@@ -146,16 +146,6 @@ def test_against_a_loop_over_particles_and_nodes(strain: float, moved: float) ->
 # --- closed forms ---------------------------------------------------------------------------------------------------
 
 
-def test_free_fall() -> None:
-    """Symplectic Euler: v = n dt g and x = x0 + dt^2 g n (n + 1) / 2, undeformed."""
-    state = ParticleState.at_rest(positions(200))
-    n, dt, g = 100, 1e-3, torch.tensor([0.7, -2.0], dtype=torch.float64)
-    result = robot(200, rules=(), gravity=tuple(g.tolist()), dt=dt).step(state, substeps=n)
-    torch.testing.assert_close(result.v, (n * dt * g).expand_as(state.v), rtol=0, atol=1e-8)
-    torch.testing.assert_close(result.x, state.x + dt**2 * g * n * (n + 1) / 2, rtol=0, atol=1e-9)
-    torch.testing.assert_close(result.F, state.F, rtol=0, atol=1e-7)
-
-
 def test_damping_acts_on_every_substep() -> None:
     v = torch.tensor([0.4, -0.3], dtype=torch.float64)
     state = replace(ParticleState.at_rest(positions(200)), v=v.expand(1, 200, 2))
@@ -200,23 +190,6 @@ def test_actuation_reaches_muscles_only() -> None:
 # --- symmetries -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("actuated", [False, True])
-def test_translation_by_whole_cells(actuated: bool) -> None:
-    """Matter, window and frame of the rules move together: nothing else changes, to rounding."""
-    rules = (VelocityRule("-y", j=(None, 6), friction=0.3, frame="window"),)
-    solver, state = robot_and_ball(60, 20, rules=rules), lively(80)
-    actuation = field() if actuated else None
-    offset = torch.tensor([[-3.0 * H, 5.0 * H]], dtype=torch.float64)
-    there = solver.step(replace(state, x=state.x + offset), actuation, substeps=30, origin=offset)
-    here = solver.step(state, actuation, substeps=30)
-    assert_close(replace(there, x=there.x - offset), here, 1e-11)
-    if not actuated:
-        free = robot_and_ball(60, 20, rules=())
-        inside = free.step(replace(state, x=state.x + H * torch.tensor([2.0, -1.0])), substeps=30)
-        moved_back = replace(inside, x=inside.x - H * torch.tensor([2.0, -1.0]))
-        assert_close(moved_back, free.step(state, substeps=30), 1e-11)
-
-
 def test_a_moving_window_does_not_matter_to_free_matter() -> None:
     """By a fraction of a cell it resamples the grid, so to the accuracy of the method only."""
     solver, state = robot(400, rules=(), gravity=(0.0, 0.0)), lively(400, strain=0.0)
@@ -231,15 +204,6 @@ def test_material_axes_turn_muscles() -> None:
     solver, state, actuation = robot(60), lively(60), field()
     renamed = solver.step(replace(state, F=state.F @ Q.T), actuation.flip(1), substeps=30)
     assert_close(replace(renamed, F=renamed.F @ Q), solver.step(state, actuation, substeps=30), 1e-11)
-
-
-def test_order_of_particles_does_not_matter() -> None:
-    order = torch.randperm(60, generator=generator(3))
-    state = lively(60)
-    shuffled = ParticleState(state.x[:, order], state.v[:, order], state.C[:, order], state.F[:, order], state.Jp)
-    there, here = (robot(60).step(s, field(), substeps=20) for s in (shuffled, state))
-    here = ParticleState(here.x[:, order], here.v[:, order], here.C[:, order], here.F[:, order], here.Jp)
-    assert_close(there, here, 1e-11)
 
 
 def test_steps_add_up() -> None:

@@ -13,17 +13,7 @@ from torchmpm.materials.linalg import Mat2, Sym2, det, orthogonal
 
 
 def corotated_stress(F: Mat2, mu: Value, lam: Value, J: Tensor | None = None) -> Sym2:
-    """Kirchhoff stress 2 mu (F - R) F^T + lam J (J - 1) I.
-
-    Args:
-        F: Deformation gradient, planes (B, N).
-        mu: Second Lame parameter, broadcastable to (B, N), Pa.
-        lam: First Lame parameter, likewise.
-        J: (B, N) volume ratio; ``None`` for det F.
-
-    Returns:
-        Planes (B, N), Pa.
-    """
+    """Kirchhoff stress 2 mu (F - R) F^T + lam J (J - 1) I, planes (B, N), Pa; J is det F unless given."""
     a, b, c, d = F
     r = orthogonal(F)
     e, f, g, h = a - r[0], b - r[1], c - r[2], d - r[3]
@@ -34,17 +24,7 @@ def corotated_stress(F: Mat2, mu: Value, lam: Value, J: Tensor | None = None) ->
 
 
 def corotated_energy(F: Mat2, mu: Value, lam: Value, J: Tensor | None = None) -> Tensor:
-    """Energy mu |F - R|^2 + lam/2 (J - 1)^2 per unit volume, whose derivative is :func:`corotated_stress`.
-
-    Args:
-        F: Deformation gradient, planes (B, N).
-        mu: Second Lame parameter, broadcastable to (B, N), Pa.
-        lam: First Lame parameter, likewise.
-        J: (B, N) volume ratio; ``None`` for det F.
-
-    Returns:
-        (B, N), J/m^2.
-    """
+    """Energy mu |F - R|^2 + lam/2 (J - 1)^2, whose derivative is :func:`corotated_stress`, (B, N), J/m^2."""
     distance = sum((f - r).square() for f, r in zip(F, orthogonal(F), strict=True))
     return mu * distance + 0.5 * lam * ((det(F) if J is None else J) - 1.0).square()
 

@@ -32,15 +32,7 @@ CUDA_TAPE_BYTES = 2**31
 
 @dataclass(frozen=True, eq=False)
 class Kernels:
-    """The kernels for one solver; builds its tables once.
-
-    Attributes:
-        grid: The window of nodes.
-        bodies: The bodies.
-        rules: The velocity rules.
-        dt: Duration of a substep, s.
-        damping: Factor on node velocities in a substep.
-    """
+    """The kernels for one solver, whose fields these are; builds its tables once."""
 
     grid: Grid
     bodies: tuple[Body, ...]
@@ -81,11 +73,7 @@ class Kernels:
         return None
 
     def load(self, dtype: torch.dtype) -> None:
-        """Compile and load the C++ kernels for a dtype, unless that has been done.
-
-        Raises:
-            ValueError: There is no compiler, or it failed.
-        """
+        """Compile and load the C++ kernels for a dtype; raises ValueError where there is no compiler or it fails."""
         call.library_for(dtype)
 
     @functools.cached_property
@@ -94,11 +82,7 @@ class Kernels:
         return make_tables(self.grid, self.bodies, self.rules, self.dt, self.damping)
 
     def values(self, like: Tensor) -> Tensor:
-        """The table of values (8, 1 or B, columns); kept where all of them are numbers.
-
-        Args:
-            like: (B, N) a plane of the state.
-        """
+        """The table of values (8, 1 or B, columns) for planes like (B, N); kept where all of them are numbers."""
         key = like.dtype, like.device
         if key in self._kept:
             return self._kept[key]
@@ -118,19 +102,7 @@ class Kernels:
         substeps: int,
         segment: Segment = "auto",
     ) -> ParticleState:
-        """Advance a state whose arguments were checked; see :meth:`torchmpm.Solver.step`.
-
-        Args:
-            state: The current state, at least one simulation.
-            actuation: (B, 2, G, G) or ``None``.
-            origin: (B, 2).
-            gravity: Two numbers, or a tensor (2,) or (B, 2).
-            substeps: Number of substeps, at least 1.
-            segment: With gradients, at most so many substeps are taped at once.
-
-        Raises:
-            ValueError: There is no compiler, or it failed.
-        """
+        """Advance a state (B, N) whose arguments were checked; see :meth:`torchmpm.Solver.step`."""
         origin = origin.contiguous()
         actuation = None if actuation is None else actuation.contiguous()
         given = gravity if isinstance(gravity, Tensor) else upload(gravity, state.Jp)
@@ -145,12 +117,7 @@ class Kernels:
         return ParticleState.from_stack(planes)
 
     def tape_limit(self, planes: Tensor, segment: Segment = "auto") -> int:
-        """How many substeps the adjoint can replay at once within the memory that is kept for its tape.
-
-        Args:
-            planes: (13, B, N).
-            segment: Not more than so many, if it is a number.
-        """
+        """How many substeps of planes (13, B, N) the adjoint can replay at once, at most ``segment``."""
         rows, batch, particles = planes.shape
         if planes.is_cuda:
             limit = CUDA_TAPE_BYTES // (planes.element_size() * rows * particles * batch)

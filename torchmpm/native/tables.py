@@ -139,18 +139,9 @@ def upload(numbers: Sequence[float], like: Tensor) -> Tensor:
 
 
 def make_values(bodies: Sequence[Body], dt: float, h: float, like: Tensor) -> Tensor:
-    """Material values, masses and volumes, with the graph of those that are tensors.
+    """Material values, masses and volumes (8, 1 or B, columns), with the graph of those that are tensors.
 
     A body whose values are the same for all its particles has one column, any other one column per particle.
-
-    Args:
-        bodies: The bodies.
-        dt: Duration of a substep, s.
-        h: Distance between nodes, m.
-        like: (B, N) a plane of the state.
-
-    Returns:
-        (8, 1 or B, columns).
     """
     tables = []
     for body, part in slices(bodies):

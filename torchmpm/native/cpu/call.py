@@ -41,18 +41,7 @@ def library_for(dtype: torch.dtype) -> ctypes.CDLL:
 
 
 def run(inputs: Inputs, handle: int, substeps: int, **outputs: Tensor) -> None:
-    """Advance all simulations, or go back through their substeps.
-
-    Args:
-        inputs: Contiguous tensors of the call.
-        handle: Of the tables of the solver.
-        substeps: Number of substeps.
-        outputs: ``result``, to which the new planes are written; or, for the adjoint, those of :data:`BARS` that are to
-            be written.
-
-    Raises:
-        MemoryError: There was not enough memory.
-    """
+    """Advance all simulations and write ``result``, or go back through the substeps and write some of :data:`BARS`."""
     call, library = _make_call(inputs, handle, substeps, outputs), library_for(inputs.planes.dtype)
     function = getattr(library, f"torchmpm_{_direction(outputs)}")
     with _scratch(_measure(call, inputs.planes.dtype, outputs)) as scratch:

@@ -86,10 +86,7 @@ def cache_folder() -> str:
 
 
 def load(real: str) -> ctypes.CDLL:
-    """The compiled kernels for one scalar type, see :func:`build`.
-
-    Args:
-        real: ``"float"`` or ``"double"``.
+    """The compiled kernels for the scalar type ``"float"`` or ``"double"``, see :func:`build`.
 
     Raises:
         ValueError: There is no compiler, or it failed; the message holds what it said.
@@ -102,10 +99,6 @@ def build(source: Path, *options: str) -> ctypes.CDLL:
 
     The first call on a machine compiles it, which takes some seconds; later processes find it in
     :func:`cache_folder`. If that folder cannot be written, each process compiles its own.
-
-    Args:
-        source: The file.
-        options: For the compiler, in addition to those that all kernels are compiled with.
 
     Raises:
         ValueError: There is no compiler, or it failed; the message holds what it said.
