@@ -10,7 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from cfp.experiment.algorithm import Algorithm
-from cfp.weights import fitting, read_policy, write_policy
+from cfp.weights import read_policy, report_mismatch, write_policy
 
 
 class OpenLoop:
@@ -29,7 +29,7 @@ class OpenLoop:
 
     def __init__(self, actions: Tensor, description: dict[str, Any] | None = None) -> None:
         if actions.ndim != 4 or actions.shape[1] != 2 or actions.shape[2] != actions.shape[3]:
-            raise ValueError(f"actions: got shape {tuple(actions.shape)}, allowed (T, 2, R, R)")
+            raise ValueError(f"actions must have shape (T, 2, R, R), got {tuple(actions.shape)}")
         self.actions = actions.detach().float().cpu()
         self.description = description or {}
 
@@ -78,7 +78,7 @@ class OpenLoop:
             CheckpointError: No such file, a damaged one, or one that is not such a policy.
         """
         tensors, description = read_policy(path)
-        with fitting(path):
+        with report_mismatch(path):
             return cls(tensors["actions"], description)
 
 

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from baselines.modular.nodes import unpack
 from cfp.agent.actor import Sample, SquashedActor, sample_squashed_gaussian
-from cfp.agent.networks import at_least_float32, initialise
+from cfp.agent.networks import initialise
 
 Kind = Literal["gnn", "transformer"]
 WIDTH = 128
@@ -25,9 +25,6 @@ class GraphTrunk(nn.Module):
     """Three rounds of messages between neighbours, with the same weights in each (after Pathak et al., NeurIPS 2019).
 
     ``h <- h + ELU(W h + V mean of the neighbours' h)``.
-
-    Args:
-        inputs: Number of features of a node.
     """
 
     def __init__(self, inputs: int) -> None:
@@ -45,11 +42,7 @@ class GraphTrunk(nn.Module):
 
 
 class AttentionTrunk(nn.Module):
-    """Three layers of self-attention over all nodes, pre-norm, without positional encoding.
-
-    Args:
-        inputs: Number of features of a node.
-    """
+    """Three layers of self-attention over all nodes, pre-norm, without positional encoding."""
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
@@ -64,13 +57,7 @@ class AttentionTrunk(nn.Module):
 
 
 class Trunk(nn.Module):
-    """Either trunk, reading rows of `baselines.modular.nodes.Nodes`.
-
-    Args:
-        kind: Which.
-        features: Length of a row without neighbours.
-        extra: Number of further inputs of each node.
-    """
+    """Either trunk, reading rows of `baselines.modular.nodes.Nodes`."""
 
     def __init__(self, kind: Kind, features: int, extra: int = 0) -> None:
         super().__init__()
@@ -85,12 +72,7 @@ class Trunk(nn.Module):
 
 
 class ModularActor(SquashedActor):
-    """A tanh-Gaussian of two muscles for every segment, with the weights of all segments shared.
-
-    Args:
-        kind: Of the trunk.
-        features: Number of features of a node.
-    """
+    """A tanh-Gaussian of two muscles for every segment, with the weights of all segments shared."""
 
     def __init__(self, kind: Kind, features: int) -> None:
         super().__init__()
@@ -100,17 +82,12 @@ class ModularActor(SquashedActor):
 
     def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
         """Draw actions (B, K, 2) for rows (B, K, columns)."""
-        mean, width = at_least_float32(self.head(self.trunk(observation))).chunk(2, -1)
+        mean, width = self.head(self.trunk(observation)).chunk(2, -1)
         return Sample(*sample_squashed_gaussian(mean, width, deterministic), None)
 
 
 class ModularCritics(nn.Module):
-    """Twin critics without shared weights: a trunk that also reads actions, the mean over nodes, a perceptron.
-
-    Args:
-        kind: Of the trunks.
-        features: Number of features of a node.
-    """
+    """Twin critics without shared weights: a trunk that also reads actions, the mean over nodes, a perceptron."""
 
     optimizer: torch.optim.Optimizer
 
@@ -127,7 +104,7 @@ class ModularCritics(nn.Module):
         """Both Q-values, (B, 1) each, of rows (B, K, columns) and actions (B, K, 2) or (B, 2 K)."""
         values = action.reshape(*observation.shape[:2], 2)
         pairs = zip(self.trunks, self.values, strict=True)
-        return tuple(at_least_float32(value(trunk(observation, values).mean(1))) for trunk, value in pairs)
+        return tuple(value(trunk(observation, values).mean(1)) for trunk, value in pairs)
 
     def set_training_mode(self, mode: bool) -> None:
         """Switch between training and evaluation; stable-baselines3 calls it, no layer depends on it."""

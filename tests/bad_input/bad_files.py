@@ -122,27 +122,15 @@ POLICIES = [
     policy("of no grid", "resolution must be between 1 and 128, got 0", changes={"resolution": 0}),
     policy("of a grid of True", "resolution must be between 1 and 128, got True", changes={"resolution": True}),
     policy("of stage -1", "stage must be between 1 and", changes={"stage": -1}),
-    policy(
-        "that is maybe deterministic",
-        "deterministic must be true or false, got 'yes'",
-        changes={"deterministic": "yes"},
-    ),
+    policy("that is maybe deterministic", "deterministic must be true or false,", changes={"deterministic": "yes"}),
     policy("for a layout by name", "layout must be between 0 and", changes={"layout": "x"}),
     policy("for no environment", "environment must be an object, got None", changes={"environment": None}),
     policy("for an unknown environment", "environment.colour is not an option", changes={"environment": {"colour": 1}}),
     policy("without a network", "do not match", changes={"network": {}}),
-    policy(
-        "with an unknown network", "do not match", "network.colour is not an option", changes={"network": {"colour": 1}}
-    ),
-    policy(
-        "with a grid of 7", "resolutions must be increasing values of (4, 8", changes={"network": {"resolutions": [7]}}
-    ),
+    policy("with an unknown network", "do not match", "network.colour is not an", changes={"network": {"colour": 1}}),
+    policy("with a grid of 7", "resolutions must be increasing values of", changes={"network": {"resolutions": [7]}}),
     policy("with grids in a text", "do not match", changes={"network": {"resolutions": "8, 16"}}),
-    policy(
-        "with a patch of a mile",
-        "and 128, got 1000000",
-        changes={"network": {"resolutions": [8], "patch": 10**6}},
-    ),
+    policy("with a patch of a mile", "and 128, got 1000", changes={"network": {"resolutions": [8], "patch": 10**6}}),
     policy("with another ladder", "do not match", changes={"network": {"resolutions": [16]}}),
     policy("of NaN", "got NaN or infinity", weights=first(lambda tensor: tensor * float("nan"))),
     policy("of other shapes", "do not match", "size mismatch", weights=first(lambda tensor: tensor[..., :1])),
@@ -175,7 +163,7 @@ POLICIES = [
             lambda desk: desk.policy({"kind": "alchemy"}),
             lambda desk: baselines.load(desk.folder / "stranger.safetensors"),
         ),
-        ("algo: got 'alchemy', allowed cfp, coarse",),
+        ("algo must be one of cfp, coarse",),
     ),
 ]
 
@@ -241,25 +229,21 @@ RUNS = [
     resumed("a checkpoint of text", write("checkpoint/state.pt", "hello"), "state.pt: the checkpoint is damaged"),
     resumed(
         "a checkpoint that runs code",
-        lambda folder: torch.save({"version": 1, "x": Stranger()}, folder / "checkpoint" / "state.pt"),
+        lambda folder: torch.save({"version": 2, "x": Stranger()}, folder / "checkpoint" / "state.pt"),
         "state.pt: the checkpoint is damaged (UnpicklingError)",
     ),
-    resumed("a checkpoint of version 99", state(version=99), "got checkpoint version 99, allowed 1"),
-    resumed("a checkpoint without a model", state(model=None), "does not fit this program (KeyError: 'model')"),
+    resumed("a checkpoint of version 99", state(version=99), "checkpoint version must be 2, got 99"),
+    resumed("a checkpoint without a model", state(algorithm=None), "does not fit this program (KeyError: 'algorithm')"),
     resumed("a checkpoint before its time", state(offset=-5), "does not fit this program", "negative"),
-    resumed("a checkpoint of stage 8", state(level=7), "does not fit this program", "it is of stage 8"),
+    resumed("a checkpoint of stage 8", state(stage=8), "does not fit this program", "it is of stage 8"),
     resumed("a checkpoint of broken options", state(config="{"), "does not fit this program (JSONDecodeError"),
     resumed("a checkpoint of another task", state(config='{"task": "run"}'), "task: the run was started with 'run'"),
-    resumed("a chunk outside", chunk_outside, "got a chunk '../../../secret.npz', allowed are files in this folder"),
+    resumed("a chunk outside", chunk_outside, "chunks must be files in this folder, got '../../../secret.npz'"),
     resumed("a chunk of objects", chunk_of_objects, "this part of the replay buffer is missing or damaged"),
     resumed("broken options", write("config.json", "{"), "config.json: cannot be read"),
     resumed("a task that is not", options(task="swim"), "config.json: cannot be read (task must be catch"),
     evaluated("no options", lambda folder: (folder / "config.json").unlink(), "there is no run (no config.json)"),
-    evaluated(
-        "options of a list",
-        write("config.json", "[1]"),
-        "config.json: cannot be read (it holds list, allowed an object",
-    ),
+    evaluated("options of a list", write("config.json", "[1]"), "config.json: cannot be read (it must hold an"),
     evaluated("unknown options", options(colour=1), "config.json: cannot be read (colour is not an option"),
     evaluated("no policy", lambda folder: (folder / "policy.safetensors").unlink(), "no policy has been written yet"),
     evaluated("a policy cut short", cut("policy.safetensors"), "policy.safetensors: the policy is damaged"),
@@ -279,24 +263,18 @@ CONFIGS = [
     file_of_options("in another encoding", b"\xff\xfe{\x00}\x00", "options.json cannot be read", "utf-8"),
     file_of_options("nested too deeply", "[" * 99_999, "options.json cannot be read as JSON (it is nested too deeply)"),
     file_of_options("too large", " " * (2**20 + 1), "options.json cannot be read", "larger than 1048576 bytes"),
-    file_of_options("of a list", "[1]", "cannot be read as JSON (it holds list, allowed an object"),
+    file_of_options("of a list", "[1]", "cannot be read as JSON (it must hold an object, got list"),
     file_of_options("with an unknown name", '{"stepz": 1}', "stepz is not an option"),
     file_of_options("with a group of nothing", '{"learning": null}', "learning must be an object, got None"),
     file_of_options("with a task of a list", '{"task": ["run"]}', "task must be catch, dig"),
-    file_of_options(
-        "with a preset of a list", '{"preset": [1]}', "preset must be quick or paper for shapematch, got [1]"
-    ),
+    file_of_options("with a preset of a list", '{"preset": [1]}', "preset must be quick or paper for shapematch,"),
     file_of_options("with steps as text", '{"steps": "x"}', "steps must be an integer, got 'x'"),
     file_of_options("with steps without end", '{"steps": 1e999}', "steps must be an integer, got inf"),
-    file_of_options(
-        "with a rate of NaN", '{"learning": {"learning_rate": NaN}}', "learning_rate must be finite, got nan"
-    ),
+    file_of_options("with a rate of NaN", '{"learning": {"learning_rate": NaN}}', "learning_rate must be finite,"),
     file_of_options("with an infinite temperature", '{"alpha": [Infinity, 0]}', "alpha must be finite, got (inf, 0.0)"),
     file_of_options("with half particles", '{"environment": {"particles": [1.5, 2]}}', "a list of 2, each an integer"),
     file_of_options("with a dtype in a list", '{"environment": {"dtype": ["float32"]}}', "'float32' or 'float64'"),
-    file_of_options(
-        "with a target of a number", '{"environment": {"target": 3}}', "target must be a string or null, got 3"
-    ),
+    file_of_options("with a target of a number", '{"environment": {"target": 3}}', "target must be a string or"),
     file_of_options("that says where to write", '{"out": "/etc"}', "out is not an option"),
     Case(
         "config file missing",

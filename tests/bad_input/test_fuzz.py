@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 import baselines
-from baselines.registry import ALGORITHMS, configure
+from baselines.registry import ALGORITHMS, configure, find
 from cfp.agent.actor import build_actor
 from cfp.config import to_json
 from cfp.errors import CheckpointError, ConfigError
@@ -74,7 +74,7 @@ CUTS = st.sampled_from([0, 0, 0, 1, 9, 500])
 @FUZZ
 @given(data=st.data())
 def test_options_of_any_kind(algo, data):
-    values = to_json(ALGORITHMS[algo].preset("shapematch", "quick"))
+    values = to_json(find(algo).preset("shapematch", "quick"))
     for _ in range(data.draw(st.integers(1, 3))):
         values = replaced(values, data.draw(st.sampled_from(sorted(paths(values)))), data.draw(JSON))
     try:
