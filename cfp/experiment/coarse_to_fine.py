@@ -1,4 +1,4 @@
-"""Soft actor-critic as an algorithm of a run, and CFP: one stage after another, each over the frozen policy of the last."""
+"""Soft actor-critic as an algorithm of a run, and the stages of CFP."""
 
 from __future__ import annotations
 
@@ -62,8 +62,6 @@ class SACAlgorithm(Algorithm):
         hyperparameters: Hyperparameters,
     ) -> CFP:
         """Create the model of a stage."""
-        if hyperparameters.compile:
-            print("compiling the updates; the first time on a machine this takes minutes ...", flush=True)
         model = CFP(
             policy,
             env,

@@ -70,7 +70,6 @@ TRAIN = [
     training("an endless rate", "--learning-rate inf", "learning_rate must be finite, got inf"),
     training("gradients clipped to nothing", "--max-grad-norm 0", "max_grad_norm must be positive, got 0.0"),
     training("a share of 2", "--reward-momentum 2", "reward_momentum must be between 0 and 1, got 2.0"),
-    training("precision half", "--precision half", "'half'", "--precision", "bfloat16"),
     training("few particles", "--particles few", "--particles", "'few'", "'full', 'lite'"),
     training("no particles", "--particles 0", "particles must be at least 1 for every body, got 0"),
     training("no robots", "--num-envs 0", "num_envs must be at least 1, got 0"),
