@@ -14,14 +14,14 @@ from matplotlib.figure import Figure
 
 from cfp import train
 from cfp.config import RunConfig
-from cfp.envs.disturbances import Case, Decides, disturbed_env, make_cases, reason_without_effect
+from cfp.envs.disturbances import Case, disturbed_env, make_cases, reason_without_effect
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection, evaluation_main
 from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
 from cfp.evaluation.plots import write_figure
 from cfp.experiment.training import Program
 from cfp.files import write_json, write_text
-from cfp.policy import Policy
+from cfp.policy import DisturbablePolicy, Policy
 from cfp.presets import from_json
 from cfp.tables import csv_text
 from cfp.validation import check_at_least
@@ -107,12 +107,15 @@ def report(
     if deterministic is None:
         deterministic = policy.deterministic_by_default
     spec, seed = make_spec(config.task, **config.environment.task_options()), evaluation_seed(config)
-    grid, results = 0 if isinstance(policy, Decides) else policy.description.get("resolution", policy.resolution), []
+    grid, results = (
+        0 if isinstance(policy, DisturbablePolicy) else policy.description.get("resolution", policy.resolution),
+        [],
+    )
     for case in cases:
         if reason_without_effect(case, spec, policy.sees_image):
             continue
         env = disturbed_env(config, policy.resolution, episodes, case, seed, grid)
-        acting = policy.through(env.disturb) if isinstance(policy, Decides) else policy
+        acting = policy.through(env.disturb) if isinstance(policy, DisturbablePolicy) else policy
         results.append(evaluate(case.name, acting, env, episodes, deterministic=deterministic, seed=seed))
     return results
 

@@ -24,7 +24,7 @@ from cfp.experiment.algorithm import Algorithm, Position, Scalars
 from cfp.experiment.folder import policy_path
 from cfp.experiment.sac_state import load_model_state_dict, model_state_dict
 from cfp.presets import preset
-from cfp.weights import KIND, fitting, load, policy_for, read_policy, save_policy, write_policy
+from cfp.weights import KIND, load, policy_for, read_policy, report_mismatch, save_policy, write_policy
 
 ROLLOUT_METRICS: dict[str, str] = {
     "rollout/return": "mean undiscounted return of the last training episodes (with action noise)",
@@ -182,7 +182,7 @@ class CoarseToFine(SACAlgorithm):
         elif stage > 1:
             path = policy_path(folder, stage - 1)
             coarse = load(path, str(model.device)).actor
-            with fitting(path):
+            with report_mismatch(path):
                 actor.get_submodule("coarse").load_state_dict(coarse.state_dict())
         algorithm = cls(config, stage, model)
         algorithm.starts_trained = stage > 1 or refines
