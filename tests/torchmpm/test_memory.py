@@ -140,13 +140,6 @@ def test_a_budget_that_nothing_fits_into(backend: str) -> None:
         segment_for(robot(300, backend=backend), lively(300), substeps=20, budget=10_000, env_steps=2)
 
 
-@pytest.mark.parametrize("backend", ["eager", pytest.param("native", marks=needs_compiler)])
-def test_without_gradients(backend: str) -> None:
-    solver, state = robot(300, backend=backend), lively(300)
-    less = estimate_memory(solver, state, substeps=20, backward=False)
-    assert 0 < less < 0.5 * estimate_memory(solver, state, substeps=20)
-
-
 def test_bad_arguments() -> None:
     with pytest.raises(ValueError, match="substeps must be at least 1, got 0"):
         estimate_memory(robot(10), lively(10), substeps=0)

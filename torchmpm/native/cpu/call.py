@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from torchmpm.native.cpu.library import POOL, load, thread_pool
-from torchmpm.native.inputs import Inputs
-from torchmpm.native.tables import Tables, tables_of
+from torchmpm.native.tables import Inputs, Tables, tables_of
 
 _REAL = {torch.float32: "float", torch.float64: "double"}
 #: Scratch memory up to this size, bytes, is kept for the next call: fresh pages cost a third of a backward pass. It is
