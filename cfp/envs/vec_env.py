@@ -93,11 +93,13 @@ class TorchVecEnv(VecEnv):
         return infos
 
     def state_dict(self) -> list[Tensor]:
-        """Tensors of the episodes in progress; see `load_state_dict`."""
+        """Tensors of the episodes in progress, with a leading B; see `load_state_dict`."""
         return [value.detach().cpu().clone() for value in tree.leaves(self.torch_env.env_state)]
 
     def load_state_dict(self, state: list[Tensor]) -> None:
-        """Restore a state of `state_dict`; call ``reset`` with the same seed before, so that later resets agree too.
+        """Restore a state of `state_dict`, tensors with a leading B.
+
+        Call ``reset`` with the same seed before, so that later resets agree too.
 
         Raises:
             ValueError: The state is not one of this environment.
@@ -144,7 +146,7 @@ class TorchVecEnv(VecEnv):
         return [result for _ in self._indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """Always False: elements are not wrapped one by one."""
+        """Always False, for any ``wrapper_class``: elements are not wrapped one by one."""
         return [False for _ in self._indices(indices)]
 
 
