@@ -87,9 +87,10 @@ class SmoothOps(RewardOps):
 
     smooth = True
 
-    def clamp(  # noqa: D102
+    def clamp(
         self, z: Tensor, low: float | None = None, high: float | None = None, *, width: float | None = None
     ) -> Tensor:
+        """Soft clamp."""
         if width is not None:
             checks.number("width", width, above=0.0)
         largest = max((abs(limit) for limit in (low, high) if limit is not None), default=0.0)
@@ -102,22 +103,24 @@ class SmoothOps(RewardOps):
             z = z - sign * w * softplus(sign * (z - limit) / w)
         return z
 
-    def heaviside(self, z: Tensor, width: float) -> Tensor:  # noqa: D102
+    def heaviside(self, z: Tensor, width: float) -> Tensor:
+        """Sigmoid."""
         return torch.sigmoid(z / width)
 
-    def split_penalty(self, split: Tensor, limit: float) -> Tensor:  # noqa: D102
+    def split_penalty(self, split: Tensor, limit: float) -> Tensor:
+        """Penalty that sets in around the limit."""
         return -(20.0 * split).square() * self.heaviside(split - limit, RELATIVE_WIDTH * limit)
 
-    def mean_over_nearest(  # noqa: D102
-        self, values: Tensor, x: Tensor, point: Tensor, fraction: float
-    ) -> Tensor:
+    def mean_over_nearest(self, values: Tensor, x: Tensor, point: Tensor, fraction: float) -> Tensor:
+        """Weighted mean."""
         squared = _squared_distance(x, point)
         edge = squared.topk(count_of(fraction, x), largest=False).values[:, -1:]
         width = 2.0 * SELECTION_WIDTH * edge.clamp_min(SELECTION_WIDTH**2).sqrt()
         weight = torch.sigmoid((edge - squared) / width)[..., None]
         return (weight * values).sum(1) / weight.sum(1)
 
-    def silhouette(self, observation: Tensor) -> Tensor:  # noqa: D102
+    def silhouette(self, observation: Tensor) -> Tensor:
+        """Probabilities that pixels are occupied."""
         return soft_silhouette(observation)
 
 

@@ -19,12 +19,6 @@ class Episodes:
     ``(i + 1) / B`` of them, so that the simulations are of different ages. A simulation that is not finite ends like
     any other, and is counted.
 
-    Args:
-        env: The simulations; they are reset.
-        seed: Seed of the layouts.
-        max_episode_steps: Control steps after which an episode is truncated; at most the task's own.
-        num_layouts: Number of particle layouts that episodes start from in turn.
-
     Attributes:
         recent_returns: Undiscounted returns of the episodes that ended since the list was last emptied.
         counts: Episodes so far, and how they ended.
@@ -43,23 +37,12 @@ class Episodes:
         self.counts = {"episodes": 0, "terminated": 0, "nonfinite": 0}
 
     def record(self, reward: Tensor, terminated: Tensor) -> Tensor:
-        """Add the rewards (B,) of a step to the returns; tell which episodes are over, (B,) bool.
-
-        Args:
-            reward: (B,).
-            terminated: (B,) bool, which episodes the task has ended.
-        """
+        """Add the rewards (B,) of a step to the returns; tell which episodes are over, (B,) bool."""
         self.returns += reward
         return terminated | (self.env.env_state.steps >= self.limit)
 
     def restart(self, done: Tensor, terminated: Tensor, finite: Tensor) -> None:
-        """Start new episodes, each on the next layout.
-
-        Args:
-            done: (B,) bool, where.
-            terminated: (B,) bool, which episodes the task has ended.
-            finite: (B,) bool, which simulations are finite.
-        """
+        """Start new episodes where ``done`` (B,), each on the next layout; count how they ended."""
         seeds = [0] * self.env.num_envs
         for i in done.nonzero()[:, 0].tolist():
             self.counts["episodes"] += 1

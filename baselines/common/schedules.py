@@ -11,13 +11,7 @@ FINAL_FRACTION = 0.1
 
 
 def stage_progress(config: RunConfig, stage: int, num_timesteps: int) -> float:
-    """Fraction of a stage that is done, 0 to 1; a stage after one that ended early is longer, and stays at 1.
-
-    Args:
-        config: Options of the run.
-        stage: Which stage, 1 is the first.
-        num_timesteps: Environment steps taken in the stage.
-    """
+    """Fraction of a stage that is done, 0 to 1; a stage after one that ended early is longer, and stays at 1."""
     return min(num_timesteps / config.stage_steps(stage), 1.0)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -13,7 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from baselines.compare.executor import Executor, Resources
 from baselines.compare.jobs import Job
-from baselines.compare.worker import EXIT_CODES, Outcome, carry_out
+from baselines.compare.worker import EXIT_CODES, Outcome, carry_out, encode
 from cfp.experiment.process import StopSignals
 from cfp.files import write_text
 
@@ -110,7 +109,7 @@ def run_process(job: Job, threads: int, lock_timeout: float, urgency: Callable[[
         )
     assert process.stdin is not None
     try:
-        pickle.dump((job, lock_timeout), process.stdin)
+        process.stdin.write(encode(job, lock_timeout))
         process.stdin.flush()
     except BrokenPipeError:
         pass  # the process has ended already; its exit code says how

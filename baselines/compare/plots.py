@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -18,30 +17,26 @@ from baselines.compare.table import Row
 COLOURS = (
     "#0173b2 #de8f05 #029e73 #d55e00 #cc78bc #ca9161 #56b4e9 #949494 #8c564b #bcbd22 #17becf #7f3c8d #e377c2 #1b5e20"
 ).split()
-LINES: dict[str, Any] = {"image": "-", "state": "--", "simulator": ":", "nothing": (0, (1, 4))}
-MARKERS = {"image": "o", "state": "s", "simulator": "^", "nothing": "v"}
+LINES: dict[str, tuple[Any, str]] = {
+    "image": ("-", "o"),
+    "state": ("--", "s"),
+    "simulator": (":", "^"),
+    "nothing": ((0, (1, 4)), "v"),
+}
+"""Line and marker by what is observed."""
 BAND_RESAMPLES = 2_000
 
 
-@dataclass(frozen=True)
-class Style:
-    """How the results of a group are drawn."""
-
-    colour: str
-    line: Any
-    marker: str
+Styles = dict[tuple[str, str], dict[str, Any]]
+"""Keywords of matplotlib's lines, by algorithm and observation."""
 
 
-def _styles(groups: Iterable[Group]) -> dict[tuple[str, str], Style]:
-    """Styles by algorithm and observation."""
-    groups = list(groups)
-    labels = list(dict.fromkeys(group.label for group in groups))
-    return {
-        (group.label, group.observes): Style(
-            COLOURS[labels.index(group.label) % len(COLOURS)], LINES[group.observes], MARKERS[group.observes]
-        )
-        for group in groups
-    }
+def _styles(groups: Sequence[Group]) -> Styles:
+    labels, styles = list(dict.fromkeys(group.label for group in groups)), Styles()
+    for group in groups:
+        (line, marker), colour = LINES[group.observes], COLOURS[labels.index(group.label) % len(COLOURS)]
+        styles[group.label, group.observes] = {"color": colour, "linestyle": line, "marker": marker}
+    return styles
 
 
 def _panels(tasks: Sequence[str], height: float, handles: list[Line2D]) -> tuple[Figure, dict[str, Axes]]:
@@ -58,11 +53,8 @@ def _panels(tasks: Sequence[str], height: float, handles: list[Line2D]) -> tuple
     return figure, panels
 
 
-def _legend(styles: dict[tuple[str, str], Style]) -> list[Line2D]:
-    return [
-        Line2D([], [], color=style.colour, linestyle=style.line, marker=style.marker, label=_name(label, observes))
-        for (label, observes), style in styles.items()
-    ]
+def _legend(styles: Styles) -> list[Line2D]:
+    return [Line2D([], [], **style, label=_name(*name)) for name, style in styles.items()]
 
 
 def _name(label: str, observes: str) -> str:
@@ -85,10 +77,9 @@ def learning_curves(groups: Sequence[Group], *, minutes: bool = False) -> Figure
         steps, values = align_curves(group.curves)
         if minutes and group.speed:
             steps = (group.teacher_seconds + steps / group.speed) / 60
-        line = {"color": style.colour, "linestyle": style.line, "marker": style.marker}
-        axes.plot(steps, interquartile_mean(values), **line, markersize=3, linewidth=1.5)
+        axes.plot(steps, interquartile_mean(values), **style, markersize=3, linewidth=1.5)
         if len(steps) and (band := bootstrap_interval([values], BAND_RESAMPLES)) is not None:
-            axes.fill_between(steps, *band, color=style.colour, alpha=0.15, linewidth=0)
+            axes.fill_between(steps, *band, color=style["color"], alpha=0.15, linewidth=0)
     for axes in panels.values():
         axes.set(xlabel="minutes of training" if minutes else "environment steps", ylabel="return of an evaluation")
     return figure
@@ -105,12 +96,11 @@ def final_returns(groups: Sequence[Group]) -> Figure:
     for task, axes in panels.items():
         shown = members[task]
         for place, group in enumerate(shown):
-            style, (low, high) = styles[group.label, group.observes], group.interval
-            axes.plot(group.scores, [place] * len(group.scores), style.marker, color=style.colour, alpha=0.35)
+            style, (low, high) = styles[group.label, group.observes] | {"linestyle": "none"}, group.interval
+            axes.plot(group.scores, [place] * len(group.scores), **style, alpha=0.35)
             if low is not None and high is not None:
-                axes.plot([low, high], [place, place], color=style.colour, linewidth=2.5)
-            mean = float(interquartile_mean(group.scores))
-            axes.plot(mean, place, style.marker, color=style.colour, markersize=8, markeredgecolor="black")
+                axes.plot([low, high], [place, place], color=style["color"], linewidth=2.5)
+            axes.plot(interquartile_mean(group.scores), place, **style, markersize=8, markeredgecolor="black")
             if place and group.observes != shown[place - 1].observes:
                 axes.axhline(place - 0.5, color="black", linewidth=1)
         _bar_names(axes, [f"{group.label} ({group.observes})" for group in shown])
@@ -126,7 +116,7 @@ def robustness_ratios(groups: Sequence[Group], rows: Sequence[Row]) -> Figure:
     for row in rows:
         if row["case"] not in cases.setdefault(row["task"], []):
             cases[row["task"]].append(row["case"])
-    handles = [Line2D([], [], color=styles[name].colour, linewidth=6, label=_name(*name)) for name in names]
+    handles = [Line2D([], [], color=styles[name]["color"], linewidth=6, label=_name(*name)) for name in names]
     handles.append(Line2D([], [], color="black", linewidth=2.5, label="the paper's CFP"))
     figure, panels = _panels(list(cases), 1.0 + max(map(len, cases.values())) * max(0.4, 0.16 * len(names)), handles)
     height = 0.8 / len(names)
@@ -134,7 +124,7 @@ def robustness_ratios(groups: Sequence[Group], rows: Sequence[Row]) -> Figure:
         axes, name = panels[row["task"]], (row["algo"], row["sees"])
         place = cases[row["task"]].index(row["case"]) + (names.index(name) - (len(names) - 1) / 2) * height
         seeds = [[row["ratio"] - row["low"]], [row["high"] - row["ratio"]]]
-        axes.barh(place, row["ratio"], height, xerr=seeds, color=styles[name].colour, error_kw={"linewidth": 1})
+        axes.barh(place, row["ratio"], height, xerr=seeds, color=styles[name]["color"], error_kw={"linewidth": 1})
         if row["paper"] is not None:
             axes.plot([row["paper"]] * 2, [place - height / 2, place + height / 2], color="black", linewidth=2.5)
     for task, axes in panels.items():

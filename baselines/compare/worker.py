@@ -1,24 +1,26 @@
 """Carries out one run of a comparison: trains it to its end, then evaluates its policy.
 
-As a program, the process reads its job as a pickle from the standard input, which its parent keeps open. When the
-standard input ends, the parent is gone, and the run stops with a checkpoint as if a signal had asked it to.
+As a program, the process reads its job as one line of JSON from the standard input, which its parent keeps open. When
+the standard input ends, the parent is gone, and the run stops with a checkpoint as if a signal had asked it to.
 """
 
 from __future__ import annotations
 
+import json
 import os
-import pickle
 import signal
 import socket
 import sys
 import threading
 import time
 import traceback
-from typing import Literal
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Literal
 
-from baselines.compare.evaluations import evaluate_run
+from baselines.compare.evaluations import Protocol, evaluate_run
 from baselines.compare.jobs import Job, check_folder, read_sessions
-from baselines.registry import find
+from baselines.registry import configure, find
 from cfp.config import to_json
 from cfp.envs.make import choose_device
 from cfp.experiment.process import Stopped, StopSignals, keep_memory, peak_memory
@@ -29,6 +31,21 @@ from cfp.files import write_json, write_text
 Outcome = Literal["finished", "failed", "busy", "stopped"]
 """How a run ended; busy: another process holds its folder."""
 EXIT_CODES: dict[Outcome, int] = {"finished": 0, "failed": 1, "busy": 3, "stopped": 4}
+
+
+def encode(job: Job, lock_timeout: float) -> bytes:
+    """A job as one line of JSON, see `decode`."""
+    values = {"label": job.label, "config": to_json(job.config), "folder": str(job.folder)}
+    return json.dumps(values | {"protocol": asdict(job.protocol), "lock_timeout": lock_timeout}).encode() + b"\n"
+
+
+def decode(line: str) -> tuple[Job, float]:
+    """Inverse of `encode`."""
+    values: dict[str, Any] = json.loads(line)
+    protocol, tier = values["protocol"], values["protocol"]["tier"]
+    protocol["tier"] = tuple(tier) if isinstance(tier, list) else tier
+    job = Job(values["label"], configure(values["config"]), Path(values["folder"]), Protocol(**protocol))
+    return job, values["lock_timeout"]
 
 
 def carry_out(job: Job, signals: StopSignals, lock_timeout: float, *, own_process: bool = True) -> Outcome:
@@ -92,13 +109,13 @@ def train(job: Job, signals: StopSignals, own_process: bool = True) -> None:
 
 def _stop_with_parent() -> None:
     """Wait for the end of the standard input, then ask this process to stop."""
-    sys.stdin.buffer.read()
+    sys.stdin.read()
     os.kill(os.getpid(), signal.SIGTERM)
 
 
 def main() -> int:
     """Entry point of the process; returns its exit code."""
-    job, lock_timeout = pickle.load(sys.stdin.buffer)
+    job, lock_timeout = decode(sys.stdin.readline())
     threading.Thread(target=_stop_with_parent, daemon=True).start()
     keep_memory()
     with StopSignals() as signals:

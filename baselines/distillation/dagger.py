@@ -31,11 +31,7 @@ class Labels(NamedTuple):
 
 
 class Dataset:
-    """The labels of all rounds; the oldest rounds are dropped when there are too many.
-
-    Args:
-        capacity: Largest number of labels; an image takes 12 KiB, an action 8 R R bytes.
-    """
+    """The labels of all rounds; the oldest rounds are dropped when there are too many."""
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
@@ -82,12 +78,9 @@ class Dataset:
 
 
 def drop_entries(values: Tensor, probability: float, grid: int | None = None) -> Tensor:
-    """Set entries to 0 in half of the elements, drawn from torch's generator.
+    """Set entries of values (B, ..., A, A) to 0 in half of the elements, drawn on a coarser ``grid`` if given.
 
-    Args:
-        values: (B, ..., A, A).
-        probability: Of an entry, in these elements.
-        grid: Rows and columns on which entries are drawn, see `cfp.envs.disturbances.drop`; A if None.
+    Draws come from torch's generator.
     """
     if not probability:
         return values
@@ -101,14 +94,6 @@ class Collector:
 
     Who controls a robot is drawn anew every ``switch_every`` steps. A label is kept where the teacher's action was
     computed from that very state, or is part of a plan which the robot has followed from its beginning.
-
-    Args:
-        env: The simulations, with the patch as action grid, so that actions of any grid can be carried out.
-        teacher: The teacher.
-        episodes: Episodes of the simulations.
-        switch_every: Control steps between draws of who controls a robot.
-        dropout: Probability with which entries of the student's observations and actions are lost, see `drop_entries`.
-        grid: The student's action grid, on which it loses entries of actions; if None, that of the actions it returns.
     """
 
     def __init__(
@@ -130,10 +115,8 @@ class Collector:
     def collect(self, steps: int, beta: float, student: Callable[[Tensor], Tensor]) -> Labels:
         """Act for some control steps and return the labels.
 
-        Args:
-            steps: How many.
-            beta: Probability that the teacher controls a robot; drawn from torch's generator.
-            student: Actions (B, 2, R, R) from images (B, 3, 64, 64).
+        The teacher controls a robot with probability ``beta``, drawn from torch's generator; the student maps images
+        (B, 3, 64, 64) to actions (B, 2, R, R), and loses entries of both with probability ``dropout``.
         """
         env, images, actions = self.env, [], []
         self.episodes.recent_returns = []

@@ -27,12 +27,7 @@ def teacher_path(folder: Path) -> Path:
 
 
 def copy_teacher(config: DistillConfig, folder: Path) -> None:
-    """Copy the teacher into the folder, if it is a policy.
-
-    Raises:
-        ConfigError: There is no such teacher, or it was trained for something else.
-        CheckpointError: The policy is damaged.
-    """
+    """Copy the teacher into the folder, if it is a policy."""
     teacher = config.teacher
     if teacher in ("mpc", *TRAINED):
         return
@@ -63,11 +58,6 @@ def train_teacher(config: DistillConfig, folder: Path, signals: StopSignals) -> 
     """Train the teacher with the defaults of its algorithm, if only that is named and it is not there yet.
 
     What this took is added up in ``teacher/cost.json``.
-
-    Args:
-        config: Options of the distillation.
-        folder: Of its run.
-        signals: Whether the user wants to stop.
     """
     if config.teacher not in TRAINED or teacher_path(folder).exists():
         return

@@ -50,11 +50,6 @@ class PolicyTeacher(Teacher):
 
     An open-loop policy plays the action of the step that each episode is at. Other policies get their memory back, and
     start anew where an episode does.
-
-    Args:
-        policy: Of any kind.
-        policy_layout: Orientation of the policy's actions, see `dittogym.TorchEnv`.
-        layout: Orientation of the returned actions.
     """
 
     def __init__(self, policy: Policy, policy_layout: ActionIndexing, layout: ActionIndexing) -> None:
@@ -85,11 +80,6 @@ class PlannerTeacher(Teacher):
     """The gradient planner, which plans from the states that the student has reached.
 
     It plans for all robots at once, every `PlannerConfig.commit` steps, each plan from what is left of the last one.
-
-    Args:
-        env: An environment of its own, with its action grid; it takes over the states of the one that is labelled.
-        config: Options of the planner.
-        seed: Seed of the planner's noise.
     """
 
     def __init__(self, env: TorchEnv, config: GradientPlannerConfig, seed: int) -> None:
@@ -119,14 +109,6 @@ def project(actions: Tensor, resolution: int, patch: int) -> Tensor:
     The environment enlarges a grid to the patch by half-pixel bicubic interpolation, ``U``. The result has the least
     squared difference from ``U a U^T`` there, clipped to [-1, 1]. It is exact wherever the new grid can represent the
     field, such as for the same grid and for the patch.
-
-    Args:
-        actions: (..., R, R).
-        resolution: The new grid S.
-        patch: Width of the environment's patch in nodes.
-
-    Returns:
-        (..., S, S).
     """
     matrix = _projection(actions.shape[-1], resolution, patch).to(actions)
     return (matrix @ actions @ matrix.T).clamp(-1.0, 1.0)
@@ -141,17 +123,7 @@ def _projection(size: int, new_size: int, patch: int) -> Tensor:
 
 
 def read_teacher(path: str | Path, task: str, environment: EnvironmentConfig) -> Policy:
-    """Load a policy that can teach a task.
-
-    Args:
-        path: A run folder, a ``.safetensors`` file, or the ``.json`` beside one.
-        task: The student's task.
-        environment: The student's environment.
-
-    Raises:
-        ConfigError: The policy was trained for something else.
-        CheckpointError: There is no such policy, or it is damaged.
-    """
+    """Load a policy that can teach a task."""
     check_trained_for("teacher", read_policy(path)[1], task, environment)
     return load(path)
 

@@ -19,10 +19,6 @@ class SegmentedEnv:
     """Observes rows of `Nodes` and takes actions of segments; for `cfp.envs.vec_env.TorchVecEnv`.
 
     A simulation that is not finite keeps its last observation; its episode ends there.
-
-    Args:
-        env: The environment, with its patch as action grid.
-        nodes: Features and actions of segments.
     """
 
     def __init__(self, env: TorchEnv, nodes: Nodes) -> None:
@@ -57,11 +53,7 @@ class SegmentedEnv:
 
     @property
     def labels(self) -> Tensor:
-        """Segment (B, N) of every particle of the robot.
-
-        Raises:
-            RuntimeError: Before the first reset.
-        """
+        """Segment (B, N) of every particle of the robot."""
         if self._labels is None:
             raise RuntimeError("call reset() before segments are used")
         return self._labels

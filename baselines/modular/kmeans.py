@@ -21,19 +21,7 @@ MIN_BORDER_PARTICLES = 3
 
 
 def fit(x: Tensor, count: int, seed: int = 0) -> Tensor:
-    """Segment particles from scratch by scikit-learn's k-means.
-
-    Args:
-        x: (B, N, 2) positions, m.
-        count: Number of segments K.
-        seed: Seed of the initial centres (k-means++).
-
-    Returns:
-        Labels (B, N), int64.
-
-    Raises:
-        ConfigError: There are fewer particles than segments.
-    """
+    """Segment particles (B, N, 2), m, from scratch by scikit-learn's k-means; returns labels (B, N), int64."""
     from sklearn.cluster import KMeans  # takes a second to import, which other algorithms need not wait for
 
     if x.shape[1] < count:
@@ -44,17 +32,9 @@ def fit(x: Tensor, count: int, seed: int = 0) -> Tensor:
 
 
 def update(x: Tensor, labels: Tensor, count: int) -> Tensor:
-    """Segment particles that have moved by a few iterations of Lloyd's algorithm from the previous labels.
+    """Segment particles (B, N, 2), m, that have moved by Lloyd's algorithm from the previous labels (B, N).
 
     A segment that is left without particles gets the one that is farthest from its centre.
-
-    Args:
-        x: (B, N, 2) positions, m.
-        labels: (B, N) of the previous segmentation.
-        count: Number of segments K.
-
-    Returns:
-        Labels (B, N), int64.
     """
     for _ in range(LLOYD_ITERATIONS):
         distance, labels = squared_distances(x, segment_means(x, labels, count)[0]).min(-1)
@@ -82,14 +62,10 @@ def squared_distances(x: Tensor, centres: Tensor) -> Tensor:
 
 
 def adjacency(x: Tensor, centres: Tensor) -> Tensor:
-    """Which segments are neighbours, (B, K, K) bool, symmetric; the graph is connected.
+    """Which segments of particles (B, N, 2) with centres (B, K, 2), m, are neighbours: (B, K, K) bool, connected.
 
     Two segments are neighbours if at least three particles of each have the other as their second nearest and lie at
     the border between the two. Components without contact are then joined by the shortest edges between centres.
-
-    Args:
-        x: (B, N, 2) positions, m.
-        centres: (B, K, 2) of the segments, m.
     """
     batch, count = centres.shape[:2]
     (first, second), (own, other) = (t.unbind(-1) for t in squared_distances(x, centres).topk(2, largest=False))

@@ -25,9 +25,6 @@ class GraphTrunk(nn.Module):
     """Three rounds of messages between neighbours, with the same weights in each (after Pathak et al., NeurIPS 2019).
 
     ``h <- h + ELU(W h + V mean of the neighbours' h)``.
-
-    Args:
-        inputs: Number of features of a node.
     """
 
     def __init__(self, inputs: int) -> None:
@@ -45,11 +42,7 @@ class GraphTrunk(nn.Module):
 
 
 class AttentionTrunk(nn.Module):
-    """Three layers of self-attention over all nodes, pre-norm, without positional encoding.
-
-    Args:
-        inputs: Number of features of a node.
-    """
+    """Three layers of self-attention over all nodes, pre-norm, without positional encoding."""
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
@@ -64,13 +57,7 @@ class AttentionTrunk(nn.Module):
 
 
 class Trunk(nn.Module):
-    """Either trunk, reading rows of `baselines.modular.nodes.Nodes`.
-
-    Args:
-        kind: Which.
-        features: Length of a row without neighbours.
-        extra: Number of further inputs of each node.
-    """
+    """Either trunk, reading rows of `baselines.modular.nodes.Nodes`."""
 
     def __init__(self, kind: Kind, features: int, extra: int = 0) -> None:
         super().__init__()
@@ -85,12 +72,7 @@ class Trunk(nn.Module):
 
 
 class ModularActor(SquashedActor):
-    """A tanh-Gaussian of two muscles for every segment, with the weights of all segments shared.
-
-    Args:
-        kind: Of the trunk.
-        features: Number of features of a node.
-    """
+    """A tanh-Gaussian of two muscles for every segment, with the weights of all segments shared."""
 
     def __init__(self, kind: Kind, features: int) -> None:
         super().__init__()
@@ -105,12 +87,7 @@ class ModularActor(SquashedActor):
 
 
 class ModularCritics(nn.Module):
-    """Twin critics without shared weights: a trunk that also reads actions, the mean over nodes, a perceptron.
-
-    Args:
-        kind: Of the trunks.
-        features: Number of features of a node.
-    """
+    """Twin critics without shared weights: a trunk that also reads actions, the mean over nodes, a perceptron."""
 
     optimizer: torch.optim.Optimizer
 

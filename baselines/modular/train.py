@@ -30,7 +30,7 @@ from dittogym import make_spec
 
 @dataclass(frozen=True)
 class ModularConfig(RunConfig):
-    """A run of a modular policy; ``algo`` says its network and how many segments the robot is cut into."""
+    """A run of a modular policy; ``algo`` names its network and the number of segments of the robot."""
 
     algo: str = "gnn-16"
     """Which algorithm."""
@@ -46,17 +46,17 @@ class ModularConfig(RunConfig):
 
     @property
     def kind(self) -> Kind:
-        """Of the networks."""
+        """Kind of the networks."""
         return cast(Kind, self.algo.split("-")[0])
 
     @property
     def segments(self) -> int:
-        """How many."""
+        """Number of segments."""
         return int(self.algo.split("-")[1])
 
     @property
     def nodes(self) -> Nodes:
-        """How segments are seen and act."""
+        """Features and actions of the segments."""
         return Nodes(self.segments, self.kind == "gnn")
 
     def ends(self) -> tuple[int, ...]:
@@ -68,7 +68,7 @@ class ModularConfig(RunConfig):
         return make_spec(self.task).patch
 
     def ineffective(self) -> dict[str, str]:
-        """What concerns ladders, and grids of actions: segments act on nodes."""
+        """Options of several levels, and of grids of actions, have no effect: segments act on nodes."""
         needs = dict.fromkeys(("learning.anchor", "learning.warm_critic", "environment.action_layout"), "algo cfp")
         return super().ineffective() | needs
 
@@ -80,48 +80,20 @@ class ModularConfig(RunConfig):
         """Check what the types cannot, see `RunConfig.check`."""
         kind, _, count = self.algo.partition("-")
         if kind not in get_args(Kind) or not count.isdecimal() or int(count) < 2:
-            raise ConfigError(f"algo: got {self.algo!r}, allowed {' or '.join(get_args(Kind))} with a count, as gnn-16")
+            raise ConfigError(
+                f"algo must be gnn or transformer with a number of segments, such as gnn-16, got {self.algo!r}"
+            )
         super().check()
         check_at_least(1, steps=self.steps)
         check_at_least(0, random_steps=self.random_steps, alpha=self.alpha)
         particles = self.environment.particles
         robot = particles[0] if isinstance(particles, tuple) else particles
         if isinstance(robot, int) and robot < self.segments:
-            raise ConfigError(f"particles: got {robot} of the robot, allowed {self.segments} (its segments) or more")
-
-
-def preset(algo: str, task: str, name: str) -> ModularConfig:
-    """The environment, learning and temperature of the first stage of `cfp.preset`, for all its steps.
-
-    Raises:
-        ConfigError: No such task or preset.
-    """
-    ladder = cfp.preset(task, name)
-    return ModularConfig(
-        algo=algo,
-        task=ladder.task,
-        preset=ladder.preset,
-        seed=ladder.seed,
-        environment=ladder.environment,
-        report=ladder.report,
-        learning=ladder.learning,
-        steps=ladder.steps,
-        random_steps=ladder.random_steps[0],
-        alpha=ladder.alpha[0],
-    )
+            raise ConfigError(f"particles of the robot must be at least {self.segments}, one per segment, got {robot}")
 
 
 class ModularPolicy(NetworkPolicy):
-    """Actor and critics over segments, for `cfp.agent.sac.CFP`.
-
-    Args:
-        observation_space: Rows (K, columns) of `Nodes`.
-        action_space: (K, 2).
-        lr_schedule: See `NetworkPolicy`.
-        kind: Of the networks.
-        features: Numbers of a row without neighbours.
-        options: See `NetworkPolicy`.
-    """
+    """Actor and critics over segments, for `cfp.agent.sac.CFP`; observes rows (K, columns) of `Nodes`."""
 
     def __init__(
         self,
@@ -136,16 +108,16 @@ class ModularPolicy(NetworkPolicy):
         super().__init__(observation_space, action_space, lr_schedule, **options)
 
     def new_actor(self) -> ModularActor:
-        """One of the kind."""
+        """An actor."""
         return ModularActor(self.kind, self.features)
 
     def new_critic(self) -> ModularCritics:
-        """Two of the kind."""
+        """Twin critics."""
         return ModularCritics(self.kind, self.features)
 
 
 class Modular(SACAlgorithm):
-    """A modular policy, trained by soft actor-critic; a subclass says which."""
+    """A modular policy, trained by soft actor-critic; a subclass names its network and number of segments."""
 
     algo: ClassVar[str]
     sees: ClassVar[Sees] = "state"
@@ -153,12 +125,24 @@ class Modular(SACAlgorithm):
 
     @classmethod
     def preset(cls, task: str, name: str) -> ModularConfig:
-        """Default options for a task, see `preset`."""
-        return preset(cls.algo, task, name)
+        """The environment, learning and temperature of the first stage of `cfp.preset`, for all its steps."""
+        base = cfp.preset(task, name)
+        return ModularConfig(
+            algo=cls.algo,
+            task=task,
+            preset=base.preset,
+            seed=base.seed,
+            environment=base.environment,
+            report=base.report,
+            learning=base.learning,
+            steps=base.steps,
+            random_steps=base.random_steps[0],
+            alpha=base.alpha[0],
+        )
 
     @classmethod
     def create(cls, config: ModularConfig, stage: int, folder: Path, resumed: bool = False) -> Modular:
-        """Networks, replay memory and environment."""
+        """The algorithm at the beginning of its only stage."""
         env = SegmentedEnv(make_torch_env(config, config.resolution(stage)), config.nodes)
         networks = {"kind": config.kind, "features": config.nodes.num_features(env.env.spec)}
         monitor = VecMonitor(TorchVecEnv(env, env.spaces))
@@ -166,7 +150,7 @@ class Modular(SACAlgorithm):
         return cls(config, stage, model)
 
     def attached(self, env: Any) -> StateBasedPolicy:
-        """The present policy, looking at an environment."""
+        """The present policy, acting on the state of an environment."""
         return self._policy({}).attached(env)
 
     def _policy(self, description: dict[str, Any]) -> SegmentPolicy:

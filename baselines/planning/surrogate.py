@@ -23,15 +23,8 @@ class Surrogate:
     that evenly spread particles stay evenly spread. It takes over position, velocity and deformation; masses and
     volumes are the small environment's own.
 
-    Args:
-        large: The environment whose states are copied, after a reset.
-        small: The environment that takes them over, after a reset; of the same batch size, dtype and device.
-
     Attributes:
         indices: (B, n) the large environment's particles that the small one's stand for.
-
-    Raises:
-        ValueError: A body of the small environment has more particles than that of the large.
     """
 
     def __init__(self, large: TorchEnv, small: TorchEnv) -> None:

@@ -38,12 +38,7 @@ def mlp(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class StateActor(nn.Module):
-    """Mean action before tanh, (B, 2, R, R), from features (B, D).
-
-    Args:
-        inputs: D.
-        resolution: R.
-    """
+    """Mean action before tanh, (B, 2, R, R), from features (B, D)."""
 
     def __init__(self, inputs: int, resolution: int) -> None:
         super().__init__()
@@ -66,11 +61,7 @@ def fix_std(actor: Actor) -> None:
 
 
 class ImageActor(nn.Module):
-    """The coarsest actor of the coarse-to-fine policy; its mean is trained and its standard deviation fixed.
-
-    Args:
-        resolution: R.
-    """
+    """The coarsest actor of the coarse-to-fine policy; its mean is trained and its standard deviation fixed."""
 
     def __init__(self, resolution: int) -> None:
         super().__init__()
@@ -97,11 +88,8 @@ def image_critic() -> nn.Module:
 class StatePolicy(StateBasedPolicy):
     """A trained `StateActor`, acting on `StateFeatures` of the environment given to `attached`.
 
-    Args:
-        actor: The network.
-        features: Its inputs.
-        noise: Standard deviation before tanh of actions that are not deterministic.
-        description: What it is and where it comes from, see `cfp.weights.describe_run`.
+    ``noise`` is the standard deviation before tanh of actions that are not deterministic; ``description`` says what the
+    policy is and where it comes from, see `cfp.weights.describe_run`.
     """
 
     def __init__(
@@ -139,11 +127,7 @@ class StatePolicy(StateBasedPolicy):
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu") -> StatePolicy:
-        """Load what `save` wrote.
-
-        Raises:
-            CheckpointError: The file is missing, damaged, or not such a policy.
-        """
+        """Load what `save` wrote."""
         tensors, description = read_policy(path, device)
         with fitting(path):
             size = description["inputs"], description["resolution"]

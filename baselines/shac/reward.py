@@ -39,11 +39,7 @@ class RewardConfig:
     """Factor of the whole, so that values are not far from one."""
 
     def check(self) -> None:
-        """Check what the types cannot.
-
-        Raises:
-            ConfigError: An option is out of range.
-        """
+        """Check what the types cannot."""
         check_at_least(
             0, split_weight=self.split_weight, split_margin=self.split_margin, integrity_weight=self.integrity_weight
         )
@@ -78,11 +74,7 @@ class Neighbours:
         return cls(index.expand(len(x), -1), neighbours, distance, distance < RADIUS)
 
     def drift(self, x: Tensor) -> Tensor:
-        """Mean over close pairs, (B,), of the square of ``(d - d_0) / RADIUS - TOLERANCE`` where it is positive.
-
-        Args:
-            x: (B, N, 2) the robot's particles now, m.
-        """
+        """Mean over close pairs, (B,), of the square of ``(d - d_0) / RADIUS - TOLERANCE`` where it is positive."""
         samples = x.gather(1, self.index[..., None].expand(-1, -1, 2))
         index = self.neighbours.flatten(1)[..., None].expand(-1, -1, 2)
         gap = samples.gather(1, index).view(*self.neighbours.shape, 2) - samples[:, :, None]
@@ -99,16 +91,7 @@ def training_reward(
     info: dict[str, Any],
     neighbours: Neighbours,
 ) -> Tensor:
-    """Training reward (B,) of the environment's last step.
-
-    Args:
-        config: Options of the reward.
-        env: The environment after the step.
-        previous_centre: (B, 2) the robot's centre of mass before the step, m.
-        reward: (B,) the smooth reward of ``env.step(action, soft=True)``.
-        info: The info of that step.
-        neighbours: Pairs that were close when the window, or the episode within it, began.
-    """
+    """Training reward (B,) of the environment's last step."""
     terms = info["reward_terms"]
     if config.form == "speed":
         seconds = env.model.substeps * env.model.solver.dt

@@ -36,14 +36,6 @@ class Rollout:
     """Collects windows from simulations that an actor drives.
 
     Gradients with respect to the action of one simulation in one step that are not finite are left out and counted.
-
-    Args:
-        episodes: Episodes of the simulations.
-        observe: Returns the inputs of the networks for the present states.
-        reward: Options of the training reward.
-        steps: Control steps T of a window.
-        noise: Standard deviation of the actions before tanh.
-        seed: Seed of the noise.
     """
 
     def __init__(
@@ -63,12 +55,8 @@ class Rollout:
     def collect(self, actor: Callable[[Tensor], Tensor], value: Callable[[Tensor], Tensor]) -> Window:
         """Collect the next window.
 
-        Args:
-            actor: Mean action before tanh, (B, 2, R, R), from an observation.
-            value: Values (B,) of an observation.
-
-        Raises:
-            NonFiniteError: The actor's actions are not finite.
+        The actor maps observations to mean actions before tanh, (B, 2, R, R), ``value`` to values (B,). A
+        `NonFiniteError` tells of an actor whose actions are not finite.
         """
         env, true_reward = self.env, 0.0
         steps: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []

@@ -165,7 +165,7 @@ class Shac(Algorithm):
         return self.env.soft_observation().float() * (2.0 / 255.0) - 1.0
 
     def value(self, critic: nn.Module, observation: Tensor) -> Tensor:
-        """Values (B,) that a critic gives to inputs (B, ...)."""
+        """Values (B,) that a ``critic`` gives to an ``observation`` (B, ...)."""
         value: Tensor = critic(observation)[..., 0] / max(1.0 - self.config.gamma, 1e-2)
         return value
 
@@ -316,10 +316,6 @@ def actor_loss(window: Window, gamma: float) -> Tensor:
 
     The sum of ``gamma^t r_t`` over the steps of an episode within the window, plus ``gamma^h V(s_h)`` after the last of
     them (Xu et al., ICLR 2022, equation 5).
-
-    Args:
-        window: With its autograd graph.
-        gamma: Discount factor.
     """
     steps = len(window.rewards)
     total, discount = torch.zeros_like(window.rewards[0]), torch.ones_like(window.rewards[0])
@@ -332,13 +328,7 @@ def actor_loss(window: Window, gamma: float) -> Tensor:
 
 @torch.no_grad()
 def td_lambda_targets(window: Window, gamma: float, td_lambda: float) -> Tensor:
-    """TD(lambda) targets (T, B) of the values of a window's observations.
-
-    Args:
-        window: Rewards, values and ends of episodes.
-        gamma: Discount factor.
-        td_lambda: Weight of the following target against the value after a single step.
-    """
+    """TD(lambda) targets (T, B) of the values of a window's observations."""
     targets = torch.empty_like(window.rewards)
     target = window.next_values[-1]
     for step in reversed(range(len(targets))):

@@ -23,12 +23,7 @@ class Objective(Protocol):
 
 
 def make_objective(env: TorchEnv, blur: tuple[float, ...]) -> Objective:
-    """Choose the objective of a task: the silhouette where there is a target picture, otherwise the reward.
-
-    Args:
-        env: The environment.
-        blur: Standard deviations in pixels, see `SilhouetteLoss`.
-    """
+    """Choose the objective of a task: the silhouette where there is a target picture, otherwise the reward."""
     if env.spec.target is None:
         return NegativeReward()
     target = torch.as_tensor(env.spec.target, device=env.device, dtype=env.dtype)
@@ -73,12 +68,7 @@ class SilhouetteLoss:
 
 
 def gaussian_matrix(sigma: float, size: int) -> Tensor:
-    """Gaussian blur along one axis as a matrix (size, size), float64, with zeros beyond the borders.
-
-    Args:
-        sigma: Standard deviation in pixels; 0 is no blur.
-        size: Number of pixels.
-    """
+    """Gaussian blur along one axis as a matrix (size, size), float64, with zeros beyond the borders."""
     if sigma == 0:
         return torch.eye(size, dtype=torch.float64)
     offset = torch.arange(-4 * size, 4 * size + 1, dtype=torch.float64)

@@ -178,7 +178,10 @@ class Gradient(OpenLoopAlgorithm):
         return scalars | {"train/failed": float(self.failed)}
 
     def play(self, progress: float) -> Episode:
-        """Play one episode from the start; a robot whose episode is over no longer counts, whatever becomes of it."""
+        """Play one episode from the start, with the objective at a ``progress`` of 0 to 1 of the stage.
+
+        A robot whose episode is over no longer counts, whatever becomes of it.
+        """
         env, window = self.env, self.config.window or self.horizon
         actions = self.theta.detach().tanh().requires_grad_()
         env.load(self.initial)

@@ -41,17 +41,6 @@ def test_search_finds_what_every_simulation_wants() -> None:
     assert (plan.mean((0, 2, 3, 4)) - target.flatten()).abs().max() < 0.1
 
 
-def test_candidates_persist_and_are_as_coarse_as_asked() -> None:
-    env = small("run", 1, substeps=1)
-    planner = CEMPlanner(env, quick(candidates=400, noise_grid=2, noise_correlation=0.8))
-    noise = planner._noise(torch.zeros(3, 1, 2, 4, 4))
-    assert noise.shape == (3, 1, 400, 2, 4, 4) and (noise[:, :, 0] == 0).all()
-    pairs = torch.corrcoef(torch.stack((noise[0].flatten(), noise[1].flatten())))
-    assert float(pairs[0, 1]) == pytest.approx(0.8, abs=0.05)
-    cells = CEMPlanner(env, quick(candidates=400, noise_grid=4))._noise(torch.zeros(3, 1, 2, 4, 4))
-    assert [float(step.std()) for step in cells] == pytest.approx([1.0] * 3, abs=0.05)
-
-
 def test_simulations_of_a_batch_are_planned_apart() -> None:
     noise = torch.linspace(-1.5, 1.5, 8).view(1, 1, 8, 1, 1, 1).expand(3, 1, 8, 2, 4, 4)
     target = torch.tensor([0.6, -0.4]).view(2, 1, 1, 1)

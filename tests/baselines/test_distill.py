@@ -24,13 +24,12 @@ from baselines.modular.networks import ModularActor
 from baselines.modular.nodes import Nodes
 from baselines.modular.policy import SegmentPolicy
 from baselines.registry import configure
-from cfp.config import to_json
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.process import StopSignals
 from cfp.sections import EnvironmentConfig, ReportConfig
 from cfp.tables import read_table
 from cfp.weights import describe_run, read_policy, write_policy
-from dittogym import TASKS, TorchEnv
+from dittogym import TorchEnv
 from dittogym.action import patch_field, to_grid_indexing
 
 
@@ -90,16 +89,6 @@ class Mirror(Teacher):
         return torch.cat((0.8 * there - 0.4, 0.4 - 0.8 * there), 1)
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("preset", ["quick", "paper"])
-def test_every_preset_is_valid_and_survives_json(task, preset):
-    config = Distill.preset(task, preset)
-    config.check()
-    assert configure(json.loads(json.dumps(to_json(config)))) == config
-    for stage in (1, 2):
-        assert config.actor_spec(stage) == cfp.preset(task, preset).actor_spec(stage)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -132,11 +121,6 @@ def test_actions_are_lost_on_the_grid_on_which_the_student_decides() -> None:
     collector.collect(8, 0.0, lambda seen: torch.ones(2, 2, 64, 64))
     cells = torch.cat(taken).unflatten(3, (16, 4)).unflatten(2, (16, 4)).transpose(3, 4).flatten(4)
     assert (cells == cells[..., :1]).all() and 0.1 < (cells == 0).float().mean() < 0.4
-
-
-def test_every_level_loses_actions_on_its_own_grid() -> None:
-    first = Distill(make())
-    assert [model.collector.grid for model in (first, Distill(make(), 2, first.policy))] == [8, 16]
 
 
 def test_student_meets_faults_and_labels_do_not() -> None:
@@ -256,26 +240,6 @@ def test_round_without_labels_has_no_fresh_loss():
     student.learn(8, EachUpdate(rows.append))
     assert rows[0]["train/fresh_loss"] > 0 and rows[-1]["train/fresh_loss"] is None
     assert rows[-1]["train/labels"] == rows[-2]["train/labels"] and rows[-1]["train/loss"] > 0
-
-
-def test_labels_larger_than_the_student_s_actions_are_kept_on_its_grid():
-    class Fine(Teacher):
-        resolution = 64
-
-        def act(self, env, seen):
-            return torch.rand(env.num_envs, 2, 64, 64)
-
-    student, given = Distill(make()), []
-    student.collector.teacher, collect = Fine(), student.collector.collect
-    student.collector.collect = lambda *options: given.append(collect(*options)) or given[-1]
-    student.learn(8)
-    (kept,), (whole,) = student.dataset.rounds, given
-    assert kept.actions.shape[1:] == (2, 8, 8) and whole.actions.shape[1:] == (2, 64, 64)
-    assert torch.equal(kept.observations, whole.observations)
-    losses = [student.loss(*labels).item() for labels in (kept, whole)]
-    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
-    coarse = Labels(whole.observations, torch.zeros(len(whole.observations), 2, 4, 4))
-    assert student._on_smaller_grid(coarse) is coarse
 
 
 @pytest.mark.parametrize(("given", "wanted"), [(8, 8), (8, 16), (16, 8), (16, 32), (16, 64), (64, 64)])

@@ -1,6 +1,5 @@
 """Open-loop gradient descent, on robots of a few hundred particles."""
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -8,12 +7,9 @@ import torch
 from updates import EachUpdate
 
 from baselines import Gradient, OpenLoop
-from baselines.registry import configure
 from baselines.trajectory.optimise import Episode
-from cfp.config import to_json
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.sections import EnvironmentConfig
-from dittogym import make_spec
 
 TASKS = ("shapematch", "run", "grow", "kick", "dig", "obstacle", "catch", "slot")
 
@@ -28,17 +24,6 @@ def shorten(algorithm, horizon):
     algorithm.horizon = horizon
     algorithm.theta = algorithm.theta.detach()[:horizon].clone().requires_grad_()
     return algorithm
-
-
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("preset", ["quick", "paper"])
-def test_every_preset_is_valid_and_survives_json(task, preset):
-    config = Gradient.preset(task, preset)
-    config.check()
-    assert configure(json.loads(json.dumps(to_json(config)))) == config
-    assert config.ends() == (config.iterations * make_spec(task).horizon,)
-    assert replace(config, polish=2).ends()[1] - config.ends()[0] == 2 * make_spec(task).horizon
-    assert config.resolution(2) == make_spec(task).fine
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from baselines.modular.kmeans import update
 from baselines.modular.networks import ModularActor, ModularCritics
 from baselines.modular.nodes import Nodes, pack, unpack, visible_positions
 from baselines.modular.policy import SegmentPolicy
-from baselines.modular.train import ModularConfig, preset
+from baselines.modular.train import GNN16, ModularConfig
 from baselines.registry import find
 from cfp.agent.losses import Losses
 from cfp.envs.disturbances import Case
@@ -130,7 +130,7 @@ def test_policy_of_a_file_acts_like_the_one_in_training(tmp_path):
     """In the training environment and attached to one of its own, step by step."""
     model = model_of("gnn-16", tmp_path / "run")
     nodes = Nodes(16, True)
-    description = describe_run(preset("gnn-16", "run", "quick"), "gnn-16", 1, 0)
+    description = describe_run(GNN16.preset("run", "quick"), "gnn-16", 1, 0)
     SegmentPolicy(model.networks()[0], nodes, description).save(tmp_path / "a.safetensors")
     policy = baselines.load(tmp_path / "a.safetensors")
     env = TorchEnv("run", 2, 64, particles=200, substeps=2)
@@ -204,7 +204,7 @@ def test_presets_learn_as_the_first_stage_does(algo):
 
 @pytest.mark.parametrize("algo", ["gnn", "gnn-x", "mlp-16", "gnn-1"])
 def test_bad_names_are_refused(algo):
-    with pytest.raises(ConfigError, match=f"algo: got {algo!r}, allowed gnn or transformer"):
+    with pytest.raises(ConfigError, match=f"algo.*{algo}"):
         ModularConfig(algo=algo, task="run").check()
 
 

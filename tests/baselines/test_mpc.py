@@ -75,14 +75,6 @@ def test_learning_stops_with_the_episode() -> None:
     assert len(seen) == 4
 
 
-def test_surrogate_is_synced_only_where_a_plan_is_made(monkeypatch) -> None:
-    mpc, synced = MPC(replace(CONFIG, train_particles=60)), []
-    sync = mpc.surrogate.sync
-    monkeypatch.setattr(mpc.surrogate, "sync", lambda state: synced.append(int(state.steps)) or sync(state))
-    mpc.learn(5)
-    assert synced == [0, 2, 4]  # a plan is carried out for two steps
-
-
 def test_layout_of_the_reference_is_kept() -> None:
     for environment, layout in (
         (ENVIRONMENT, "image"),

@@ -1,6 +1,5 @@
 """Short-horizon actor-critic, on robots of a few hundred particles."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +18,6 @@ from baselines.shac.rollout import Window
 from baselines.shac.train import METRICS, actor_loss, td_lambda_targets
 from cfp.agent.actor import build_actor
 from cfp.agent.spec import ActorSpec
-from cfp.config import to_json
 from cfp.envs.make import make_env
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
 from cfp.evaluation.evaluate import attached, evaluate
@@ -39,17 +37,6 @@ def make(task="run", **changes):
 
 def parameters(algorithm):
     return torch.nn.utils.parameters_to_vector(algorithm.actor.parameters()).detach().clone()
-
-
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("preset", ["quick", "paper"])
-def test_every_preset_is_valid_and_survives_json(task, preset):
-    config = Shac.preset(task, preset)
-    config.check()
-    assert configure(json.loads(json.dumps(to_json(config)))) == config
-    learned = config.environment.for_training(config.train_particles)
-    assert (learned.particles, learned.parity) == ("lite", "clean")
-    assert learned.action_indexing == config.environment.action_indexing == ("grid" if preset == "paper" else "image")
 
 
 @pytest.mark.parametrize(

@@ -143,20 +143,6 @@ def test_an_element_fails_alone(task: str, how: str) -> None:
     assert info["finite"].all() and float(info["reward_terms"]["failure"][1]) == 0.0
 
 
-def test_gradients_of_the_neighbours_do_not_notice() -> None:
-    gradients = []
-    for how in (None, "nan"):
-        env = tiny("kick", 3)
-        env.reset(seed=0)
-        if how is not None:
-            spoil(env, how)
-        drive = actions(env, 2).requires_grad_()
-        sum(env.step(action)[1].sum() for action in drive).backward()
-        gradients.append(drive.grad[:, [0, 2]])
-    assert gradients[0].abs().amax((2, 3, 4)).min() > 0
-    assert_same_bits(*gradients)
-
-
 def test_a_failed_element_of_a_vector_environment_starts_anew() -> None:
     env = BatchEnv("grow", 3, **SMALL)
     env.reset(seed=0)

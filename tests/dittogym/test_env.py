@@ -51,11 +51,6 @@ def test_step_and_info() -> None:
     assert env.unwrapped.state.x.shape == (1, 200, 2)
 
 
-def test_unknown_task_names_the_tasks() -> None:
-    with pytest.raises(ValueError, match=r"task must be one of catch, dig, .*, slot or MODULE:NAME, got 'swim'"):
-        dittogym.Env("swim")
-
-
 def episode(vector: gymnasium.vector.VectorEnv, steps: int) -> list[tuple]:
     first, _ = vector.reset(seed=0)
     action = np.zeros(vector.action_space.shape, np.float32)

@@ -17,7 +17,7 @@ from tiny import SMALL, actions, assert_same_bits, everything, tiny
 import dittogym
 from dittogym.bodies.shapes import Disc, Rectangle
 from dittogym.contract import Moment, Outcome
-from dittogym.geometry import Obstacle, ceiling, floor
+from dittogym.geometry import ceiling, floor
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.tasks import fingerprint
 from dittogym.window import Window
@@ -452,15 +452,6 @@ def test_a_function_that_is_written_anew_takes_the_place_of_the_old_one() -> Non
 def test_numbers_that_would_fail_late_are_refused(changes: dict, error: type, message: str) -> None:
     with pytest.raises(error, match=message):
         dataclasses.replace(hop(), **changes)
-
-
-def test_obstacles_and_windows_check_their_parts() -> None:
-    with pytest.raises(TypeError, match="rules must be a sequence of VelocityRule, got VelocityRule"):
-        Obstacle("ledge", rules=VelocityRule("-y"))
-    with pytest.raises(TypeError, match=r"observed\[0\] must be a Box, got tuple"):
-        Obstacle("ledge", rules=(), observed=((0.0, 1.0),))
-    with pytest.raises(ValueError, match="left must be finite, got nan"):
-        Window(left=math.nan)
 
 
 def test_a_robot_outside_its_window_is_refused() -> None:

@@ -86,16 +86,6 @@ def test_particles_fill_the_mask_evenly(body, particles) -> None:
     assert cells[ELL] == pytest.approx(np.full(ELL.sum(), share), rel=0.07 if particles == 2000 else 0.15)
 
 
-def test_an_outline_and_its_picture_are_nearly_the_same() -> None:
-    shapes = [dittogym.make_spec("run", body=body).robot.shape for body in (ELL_OUTLINE, large())]
-    first, second = (points(shape) for shape in shapes)
-    assert first.mean(0) == pytest.approx(second.mean(0), abs=1e-3)
-    assert first.std(0) == pytest.approx(second.std(0), abs=1e-3)
-    tip = points(dittogym.make_spec("run", body=[(0, 0), (2, 0), (1, 2)]).robot.shape)
-    low, high = tip[:, 1].min(), tip[:, 1].max()
-    assert tip[:, 1].mean() == pytest.approx(low + (high - low) / 3, abs=2e-3)  # y is upwards
-
-
 def test_particle_positions_of_a_picture_pixel_by_pixel() -> None:
     """Speckle, with a random share of the pixels set: every particle lies in one of them."""
     mask = np.random.default_rng(0).random((40, 30)) < 0.5

@@ -118,19 +118,6 @@ def test_bad_observation_sizes(make, size: int) -> None:
         observation_resolution(make(), size)
 
 
-def test_the_limit_is_that_of_what_is_wrapped() -> None:
-    assert action_resolution(single(resolution=32), 32).action_space.shape == (2, 32, 32)
-    with pytest.raises(ValueError, match="size must be at most 16, got 17"):
-        observation_resolution(observation_resolution(single(), 16), 17)
-
-
-def test_actions_that_are_not_finite_are_noticed_behind_the_wrapper() -> None:
-    env = action_resolution(single(disable_env_checker=True), 4)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="action must be finite"):
-        env.step(np.full((2, 4, 4), np.nan, np.float32))
-
-
 # Gymnasium's wrappers.
 
 
