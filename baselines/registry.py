@@ -40,14 +40,13 @@ def find(name: str) -> type[Algorithm]:
     Raises:
         ConfigError: There is none of that name.
     """
-    if isinstance(name, str):
-        name = ALIASES.get(name, name)
-        if name in REFERENCE_POLICIES:
-            raise ConfigError(
-                f"algo: {name!r} is a reference policy, which is not trained; evaluate it with: "
-                f"python -m baselines.compare --algos {name}"
-            )
-    if not isinstance(name, str) or name not in ALGORITHMS:
+    name = ALIASES.get(name, name) if isinstance(name, str) else str(name)
+    if name in REFERENCE_POLICIES:
+        raise ConfigError(
+            f"algo: {name!r} is a reference policy, which is not trained; evaluate it with: "
+            f"python -m baselines.compare --algos {name}"
+        )
+    if name not in ALGORITHMS:
         raise ConfigError(f"algo must be one of {', '.join(ALGORITHMS)}, got {name!r}")
     module, _, attribute = ALGORITHMS[name].partition(":")
     algorithm: type[Algorithm] = getattr(import_module(module), attribute)

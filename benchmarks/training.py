@@ -1,7 +1,7 @@
 """Cost of a training step and its parts: `python benchmarks/training.py`.
 
-Prints seconds per update (batches of the quick and the paper preset, float32 and bfloat16 in turn), training steps per
-second of the quick preset with the shares of simulation, updates and the rest, and environment steps per second alone.
+Prints seconds per update (batches of the quick and the paper preset), training steps per second of the quick preset
+with the shares of simulation, updates and the rest, and environment steps per second alone.
 """
 
 import argparse
@@ -49,33 +49,25 @@ def make_batch(size: int, resolution: int) -> ReplayBufferSamples:
     return ReplayBufferSamples(images[0], actions, images[1], (dones > 2).float(), rewards)
 
 
-def in_turn(cases: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Minimum seconds of each case; the cases take turns, so that other programs slow down all of them alike."""
-    least = dict.fromkeys(cases, float("inf"))
-    for number in range(rounds + 2):  # two rounds for warming up
-        for name, run in cases.items():
-            start = time.perf_counter()
-            run()
-            if number > 1:
-                least[name] = min(least[name], time.perf_counter() - start)
-    return least
+def minimum_seconds(function: Callable[[], object], repeats: int) -> float:
+    """Minimum seconds of a call."""
+    seconds = []
+    for _ in range(repeats + 2):  # two calls for warming up
+        start = time.perf_counter()
+        function()
+        seconds.append(time.perf_counter() - start)
+    return min(seconds[2:])
 
 
-def updates(config: Config, modes: list[str], rounds: int) -> None:
+def updates(config: Config, repeats: int) -> None:
     """Print seconds per update."""
-    print("| stage | batch | " + " | ".join(modes) + f" | {modes[-1]} : {modes[0]} |")
-    print("| --- " * (3 + len(modes)) + "|")
+    print("| stage | batch | seconds |")
+    print("| --- " * 3 + "|")
     for stage in (1, 2):
+        model = make_model(config, stage, 1)
         for size in (64, 256):
-            batch, cases = make_batch(size, config.resolution(stage)), {}
-            for mode in modes:
-                precision, _, compiled = mode.partition("+")
-                learning = replace(config.learning, precision=precision, compile=bool(compiled))
-                model = make_model(replace(config, learning=learning), stage, 1)
-                cases[mode] = partial(model.update, batch)
-            least = list(in_turn(cases, rounds).values())
-            numbers = " | ".join(f"{value:.4f}" for value in least)
-            print(f"| {stage} | {size} | {numbers} | {least[-1] / least[0]:.2f} |", flush=True)
+            batch = make_batch(size, config.resolution(stage))
+            print(f"| {stage} | {size} | {minimum_seconds(partial(model.update, batch), repeats):.4f} |", flush=True)
 
 
 @contextmanager
@@ -97,8 +89,8 @@ def timed(owner: object, name: str, clock: dict[str, float]) -> Iterator[None]:
 
 def training(config: Config, steps: int) -> None:
     """Print training steps per second and the shares of their parts."""
-    print("| stage | robots | updates per step | precision | training steps/s | simulation | updates | rest |")
-    print("| --- " * 8 + "|")
+    print("| stage | robots | updates per step | training steps/s | simulation | updates | rest |")
+    print("| --- " * 7 + "|")
     for stage in (1, 2):
         for num_envs, gradient_steps in ((1, 1), (config.environment.num_envs, config.learning.gradient_steps)):
             learning = replace(config.learning, gradient_steps=gradient_steps)
@@ -110,8 +102,7 @@ def training(config: Config, steps: int) -> None:
                 total = time.perf_counter() - start
             simulation, update = clock["step"] / total, clock["train"] / total
             shares = " | ".join(f"{100 * share:.0f} %" for share in (simulation, update, 1 - simulation - update))
-            precision = "bfloat16" if model.losses.bfloat16 else "float32"
-            head = f"| {stage} | {num_envs} | {gradient_steps} | {precision}"
+            head = f"| {stage} | {num_envs} | {gradient_steps}"
             print(f"{head} | {steps * num_envs / total:.1f} | {shares} |", flush=True)
 
 
@@ -123,26 +114,23 @@ def environments(steps: int) -> None:
         )
         env.reset(seed=0)
         action = np.asarray(env.action_space.sample())
-        least = in_turn({"step": lambda env=env, action=action: env.step(action)}, steps)["step"]
-        print(f"make_vec, {count} x lite RUN: {count / least:.0f} environment steps/s")
+        seconds = minimum_seconds(partial(env.step, action), steps)
+        print(f"make_vec, {count} x lite RUN: {count / seconds:.0f} environment steps/s")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--compile", action="store_true", help="also compiled updates")
     parser.add_argument("--rounds", type=int, default=12, help="repeats of an update and of a step")
     parser.add_argument("--steps", type=int, default=12, help="batched training steps")
-    parser.add_argument("--precision", default="auto", help="of the updates in training steps")
     parser.add_argument("--skip", nargs="*", default=[], choices=("updates", "training", "environments"))
     arguments = parser.parse_args()
     keep_memory()
     print(f"torch {torch.__version__}, {torch.get_num_threads()} threads")
     config = preset("shapematch")
     if "updates" not in arguments.skip:
-        modes = ["float32", "bfloat16"] + ["float32+compile", "bfloat16+compile"] * arguments.compile
-        updates(config, modes, arguments.rounds)
+        updates(config, arguments.rounds)
     if "training" not in arguments.skip:
-        training(replace(config, learning=replace(config.learning, precision=arguments.precision)), arguments.steps)
+        training(config, arguments.steps)
     if "environments" not in arguments.skip:
         environments(arguments.steps)
 

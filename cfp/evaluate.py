@@ -60,7 +60,7 @@ class Selection:
         """
         check_at_least(1, episodes=self.episodes)
         if (self.folder is None) == (self.policy is None):
-            raise ConfigError(f"policy: got {self.policy!r} and the folder {self.folder}, allowed is one of the two")
+            raise ConfigError(f"either policy or a folder must be given, got {self.policy!r} and {self.folder}")
         if self.folder is not None:
             config, policies = open_run(program, self.folder, self.device, self.seed)
         else:
@@ -113,11 +113,11 @@ def open_run(
     for (name, policy), path in zip(policies.items(), files.values(), strict=True):
         found, stage = (policy.description["task"], policy.description["resolution"]), policy.description["stage"]
         if stage > len(config.ends()):
-            raise CheckpointError(f"{path}: got a policy of stage {stage}, allowed 1 to {len(config.ends())}")
+            raise CheckpointError(f"{path}: stage must be between 1 and {len(config.ends())}, got {stage}")
         wanted = config.task, config.resolution(stage)
         if found != wanted:
             given, allowed = (f"{task} on a grid of {grid}" for task, grid in (found, wanted))
-            raise CheckpointError(f"{path}: got a policy for {given}, allowed in {name} of this run is {allowed}")
+            raise CheckpointError(f"{path}: {name} of this run must be a policy for {allowed}, got one for {given}")
     return config, policies
 
 

@@ -81,7 +81,7 @@ def read_json(path: Path) -> dict[str, Any]:
         raise ValueError(f"it is larger than {LARGEST_JSON} bytes")
     value = parse_json(content.decode())
     if not isinstance(value, dict):
-        raise ValueError(f"it holds {type(value).__name__}, allowed an object with named values")
+        raise ValueError(f"it must hold an object, got {type(value).__name__}")
     return value
 
 

@@ -63,14 +63,14 @@ class Command(Selection):
         """
         check_at_least(1, latency=self.latency)
         if self.out is None and self.folder is None:
-            raise ConfigError("out: got none, allowed with a single policy is a folder to write into")
+            raise ConfigError("out must be given with a single policy: the folder to write into")
         for name in ("dropout", "shift"):
             if not 0 < getattr(self, name) < 1:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, allowed between 0 and 1")
+                raise ConfigError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if not 0 < self.noise < math.inf:
-            raise ConfigError(f"noise: got {self.noise}, allowed more than 0")
+            raise ConfigError(f"noise must be positive and finite, got {self.noise}")
         if not all(value >= 0 for value in self.friction):
-            raise ConfigError(f"friction: got {self.friction}, allowed 0 or more, inf sticks")
+            raise ConfigError(f"friction must be at least 0 (inf sticks), got {self.friction}")
 
 
 def choose(cases: Sequence[Case], words: Sequence[str]) -> list[Case]:
@@ -81,7 +81,7 @@ def choose(cases: Sequence[Case], words: Sequence[str]) -> list[Case]:
     """
     for word in words:
         if not any(word in case.name for case in cases[1:]):
-            raise ConfigError(f"cases: got {word!r}, allowed words of {', '.join(case.name for case in cases[1:])}")
+            raise ConfigError(f"cases must be words of {', '.join(case.name for case in cases[1:])}, got {word!r}")
     return [*cases[:1], *(case for case in cases[1:] if not words or any(word in case.name for word in words))]
 
 
@@ -97,7 +97,7 @@ def check_words(cases: Sequence[Case], words: Sequence[str], spec: TaskSpec, pol
         }
         if all(reasons.values()):
             told = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
-            raise ConfigError(f"cases: got {word!r}, allowed words of cases that change something ({told})")
+            raise ConfigError(f"cases must be words of cases that change something, got {word!r} ({told})")
 
 
 def report(

@@ -93,4 +93,4 @@ def _check_number(path: Path, column: str, text: str | None) -> None:
     try:
         float(text or "")
     except ValueError as error:
-        raise CheckpointError(f"{path}: got {text!r} in column {column}, allowed is a number") from error
+        raise CheckpointError(f"{path}: column {column} must hold numbers, got {text!r}") from error

@@ -29,7 +29,7 @@ class OpenLoop:
 
     def __init__(self, actions: Tensor, description: dict[str, Any] | None = None) -> None:
         if actions.ndim != 4 or actions.shape[1] != 2 or actions.shape[2] != actions.shape[3]:
-            raise ValueError(f"actions: got shape {tuple(actions.shape)}, allowed (T, 2, R, R)")
+            raise ValueError(f"actions must have shape (T, 2, R, R), got {tuple(actions.shape)}")
         self.actions = actions.detach().float().cpu()
         self.description = description or {}
 

@@ -25,7 +25,9 @@ class LevelConfig(Config):
     def check(self) -> None:
         """Check what the types cannot, see `cfp.config.RunConfig.check`."""
         if len(self.resolutions) != 1:
-            raise ConfigError(f"resolutions: got {self.resolutions}, allowed is one; --algo cfp trains a ladder")
+            raise ConfigError(
+                f"resolutions must have one value, got {self.resolutions}; --algo cfp trains several stages"
+            )
         super().check()
 
 

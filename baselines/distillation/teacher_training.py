@@ -37,7 +37,7 @@ def copy_teacher(config: DistillConfig, folder: Path) -> None:
         if Path(teacher).exists():
             raise
         names = ", ".join(("mpc", *TRAINED, *shipped()))
-        raise ConfigError(f"teacher: got {teacher!r}, allowed {names}, a run folder or a policy.safetensors") from error
+        raise ConfigError(f"teacher must be {names}, a run folder or a policy.safetensors, got {teacher!r}") from error
     write_policy(teacher_path(folder), *read_policy(teacher))
 
 

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from baselines.modular.nodes import unpack
 from cfp.agent.actor import Sample, SquashedActor, sample_squashed_gaussian
-from cfp.agent.networks import at_least_float32, initialise
+from cfp.agent.networks import initialise
 
 Kind = Literal["gnn", "transformer"]
 WIDTH = 128
@@ -82,7 +82,7 @@ class ModularActor(SquashedActor):
 
     def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
         """Draw actions (B, K, 2) for rows (B, K, columns)."""
-        mean, width = at_least_float32(self.head(self.trunk(observation))).chunk(2, -1)
+        mean, width = self.head(self.trunk(observation)).chunk(2, -1)
         return Sample(*sample_squashed_gaussian(mean, width, deterministic), None)
 
 
@@ -104,7 +104,7 @@ class ModularCritics(nn.Module):
         """Both Q-values, (B, 1) each, of rows (B, K, columns) and actions (B, K, 2) or (B, 2 K)."""
         values = action.reshape(*observation.shape[:2], 2)
         pairs = zip(self.trunks, self.values, strict=True)
-        return tuple(at_least_float32(value(trunk(observation, values).mean(1))) for trunk, value in pairs)
+        return tuple(value(trunk(observation, values).mean(1)) for trunk, value in pairs)
 
     def set_training_mode(self, mode: bool) -> None:
         """Switch between training and evaluation; stable-baselines3 calls it, no layer depends on it."""

@@ -15,7 +15,6 @@ from cfp.agent.networks import (
     IMAGE_SIZE,
     Encoder,
     PairEncoder,
-    at_least_float32,
     initialise,
     make_head,
     normalise_image,
@@ -112,13 +111,9 @@ class Actor(SquashedActor):
     def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
         """Sample an action for uint8 observations (B, 3, 64, 64)."""
         latent = self.encoder(normalise_image(observation))
-        mean, raw_std = self._decode(latent, self.mean, self.std)
+        mean, raw_std = fused.decode([self.mean, self.std], latent)
         action, log_prob = sample_squashed_gaussian(mean, raw_std, deterministic)
         return Sample(action, log_prob, None, (action,))
-
-    @staticmethod
-    def _decode(latent: Tensor, *heads: nn.Sequential) -> list[Tensor]:
-        return [at_least_float32(output) for output in fused.decode(heads, latent)]
 
 
 class ResidualActor(Actor):
@@ -147,7 +142,7 @@ class ResidualActor(Actor):
             coarse = self._enlarge(coarse_sample.action)
         patch = upsample(coarse, IMAGE_SIZE, self.interpolation)
         latent = self.encoder(normalise_image(observation), patch)
-        mean, raw_std, gate_logit = self._decode(latent, self.mean, self.std, self.gate)
+        mean, raw_std, gate_logit = fused.decode([self.mean, self.std, self.gate], latent)
         residual, log_prob = sample_squashed_gaussian(mean, raw_std, deterministic)
         gate = self.gate_scale * torch.sigmoid(gate_logit + self.gate_bias)
         action = blend(coarse, residual, gate, self._enlarge)

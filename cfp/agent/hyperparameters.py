@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 from cfp.validation import check_at_least, check_fraction, check_positive
-
-Precision = Literal["auto", "float32", "bfloat16"]
 
 
 @dataclass(frozen=True)
@@ -38,11 +35,6 @@ class LearningConfig:
     """Momentum of the running mean and variance of the rewards."""
     max_grad_norm: float = 10.0
     """Largest gradient norm of each parameter tensor."""
-    precision: Precision = "float32"
-    """Precision of convolutions and matrix products in updates: float32, bfloat16, or auto (bfloat16 on CPUs that
-    support it)."""
-    compile: bool = False
-    """Run the updates through torch.compile."""
     warm_critic: bool = False
     """Initialise critics and reward statistics of each stage from the previous one, instead of anew."""
 

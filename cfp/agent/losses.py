@@ -1,24 +1,13 @@
-"""The losses of soft actor-critic, in the precision and execution mode that a run asks for."""
+"""The losses of soft actor-critic (Haarnoja et al., 2018), with the gate penalty of the paper."""
 
 from __future__ import annotations
-
-import functools
-import logging
-from collections.abc import Callable
-from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from cfp.agent.actor import Actor
-from cfp.agent.hyperparameters import Precision
-from cfp.agent.networks import TwinCritic, normalise_image
-from torchmpm.backends import compiler_found
-
-Function = TypeVar("Function", bound=Callable[..., Any])
-
-_logger = logging.getLogger(__name__)
+from cfp.agent.networks import TwinCritic
 
 
 def critic_target(
@@ -32,14 +21,7 @@ def critic_target(
 ) -> Tensor:
     """Regression target ``y = r + c gamma (min Q'(s', a') - alpha log pi(a'|s'))``, (B, 1), without gradient.
 
-    Args:
-        actor: Samples a'.
-        target: Target critics Q'.
-        next_obs: Next observations s', (B, 3, 64, 64).
-        rewards: Normalised rewards r, (B, 1).
-        not_done: Continuation flag c, (B, 1); 1 at a time limit.
-        alpha: Temperature.
-        gamma: Discount factor.
+    The rewards r are normalised; the continuation flag c (``not_done``) is 1 at a time limit.
     """
     with torch.no_grad():
         sample = actor.sample(next_obs)
@@ -61,19 +43,10 @@ def actor_loss(
     origin: Actor | None = None,
     anchor: float = 0.0,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Mean of ``alpha log pi - min Q`` plus penalties.
+    """Mean of ``alpha log pi - min Q`` plus penalties, and scalars to log (see `cfp.agent.sac.METRICS`).
 
-    Args:
-        actor: Actor to improve.
-        critic: Critics of its actions.
-        obs: Observations (B, 3, 64, 64).
-        alpha: Temperature.
-        gate_penalty: Weight of the gate penalty.
-        origin: Actor to stay close to, with the same action grid.
-        anchor: Weight of the mean squared difference between the actions and the mean actions of ``origin``.
-
-    Returns:
-        The loss, and scalars to log (see `cfp.agent.sac.METRICS`).
+    ``gate_penalty`` weighs the gate of a residual actor, ``anchor`` the mean squared difference between the actions and
+    the mean actions of ``origin``, an actor to stay close to.
     """
     action, log_prob, gate, _ = actor.sample(obs)
     q_values = torch.minimum(*critic(obs, action))
@@ -90,89 +63,3 @@ def actor_loss(
         loss = loss + anchor * drift
         scalars["drift"] = drift.detach()
     return loss, scalars
-
-
-class Losses:
-    """`critic_target`, `critic_loss` and `actor_loss` in a given precision, compiled if asked for.
-
-    In bfloat16 only convolutions and matrix products are computed: weights and their gradients, optimisers, densities,
-    rewards and the losses themselves stay in float32.
-
-    Args:
-        device: Device of the networks.
-        precision: See `choose_precision`.
-        compile: Run the losses through ``torch.compile``. Where that is impossible a warning is logged and they run
-            eagerly.
-
-    Raises:
-        ValueError: There is no such precision.
-    """
-
-    def __init__(self, device: torch.device, precision: Precision = "float32", compile: bool = False) -> None:
-        self.device = device
-        self.bfloat16 = choose_precision(precision, device) == "bfloat16"
-        if compile and device.type == "cpu" and not compiler_found():
-            _logger.warning("updates are not compiled, only slower: no C++ compiler (g++, clang++ or $CXX) was found")
-            compile = False
-        self.critic_target = self._prepare(critic_target, compile)
-        self.critic_loss = self._prepare(critic_loss, compile)
-        self.actor_loss = self._prepare(actor_loss, compile)
-
-    def prepare(self, observation: Tensor) -> Tensor:
-        """Normalise uint8 observations (B, 3, 64, 64) once for all networks of an update, in their precision.
-
-        Observations of other types are returned as they are: some contain codes, of which every bit counts.
-        """
-        image = normalise_image(observation)
-        return image.bfloat16() if self.bfloat16 and observation.dtype == torch.uint8 else image
-
-    def _prepare(self, function: Function, compile: bool) -> Function:
-        @functools.wraps(function)
-        def run(*arguments: Any) -> Any:
-            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
-                return function(*arguments)
-
-        return _compiled(run) if compile else run  # type: ignore[return-value]
-
-
-def choose_precision(precision: Precision, device: torch.device) -> str:
-    """Resolve ``"auto"``: bfloat16 on a CPU with instructions for it, float32 everywhere else.
-
-    Raises:
-        ValueError: There is no such precision.
-    """
-    if precision == "auto":
-        return "bfloat16" if device.type == "cpu" and _multiplies_bfloat16() else "float32"
-    if precision not in ("float32", "bfloat16"):
-        raise ValueError(f"precision must be 'auto', 'float32' or 'bfloat16', got {precision!r}")
-    return precision
-
-
-def _multiplies_bfloat16() -> bool:
-    """Whether this CPU has bfloat16 instructions; torch emulates them elsewhere, slower than float32.
-
-    Versions of torch without ``torch.cpu.get_capabilities`` do not tell; they count as no.
-    """
-    capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
-    return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16"))
-
-
-def _compiled(function: Function) -> Function:
-    """``function``, compiled at its first call for each shape; itself from the first failure on."""
-    # Noise comes from torch's own generator, as without compilation, so that a resumed run samples the same.
-    fast = torch.compile(function, dynamic=False, options={"fallback_random": True})
-    failed = False
-
-    @functools.wraps(function)
-    def run(*arguments: Any) -> Any:
-        nonlocal failed
-        if not failed:
-            try:
-                return fast(*arguments)
-            except RuntimeError as error:  # the base class of all of torch.compile's errors
-                failed = True
-                reason = str(error).strip().splitlines()[0]
-                _logger.warning("updates are not compiled, only slower: torch.compile failed (%s)", reason)
-        return function(*arguments)
-
-    return run  # type: ignore[return-value]

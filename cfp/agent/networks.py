@@ -49,11 +49,6 @@ def normalise_image(observation: Tensor) -> Tensor:
     return observation.float().mul_(2.0 / 255.0).sub_(1.0)
 
 
-def at_least_float32(output: Tensor) -> Tensor:
-    """Convert the output of a network to the precision that densities, losses and statistics need."""
-    return output.to(torch.promote_types(output.dtype, torch.float32))
-
-
 def initialise(module: nn.Module) -> nn.Module:
     """Initialise linear layers Xavier-uniform with zero bias; convolutions keep PyTorch's default."""
     for layer in module.modules():
@@ -182,7 +177,7 @@ class TwinCritic(nn.Module):
         image = normalise_image(observation)
         action = action.reshape(-1, 2, self.resolution, self.resolution)
         patch = upsample(action, IMAGE_SIZE, self.interpolation)
-        return tuple(at_least_float32(self._q_values(image, patch)))
+        return tuple(self._q_values(image, patch))
 
     def _q_values(self, image: Tensor, patch: Tensor) -> Tensor:
         """The results (2, B, 1) of `Critic.forward`, computed for both critics at once."""

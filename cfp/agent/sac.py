@@ -23,8 +23,8 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from cfp.agent.actor import Actor
 from cfp.agent.composition import Composition
 from cfp.agent.hyperparameters import Hyperparameters
-from cfp.agent.losses import Losses
-from cfp.agent.networks import TwinCritic, upsample
+from cfp.agent.losses import actor_loss, critic_loss, critic_target
+from cfp.agent.networks import TwinCritic, normalise_image, upsample
 from cfp.agent.policies import CFPPolicy, NetworkPolicy
 from cfp.agent.replay import ReplayRing
 from cfp.errors import NonFiniteError
@@ -132,9 +132,7 @@ class CFP(SAC):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        own = self.hyperparameters
-        self.reward_statistics = RewardStatistics(own.reward_momentum).to(self.device)
-        self.losses = Losses(self.device, own.precision, own.compile)
+        self.reward_statistics = RewardStatistics(self.hyperparameters.reward_momentum).to(self.device)
         self.update_average = get_ema_multi_avg_fn(1 - self.tau)
 
     def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
@@ -168,7 +166,7 @@ class CFP(SAC):
 
     def update(self, batch: ReplayBufferSamples) -> dict[str, Tensor]:
         """Perform one update; returns scalars by name, see `METRICS`."""
-        obs, next_obs = map(self.losses.prepare, (batch.observations, batch.next_observations))
+        obs, next_obs = normalise_image(batch.observations), normalise_image(batch.next_observations)
         scalars = self._update_critic(obs, next_obs, batch)
         if self.num_timesteps >= self.hyperparameters.actor_start:
             scalars |= self._update_actor(obs)
@@ -181,10 +179,8 @@ class CFP(SAC):
     def _update_critic(self, obs: Tensor, next_obs: Tensor, batch: ReplayBufferSamples) -> dict[str, Tensor]:
         actor, critic, target = self.networks()
         rewards, not_done = self.reward_statistics(batch.rewards), 1 - batch.dones
-        target_q = self.losses.critic_target(
-            actor, target, next_obs, rewards, not_done, self.ent_coef_tensor, self.gamma
-        )
-        loss = self.losses.critic_loss(critic, obs, batch.actions, target_q)
+        target_q = critic_target(actor, target, next_obs, rewards, not_done, self.ent_coef_tensor, self.gamma)
+        loss = critic_loss(critic, obs, batch.actions, target_q)
         self._descend(loss, critic.optimizer, list(critic.parameters()), "critic")
         return {"critic_loss": loss.detach(), "q_target": target_q.mean()}
 
@@ -192,9 +188,7 @@ class CFP(SAC):
         actor, critic, _ = self.networks()
         own = self.hyperparameters
         critic.requires_grad_(False)  # avoids computing weight gradients of the critics, which would be discarded
-        loss, scalars = self.losses.actor_loss(
-            actor, critic, obs, self.ent_coef_tensor, own.gate_penalty, self.origin, own.anchor
-        )
+        loss, scalars = actor_loss(actor, critic, obs, self.ent_coef_tensor, own.gate_penalty, self.origin, own.anchor)
         self._descend(loss, actor.optimizer, actor.trainable_parameters(), "actor")
         critic.requires_grad_(True)
         return scalars | {"actor_loss": loss.detach()}
@@ -279,4 +273,4 @@ class CFP(SAC):
         return [*modules, "reward_statistics"], tensors
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "reward_statistics", "losses", "origin", "update_average"]
+        return [*super()._excluded_save_params(), "reward_statistics", "origin", "update_average"]

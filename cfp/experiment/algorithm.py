@@ -146,7 +146,7 @@ class Algorithm(ABC):
         self.logger = logger
 
     def warm_start(self, previous: Any) -> None:  # noqa: B027  (most algorithms hand over a policy only)
-        """Take from the algorithm of the stage before what a new one shall have besides its policy."""
+        """Take what a new stage needs from the algorithm of the ``previous`` one, besides its policy."""
 
     @property
     def finished(self) -> bool:

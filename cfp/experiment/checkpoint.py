@@ -81,7 +81,7 @@ class Checkpoint:
             ) from error
         if not isinstance(state, dict) or state.get("version") != VERSION:
             found = state.get("version") if isinstance(state, dict) else type(state).__name__
-            raise CheckpointError(f"{self.path}: got checkpoint version {found}, allowed {VERSION}")
+            raise CheckpointError(f"{self.path}: checkpoint version must be {VERSION}, got {found}")
         try:
             parse_json(state["config"])
             if min(state["stage"] - 1, state["offset"], state["num_timesteps"]) < 0:

@@ -76,8 +76,6 @@ class SACAlgorithm(Algorithm):
             networks: Options of the networks.
             hyperparameters: Of the stage.
         """
-        if hyperparameters.compile:
-            print("compiling the updates; the first time on a machine this takes minutes ...", flush=True)
         model = CFP(
             policy,
             env,
@@ -170,10 +168,10 @@ class CoarseToFine(SACAlgorithm):
         policy, refine = policy_for(config, config.start_from), config.refine
         levels, resolutions = len(policy.spec.resolutions), config.resolutions
         if policy.spec.resolutions != resolutions[:levels] or (levels == len(resolutions) and not refine):
-            allowed = f"the first of {resolutions}" + ("" if refine else " but the last")
-            raise ConfigError(f"start_from: got a policy of levels {policy.spec.resolutions}, allowed {allowed}")
+            allowed = f"the first resolutions of {resolutions}" + ("" if refine else ", but not all")
+            raise ConfigError(f"start_from must be a policy of {allowed}, got {policy.spec.resolutions}")
         if levels > 1 and policy.spec != (allowed_spec := config.actor_spec(levels)):
-            raise ConfigError(f"start_from: got networks {policy.spec}, allowed {allowed_spec}")
+            raise ConfigError(f"start_from must have networks {allowed_spec}, got {policy.spec}")
         stage = levels if refine else levels + 1
         copy = _start_path(folder) if refine else policy_path(folder, levels)
         write_policy(copy, *read_policy(config.start_from))

@@ -71,7 +71,7 @@ def check_trackers(config: RunConfig) -> None:
         import_wandb(report.wandb)
     if report.video_every and not available():
         raise ConfigError(
-            f"video_every: got {report.video_every}, allowed 0 without imageio and its ffmpeg; install them with: "
+            f"video_every must be 0 without imageio and its ffmpeg, got {report.video_every}; install them with: "
             "pip install 'torchmpm[video]'"
         )
 
@@ -86,7 +86,7 @@ def import_wandb(mode: str) -> ModuleType:
         return importlib.import_module("wandb")
     except ImportError as error:
         raise ConfigError(
-            f"wandb: got {mode!r}, allowed without the package wandb is only 'off'; install it with: "
+            f"wandb must be 'off' without the package wandb, got {mode!r}; install it with: "
             "pip install 'torchmpm[wandb]'"
         ) from error
 

@@ -81,7 +81,7 @@ class ReplayArchive:
         covered = oldest
         for chunk in self.chunks:
             if Path(chunk.file).name != chunk.file:
-                raise CheckpointError(f"{self.folder}: got a chunk {chunk.file!r}, allowed are files in this folder")
+                raise CheckpointError(f"{self.folder}: chunks must be files in this folder, got {chunk.file!r}")
             first = max(oldest, chunk.start)
             if first != covered:
                 raise CheckpointError(f"{self.folder}: rows {covered} to {first} of the replay buffer are missing")
@@ -89,7 +89,7 @@ class ReplayArchive:
             for name, values in _read_arrays(self.folder / chunk.file).items():
                 ring = getattr(buffer, name)
                 if values.shape[1:] != ring.shape[1:]:
-                    raise ValueError(f"{chunk.file}: got {name} of shape {values.shape[1:]}, allowed {ring.shape[1:]}")
+                    raise ValueError(f"{chunk.file}: {name} must have shape {ring.shape[1:]}, got {values.shape[1:]}")
                 ring[index] = values[first - chunk.start :]
             covered = chunk.stop
         if covered != rows:

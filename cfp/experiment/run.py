@@ -79,7 +79,7 @@ class Run:
     ) -> None:
         check_options(config)
         if holds_run(folder) and not resume:
-            raise ConfigError(f"out: {folder} already holds a run, allowed with --resume; or name another folder")
+            raise ConfigError(f"out: {folder} already holds a run; continue it with --resume, or name another folder")
         self.algorithm, self.config, self.folder, self.signals = algorithm, config, folder, signals
         self.stages, self.evaluation_seconds = len(config.ends()), 0.0
         self.checkpoint = Checkpoint(folder / "checkpoint")

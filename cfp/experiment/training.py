@@ -151,7 +151,7 @@ def _train(program: Program, arguments: Sequence[str], started: str) -> None:
     folder, config = command.out, command.run
     assert folder is not None
     if folder.exists() and not folder.is_dir():
-        raise ConfigError(f"out: {folder} is a file, allowed is a folder")
+        raise ConfigError(f"out must be a folder, got the file {folder}")
     if command.resume and not holds_run(folder):
         print(f"{folder} holds no run yet: starting afresh")
     if command.dry_run:

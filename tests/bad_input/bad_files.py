@@ -107,13 +107,9 @@ POLICIES = [
     policy("of stage -1", "stage must be between 1 and", changes={"stage": -1}),
     policy("for an unknown environment", "environment.colour is not an option", changes={"environment": {"colour": 1}}),
     policy("without a network", "do not match", changes={"network": {}}),
-    policy(
-        "with an unknown network", "do not match", "network.colour is not an option", changes={"network": {"colour": 1}}
-    ),
-    policy(
-        "with a grid of 7", "resolutions must be increasing values of (4, 8", changes={"network": {"resolutions": [7]}}
-    ),
-    policy("with a patch of a mile", "and 128, got 1000000", changes={"network": {"resolutions": [8], "patch": 10**6}}),
+    policy("with an unknown network", "do not match", "network.colour is not an", changes={"network": {"colour": 1}}),
+    policy("with a grid of 7", "resolutions must be increasing values of", changes={"network": {"resolutions": [7]}}),
+    policy("with a patch of a mile", "and 128, got 1000", changes={"network": {"resolutions": [8], "patch": 10**6}}),
     policy("of NaN", "got NaN or infinity", weights=first(lambda tensor: tensor * float("nan"))),
     policy("of other shapes", "do not match", "size mismatch", weights=first(lambda tensor: tensor[..., :1])),
     policy(
@@ -136,7 +132,7 @@ POLICIES = [
             lambda desk: desk.policy({"kind": "alchemy"}),
             lambda desk: baselines.load(desk.folder / "stranger.safetensors"),
         ),
-        ("algo must be one of cfp, coarse", "got 'alchemy'"),
+        ("algo must be one of cfp, coarse",),
     ),
 ]
 
@@ -200,15 +196,15 @@ RUNS = [
     resumed("a checkpoint cut short", cut("checkpoint/state.pt"), "state.pt: the checkpoint is damaged"),
     resumed(
         "a checkpoint that runs code",
-        lambda folder: torch.save({"version": 1, "x": Stranger()}, folder / "checkpoint" / "state.pt"),
+        lambda folder: torch.save({"version": 2, "x": Stranger()}, folder / "checkpoint" / "state.pt"),
         "state.pt: the checkpoint is damaged (UnpicklingError)",
     ),
-    resumed("a checkpoint of version 99", state(version=99), "got checkpoint version 99"),
-    resumed("a checkpoint without a model", state(algorithm=None), "KeyError: 'algorithm'"),
+    resumed("a checkpoint of version 99", state(version=99), "checkpoint version must be 2, got 99"),
+    resumed("a checkpoint without a model", state(algorithm=None), "does not fit this program (KeyError: 'algorithm')"),
     resumed("a checkpoint before its time", state(offset=-5), "does not fit this program", "negative"),
-    resumed("a checkpoint of stage 8", state(stage=8), "does not fit this program", "stage 8"),
+    resumed("a checkpoint of stage 8", state(stage=8), "does not fit this program", "it is of stage 8"),
     resumed("a checkpoint of another task", state(config='{"task": "run"}'), "task: the run was started with 'run'"),
-    resumed("a chunk outside", chunk_outside, "got a chunk '../../../secret.npz', allowed are files in this folder"),
+    resumed("a chunk outside", chunk_outside, "chunks must be files in this folder, got '../../../secret.npz'"),
     resumed("a chunk of objects", chunk_of_objects, "this part of the replay buffer is missing or damaged"),
     resumed("broken options", write("config.json", "{"), "config.json: cannot be read"),
     evaluated("no options", lambda folder: (folder / "config.json").unlink(), "there is no run (no config.json)"),
@@ -230,13 +226,11 @@ CONFIGS = [
     file_of_options("in another encoding", b"\xff\xfe{\x00}\x00", "options.json cannot be read", "utf-8"),
     file_of_options("nested too deeply", "[" * 99_999, "options.json cannot be read as JSON (it is nested too deeply)"),
     file_of_options("too large", " " * (2**20 + 1), "options.json cannot be read", "larger than 1048576 bytes"),
-    file_of_options("of a list", "[1]", "cannot be read as JSON (it holds list, allowed an object"),
+    file_of_options("of a list", "[1]", "cannot be read as JSON (it must hold an object, got list"),
     file_of_options("with an unknown name", '{"stepz": 1}', "stepz is not an option"),
     file_of_options("with a group of nothing", '{"learning": null}', "learning must be an object, got None"),
     file_of_options("with steps as text", '{"steps": "x"}', "steps must be an integer, got 'x'"),
-    file_of_options(
-        "with a rate of NaN", '{"learning": {"learning_rate": NaN}}', "learning_rate must be finite, got nan"
-    ),
+    file_of_options("with a rate of NaN", '{"learning": {"learning_rate": NaN}}', "learning_rate must be finite,"),
     file_of_options("with half particles", '{"environment": {"particles": [1.5, 2]}}', "a list of 2, each an integer"),
     Case(
         "config file missing",

@@ -7,8 +7,10 @@ from test_compare import PLAN, compare
 
 from baselines.compare.__main__ import main
 from baselines.compare.evaluations import Protocol
-from baselines.compare.jobs import make_jobs, resolve
+from baselines.compare.jobs import Job, make_jobs, resolve
 from baselines.compare.plan import Plan
+from baselines.compare.worker import decode, encode
+from baselines.registry import configure
 
 
 @pytest.mark.parametrize(
@@ -80,3 +82,9 @@ def test_plan_file_that_is_none_is_named(tmp_path, capsys):
     assert "must hold common, tasks and algos only, got runs" in capsys.readouterr().err
     assert main(["--plan", str(tmp_path / "missing.json")]) == 2
     assert "cannot be read as JSON" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("tier", ["lite", 100, (100, 50)])
+def test_job_is_the_same_in_another_process(tmp_path, tier):
+    job = Job("mine", configure({"algo": "cem", "task": "kick"}), tmp_path, Protocol(3, tier, "all", "with"))
+    assert decode(encode(job, 1.5).decode()) == (job, 1.5)

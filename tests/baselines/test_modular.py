@@ -13,11 +13,10 @@ import cfp
 from baselines.modular.env import segment
 from baselines.modular.kmeans import update
 from baselines.modular.networks import ModularActor, ModularCritics
-from baselines.modular.nodes import Nodes, pack, unpack, visible_positions
+from baselines.modular.nodes import Nodes, pack, visible_positions
 from baselines.modular.policy import SegmentPolicy
 from baselines.modular.train import GNN16, ModularConfig
 from baselines.registry import find
-from cfp.agent.losses import Losses
 from cfp.envs.disturbances import Case
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import CheckpointError, ConfigError
@@ -230,10 +229,3 @@ def test_matter_that_flew_off_leaves_finite_what_is_seen(graph):
     field = nodes.to_grid(env, labels, torch.rand(1, 16, 2))
     _, _, _, _, info = env.step(field)
     assert info["finite"].all()
-
-
-def test_only_images_lose_bits_to_bfloat16():
-    losses = Losses(torch.device("cpu"), "bfloat16")
-    edges = torch.rand(2, 16, 32, generator=torch.Generator().manual_seed(0)) < 0.5
-    assert torch.equal(unpack(losses.prepare(pack(edges)), 32), edges.float())
-    assert losses.prepare(torch.zeros(1, 3, 64, 64, dtype=torch.uint8)).dtype == torch.bfloat16

@@ -51,5 +51,5 @@ def test_file_without_actions_is_refused(tmp_path):
 
 
 def test_wrong_shape_is_named():
-    with pytest.raises(ValueError, match=r"actions: got shape \(3, 2, 4, 5\), allowed \(T, 2, R, R\)"):
+    with pytest.raises(ValueError, match=r"actions must have shape \(T, 2, R, R\), got \(3, 2, 4, 5\)"):
         OpenLoop(torch.zeros(3, 2, 4, 5))

@@ -23,9 +23,7 @@ def make(stage=2):
     # The ring (20 rows) wraps around, and 7 does not divide anything: episodes are in progress at every checkpoint.
     env = monitored(FakeEnv(num_envs=2, resolution=CONFIG.action_size(stage), horizon=7))
     spec = CONFIG.actor_spec(stage)
-    hyperparameters = Hyperparameters(
-        buffer_size=40, batch_size=4, update_start=6, random_steps=10, precision="bfloat16", gate_penalty=0.1
-    )
+    hyperparameters = Hyperparameters(buffer_size=40, batch_size=4, update_start=6, random_steps=10, gate_penalty=0.1)
     model = CFP(CFPPolicy, env, hyperparameters, policy_kwargs={"spec": spec}, seed=3, device="cpu")
     model.set_logger(Logger(None, []))
     return CoarseToFine(CONFIG, stage, model)

@@ -74,7 +74,7 @@ def test_second_level_starts_from_a_policy(coarse, tmp_path, name):
     ("options", "message"),
     [
         (["--task", "run"], "start_from must be a policy for run, got one for shapematch"),
-        (["--resolutions", "8", "16"], "start_from: got a policy of levels (4,), allowed the first of (8, 16)"),
+        (["--resolutions", "8", "16"], "start_from must be a policy of the first resolutions of (8, 16)"),
         (["--warm-critic"], "warm_critic must be False with start_from"),
         (["--start-from", "no/such"], "there is no policy"),
         (["--action-layout", "grid"], "start_from must be a policy for action_layout grid, got image"),
@@ -83,7 +83,7 @@ def test_second_level_starts_from_a_policy(coarse, tmp_path, name):
         (["--parity", "reference"], "start_from must be a policy for action_layout grid, got image"),
         (
             ["--refine", "--resolutions", "8", "16"],
-            "start_from: got a policy of levels (4,), allowed the first of (8, 16)",
+            "start_from must be a policy of the first resolutions of (8, 16)",
         ),
     ],
 )

@@ -18,7 +18,7 @@ from cfp.envs.disturbances import Case, Disturbed, disturbed_env, make_cases, re
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from cfp.evaluate import open_policy, open_run
-from cfp.evaluation.evaluate import Result, ZeroPolicy, evaluate, student
+from cfp.evaluation.evaluate import Result, ZeroPolicy, evaluate
 from cfp.files import write_json
 from cfp.presets import preset
 from cfp.train import PROGRAM
@@ -127,7 +127,6 @@ def test_cases_that_change_nothing_in_a_task_are_left_out():
 
 @pytest.mark.parametrize("degrees", [1, 2, 4, 30])
 def test_interval_is_student_s(degrees):
-    assert student(degrees) == pytest.approx(stats.t.ppf(0.975, degrees), rel=1e-5)
     returns = np.random.default_rng(0).normal(size=degrees + 1)
     low, high = stats.t.interval(0.95, degrees, returns.mean(), stats.sem(returns))
     assert Result("", 8, tuple(returns)).interval == pytest.approx((high - low) / 2, rel=1e-5)
@@ -185,7 +184,7 @@ def test_single_policy_with_other_particles_needs_a_folder_to_write_into(folder,
         "500",
     ]
     assert robustness.main([*single, "--cases", "noise"]) == 2
-    assert "out: got none, allowed with a single policy" in capsys.readouterr().err
+    assert "out must be given with a single policy" in capsys.readouterr().err
     assert robustness.main([*single, "--cases", "noise", "--out", str(tmp_path / "new")]) == 0
     table = (tmp_path / "new" / "robustness.md").read_text()
     assert "particles 500" in table and table.count("\n| ") == 4
@@ -246,12 +245,12 @@ def test_ratios_need_a_positive_return():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--dropout", "1.5"], "dropout: got 1.5, allowed between 0 and 1"),
+        (["--dropout", "1.5"], "dropout must be between 0 and 1, got 1.5"),
         (["--latency", "0"], "latency must be at least 1, got 0"),
-        (["--noise", "nan"], "noise: got nan"),
-        (["--friction", "-1"], "friction: got (-1.0,), allowed 0 or more"),
+        (["--noise", "nan"], "noise must be positive and finite, got nan"),
+        (["--friction", "-1"], "friction must be at least 0 (inf sticks), got (-1.0,)"),
         (["--device", "abacus"], "device must be auto, cpu or cuda, got 'abacus'"),
-        (["--cases", "noise", "gravity"], "cases: got 'gravity', allowed words of cases that change something"),
+        (["--cases", "noise", "gravity"], "that change something, got 'gravity'"),
     ],
 )
 def test_wrong_option_is_one_line_and_exit_code_two(folder, capsys, arguments, message):

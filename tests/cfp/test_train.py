@@ -338,8 +338,8 @@ def test_other_particles_are_not_those_of_the_reference_s_faults(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "policy: got None and the folder None, allowed is one of the two"),
-        (["somewhere", "--policy", "run"], "allowed is one of the two"),
+        ([], "either policy or a folder must be given, got None"),
+        (["somewhere", "--policy", "run"], "either policy or a folder must be given"),
         (["--policy", "alchemy"], "(catch, grow, run, shapematch)"),
         (["--policy", "run", "--particles", "0"], "particles"),
     ],
