@@ -100,7 +100,7 @@ TRAIN = [
 OTHERS = [
     learning("alchemy", "gold", "", "algo must be one of cfp, coarse, fine, gnn-16", "got 'alchemy'"),
     learning("coarse", "two grids", "--resolutions 4 8", "resolutions must have one value, got (4, 8)"),
-    learning("gnn-16", "ten particles", "--particles 10", "particles: got 10 of the robot, allowed 16"),
+    learning("gnn-16", "ten particles", "--particles 10", "particles of the robot must be at least 16", "got 10"),
     learning("gnn-16", "a negative temperature", "--alpha -1", "alpha must be at least 0, got -1.0"),
     learning("gradient", "no iterations", "--iterations 0", "iterations must be at least 1, got 0"),
     learning("gradient", "a grid of 99", "--grid 99", "resolution must be 'coarse', 'fine' or 1 to 64, got 99"),
