@@ -34,7 +34,7 @@ class DistillConfig(LadderConfig):
     student_noise: bool = True
     """The student acts with the noise of its policy."""
     student_learning_rate: float = 1e-3
-    """Adam's step size at the beginning of each level; it falls to a tenth."""
+    """Adam's step size at the beginning of each stage; it falls to a tenth."""
     max_grad_norm: float = 1.0
     """Largest norm of the gradient."""
     beta_decay: float = 0.7
