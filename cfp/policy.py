@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
 
@@ -33,3 +35,11 @@ class SeesState(Protocol):
 
     def attached(self, env: Any) -> PolicyPredictor:
         """The same policy, looking at a `dittogym.TorchEnv`."""
+
+
+@runtime_checkable
+class DisturbablePolicy(Protocol):
+    """A policy whose decisions are not on an action grid, from which its actions are computed."""
+
+    def through(self, change: Callable[[np.ndarray], np.ndarray]) -> Policy:
+        """The same policy, with ``change`` applied to its decisions (B, ...) before they become actions."""

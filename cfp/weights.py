@@ -30,21 +30,20 @@ from dittogym.tasks import fingerprint
 FORMAT = "cfp-policy"
 VERSION = 1
 KIND = "cfp"
-_DESCRIBED: dict[str, tuple[type, int | None, int]] = {
-    "kind": (str, None, 0),
-    "task": (str, None, 0),
-    "resolution": (int, 1, NODES),
-    "stage": (int, 1, 1000),
-    "steps": (int, 0, 2**62),
-    "seed": (int, 0, LARGEST_SEED),
-    "deterministic": (bool, None, 0),
-    "environment": (dict, None, 0),
-    "layout": (int, 0, LARGEST_SEED),
-    "task_file": (str, None, 0),
+_DESCRIBED: dict[str, type | range] = {
+    "kind": str,
+    "task": str,
+    "resolution": range(1, NODES + 1),
+    "stage": range(1, 1001),
+    "steps": range(2**62),
+    "seed": range(LARGEST_SEED + 1),
+    "deterministic": bool,
+    "environment": dict,
+    "layout": range(LARGEST_SEED + 1),
+    "task_file": str,
 }
-"""Type, smallest and largest value of the entries of a description."""
+"""Types, or values, of the entries of a description; only policies for one initial position have a layout."""
 _OPTIONAL = ("layout", "task_file")
-"""Entries that only policies for a single initial position, or for custom tasks, have."""
 MAX_REASON = 300
 """Characters shown of an error of torch, which lists every layer."""
 SHIPPED = Path(__file__).parent / "pretrained"
@@ -52,14 +51,7 @@ SHIPPED = Path(__file__).parent / "pretrained"
 
 
 def describe_run(config: RunConfig, kind: str, stage: int, steps: int) -> dict[str, Any]:
-    """Description of a policy of any kind, as JSON values.
-
-    Args:
-        config: Options of the run that trained it.
-        kind: Algorithm that can load it.
-        stage: Number of its stage, 1 is the first.
-        steps: Environment steps of the run so far.
-    """
+    """Description of a policy of any kind, as JSON values; ``kind`` is the algorithm that can load it."""
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -86,14 +78,10 @@ def describe(config: Config, stage: int, steps: int) -> dict[str, Any]:
 
 
 def write_policy(path: Path, tensors: Mapping[str, Tensor], description: dict[str, Any]) -> None:
-    """Write a policy of any kind.
+    """Write a policy of any kind, with the description of `describe_run` and further entries that its kind needs.
 
-    The weights file contains the description too, so that the two cannot disagree; the JSON file is for readers.
-
-    Args:
-        path: The ``.safetensors`` file; the ``.json`` file gets the same name.
-        tensors: Weights by name.
-        description: From `describe_run`, with further entries that its kind needs.
+    The weights file contains the description too, so that the two cannot disagree; the JSON file beside it is for
+    readers.
     """
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     content = safetensors.torch.save(plain, {FORMAT: json.dumps(description)})
@@ -107,15 +95,7 @@ def shipped() -> list[str]:
 
 
 def policy_file(path: str | Path) -> Path:
-    """Resolve a path to a ``.safetensors`` file.
-
-    Args:
-        path: A run folder, the file itself, the ``.json`` beside it, or, if no such path exists, the name of a policy
-            that comes with the package.
-
-    Raises:
-        CheckpointError: There is no policy.
-    """
+    """The ``.safetensors`` file of a policy; see `load` for what ``path`` may be."""
     file = Path(path)
     if not file.exists() and str(path) in shipped():
         file = SHIPPED / str(path)
@@ -126,18 +106,7 @@ def policy_file(path: str | Path) -> Path:
 
 
 def read_policy(path: str | Path, device: str = "cpu") -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read a policy that `write_policy` wrote; nothing is unpickled.
-
-    Args:
-        path: See `policy_file`.
-        device: Device of the tensors.
-
-    Returns:
-        Weights by name, and the description.
-
-    Raises:
-        CheckpointError: The file is missing, damaged, or not a policy.
-    """
+    """Weights by name and description of a policy that `write_policy` wrote; nothing is unpickled."""
     file = policy_file(path)
     try:
         with safetensors.safe_open(file, framework="pt", device=device) as content:
@@ -147,7 +116,7 @@ def read_policy(path: str | Path, device: str = "cpu") -> tuple[dict[str, Tensor
     except (OSError, ValueError, MemoryError, safetensors.SafetensorError) as error:
         raise CheckpointError(f"{file}: the policy is damaged ({error})") from error
     try:
-        description = _checked(description)
+        _check_description(description)
     except ConfigError as error:
         raise CheckpointError(f"{file}: {error}") from error
     for name, tensor in tensors.items():
@@ -156,34 +125,26 @@ def read_policy(path: str | Path, device: str = "cpu") -> tuple[dict[str, Tensor
     return tensors, description
 
 
-def _checked(description: Any) -> dict[str, Any]:
-    """Check the entries of a description that every kind of policy has.
-
-    Raises:
-        ConfigError: It is not a description, or an entry is wrong.
-    """
+def _check_description(description: Any) -> None:
+    """Check the entries of a description that every kind of policy has."""
     known = isinstance(description, dict) and description.get("format") == FORMAT
     if not known or description.get("version") != VERSION:
         raise ConfigError(f"the file must have a {FORMAT} description of version {VERSION}")
-    for name, (kind, least, most) in _DESCRIBED.items():
-        value: Any = description.get(name)
+    for name, allowed in _DESCRIBED.items():
+        value = description.get(name)
         if name in _OPTIONAL and value is None:
             continue
-        wrong = type(value) is not kind  # isinstance would accept a bool for an int
-        if wrong or (least is not None and not least <= value <= most):
-            allowed = type_name(kind) if least is None else f"between {least} and {most}"
-            raise ConfigError(f"{name} must be {allowed}, got {value!r}")
+        if isinstance(allowed, range):
+            if type(value) is not int or value not in allowed:  # isinstance would accept a bool
+                raise ConfigError(f"{name} must be between {allowed[0]} and {allowed[-1]}, got {value!r}")
+        elif not isinstance(value, allowed):
+            raise ConfigError(f"{name} must be {type_name(allowed)}, got {value!r}")
     update_from_dict(EnvironmentConfig(), description["environment"], "environment")
-    return description
 
 
 @contextmanager
-def fitting(path: str | Path) -> Iterator[None]:
-    """Report errors while a policy is built from its file as errors that name the file.
-
-    Raises:
-        CheckpointError: Weights and description do not match.
-    """
+def report_mismatch(path: str | Path) -> Iterator[None]:
+    """Report errors while a policy is built from its file as a `CheckpointError` that names the file."""
     try:
         yield
     except (KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
@@ -192,13 +153,7 @@ def fitting(path: str | Path) -> Iterator[None]:
 
 
 def save_policy(path: Path, actor: Actor, description: dict[str, Any]) -> None:
-    """Write an actor with its frozen coarser stages.
-
-    Args:
-        path: The ``.safetensors`` file.
-        actor: The network.
-        description: From `describe`.
-    """
+    """Write an actor with its frozen coarser stages."""
     write_policy(path, actor.state_dict(), description)
 
 
@@ -222,7 +177,7 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
     tensors, description = read_policy(path, device)
     if description["kind"] != KIND:
         raise CheckpointError(f"{policy_file(path)}: kind must be {KIND!r}, got {description['kind']!r}")
-    with fitting(path):
+    with report_mismatch(path):
         spec = update_from_dict(ActorSpec(resolutions=RESOLUTIONS[:1]), description["network"], "network")
         policy = ActorPolicy(spec, description["deterministic"])
         policy.actor.load_state_dict(tensors)
@@ -233,16 +188,7 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
 
 
 def policy_for(config: RunConfig, path: str) -> ActorPolicy:
-    """Load the policy that a run starts from.
-
-    Args:
-        config: The run's options.
-        path: Its option ``start_from``.
-
-    Raises:
-        ConfigError: The policy is for another task, target, physics or orientation of actions.
-        CheckpointError: See `load`.
-    """
+    """Load the policy that a run starts from, which must be for its task, physics and orientation of actions."""
     policy = load(path)
     check_trained_for("start_from", policy.description, config.task, config.environment)
     environment = update_from_dict(EnvironmentConfig(), policy.description["environment"])
@@ -252,17 +198,7 @@ def policy_for(config: RunConfig, path: str) -> ActorPolicy:
 
 
 def check_trained_for(option: str, description: Mapping[str, Any], task: str, environment: EnvironmentConfig) -> None:
-    """Check that a policy was trained for a task and environment.
-
-    Args:
-        option: Option that names the policy, for the message.
-        description: Description of the policy.
-        task: The task.
-        environment: The environment.
-
-    Raises:
-        ConfigError: It was trained for another task, target, material or number of substeps.
-    """
+    """Check that a policy, named by an option, was trained for a task, its target and material, and the substeps."""
     if (found := description["task"]) != task:
         raise ConfigError(f"{option} must be a policy for {task}, got one for {found}")
     own = update_from_dict(EnvironmentConfig(), description["environment"])
@@ -279,19 +215,7 @@ def check_trained_for(option: str, description: Mapping[str, Any], task: str, en
 
 
 def is_same_task(task: str, option: str, value: str | None, other: str | None) -> bool:
-    """Whether two values of an option result in the same task; None is the task's default.
-
-    Args:
-        task: Name of the task.
-        option: One of `cfp.sections.TASK_OPTIONS`.
-        value: A value.
-        other: Another value.
-
-    Raises:
-        ValueError: The task refuses a value.
-        TypeError: The task has no such option.
-        OSError: An image cannot be read.
-    """
+    """Whether two values of one of `TASK_OPTIONS` result in the same task; None is the task's default."""
     if value == other:
         return True
     options: list[dict[str, Any]] = [{} if each is None else {option: each} for each in (value, other)]

@@ -10,7 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from cfp.experiment.algorithm import Algorithm
-from cfp.weights import fitting, read_policy, write_policy
+from cfp.weights import read_policy, report_mismatch, write_policy
 
 
 class OpenLoop:
@@ -78,7 +78,7 @@ class OpenLoop:
             CheckpointError: No such file, a damaged one, or one that is not such a policy.
         """
         tensors, description = read_policy(path)
-        with fitting(path):
+        with report_mismatch(path):
             return cls(tensors["actions"], description)
 
 

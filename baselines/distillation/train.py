@@ -59,8 +59,8 @@ class Distill(Algorithm):
 
     Args:
         config: Options of the run.
-        stage: Which level, 1 is the coarsest.
-        start: Policy of the coarser levels, which are frozen.
+        stage: Which stage, 1 is the coarsest.
+        start: Policy of the coarser stages, which are frozen.
         teacher: File of the teacher's policy, if it is not the one that the options name.
     """
 

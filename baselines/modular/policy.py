@@ -17,7 +17,7 @@ from baselines.modular.env import segment
 from baselines.modular.kmeans import update
 from baselines.modular.networks import ModularActor
 from baselines.modular.nodes import Nodes, visible_positions
-from cfp.weights import fitting, read_policy, write_policy
+from cfp.weights import read_policy, report_mismatch, write_policy
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
 
@@ -89,6 +89,6 @@ class SegmentPolicy(StateBasedPolicy):
             CheckpointError: The file is missing, damaged, or not such a policy.
         """
         tensors, description = read_policy(path, device)
-        with fitting(path):
+        with report_mismatch(path):
             actor = load_network(lambda: ModularActor(**description["network"]), tensors, device)
             return cls(actor, Nodes(**description["nodes"]), description)

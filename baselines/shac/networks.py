@@ -15,7 +15,7 @@ from baselines.shac.features import StateFeatures
 from cfp.agent.actor import Actor
 from cfp.agent.networks import LATENT, Encoder, initialise
 from cfp.agent.spec import ActorSpec
-from cfp.weights import fitting, read_policy, write_policy
+from cfp.weights import read_policy, report_mismatch, write_policy
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
 
@@ -129,7 +129,7 @@ class StatePolicy(StateBasedPolicy):
     def load(cls, path: Path, device: str = "cpu") -> StatePolicy:
         """Load what `save` wrote."""
         tensors, description = read_policy(path, device)
-        with fitting(path):
+        with report_mismatch(path):
             size = description["inputs"], description["resolution"]
             actor = load_network(lambda: StateActor(*size), tensors, device)
             return cls(actor, StateFeatures(**description["features"]), float(description["noise"]), description)

@@ -65,7 +65,7 @@ class ShacConfig(GridConfig):
     sees: Literal["state", "image"] = "state"
     """Input of the policy: the privileged state (matter, deformation, clock), or the image like CFP's."""
     start_from: str | None = None
-    """Policy with one level, of the image, from which the actor starts, except for its standard deviation."""
+    """Policy of the image with one stage from which the actor starts, except for its standard deviation."""
     train_particles: Particles = "lite"
     """Particles of the simulations in training."""
     window: int = 16

@@ -22,16 +22,8 @@ from cfp.agent.spec import ActorSpec
 class NetworkPolicy(sac_policies.SACPolicy, ABC):
     """Base class of the policies that `cfp.agent.sac.CFP` trains; subclasses create actor and critics.
 
-    Args:
-        observation_space: Observations, which the networks read as they are (``normalize_images`` is off).
-        action_space: Actions in [-1, 1].
-        lr_schedule: Learning rate of both optimisers as a function of the remaining progress.
-        use_sde: Accepted because stable-baselines3 passes it; must be False.
-        optimizer_class: Optimiser of actor and critics.
-        optimizer_kwargs: Options of the optimiser except the learning rate; None: a fused Adam.
-
-    Raises:
-        ValueError: ``use_sde`` is set.
+    Networks read observations as they are (``normalize_images`` is off). ``use_sde`` must be False; without
+    ``optimizer_kwargs`` the optimiser is a fused Adam.
     """
 
     def __init__(
@@ -43,7 +35,6 @@ class NetworkPolicy(sac_policies.SACPolicy, ABC):
         optimizer_class: type[torch.optim.Optimizer] = torch.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
-        """Build the networks and their optimisers."""
         if use_sde:
             raise ValueError("use_sde must be False, got True: the actor has its own exploration noise")
         super().__init__(
@@ -108,7 +99,6 @@ class CFPPolicy(NetworkPolicy):
         spec: ActorSpec | None = None,
         **options: Any,
     ) -> None:
-        """Build the networks and their optimisers."""
         self.spec = spec or ActorSpec((action_space.shape[-1],))
         size = self.spec.action_size
         if action_space.shape != (2, size, size):
@@ -133,11 +123,7 @@ class CFPPolicy(NetworkPolicy):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Choose actions, see `cfp.agent.actor_policy.ActorPolicy.predict`.
-
-        Raises:
-            ValueError: The observation is neither an image nor a batch of images.
-        """
+        """Choose actions for an observation (3, 64, 64) or (B, 3, 64, 64) uint8, see `cfp.ActorPolicy.predict`."""
         check_images(observation)
         return super().predict(observation, state, episode_start, deterministic)
 

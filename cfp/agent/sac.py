@@ -60,7 +60,6 @@ class RewardStatistics(nn.Module):
     variance: Tensor
 
     def __init__(self, momentum: float = 0.99) -> None:
-        """Start at mean 0 and variance 1."""
         super().__init__()
         self.momentum = momentum
         self.register_buffer("mean", torch.zeros(()))
@@ -108,7 +107,6 @@ class CFP(SAC):
         hyperparameters: Hyperparameters = Hyperparameters(),  # noqa: B008  (it is immutable)
         **sac_options: Any,
     ) -> None:
-        """Create networks, replay buffer and reward statistics."""
         self.hyperparameters = hyperparameters
         self.origin: Actor | None = None
         spec = (sac_options.get("policy_kwargs") or {}).get("spec")
@@ -165,7 +163,7 @@ class CFP(SAC):
         self.logger.record("train/n_updates", self._n_updates)
 
     def update(self, batch: ReplayBufferSamples) -> dict[str, Tensor]:
-        """Perform one update; returns scalars by name, see `METRICS`."""
+        """Perform one update with a ``batch``; returns scalars by name, see `METRICS`."""
         obs, next_obs = normalise_image(batch.observations), normalise_image(batch.next_observations)
         scalars = self._update_critic(obs, next_obs, batch)
         if self.num_timesteps >= self.hyperparameters.actor_start:
@@ -225,10 +223,7 @@ class CFP(SAC):
     def _on_action_grid(
         self, actions: np.ndarray, stored: np.ndarray, composition: Composition | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Coarsen uniform actions to the action grid of the stage.
-
-        Of independent values for each pixel of a larger patch little would be left in the force field.
-        """
+        """Coarsen uniform actions to the action grid of the stage; independent pixels of a patch would average out."""
         if not isinstance(self.policy, CFPPolicy):
             return actions, stored
         grid, size = self.networks()[0].resolution, self.policy.spec.action_size

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -17,10 +16,9 @@ from torch import Tensor
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import monitored
-from cfp.policy import Policy
 from dittogym import make_spec
 from dittogym.action import bicubic
-from dittogym.geometry import Obstacle, floor
+from dittogym.geometry import floor
 from dittogym.spec import TaskSpec
 
 FLOOR = floor().name
@@ -33,7 +31,7 @@ class Case:
     Attributes:
         name: Name in tables and plots.
         action_dropout: Fraction of the policy's decisions that are set to 0, drawn anew in each step; decisions are the
-            2 R R entries of its action grid, or those of `Decides`.
+            2 R R entries of its action grid, or those of `cfp.policy.DisturbablePolicy`.
         observation_dropout: Fraction of the 3 x 64 x 64 pixels that are set to 0, drawn anew in each step. A velocity
             pixel of 0 means fast motion, a pixel of 132 rest.
         action_noise: Standard deviation of Gaussian noise on each decision; 1 is the full actuation.
@@ -52,13 +50,7 @@ class Case:
 
 
 def reason_without_effect(case: Case, spec: TaskSpec, sees_image: bool = True) -> str:
-    """Why a case has no effect on a policy in a task; empty if it has one.
-
-    Args:
-        case: The disturbance.
-        spec: The task.
-        sees_image: Whether the policy uses the image.
-    """
+    """Why a case has no effect on a policy in a task; empty if it has one."""
     if case.observation_dropout and not sees_image:
         return "the policy does not use the image"
     if "gravity" in case.physics and not any(spec.gravity):
@@ -77,26 +69,15 @@ def reason_without_effect(case: Case, spec: TaskSpec, sees_image: bool = True) -
 def disturbed_env(
     config: RunConfig, resolution: int, num_envs: int, case: Case, seed: int, grid: int | None = None
 ) -> Disturbed:
-    """Create the environment of a run with a disturbance.
-
-    Args:
-        config: The run's options.
-        resolution: Action grid R.
-        num_envs: Number of robots.
-        case: The disturbance.
-        seed: Seed of the disturbance, and of a first reset that sets the constants.
-        grid: Action grid of the policy, see `Disturbed`.
-    """
+    """Create the environment of a run with a disturbance; a first reset sets the constants of the physics."""
     spec = make_spec(config.task, **config.environment.task_options())
-    options = {} if case.friction is None else {"obstacles": _with_friction(spec, case.friction)}
-    env = make_torch_env(config, resolution, num_envs, **options)
+    obstacles = spec.obstacles
+    if case.friction is not None:
+        obstacles = tuple(item.with_friction(case.friction) if item.name == FLOOR else item for item in obstacles)
+    env = make_torch_env(config, resolution, num_envs, obstacles=obstacles)
     own = {name: np.asarray(getattr(spec, name), np.float64) for name in case.physics}
     env.reset(seed=seed, options={"physics": {name: own[name] * factor for name, factor in case.physics.items()}})
     return Disturbed(monitored(env), case, seed, grid)
-
-
-def _with_friction(spec: TaskSpec, friction: float) -> tuple[Obstacle, ...]:
-    return tuple(item.with_friction(friction) if item.name == FLOOR else item for item in spec.obstacles)
 
 
 def drop(values: Tensor, mask: Tensor) -> Tensor:
@@ -106,14 +87,6 @@ def drop(values: Tensor, mask: Tensor) -> Tensor:
         cell = torch.arange(size, device=mask.device) * grid // size
         mask = mask[..., cell[:, None], cell]
     return values.masked_fill(mask, 0)
-
-
-@runtime_checkable
-class Decides(Protocol):
-    """A policy whose decisions are not on an action grid, from which its actions are computed."""
-
-    def through(self, change: Callable[[np.ndarray], np.ndarray]) -> Policy:
-        """The same policy, with ``change`` applied to its decisions (B, ...) before they become actions."""
 
 
 class Disturbed(VecEnvWrapper):
@@ -127,7 +100,7 @@ class Disturbed(VecEnvWrapper):
         case: The disturbance; its constants are not applied here.
         seed: Seed of the generator, which restarts at each ``reset``.
         grid: Rows and columns R of the grid on which the policy decides; None: A; 0: none, and the policy calls
-            `disturb` itself, see `Decides`.
+            `disturb` itself, see `cfp.policy.DisturbablePolicy`.
     """
 
     def __init__(self, venv: VecEnv, case: Case, seed: int, grid: int | None = None) -> None:
@@ -162,16 +135,15 @@ class Disturbed(VecEnvWrapper):
 
     def _disturb(self, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
         """Apply noise and dropout that are drawn in ``shape``."""
-        disturbed = torch.from_numpy(values)
         if self.case.action_noise:
-            noise = torch.from_numpy(self.generator.standard_normal(shape, np.float32))
-            disturbed = disturbed + self.case.action_noise * (
-                noise if shape == values.shape else bicubic(noise, self.size)
-            )
+            noise = self.generator.standard_normal(shape, np.float32)
+            if shape != values.shape:
+                noise = bicubic(torch.from_numpy(noise), self.size).numpy()
+            values = values + np.float32(self.case.action_noise) * noise
         if self.case.action_dropout:
-            disturbed = drop(disturbed, torch.from_numpy(self.generator.random(shape) < self.case.action_dropout))
-        result: np.ndarray = disturbed.numpy()
-        return result
+            mask = torch.from_numpy(self.generator.random(shape) < self.case.action_dropout)
+            values = drop(torch.from_numpy(values), mask).numpy()
+        return values
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step; delayed actions of an ended episode are cleared."""
@@ -195,15 +167,7 @@ def make_cases(
     shift: float = 0.2,
     friction: tuple[float, ...] = (0.0, 0.5, math.inf),
 ) -> list[Case]:
-    """The cases of a robustness report, the unperturbed one first.
-
-    Args:
-        dropout: Fraction of dropped action and of dropped observation entries.
-        noise: Standard deviation of the action noise.
-        latency: Delay in control steps.
-        shift: Physical constants are multiplied by 1 - shift and by 1 + shift.
-        friction: Friction coefficients of the floor.
-    """
+    """The cases of a robustness report, the unperturbed one first; constants are multiplied by 1 -+ ``shift``."""
     cases = [
         Case("unperturbed"),
         Case(f"action dropout {100 * dropout:g}%", action_dropout=dropout),
@@ -211,7 +175,8 @@ def make_cases(
         Case(f"action noise {noise:g}", action_noise=noise),
         Case(f"latency {latency} step{'s' if latency > 1 else ''}", latency=latency),
     ]
-    for name, symbol in (("mu", "mu"), ("yield_stress", "yield stress"), ("gravity", "gravity")):
-        cases += [Case(f"{symbol} x {factor:g}", physics={name: factor}) for factor in (1 - shift, 1 + shift)]
+    for name in ("mu", "yield_stress", "gravity"):
+        label = name.replace("_", " ")
+        cases += [Case(f"{label} x {factor:g}", physics={name: factor}) for factor in (1 - shift, 1 + shift)]
     named = [("sticky" if math.isinf(value) else f"{value:g}", value) for value in friction]
     return cases + [Case(f"floor friction {name}", friction=value) for name, value in named]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Protocol, cast
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -13,30 +13,10 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 from torch import Tensor
 
-import dittogym.env
 from cfp.errors import NonFiniteError
-from dittogym import TorchEnv
+from dittogym import env as dittogym_env
 from dittogym.vector import autoreset_step
 from torchmpm import tree
-
-
-class BatchedEnv(Protocol):
-    """What `TorchVecEnv` needs of an environment; `dittogym.TorchEnv` has it."""
-
-    num_envs: int
-    action_resolution: int
-    device: Any
-    env_state: Any
-    generators: Any
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        """Observations (B, 3, 64, 64) and info; ``options["reset_mask"]`` (B,) selects the elements to reset."""
-
-    def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Observation, reward, terminated, truncated (each with leading B) and info for actions (B, 2, R, R)."""
-
-    def render(self, index: int = 0) -> np.ndarray:
-        """Picture of one element, uint8 (512, 512, 3)."""
 
 
 class TorchVecEnv(VecEnv):
@@ -48,15 +28,14 @@ class TorchVecEnv(VecEnv):
     bootstraps there. An element whose state is not finite (``info["finite"]`` false) terminates and is reset.
 
     Args:
-        env: The environment, which is stepped without gradients.
+        env: A `dittogym.TorchEnv`, or an environment with its interface; it is stepped without gradients.
         spaces: Spaces of observations and actions; None: those of `dittogym.TorchEnv`.
     """
 
-    def __init__(self, env: BatchedEnv, spaces: tuple[Space[Any], Space[Any]] | None = None) -> None:
-        """Take over an environment."""
+    def __init__(self, env: Any, spaces: tuple[Space[Any], Space[Any]] | None = None) -> None:
         self.torch_env = env
         self.render_mode = "rgb_array"
-        super().__init__(env.num_envs, *(spaces or dittogym.env.spaces(cast(TorchEnv, env))))
+        super().__init__(env.num_envs, *(spaces or dittogym_env.spaces(env)))
         self._actions: Tensor | None = None
 
     @torch.no_grad()
@@ -107,21 +86,20 @@ class TorchVecEnv(VecEnv):
     def _split_info(self, info: dict[str, Any]) -> list[dict[str, Any]]:
         """Turn one dictionary of tensors with leading B into B dictionaries of numbers."""
         columns = {key: value.tolist() for key, value in info.items() if isinstance(value, Tensor)}
-        terms = {key: value.tolist() for key, value in info.get("reward_terms", {}).items()}
-        infos: list[dict[str, Any]] = []
-        for index in range(self.num_envs):
-            element: dict[str, Any] = {key: value[index] for key, value in columns.items()}
-            if terms:
-                element["reward_terms"] = {key: value[index] for key, value in terms.items()}
-            infos.append(element)
+        infos = [{key: value[index] for key, value in columns.items()} for index in range(self.num_envs)]
+        if terms := info.get("reward_terms"):
+            for element, reward_terms in zip(infos, self._split_info(terms), strict=True):
+                element["reward_terms"] = reward_terms
         return infos
 
     def state_dict(self) -> list[Tensor]:
-        """Tensors of the episodes in progress; see `load_state_dict`."""
+        """Tensors of the episodes in progress, with a leading B; see `load_state_dict`."""
         return [value.detach().cpu().clone() for value in tree.leaves(self.torch_env.env_state)]
 
     def load_state_dict(self, state: list[Tensor]) -> None:
-        """Restore a state of `state_dict`; call ``reset`` with the same seed before, so that later resets agree too.
+        """Restore a state of `state_dict`, tensors with a leading B.
+
+        Call ``reset`` with the same seed before, so that later resets agree too.
 
         Raises:
             ValueError: The state is not one of this environment.
@@ -168,7 +146,7 @@ class TorchVecEnv(VecEnv):
         return [result for _ in self._indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """Always False: elements are not wrapped one by one."""
+        """Always False, for any ``wrapper_class``: elements are not wrapped one by one."""
         return [False for _ in self._indices(indices)]
 
 
@@ -178,6 +156,6 @@ def _to_numpy(tensor: Tensor) -> np.ndarray:
     return array
 
 
-def monitored(env: BatchedEnv) -> VecMonitor:
+def monitored(env: Any) -> VecMonitor:
     """Wrap an environment for training or `evaluate_policy`; adds return and length as ``info["episode"]``."""
     return VecMonitor(TorchVecEnv(env))

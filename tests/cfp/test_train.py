@@ -194,7 +194,7 @@ def test_other_options_than_the_checkpoint_s_are_refused(finished, tmp_path, cap
 
 def test_resume_without_a_run_starts_afresh(tmp_path, capsys):
     assert run(tmp_path / "new", "--resume", "--steps", "30", "--handover", "20") == 0
-    assert "starting afresh" in capsys.readouterr().out
+    assert "starting a new one" in capsys.readouterr().out
     assert read_table(tmp_path / "new" / "progress.csv")[-1]["step"] == "30"
 
 

@@ -1,10 +1,8 @@
 """Predicted against measured memory of gradients."""
 
-import contextlib
 import gc
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,27 +53,6 @@ def test_eager(count: int, batch: int, substeps: int, segment: int | None, env_s
     solver, options = robot_and_ball(count - 50, 50), {"substeps": substeps, "segment": segment, "env_steps": env_steps}
     predicted = estimate_memory(solver, (batch, count, torch.float64), **options)
     assert predicted == pytest.approx(measured(solver, batch, substeps, segment, env_steps), rel=0.25)
-
-
-@needs_compiler
-@pytest.mark.parametrize(
-    ("count", "batch", "substeps", "env_steps"), [(300, 1, 4, 1), (2000, 2, 20, 1), (900, 1, 5, 6)]
-)
-def test_native(count: int, batch: int, substeps: int, env_steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Much nearer than a quarter."""
-    asked, scratch = [], call._scratch
-
-    @contextlib.contextmanager
-    def watched(size: int) -> Iterator[int]:
-        asked.append(size)
-        with scratch(size) as address:
-            yield address
-
-    monkeypatch.setattr(call, "_scratch", watched)
-    solver = robot(count, backend="native")
-    predicted = estimate_memory(solver, (batch, count, torch.float64), substeps=substeps, env_steps=env_steps)
-    tensors = measured(solver, batch, substeps, None, env_steps)
-    assert predicted == pytest.approx(max(asked) + tensors, rel=0.1)
 
 
 PROGRAM = """
