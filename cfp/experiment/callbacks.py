@@ -243,15 +243,12 @@ class CheckpointCallback(StageCallback):
             self._act()
 
 
-class StopCallback(BaseCallback):
+class StopCallback(StageCallback):
     """Stops the run when the user wants to, and the stage when its evaluations no longer improve."""
 
-    def __init__(self, evaluation: EvaluationCallback, signals: StopSignals) -> None:
-        super().__init__()
+    def __init__(self, stage: Stage, evaluation: EvaluationCallback, signals: StopSignals) -> None:
+        super().__init__(stage, 0)
         self.evaluation, self.signals = evaluation, signals
-
-    def _on_step(self) -> bool:
-        return True
 
     def _on_rollout_start(self) -> None:
         self._on_training_end()

@@ -148,7 +148,7 @@ class Run:
                 evaluation,
                 FilmCallback(stage, self.tracker),
                 CheckpointCallback(stage, self.checkpoint, evaluation, self.signals),
-                StopCallback(evaluation, self.signals),
+                StopCallback(stage, evaluation, self.signals),
             ]
         )
         try:
