@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import Any, ClassVar, Literal
 
 from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
-from cfp.agent.spec import RESOLUTIONS, ActorSpec
+from cfp.agent.spec import ActorSpec
 from cfp.errors import ConfigError
 from cfp.from_dict import flatten
 from cfp.sections import EnvironmentConfig, NetworkConfig, ReportConfig
@@ -84,10 +84,10 @@ class RunConfig:
 
     def check_effect(self, base: RunConfig, given: Collection[str] | None = None) -> None:
         """Refuse options, all or those ``given``, that differ from the preset ``base`` but are `ineffective`."""
-        mine, theirs = flatten(to_json(self)), flatten(to_json(base))
-        for option, required in self.ineffective().items():
-            for name, value in mine.items():
-                if name.startswith(option) and value != theirs[name] and (given is None or name in given):
+        defaults = flatten(to_json(base))
+        for name, value in flatten(to_json(self)).items():
+            for option, required in self.ineffective().items():
+                if name.startswith(option) and value != defaults[name] and (given is None or name in given):
                     raise ConfigError(f"{name.split('.')[-1]} requires {required}, got {value!r} without it")
 
     def check(self) -> None:
@@ -170,11 +170,9 @@ class StagedConfig(RunConfig):
     def check(self) -> None:
         """Raise a `ConfigError` for options that are wrong."""
         super().check()
-        increasing = list(self.resolutions) == sorted(set(self.resolutions))
-        if not self.resolutions or not increasing or not set(self.resolutions) <= set(RESOLUTIONS):
-            raise ConfigError(f"resolutions must be increasing values of {RESOLUTIONS}, got {self.resolutions}")
-        if self.resolutions[-1] > (patch := make_spec(self.task).patch):
+        if max(self.resolutions, default=0) > (patch := make_spec(self.task).patch):
             raise ConfigError(f"resolutions must be at most {patch} in {self.task}, got {self.resolutions}")
+        self.actor_spec(len(self.resolutions))  # checks the resolutions
         check_at_least(1, steps=self.steps)
         for name, count in self._counts().items():
             if (found := len(getattr(self, name))) != count:

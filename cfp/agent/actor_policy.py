@@ -18,10 +18,11 @@ IMAGE_SHAPE = (3, IMAGE_SIZE, IMAGE_SIZE)
 
 def check_images(observation: object) -> None:
     """Refuse anything but a uint8 image or a batch of them: networks take other numbers as normalised already."""
-    found = type(observation).__name__
-    if isinstance(observation, np.ndarray):
-        if observation.dtype == np.uint8 and observation.shape[-3:] == IMAGE_SHAPE and observation.ndim in (3, 4):
-            return
+    if not isinstance(observation, np.ndarray):
+        found = type(observation).__name__
+    elif observation.dtype == np.uint8 and observation.shape[-3:] == IMAGE_SHAPE and observation.ndim in (3, 4):
+        return
+    else:
         found = f"{observation.dtype} array of shape {observation.shape}"
     raise ValueError(f"observation must be a uint8 array of shape (3, 64, 64) or (B, 3, 64, 64), got {found}")
 

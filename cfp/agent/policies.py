@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac import policies as sac_policies
 from torch import nn
 
@@ -116,23 +116,11 @@ class CFPPolicy(NetworkPolicy):
         """Create critics of the executed action."""
         return TwinCritic(self.spec.action_size, self.spec.split, self.spec.interpolation)
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Choose actions for an observation (3, 64, 64) or (B, 3, 64, 64) uint8, see `cfp.ActorPolicy.predict`."""
+    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
+        """The ``observation``, uint8 (3, 64, 64) or (B, 3, 64, 64), as a batch (B, 3, 64, 64), and if it was one."""
         check_images(observation)
-        return super().predict(observation, state, episode_start, deterministic)
+        return super().obs_to_tensor(observation)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {
-            "observation_space": self.observation_space,
-            "action_space": self.action_space,
-            "lr_schedule": self._dummy_schedule,
-            "spec": self.spec,
-            "optimizer_class": self.optimizer_class,
-            "optimizer_kwargs": self.optimizer_kwargs,
-        }
+        names = ("observation_space", "action_space", "spec", "optimizer_class", "optimizer_kwargs")
+        return {name: getattr(self, name) for name in names} | {"lr_schedule": self._dummy_schedule}

@@ -131,19 +131,14 @@ class CFP(SAC):
     def _setup_model(self) -> None:
         super()._setup_model()
         self.reward_statistics = RewardStatistics(self.hyperparameters.reward_momentum).to(self.device)
-        self.update_average = get_ema_multi_avg_fn(1 - self.tau)
 
     def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
-        """Actor, critics and target critics with their own types."""
+        """Actor, critics and target critics."""
         assert isinstance(self.policy, NetworkPolicy)
         return self.policy.networks()
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Perform updates of critics, actor and target critics.
-
-        Args:
-            gradient_steps: Number of updates.
-            batch_size: Transitions in each.
+        """Perform ``gradient_steps`` updates, each with ``batch_size`` transitions.
 
         Raises:
             NonFiniteError: A loss is not finite; the optimiser step is not taken.
@@ -169,7 +164,7 @@ class CFP(SAC):
         if self.num_timesteps >= self.hyperparameters.actor_start:
             scalars |= self._update_actor(obs)
         _, critic, target = self.networks()
-        self.update_average(list(target.parameters()), list(critic.parameters()), 1)
+        get_ema_multi_avg_fn(1 - self.tau)(list(target.parameters()), list(critic.parameters()), 1)
         scalars["reward_mean"] = self.reward_statistics.mean
         scalars["reward_std"] = self.reward_statistics.variance.sqrt()
         return scalars
@@ -268,4 +263,4 @@ class CFP(SAC):
         return [*modules, "reward_statistics"], tensors
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "reward_statistics", "origin", "update_average"]
+        return [*super()._excluded_save_params(), "reward_statistics", "origin"]

@@ -46,8 +46,7 @@ class TorchVecEnv(VecEnv):
             uint8 (B, 3, 64, 64).
 
         Raises:
-            ValueError: The environment refuses the options, or they differ between elements. Values for each element
-                are given within one dictionary of options, see `dittogym.TorchEnv.reset`.
+            ValueError: The options are not one dictionary for all elements, see `dittogym.TorchEnv.reset`.
         """
         options = self._options[0] if self._options else {}
         shared = len(self._options) == self.num_envs and all(other is options for other in self._options)
@@ -63,7 +62,7 @@ class TorchVecEnv(VecEnv):
         """Set the actions (B, 2, R, R), float, of the next step.
 
         Raises:
-            NonFiniteError: An action is NaN or infinite, because the policy has diverged.
+            NonFiniteError: An action is NaN or infinite.
         """
         if not np.isfinite(actions).all():
             raise NonFiniteError("an action is not finite: the policy has diverged; the last checkpoint is untouched")
