@@ -53,10 +53,9 @@ def find_device(device: str | torch.device) -> torch.device:
         raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}") from error
     if found.type not in ("cpu", "cuda"):
         raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
-    if found.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device must be available, got {device!r}, but torch finds no CUDA device")
-    if found.index is not None and found.index >= (count := max(1, torch.cuda.device_count())):
-        raise ValueError(f"device must be available, got {device!r}, but torch numbers its devices 0 to {count - 1}")
+    count = torch.cuda.device_count() if found.type == "cuda" else 1
+    if (found.index or 0) >= count:
+        raise ValueError(f"device must be available, got {device!r}, but torch finds {count} of this kind")
     return found
 
 

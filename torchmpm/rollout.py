@@ -24,11 +24,7 @@ SEGMENT = 10
 
 
 def check_repetition(times: int, segment: Segment, name: str = "times") -> tuple[int, Segment]:
-    """``times``, which the caller calls ``name``, and ``segment``, converted to Python's integers.
-
-    Raises:
-        ValueError: ``times`` is negative or ``segment`` is below 1.
-    """
+    """``times``, which the caller calls ``name``, and ``segment``, converted to Python's integers."""
     given: Any = segment
     if given not in (None, "auto"):
         if isinstance(given, bool) or not isinstance(given, Integral) or int(given) < 1:

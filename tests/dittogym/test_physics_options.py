@@ -91,11 +91,7 @@ def test_through_gymnasium() -> None:
     env.reset(seed=0, options={"physics": {"gravity": (0.0, 0.0), "mu": 100}})
     assert env.unwrapped.torch_env.env_state.physics["mu"].tolist() == [100.0]
     vector = gymnasium.make_vec(
-        "dittogym/run-coarse-v0",
-        num_envs=2,
-        vectorization_mode="vector_entry_point",
-        max_episode_steps=2,
-        **SMALL,
+        "dittogym/run-coarse-v0", num_envs=2, vectorization_mode="vector_entry_point", max_episode_steps=2, **SMALL
     )
     vector.reset(seed=0, options={"physics": {"mu": np.array([100.0, 200.0])}})
     for _ in range(3):  # through an autoreset

@@ -8,12 +8,7 @@ import dittogym
 from dittogym.tasks.targets import load_target
 
 #: Published areas and centroids (row, column) of the reference's pictures.
-FACTS = {
-    "star": (463, (33.0, 31.9)),
-    "I": (444, (31.5, 30.4)),
-    "M": (435, (32.0, 31.7)),
-    "T": (427, (30.5, 31.6)),
-}
+FACTS = {"star": (463, (33.0, 31.9)), "I": (444, (31.5, 30.4)), "M": (435, (32.0, 31.7)), "T": (427, (30.5, 31.6))}
 
 
 @pytest.mark.parametrize("name", FACTS)

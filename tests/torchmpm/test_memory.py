@@ -41,13 +41,7 @@ def measured(solver: Solver, batch: int, substeps: int, segment: int | None, env
 
 @pytest.mark.parametrize(
     ("count", "batch", "substeps", "segment", "env_steps"),
-    [
-        (300, 1, 8, None, 1),
-        (300, 1, 12, 3, 1),
-        (1000, 1, 6, 2, 1),
-        (150, 3, 4, None, 1),
-        (300, 1, 3, None, 4),
-    ],
+    [(300, 1, 8, None, 1), (300, 1, 12, 3, 1), (1000, 1, 6, 2, 1), (150, 3, 4, None, 1), (300, 1, 3, None, 4)],
 )
 def test_eager(count: int, batch: int, substeps: int, segment: int | None, env_steps: int) -> None:
     solver, options = robot_and_ball(count - 50, 50), {"substeps": substeps, "segment": segment, "env_steps": env_steps}
@@ -138,13 +132,6 @@ def test_a_budget_that_nothing_fits_into(backend: str) -> None:
         ValueError, match=r"budget must be at least [\d,]+ bytes for 2 step\(s\) of 20 .* got 10,000: take"
     ):
         segment_for(robot(300, backend=backend), lively(300), substeps=20, budget=10_000, env_steps=2)
-
-
-@pytest.mark.parametrize("backend", ["eager", pytest.param("native", marks=needs_compiler)])
-def test_without_gradients(backend: str) -> None:
-    solver, state = robot(300, backend=backend), lively(300)
-    less = estimate_memory(solver, state, substeps=20, backward=False)
-    assert 0 < less < 0.5 * estimate_memory(solver, state, substeps=20)
 
 
 def test_bad_arguments() -> None:
