@@ -88,7 +88,7 @@ def test_policy_of_two_levels_is_disturbed_on_its_finer_grid(tmp_path, monkeypat
 def test_lost_pixels_are_no_case_for_a_policy_without_eyes(folder):
     config, policies = open_run(PROGRAM, folder, "cpu")
     blind = policies["stage 2"]
-    blind.sees_image = False
+    blind.uses_image = False
     names = [result.name for result in robustness.report(config, blind, make_cases()[:4], 1)]
     assert names == ["unperturbed", "action dropout 20%", "action noise 0.2"]
 
@@ -210,7 +210,7 @@ def test_chosen_cases_that_change_nothing_are_refused(folder):
         robustness.check_words(make_cases(), words, replace(run, obstacles=tuple(ground)), policy)
     with pytest.raises(ConfigError, match="floor friction sticky: the floor of run has this friction"):
         robustness.check_words(make_cases(), ["sticky"], run, policy)
-    policy.sees_image = False
+    policy.uses_image = False
     with pytest.raises(ConfigError, match="observation dropout 20%: the policy does not use the image"):
         robustness.check_words(make_cases(), ["observation"], run, policy)
 
