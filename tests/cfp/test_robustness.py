@@ -77,7 +77,7 @@ def test_blended_actions_are_disturbed_on_the_grid_that_they_were_decided_on():
 def test_lost_pixels_are_no_case_for_a_policy_without_eyes(folder):
     config, policies = open_run(PROGRAM, folder, "cpu")
     blind = policies["stage 2"]
-    blind.sees_image = False
+    blind.uses_image = False
     names = [result.name for result in robustness.report(config, blind, make_cases()[:4], 1)]
     assert names == ["unperturbed", "action dropout 20%", "action noise 0.2"]
 
@@ -198,7 +198,7 @@ def test_chosen_cases_that_change_nothing_are_refused(folder):
         robustness.check_words(make_cases(), words, replace(run, obstacles=tuple(ground)), policy)
     with pytest.raises(ConfigError, match="floor friction sticky: the floor of run has this friction"):
         robustness.check_words(make_cases(), ["sticky"], run, policy)
-    policy.sees_image = False
+    policy.uses_image = False
     with pytest.raises(ConfigError, match="observation dropout 20%: the policy does not use the image"):
         robustness.check_words(make_cases(), ["observation"], run, policy)
 
