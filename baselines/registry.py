@@ -16,8 +16,8 @@ from cfp.weights import read_policy
 
 ALGORITHMS: dict[str, str] = {
     "cfp": "cfp.experiment.coarse_to_fine:CoarseToFine",
-    "coarse": "baselines.common.single_level:Coarse",
-    "fine": "baselines.common.single_level:Fine",
+    "coarse": "baselines.common.single_stage:Coarse",
+    "fine": "baselines.common.single_stage:Fine",
     "gnn-16": "baselines.modular.train:GNN16",
     "gnn-64": "baselines.modular.train:GNN64",
     "transformer-16": "baselines.modular.train:Transformer16",

@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import Any, ClassVar, Literal
 
 from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
-from cfp.agent.spec import RESOLUTIONS, ActorSpec
+from cfp.agent.spec import ActorSpec
 from cfp.errors import ConfigError
 from cfp.from_dict import flatten
 from cfp.sections import EnvironmentConfig, NetworkConfig, ReportConfig
@@ -29,8 +29,7 @@ EVALUATION_SEED = 10_000
 class RunConfig:
     """Options of a training run that every algorithm has.
 
-    A run consists of one or more stages. Methods take the index of a stage, which counts from 0; users see stages
-    counted from 1.
+    A run consists of one or more stages, which are counted from 1.
     """
 
     task: str
@@ -59,7 +58,7 @@ class RunConfig:
         raise NotImplementedError
 
     def stage_steps(self, stage: int) -> int:
-        """Environment steps of a stage; 1 is the first."""
+        """Environment steps of a stage."""
         bounds = (0, *self.ends())
         return bounds[stage] - bounds[stage - 1]
 
@@ -76,40 +75,23 @@ class RunConfig:
         return self.seed + EVALUATION_SEED, self.report.eval_episodes
 
     def with_derived(self, base: RunConfig, given: Collection[str]) -> RunConfig:
-        """These options, with those that follow from others computed anew unless they were given.
-
-        Args:
-            base: The preset.
-            given: Names of the options that were given, even if with the values of the preset.
-        """
+        """These options, with those that follow from others in the preset ``base`` computed anew unless given."""
         return self
 
     def ineffective(self) -> dict[str, str]:
-        """Options without effect under the other options, and what they require (a trailing dot: the section)."""
+        """Options without effect under the others, and what they require (a trailing dot: the whole section)."""
         return {"report.wandb_project": "wandb"} if self.report.wandb == "off" else {}
 
     def check_effect(self, base: RunConfig, given: Collection[str] | None = None) -> None:
-        """Refuse options that differ from those of the preset but have no effect, see `ineffective`.
-
-        Args:
-            base: The preset.
-            given: Dotted names of the options to check; None checks all.
-
-        Raises:
-            ConfigError: An option has no effect.
-        """
-        mine, theirs = flatten(to_json(self)), flatten(to_json(base))
-        for option, required in self.ineffective().items():
-            for name, value in mine.items():
-                if name.startswith(option) and value != theirs[name] and (given is None or name in given):
+        """Refuse options, all or those ``given``, that differ from the preset ``base`` but are `ineffective`."""
+        defaults = flatten(to_json(base))
+        for name, value in flatten(to_json(self)).items():
+            for option, required in self.ineffective().items():
+                if name.startswith(option) and value != defaults[name] and (given is None or name in given):
                     raise ConfigError(f"{name.split('.')[-1]} requires {required}, got {value!r} without it")
 
     def check(self) -> None:
-        """Check what the types do not express.
-
-        Raises:
-            ConfigError: An option is wrong.
-        """
+        """Raise a `ConfigError` for options that are wrong."""
         check_task(self.task)
         _check_finite(self)
         if not 0 <= self.seed <= LARGEST_SEED:
@@ -122,7 +104,7 @@ class RunConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LadderConfig(RunConfig):
+class StagedConfig(RunConfig):
     """A run that trains several stages with action grids of increasing resolution, listed coarsest first."""
 
     steps: int
@@ -169,7 +151,7 @@ class LadderConfig(RunConfig):
 
         Stages are then equally long, and additional ones take the last value of the preset.
         """
-        assert isinstance(base, LadderConfig)
+        assert isinstance(base, StagedConfig)
         stages, scale, changes = len(self.resolutions), self.steps / base.steps, dict[str, Any]()
         for name, count in self._counts().items():
             values: tuple[float, ...] = getattr(base, name)
@@ -181,22 +163,16 @@ class LadderConfig(RunConfig):
         return replace(self, **{name: value for name, value in changes.items() if name not in given})
 
     def ineffective(self) -> dict[str, str]:
-        """A single stage has no gate."""
+        """Options without effect under the others: a single stage has no gate."""
         single = {"network.gate_scale": "several resolutions"} if len(self.resolutions) == 1 else {}
         return super().ineffective() | single
 
     def check(self) -> None:
-        """Check what the types do not express.
-
-        Raises:
-            ConfigError: An option is wrong.
-        """
+        """Raise a `ConfigError` for options that are wrong."""
         super().check()
-        increasing = list(self.resolutions) == sorted(set(self.resolutions))
-        if not self.resolutions or not increasing or not set(self.resolutions) <= set(RESOLUTIONS):
-            raise ConfigError(f"resolutions must be increasing values of {RESOLUTIONS}, got {self.resolutions}")
-        if self.resolutions[-1] > (patch := make_spec(self.task).patch):
+        if max(self.resolutions, default=0) > (patch := make_spec(self.task).patch):
             raise ConfigError(f"resolutions must be at most {patch} in {self.task}, got {self.resolutions}")
+        self.actor_spec(len(self.resolutions))  # checks the resolutions
         check_at_least(1, steps=self.steps)
         for name, count in self._counts().items():
             if (found := len(getattr(self, name))) != count:
@@ -213,7 +189,7 @@ class LadderConfig(RunConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(LadderConfig):
+class Config(StagedConfig):
     """A run of the coarse-to-fine policy; `cfp.preset` supplies the values for a task."""
 
     random_steps: tuple[int, ...]
@@ -230,7 +206,7 @@ class Config(LadderConfig):
     learning: LearningConfig = field(default_factory=LearningConfig)
 
     per_stage: ClassVar[tuple[str, ...]] = ("random_steps", "alpha")
-    per_residual_stage: ClassVar[tuple[str, ...]] = (*LadderConfig.per_residual_stage, "gate_penalty")
+    per_residual_stage: ClassVar[tuple[str, ...]] = (*StagedConfig.per_residual_stage, "gate_penalty")
 
     def hyperparameters(self, stage: int) -> Hyperparameters:
         """Hyperparameters of a stage."""
@@ -264,15 +240,9 @@ class Config(LadderConfig):
 
 
 def check_training_layouts(name: str, count: int, before: int = 0) -> None:
-    """Check that training uses no initial positions that evaluations use; both are numbered from the run's seed.
+    """Check that training uses no initial positions of evaluations; both are numbered from the run's seed.
 
-    Args:
-        name: Option that determines their number.
-        count: Number of initial positions.
-        before: Number of those used before them.
-
-    Raises:
-        ConfigError: Training would reach the initial positions of evaluations.
+    The option ``name`` determines their number, ``count``; ``before`` others are used before them.
     """
     if before + count > EVALUATION_SEED:
         largest = EVALUATION_SEED - before
@@ -280,11 +250,7 @@ def check_training_layouts(name: str, count: int, before: int = 0) -> None:
 
 
 def check_task(task: object) -> None:
-    """Check that a value names a task; a module that it names is imported.
-
-    Raises:
-        ConfigError: It does not.
-    """
+    """Check that a value names a task; a module that it names is imported."""
     if (allowed := allowed_instead(task)) is not None:
         raise ConfigError(f"task must be {allowed}, got {task!r}")
 

@@ -1,4 +1,4 @@
-"""``python -m cfp.evaluate RUN_FOLDER``: how good is a trained policy; works while training goes on."""
+"""``python -m cfp.evaluate RUN_FOLDER``: returns of a trained policy; also while it is in training."""
 
 from __future__ import annotations
 
@@ -52,9 +52,6 @@ class Selection:
     def open(self, program: Program) -> tuple[RunConfig, dict[str, Policy]]:
         """Options to evaluate with, and policies by stage, the newest last.
 
-        Args:
-            program: Knows how to read them.
-
         Raises:
             CFPError: An option is wrong, there is no run, it has no policy yet, or a file is damaged.
         """
@@ -92,12 +89,6 @@ def open_run(
 ) -> tuple[RunConfig, dict[str, Policy]]:
     """Options of the run in a folder, for evaluation, and its policies by stage, the newest last.
 
-    Args:
-        program: Knows how to read them.
-        folder: Of the run.
-        device: Where environments go.
-        seed: In place of the run's own.
-
     Raises:
         CFPError: There is no run, it has no policy yet, a file is damaged or not of this run, or the seed is negative.
     """
@@ -126,16 +117,16 @@ def open_policy(program: Program, path: str, device: str, seed: int | None) -> t
     policy = program.load(Path(path), choose_device(device))
     about = policy.description
     base = program.configure({"algo": about["kind"], "task": about["task"]})
-    config = update_from_dict(base, {"environment": about["environment"], **_ladder(about)}).with_derived(
-        base, _ladder(about)
+    config = update_from_dict(base, {"environment": about["environment"], **_stages(about)}).with_derived(
+        base, _stages(about)
     )
     config = replace(config, device=device, seed=about["seed"] if seed is None else seed)
     config.check()
     return config, {policy_file(path).stem: policy}
 
 
-def _ladder(about: dict[str, Any]) -> dict[str, Any]:
-    """The levels of a policy; those of the preset may be none that networks have, in a task of one's own."""
+def _stages(about: dict[str, Any]) -> dict[str, Any]:
+    """Options of the stages of a policy; in a custom task, those of the preset may not fit the networks."""
     network = about.get("network")
     if not isinstance(network, dict):
         return {}
@@ -157,25 +148,17 @@ def run(program: Program, command: Command) -> str:
 
 def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:
     """Command line entry; returns the exit code."""
-    return judge("evaluate", Command, run, arguments, program)
+    return evaluation_main("evaluate", Command, run, arguments, program)
 
 
-def judge(
+def evaluation_main(
     name: str,
     kind: type[Chosen],
     run: Callable[[Program, Chosen], str],
     arguments: Sequence[str] | None,
     program: Program,
 ) -> int:
-    """Command line entry of a program that judges policies and prints what it finds; returns the exit code.
-
-    Args:
-        name: Of the program's module.
-        kind: Its options.
-        run: Does what they say and returns what is printed.
-        arguments: Words of the command line; the process's own if None.
-        program: Whose policies they are.
-    """
+    """Command line entry of a program that evaluates policies and prints what it finds; returns the exit code."""
     started = program_name(f"{program.package}.{name}", arguments)
     return run_command(lambda: print(run(program, tyro.cli(kind, prog=started, args=arguments))))
 

@@ -22,16 +22,7 @@ _TYPE_NAMES: dict[Any, str] = {
 
 
 def update_from_dict(base: Options, values: Any, path: str = "") -> Options:
-    """Replace fields of a dataclass by JSON values, recursively.
-
-    Args:
-        base: Dataclass that supplies the values of fields that are left out.
-        values: JSON object.
-        path: Dotted path of the dataclass within the whole configuration, for error messages.
-
-    Raises:
-        ConfigError: A name is unknown or a value has the wrong type.
-    """
+    """Replace fields of a dataclass by JSON values, recursively; ``path`` is its dotted path, for error messages."""
     assert dataclasses.is_dataclass(base) and not isinstance(base, type)
     if not isinstance(values, dict):
         raise ConfigError(f"{path or 'configuration'} must be an object, got {values!r}")

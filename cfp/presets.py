@@ -133,12 +133,7 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
 def from_json(values: dict[str, Any], program: str = "train") -> Config:
     """A configuration from JSON values; those that are left out come from the preset that the values name.
 
-    Args:
-        values: Options by name.
-        program: Program of `baselines` that takes other algorithms, for the error message.
-
-    Raises:
-        ConfigError: A name is unknown or a value has the wrong type.
+    An error names the ``program`` of `baselines` that takes other algorithms.
     """
     if (algo := values.get("algo", "cfp")) != "cfp":
         raise ConfigError(f"algo must be 'cfp', got {algo!r}; python -m baselines.{program} runs other algorithms")

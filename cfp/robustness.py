@@ -16,7 +16,7 @@ from cfp import train
 from cfp.config import RunConfig
 from cfp.envs.disturbances import Case, disturbed_env, make_cases, reason_without_effect
 from cfp.errors import ConfigError
-from cfp.evaluate import Selection, judge
+from cfp.evaluate import Selection, evaluation_main
 from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
 from cfp.evaluation.plots import write_figure
 from cfp.experiment.training import Program
@@ -50,7 +50,7 @@ class Command(Selection):
     shift: float = 0.2
     """mu, yield stress and gravity are tried at 1 - shift and 1 + shift times their value."""
     friction: tuple[float, ...] = (0.0, 0.5, math.inf)
-    """Coulomb coefficients of the floor; inf sticks. The task's own is left out."""
+    """Coulomb coefficients of the floor; inf sticks. That of the task is left out."""
     cases: tuple[str, ...] = ()
     """Try only cases whose names hold one of these words, such as "dropout", beside the unperturbed one; all if not
     given."""
@@ -93,25 +93,17 @@ def check_words(cases: Sequence[Case], words: Sequence[str], spec: TaskSpec, pol
     """
     for word in words:
         reasons = {
-            case.name: reason_without_effect(case, spec, policy.sees_image) for case in cases[1:] if word in case.name
+            case.name: reason_without_effect(case, spec, policy.uses_image) for case in cases[1:] if word in case.name
         }
         if all(reasons.values()):
-            told = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
-            raise ConfigError(f"cases must be words of cases that change something, got {word!r} ({told})")
+            explained = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
+            raise ConfigError(f"cases must be words of cases that change something, got {word!r} ({explained})")
 
 
 def report(
     config: RunConfig, policy: Policy, cases: Sequence[Case], episodes: int, *, deterministic: bool | None = None
 ) -> list[Result]:
-    """Evaluate a policy in every case that changes something for it, on the same layouts with the same noise.
-
-    Args:
-        config: Options of the run that trained it.
-        policy: The policy.
-        cases: The unperturbed one first.
-        episodes: Episodes of each case.
-        deterministic: Act without noise; None: as the run that trained the policy evaluates it.
-    """
+    """Evaluate a policy in every case that changes something for it, on the same layouts with the same noise."""
     if deterministic is None:
         deterministic = policy.deterministic_by_default
     spec, seed = make_spec(config.task, **config.environment.task_options()), evaluation_seed(config)
@@ -120,7 +112,7 @@ def report(
         [],
     )
     for case in cases:
-        if reason_without_effect(case, spec, policy.sees_image):
+        if reason_without_effect(case, spec, policy.uses_image):
             continue
         env = disturbed_env(config, policy.resolution, episodes, case, seed, grid)
         acting = policy.through(env.disturb) if isinstance(policy, DisturbablePolicy) else policy
@@ -213,7 +205,7 @@ def run(program: Program, command: Command) -> str:
 
 def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:
     """Command line entry; returns the exit code."""
-    return judge("robustness", Command, run, arguments, program)
+    return evaluation_main("robustness", Command, run, arguments, program)
 
 
 if __name__ == "__main__":

@@ -63,11 +63,7 @@ class EnvironmentConfig:
         return replace(self, particles=particles) if particles == "full" else self.for_training(particles)
 
     def check(self) -> None:
-        """Check the ranges that the types do not express.
-
-        Raises:
-            ConfigError: A value is out of range.
-        """
+        """Raise a `ConfigError` for values out of range."""
         check_at_least(1, num_envs=self.num_envs, substeps=self.substeps)
 
 
@@ -83,11 +79,7 @@ class NetworkConfig:
     """Largest gate value (the reference: 0.25 with split encoders)."""
 
     def check(self) -> None:
-        """Check the ranges that the types do not express.
-
-        Raises:
-            ConfigError: A value is out of range.
-        """
+        """Raise a `ConfigError` for values out of range."""
         check_positive(gate_scale=self.gate_scale)
 
 
@@ -117,11 +109,7 @@ class ReportConfig:
     """Weights & Biases project."""
 
     def check(self) -> None:
-        """Check the ranges that the types do not express.
-
-        Raises:
-            ConfigError: A value is out of range.
-        """
+        """Raise a `ConfigError` for values out of range."""
         check_at_least(
             1, eval_episodes=self.eval_episodes, checkpoint_every=self.checkpoint_every, log_every=self.log_every
         )

@@ -13,12 +13,7 @@ from cfp.files import names_file, write_text
 
 
 def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> str:
-    """A table as CSV.
-
-    Args:
-        rows: Values by column; other values are left out.
-        columns: In their order.
-    """
+    """A table as CSV."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -28,11 +23,6 @@ def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> str:
 
 class Table:
     """A CSV file that grows row by row, also over several sessions, and can take new columns on the way.
-
-    Args:
-        path: The file; what it holds is kept.
-        last_step: Rows whose ``step`` is beyond this are dropped: they belong to work that a resumed run repeats.
-        numbers: Columns that hold a number in every row that is there.
 
     Raises:
         CheckpointError: The file is damaged.
@@ -66,10 +56,6 @@ class Table:
 
 def read_table(path: Path, numbers: Sequence[str] = ("step",)) -> list[dict[str, str]]:
     """Rows of a CSV file as text, none if it does not exist; a last line cut short by a crash is left out.
-
-    Args:
-        path: The file.
-        numbers: Columns that hold a number in every row.
 
     Raises:
         CheckpointError: It is no such table.

@@ -12,7 +12,7 @@ from cfp.weights import load
 
 PROGRAM = training.Program(
     "cfp",
-    "Train the coarse-to-fine policy on a DittoGym task: all levels of the ladder, one after the other.",
+    "Train the coarse-to-fine policy on a DittoGym task, one stage after the other.",
     from_json,
     lambda _: CoarseToFine,
     load,

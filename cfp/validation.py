@@ -6,33 +6,21 @@ from cfp.errors import ConfigError
 
 
 def check_at_least(minimum: float, **values: float) -> None:
-    """Check that each value, given by the name of its option, is at least ``minimum``.
-
-    Raises:
-        ConfigError: A value is smaller, or NaN.
-    """
+    """Check that each value, given by the name of its option, is at least ``minimum``; NaN is refused."""
     for name, value in values.items():
         if not value >= minimum:
             raise ConfigError(f"{name} must be at least {minimum}, got {value}")
 
 
 def check_positive(**values: float) -> None:
-    """Check that each value, given by the name of its option, is positive.
-
-    Raises:
-        ConfigError: A value is zero, negative, or NaN.
-    """
+    """Check that each value, given by the name of its option, is positive; NaN is refused."""
     for name, value in values.items():
         if not value > 0:
             raise ConfigError(f"{name} must be positive, got {value}")
 
 
 def check_fraction(**values: float) -> None:
-    """Check that each value, given by the name of its option, lies in [0, 1].
-
-    Raises:
-        ConfigError: A value lies outside, or is NaN.
-    """
+    """Check that each value, given by the name of its option, lies in [0, 1]; NaN is refused."""
     for name, value in values.items():
         if not 0 <= value <= 1:
             raise ConfigError(f"{name} must be between 0 and 1, got {value}")

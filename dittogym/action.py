@@ -16,9 +16,8 @@ ActionIndexing = Literal["image", "grid"]
 def to_grid_indexing(action: Tensor, indexing: ActionIndexing) -> Tensor:
     """Bring an action (B, 2, R, R) to the index order (component, x rightwards, y upwards).
 
-    With the indexing ``"image"`` the last indices are row from the top and column, as in the observation, so a pixel of
-    the action acts where the same pixel of the observation looks. The reference implementation indexes actions as
-    ``"grid"`` and observations as images, a quarter turn apart.
+    With ``"image"`` a pixel of the action acts where the same pixel of the observation looks; the reference
+    implementation indexes actions as ``"grid"``.
     """
     return action.flip(-2).transpose(-1, -2) if indexing == "image" else action
 
@@ -31,8 +30,7 @@ def from_grid_indexing(action: Tensor, indexing: ActionIndexing) -> Tensor:
 def patch_field(action: Tensor, patch: int, max_actuation: float | Tensor) -> Tensor:
     """Upsample an action (B, 2, R, R) to the patch and scale it to muscle stress (B, 2, P, P), Pa.
 
-    Bicubic interpolation (a = -0.75) with half-pixel centres; the result is clipped to the muscles' limit, because the
-    interpolation overshoots.
+    The result is clipped to the muscles' limit, because bicubic interpolation overshoots.
     """
     upsampled = bicubic(action, patch)
     scale = max_actuation.view(-1, 1, 1, 1) if isinstance(max_actuation, Tensor) else max_actuation
@@ -42,8 +40,7 @@ def patch_field(action: Tensor, patch: int, max_actuation: float | Tensor) -> Te
 def bicubic(image: Tensor, size: int, align_corners: bool = False) -> Tensor:
     """Bicubic interpolation (a = -0.75) of square images (..., R, R) to (..., size, size).
 
-    Computed as two small matrix products, which on a CPU are several times faster than
-    ``torch.nn.functional.interpolate``, forward and backward.
+    As two small matrix products, several times faster on a CPU than ``torch.nn.functional.interpolate``.
     """
     matrix = bicubic_matrix(image.shape[-1], size, align_corners, image.dtype, image.device)
     with torch.autocast(image.device.type, enabled=False):  # its result is executed, so precision matters

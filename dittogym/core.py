@@ -122,12 +122,7 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
 
 
 class _GradientGuard:
-    """Keeps what simulations share free of the gradients of those that are not finite after a step.
-
-    Such an element ends with a constant reward, whose derivative is zero. Where autograd goes back through the step it
-    meets zero times infinity, and a sum over the batch, such as the gradient in a shared action or constant, would be
-    NaN for all.
-    """
+    """Stops gradients of elements that are not finite after a step: NaN would reach all through what they share."""
 
     def __init__(self) -> None:
         self.used = False
@@ -178,15 +173,11 @@ def evaluate(model: Model, state: EnvState, actuation: Tensor, *, soft: bool = F
     info = measured_info(model, state, now)
     valid = info["finite"]
     moment = _moment(model, state, now, observation, EXACT)
-    outcome = _outcome(model, moment)
-    terms = _weighted_terms(model, moment, outcome, actuation, valid)
-    reward = true_reward = _total(terms)
-    image = None
+    outcome, terms, reward = _judge(model, moment, actuation, valid)
+    image, true_reward = None, reward
     if soft:
         image = soft_observation(model, state)
-        moment = moment._replace(observation=image, ops=SMOOTH)
-        terms = _weighted_terms(model, moment, _outcome(model, moment), actuation, valid)
-        reward = _total(terms)
+        _, terms, reward = _judge(model, moment._replace(observation=image, ops=SMOOTH), actuation, valid)
     terminated = ~valid if outcome.terminated is None else outcome.terminated | ~valid
     if spec.split_limit is not None:
         terminated = terminated | (now.split > spec.split_limit)
@@ -222,18 +213,11 @@ def _moment(model: Model, state: EnvState, now: Measurement, observation: Tensor
     return Moment(state.particles, model.num_robot_particles, now, state.start, observation, state.memory, ops)
 
 
-def _outcome(model: Model, moment: Moment) -> Outcome:
-    spec = model.spec
-    outcome = spec.reward_fn(moment, spec)
-    check_outcome(spec.name, outcome, moment.memory, spec.weights, len(moment.now.split), model.checked)
-    return outcome
-
-
-def _weighted_terms(
-    model: Model, moment: Moment, outcome: Outcome, actuation: Tensor, valid: Tensor
-) -> dict[str, Tensor]:
-    """The task's terms and the engine's, weighted; of simulations that are not valid (B,) only ``failure``."""
+def _judge(model: Model, moment: Moment, actuation: Tensor, valid: Tensor) -> tuple[Outcome, dict[str, Tensor], Tensor]:
+    """Outcome, weighted terms and their sum; of simulations that are not valid (B,) only ``failure`` counts."""
     spec, now = model.spec, moment.now
+    outcome = spec.reward_fn(moment, spec)
+    check_outcome(spec.name, outcome, moment.memory, spec.weights, len(now.split), model.checked)
     terms, weights = dict(outcome.terms), spec.weights
     if spec.split_limit is not None:
         terms["split"] = moment.ops.split_penalty(now.split, spec.split_limit)
@@ -244,7 +228,8 @@ def _weighted_terms(
     _check_finite(spec.name, list(terms), values, valid)
     values = torch.where(valid, values, 0.0)
     failure = torch.where(valid, 0.0, FAILURE_REWARD).to(now.split)
-    return {**dict(zip(terms, values.unbind(), strict=True)), "failure": failure}
+    weighted = {**dict(zip(terms, values.unbind(), strict=True)), "failure": failure}
+    return outcome, weighted, torch.stack(tuple(weighted.values())).sum(0)
 
 
 def _check_finite(task: str, names: list[str], values: Tensor, valid: Tensor) -> None:
@@ -256,7 +241,3 @@ def _check_finite(task: str, names: list[str], values: Tensor, valid: Tensor) ->
             f"reward_fn of task {task!r} must return finite terms where the simulation is finite, "
             f"got {values[term, element].item()} for {names[term]!r} in simulation {element}"
         )
-
-
-def _total(terms: Mapping[str, Tensor]) -> Tensor:
-    return torch.stack(tuple(terms.values())).sum(0)

@@ -55,18 +55,13 @@ def as_numpy(info: dict[str, Any]) -> dict[str, Any]:
 
 def element(info: dict[str, Any], index: int) -> dict[str, Any]:
     """One element of an ``info`` of arrays; numbers come out as Python numbers."""
-    picked: dict[str, Any] = {}
-    for key, value in info.items():
+
+    def pick(value: Any) -> Any:
         if isinstance(value, dict):
-            picked[key] = element(value, index)
-        else:
-            picked[key] = value[index].item() if value[index].ndim == 0 else value[index]
-    return picked
+            return element(value, index)
+        return value[index].item() if value[index].ndim == 0 else value[index]
 
-
-def registered_horizon(task: str | TaskSpec) -> int:
-    """Steps after which an episode of a task ends without options, which is the time limit of its ids."""
-    return make_spec(task).horizon
+    return {name: pick(value) for name, value in info.items()}
 
 
 class Env(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -100,7 +95,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
                 "gymnasium.make_vec(..., vectorization_mode='vector_entry_point') or dittogym.TorchEnv"
             )
         self.torch_env = TorchEnv(task, 1, **options)
-        self._own_limit = self.torch_env.spec.horizon != registered_horizon(task)
+        self._own_limit = self.torch_env.spec.horizon != make_spec(task).horizon
         self.observation_space, self.action_space = spaces(self.torch_env)
         self.render_mode, self.render_muscles = render_mode, render_muscles
         self._screen = None
@@ -144,21 +139,16 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         with torch.no_grad():
             batch = as_tensor(action, self.torch_env, single=True)
             observation, reward, terminated, truncated, info = self.torch_env.step(batch)
-            if self.spec is not None and not self._own_limit:
-                truncated = torch.zeros_like(truncated)  # made by Gymnasium, whose TimeLimit wrapper does it
         self._show()
-        picked = element(as_numpy(info), 0)
-        return as_image(observation)[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), picked
+        limit = bool(truncated[0]) and (self.spec is None or self._own_limit)  # else Gymnasium's TimeLimit truncates
+        return as_image(observation)[0], float(reward[0]), bool(terminated[0]), limit, element(as_numpy(info), 0)
 
     def save(self) -> Snapshot:
         """The present moment, to return to with :meth:`load`; see :meth:`dittogym.TorchEnv.save`."""
         return self.torch_env.save()
 
     def load(self, snapshot: Snapshot) -> np.ndarray:
-        """Continue from a saved moment, and return its observation (3, 64, 64) uint8.
-
-        See :meth:`dittogym.TorchEnv.load`.
-        """
+        """Continue from a saved moment, see :meth:`dittogym.TorchEnv.load`; returns its image (3, 64, 64) uint8."""
         return as_image(self.torch_env.load(snapshot))[0]
 
     def render(self) -> np.ndarray | None:

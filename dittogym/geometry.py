@@ -167,10 +167,9 @@ def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True, fric
             so that its faces would overlap.
     """
     for axis, given in (("i", i), ("j", j)):
-        if not isinstance(given, tuple) or len(given) != 2 or not {type(end) for end in given} <= {int, type(None)}:
+        kinds = {int} if axis == "i" else {int, type(None)}
+        if not isinstance(given, tuple) or len(given) != 2 or not {type(end) for end in given} <= kinds:
             raise ValueError(f"{axis} must be a range (low, high) of node indices, got {given!r}")
-    if None in i:
-        raise ValueError(f"i must have both ends, got {i!r}")
     low, high = j
     box = nodes(*i, -math.inf if low is None else low, math.inf if high is None else high)
     return Obstacle(name, (box,), friction, observed=None if visible else ())

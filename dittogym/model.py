@@ -185,15 +185,7 @@ def make_model(
 
 
 def check_stability(model: Model, physics: Physics) -> None:
-    """Refuse matter that the solver's substep is too long for.
-
-    Args:
-        model: The task.
-        physics: Constants that differ from the task's.
-
-    Raises:
-        ValueError: Substeps would have to be shorter.
-    """
+    """Refuse matter, with the muscles of the task or of ``physics``, that needs shorter substeps."""
     solver = model.solver_for(physics)
     limit = solver.stable_dt(physics.get("max_actuation", model.spec.max_actuation))
     if solver.dt > limit:

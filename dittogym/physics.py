@@ -95,10 +95,10 @@ def part_of(value: float | Tensor, particles: slice) -> float | Tensor:
 
 def _alike(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
     """Values of one shape: where one has a value per particle, both have."""
-    if one.ndim == other.ndim:
-        return one, other
-    one, other = (value[:, None] if value.ndim == 1 else value for value in (one, other))
-    return one.expand_as(one + other), other.expand_as(one + other)
+    if one.ndim != other.ndim:
+        one, other = (value[:, None] if value.ndim == 1 else value for value in (one, other))
+    alike = torch.broadcast_tensors(one, other)
+    return alike[0], alike[1]
 
 
 def _expanded(value: Tensor, name: str, batch: int) -> Tensor:

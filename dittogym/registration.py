@@ -45,9 +45,8 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
     if spec.name != task:
         raise ValueError(f"task must be the name in the specification, got {task!r} for a TaskSpec {spec.name!r}")
     if TASKS.get(task, make) is not make:
-        ours = [known for known in gymnasium.registry.values() if known.entry_point == ENTRY_POINT]
-        for known in ours:
-            if known.kwargs["task"] == task:
+        for known in list(gymnasium.registry.values()):
+            if known.entry_point == ENTRY_POINT and known.kwargs["task"] == task:
                 del gymnasium.registry[known.id]
     for resolution in ("coarse", "fine"):
         name = f"{namespace}/{task}-{resolution}-v{version}"

@@ -75,7 +75,7 @@ class RewardOps:
             (B, K).
         """
         index = nearest(x.detach(), point.detach(), fraction)
-        return values.gather(1, index[..., None].expand(-1, -1, values.shape[2])).mean(1)
+        return pick(values, index).mean(1)
 
     def silhouette(self, observation: Tensor) -> Tensor:
         """Pixels (B, 64, 64) in which an observation shows matter: bool, or probabilities in the smooth form."""
@@ -165,8 +165,8 @@ def drop_widest(index: Tensor, x: Tensor) -> Tensor:
 
 
 def pick(x: Tensor, index: Tensor) -> Tensor:
-    """Positions (B, K, 2) of the particles ``index`` (B, K) among ``x`` (B, N, 2)."""
-    return x.gather(1, index[..., None].expand(-1, -1, 2))
+    """Values (B, K, D) of the particles ``index`` (B, K) among ``x`` (B, N, D)."""
+    return x.gather(1, index[..., None].expand(-1, -1, x.shape[2]))
 
 
 def action_cost(actuation: Tensor) -> Tensor:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
 from torch import Tensor
 
-from dittogym.bodies.shapes import Shape
+from dittogym.bodies.shapes import Shape, check_pair
 from dittogym.contract import Memory, Moment, Outcome
 from dittogym.geometry import NODES, Box, Obstacle, mark
 from dittogym.observation.image import SIZE
@@ -118,10 +118,12 @@ class TaskSpec:
     target: np.ndarray | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
-        """Check all values, some of which would otherwise fail late or silently."""
         checks.instance("name", self.name, str)
         self._check_numbers()
-        self._check_weights()
+        checks.instance("weights", self.weights, Mapping)
+        for name, value in self.weights.items():
+            checks.number(f"weights[{name!r}]", value)
+        object.__setattr__(self, "weights", dict(self.weights))  # later changes of the caller's do not reach it
         checks.instance("window", self.window, Window)
         checks.instances("obstacles", self.obstacles, Obstacle)
         checks.instance("robot", self.robot, BodySpec)
@@ -146,24 +148,12 @@ class TaskSpec:
         checks.whole("patch", self.patch, 4, NODES)
         for name in ("coarse", "fine"):
             checks.whole(name, getattr(self, name), 1, self.patch)
-        for name in ("gravity", "goal", "view", "reach"):
-            self._check_point(name, optional=name == "goal", open_ended=name in ("view", "reach"))
-
-    def _check_point(self, name: str, *, optional: bool, open_ended: bool) -> None:
-        given = getattr(self, name)
-        if given is None and optional:
-            return
-        if not isinstance(given, Sequence) or isinstance(given, str) or len(given) != 2:
-            raise ValueError(f"{name} must be two numbers (x, y), got {given!r}")
-        for axis, value in zip("xy", given, strict=True):
-            if value is not None or not open_ended:
-                checks.number(f"{name} {axis}", value)
-
-    def _check_weights(self) -> None:
-        checks.instance("weights", self.weights, Mapping)
-        for name, value in self.weights.items():
-            checks.number(f"weights[{name!r}]", value)
-        object.__setattr__(self, "weights", dict(self.weights))  # later changes of the caller's do not reach it
+        check_pair("gravity", self.gravity)
+        if self.goal is not None:
+            check_pair("goal", self.goal)
+        for name in ("view", "reach"):
+            centre: Centre = getattr(self, name)
+            check_pair(name, tuple(0.0 if c is None else c for c in centre))  # None follows the robot
 
     @property
     def bodies(self) -> tuple[BodySpec, ...]:

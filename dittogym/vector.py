@@ -13,9 +13,10 @@ from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from dittogym.bodies.positions import Seed
-from dittogym.env import RENDER_FPS, RENDER_MODES, as_image, as_numpy, as_tensor, registered_horizon, spaces
+from dittogym.env import RENDER_FPS, RENDER_MODES, as_image, as_numpy, as_tensor, spaces
 from dittogym.model import Snapshot
 from dittogym.spec import TaskSpec
+from dittogym.tasks import make_spec
 from dittogym.torch_env import TorchEnv
 from torchmpm import ParticleState, checks
 
@@ -88,7 +89,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.torch_env = TorchEnv(task, num_envs, **options)
         self.num_envs, self.render_mode, self.render_muscles = num_envs, render_mode, render_muscles
-        own, usual = self.torch_env.spec.horizon, registered_horizon(task)
+        own, usual = self.torch_env.spec.horizon, make_spec(task).horizon
         # Gymnasium passes the limit of the id, whatever the task's options say.
         limit = own if max_episode_steps in (None, usual) else max_episode_steps
         self._horizon = math.inf if limit == -1 else limit
@@ -131,34 +132,29 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             Observations (B, 3, 64, 64) uint8, rewards (B,) float64, terminated and truncated (B,) bool, ``info``.
         """
         action = as_tensor(actions, self.torch_env)
-        everyone = np.ones(self.num_envs, dtype=bool)
-        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
-            return self._step_then_reset_next(action)
-        if self.autoreset_mode is AutoresetMode.DISABLED:
-            observation, reward, terminated, _, info = self.torch_env.step(action)
-            limits = _array(self.torch_env.env_state.steps >= self._horizon)
-            rewards, ends = _array(reward.double()), _array(terminated)
-            return as_image(observation), rewards, ends, limits, _with_masks(as_numpy(info), everyone)
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP:
+            return self._reset_then_step(action)
         step = autoreset_step(self.torch_env, action, self._horizon)
         rewards, ends, limits = _array(step.reward.double()), _array(step.terminated), _array(step.truncated)
         images, info = as_image(step.observation), as_numpy(step.info)
         if step.reset_info is None:
-            return images, rewards, ends, limits, _with_masks(info, everyone)
+            return images, rewards, ends, limits, _with_masks(info, np.ones_like(ends))
         done, finals, final = _array(step.done), as_image(step.final_observation), np.empty(self.num_envs, dtype=object)
         for i in np.flatnonzero(done):
             final[i] = finals[i]
         last = {"final_obs": final, "_final_obs": done, "final_info": _with_masks(info, done), "_final_info": done}
         return images, rewards, ends, limits, _restarted(info, as_numpy(step.reset_info), done) | last
 
-    def _step_then_reset_next(self, action: torch.Tensor) -> tuple[Any, ...]:
-        """A step in which elements that have ended before are reset instead; their actions do not count."""
+    def _reset_then_step(self, action: torch.Tensor) -> tuple[Any, ...]:
+        """A step in which, in the mode ``NEXT_STEP``, elements that have ended before are reset instead."""
         fresh = self._ended.copy()
         ended = torch.as_tensor(fresh, device=action.device)
-        action = action.masked_fill(ended[:, None, None, None], 0.0)  # which may hold NaN
+        action = action.masked_fill(ended[:, None, None, None], 0.0)  # ignored, and may hold NaN
         observation, reward, terminated, _, raw = self.torch_env.step(action)
         limits = _array(self.torch_env.env_state.steps >= self._horizon) & ~fresh
         rewards, ends, info = _array(reward.double()) * ~fresh, _array(terminated) & ~fresh, as_numpy(raw)
-        self._ended = ends | limits
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            self._ended = ends | limits
         if not fresh.any():
             return as_image(observation), rewards, ends, limits, _with_masks(info, ~fresh)
         observation, start = self.torch_env.reset(options={"reset_mask": ended})

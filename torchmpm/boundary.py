@@ -79,21 +79,13 @@ def fixed(
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """All rules against one direction, as masks over the padded grid for the current position of the window.
+    """All rules against one direction, as masks over the padded grid for the current position of the window."""
 
-    Attributes:
-        axis: 0 for x, 1 for y.
-        sign: +1 or -1, the sign of the removed component.
-        active: (1 or B, cells) nodes with a rule.
-        stick: (1 or B, cells) those of them that stick, or ``None`` if no rule does.
-        friction: (1 or B, cells) Coulomb coefficients, or ``None`` if no rule has a finite friction.
-    """
-
-    axis: int
-    sign: int
-    active: Tensor
-    stick: Tensor | None
-    friction: Tensor | None
+    axis: int  # 0 for x, 1 for y
+    sign: int  # +1 or -1, the sign of the removed component
+    active: Tensor  # (1 or B, cells) nodes with a rule
+    stick: Tensor | None  # (1 or B, cells) those of them that stick, if any
+    friction: Tensor | None  # (1 or B, cells) Coulomb coefficients, if any
 
 
 def node_shift(grid: Grid, origin: Tensor) -> Tensor:
@@ -102,13 +94,7 @@ def node_shift(grid: Grid, origin: Tensor) -> Tensor:
 
 
 def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Face, ...]:
-    """Turn rules into masks; the window does not move during a step, so this is done once a step.
-
-    Args:
-        rules: The rules, in their order of precedence.
-        grid: The window.
-        origin: (B, 2) lower left corner of the window in the world, m.
-    """
+    """The rules as masks for a window at origin (B, 2), m; it does not move during a step, so they serve all of it."""
     window = torch.arange(-PAD, grid.resolution + PAD, device=origin.device)[None]
     shift = node_shift(grid, origin)
 
@@ -146,14 +132,10 @@ def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Fa
 
 
 def constrain(faces: Sequence[Face], velocity: Tensor) -> Tensor:
-    """Apply the rules to node velocities.
+    """Apply the rules to node velocities (2, B, cells), m/s.
 
     Rules of different directions commute as long as none has a finite friction, so the order of directions only
     matters in a corner between two walls with friction.
-
-    Args:
-        faces: Masks from :func:`faces`.
-        velocity: (2, B, cells), m/s.
     """
     component = list(velocity.unbind(0))
     for face in faces:

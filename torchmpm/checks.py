@@ -11,11 +11,7 @@ from torch import Tensor
 
 
 def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
-    """A whole number as a Python integer.
-
-    Raises:
-        ValueError: It is something else (truth values too), below ``least`` or above ``most``.
-    """
+    """A whole number (no truth value) from ``least`` to ``most`` as a Python integer, or else a ValueError."""
     if isinstance(value, bool) or not isinstance(value, Integral):
         raise ValueError(f"{name} must be a whole number, got {value!r}")
     number = int(value)
@@ -27,11 +23,7 @@ def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
 
 
 def number(name: str, value: Any, *, least: float | None = None, above: float | None = None) -> None:
-    """Check a finite number.
-
-    Raises:
-        ValueError: It is something else, below ``least``, or not above ``above``.
-    """
+    """Raise a ValueError unless this is a finite number, at least ``least`` and above ``above``."""
     if isinstance(value, bool) or not isinstance(value, Real):
         raise ValueError(f"{name} must be a number, got {value!r}")
     if least is not None and not float(value) >= least:
@@ -43,11 +35,7 @@ def number(name: str, value: Any, *, least: float | None = None, above: float | 
 
 
 def value(name: str, given: Any, *, least: float | None = None, above: float | None = None) -> None:
-    """Check what may be a number or a tensor; what a tensor holds is left to :meth:`torchmpm.Solver.stable_dt`.
-
-    Raises:
-        ValueError: See `number`.
-    """
+    """As :func:`number`, or a tensor; what it holds is left to :meth:`torchmpm.Solver.stable_dt`."""
     if isinstance(given, Tensor):
         return
     if not isinstance(given, Real):
@@ -56,21 +44,13 @@ def value(name: str, given: Any, *, least: float | None = None, above: float | N
 
 
 def instance(name: str, given: Any, kind: type) -> None:
-    """Check the type of an object.
-
-    Raises:
-        TypeError: It is something else.
-    """
+    """Raise a TypeError unless an object is of a type."""
     if not isinstance(given, kind) or isinstance(given, type):
         raise TypeError(f"{name} must be a {kind.__name__}, got {_brief(given)}")
 
 
 def instances(name: str, given: Any, kind: type) -> None:
-    """Check a sequence of objects of one type.
-
-    Raises:
-        TypeError: It is no sequence, or holds something else.
-    """
+    """Raise a TypeError unless this is a sequence of objects of one type."""
     if not isinstance(given, Sequence) or isinstance(given, str):
         raise TypeError(f"{name} must be a sequence of {kind.__name__}, got {_brief(given)}")
     for index, item in enumerate(given):
@@ -78,11 +58,7 @@ def instances(name: str, given: Any, kind: type) -> None:
 
 
 def flag(name: str, given: Any) -> None:
-    """Check a truth value, for which any text, "no" too, would count as true.
-
-    Raises:
-        ValueError: It is neither True nor False.
-    """
+    """Raise a ValueError unless this is True or False; any text, "no" too, would count as true."""
     if not isinstance(given, bool):
         raise ValueError(f"{name} must be True or False, got {given!r}")
 

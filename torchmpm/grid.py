@@ -52,11 +52,6 @@ class Grid:
         return self.resolution + 2 * PAD
 
     def contains(self, x: Tensor, origin_x: Tensor) -> Tensor:
-        """Which particles take part: the window test in x, false for NaN.
-
-        Args:
-            x: (B, N) horizontal positions, m.
-            origin_x: (B, 1) left end of the window, m.
-        """
+        """Whether particles at x (B, N), m, take part: inside of the window from origin_x (B, 1), m; false for NaN."""
         offset = x - origin_x
         return (offset > self.margin) & (offset < self.resolution * self.h - self.margin)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from torchmpm import checks
-from torchmpm.native.cpu import call
-from torchmpm.native.inputs import Inputs
 from torchmpm.rollout import SEGMENT, Segment, check_repetition
 from torchmpm.solver import Solver
 from torchmpm.state import ParticleState
@@ -15,24 +15,23 @@ from torchmpm.substep import Planes, substep
 
 #: Component planes of a state.
 PLANES = 13
-#: Largest temporary memory of an eager substep, in units of the graph that it leaves: on top of a graph, and without.
-WITH_GRAPH, WITHOUT_GRAPH = 0.4, 0.7
+#: Largest temporary memory of an eager substep, in units of the graph that it leaves.
+TEMPORARY = 0.4
+#: Numbers of a node in the grids of a native step.
+GRIDS = 16
+
+#: Where a step starts, or (B, N, dtype) of a state on the CPU.
+Start = ParticleState | tuple[int, int, torch.dtype]
 
 
 def estimate_memory(
-    solver: Solver,
-    state: ParticleState | tuple[int, int, torch.dtype],
-    *,
-    substeps: int,
-    segment: Segment = "auto",
-    env_steps: int = 1,
-    backward: bool = True,
+    solver: Solver, state: Start, *, substeps: int, segment: Segment = "auto", env_steps: int = 1
 ) -> int:
-    """Bytes that :meth:`torchmpm.Solver.step`, and a backward pass through it, will need beyond their inputs.
+    """Bytes that :meth:`torchmpm.Solver.step` and a backward pass through it need beyond their inputs.
 
     For the eager backend, the graph of a substep is measured on tensors without memory, and the result is extrapolated.
-    A compiled substep keeps less than an eager one, so there this is an upper bound. The native backend reports the
-    size of its scratch memory. The estimate is the largest number of bytes alive at once, with gradients in state and
+    A compiled substep keeps less than an eager one, so there this is an upper bound. For the native backend, the
+    size of its tape is known. The estimate is the largest number of bytes alive at once, with gradients in state and
     actuation; what an allocator rounds up, or keeps for later, is not included.
 
     Args:
@@ -42,36 +41,16 @@ def estimate_memory(
         substeps: Substeps of a step.
         segment: As in :meth:`torchmpm.Solver.step`.
         env_steps: Steps in a row, through :func:`torchmpm.trajectory` with its checkpoints.
-        backward: With a gradient; else only what one step needs without.
 
     Raises:
         ValueError: A number is below 1, the solver cannot run such a state, or it would run it natively on CUDA, whose
             memory is not known beforehand.
     """
-    batch = state.batch_size if isinstance(state, ParticleState) else state[0]
-    for name, number in (("substeps", substeps), ("env_steps", env_steps), ("the state's batch size", batch)):
-        checks.whole(name, number, 1)
     substeps, segment = check_repetition(substeps, segment, "substeps")
-    share = _occupied(solver, state)
-    state = _empty(solver, state)
-    if solver.runs_native(state):
-        if state.device.type != "cpu":
-            raise ValueError(f"state must be on the CPU for the memory of backend 'native', got {state.device}")
-        return _native(solver, state, substeps, segment, env_steps, backward, share)
-    graph = _graph_bytes(solver, state)
-    if not backward:
-        return int(WITHOUT_GRAPH * graph)
-    return _eager(state, graph, substeps, segment) + (env_steps - 1) * _step_bytes(solver, state)
+    return _estimate(solver, state, substeps, env_steps)(segment)
 
 
-def segment_for(
-    solver: Solver,
-    state: ParticleState | tuple[int, int, torch.dtype],
-    *,
-    substeps: int,
-    budget: int,
-    env_steps: int = 1,
-) -> int | None:
+def segment_for(solver: Solver, state: Start, *, substeps: int, budget: int, env_steps: int = 1) -> int | None:
     """The ``segment`` for :meth:`torchmpm.Solver.step` with which gradients fit into a budget.
 
     The whole graph (``None``) if that fits, which saves a second forward pass eagerly; else as few checkpoints as fit.
@@ -86,57 +65,54 @@ def segment_for(
     Raises:
         ValueError: The smallest need exceeds the budget, or a number is below 1.
     """
-    least = estimate_memory(solver, state, substeps=substeps, segment=None, env_steps=env_steps)
-    if least <= budget:
-        return None
-    share, state = _occupied(solver, state), _empty(solver, state)
-    lengths = range(substeps - 1, 0, -1)
-    if solver.runs_native(state):
-        needs = {n: _native(solver, state, substeps, n, env_steps, True, share) for n in lengths}
-    else:
-        graph = _graph_bytes(solver, state)
-        others = least - _eager(state, graph, substeps, None)
-        needs = {n: others + _eager(state, graph, substeps, n) for n in lengths}
-    for length, need in needs.items():
-        if need <= budget:
-            return length
-    least = min([least, *needs.values()])
+    need = _estimate(solver, state, substeps, env_steps)
+    needs = []
+    for segment in (None, *range(substeps - 1, 0, -1)):
+        needs.append(need(segment))
+        if needs[-1] <= budget:
+            return segment
     raise ValueError(
-        f"budget must be at least {least:,} bytes for {env_steps} step(s) of {substeps} substeps, {state.batch_size} x "
-        f"{state.num_particles} particles in {state.dtype}, got {budget:,}: take fewer particles, simulations or "
-        "substeps a step"
+        f"budget must be at least {min(needs):,} bytes for {env_steps} step(s) of {substeps} substeps, got {budget:,}: "
+        "take fewer particles, simulations or substeps a step"
     )
 
 
-def _empty(solver: Solver, state: ParticleState | tuple[int, int, torch.dtype]) -> ParticleState:
-    """A state of that size; nothing is written to its memory, so it takes none."""
-    if isinstance(state, ParticleState):
-        return state
-    batch, count, dtype = state
-    if count != solver.num_particles:
-        raise ValueError(f"state has {count} particles, the solver's bodies {solver.num_particles}")
-    return ParticleState.from_stack(torch.empty(PLANES, batch, count, dtype=dtype))
+def _estimate(solver: Solver, start: Start, substeps: int, env_steps: int) -> Callable[[Segment], int]:
+    """The bytes as a function of the segment."""
+    if isinstance(start, ParticleState):
+        state = start
+    else:  # nothing is written to the memory of this state, so it takes none
+        batch, count, dtype = start
+        state = ParticleState.from_stack(torch.empty(PLANES, batch, count, dtype=dtype))
+    if state.num_particles != solver.num_particles:
+        raise ValueError(f"state has {state.num_particles} particles, the solver's bodies {solver.num_particles}")
+    sizes = {"substeps": substeps, "env_steps": env_steps, "the state's batch size": state.batch_size}
+    for name, number in sizes.items():
+        checks.whole(name, number, 1)
+    if not solver.runs_native(state):
+        return _eager(solver, state, substeps, env_steps)
+    if state.device.type != "cpu":
+        raise ValueError(f"state must be on the CPU for the memory of backend 'native', got {state.device}")
+    return _native(solver, state, substeps, env_steps, 1.0 if start is not state else _occupied(solver, state))
 
 
-def _state_bytes(state: ParticleState) -> int:
-    return PLANES * state.batch_size * state.num_particles * state.x.element_size()
+def _sizes(solver: Solver, state: ParticleState) -> tuple[int, int]:
+    """Bytes of a state and of an actuation field."""
+    size = state.batch_size * state.x.element_size()
+    return PLANES * state.num_particles * size, 2 * solver.grid.resolution**2 * size
 
 
-def _field_bytes(solver: Solver, state: ParticleState) -> int:
-    return 2 * state.batch_size * solver.grid.resolution**2 * state.x.element_size()
+def _eager(solver: Solver, state: ParticleState, substeps: int, env_steps: int) -> Callable[[Segment], int]:
+    (state_bytes, field_bytes), graph = _sizes(solver, state), _graph_bytes(solver, state)
 
+    def need(segment: Segment) -> int:
+        length = SEGMENT if segment == "auto" else substeps if segment is None else segment
+        starts = 0 if length >= substeps else -(-substeps // length)
+        # A further step of a trajectory keeps its start, and the derivative in its actuation.
+        others = (env_steps - 1) * (state_bytes + field_bytes)
+        return int(graph * (min(length, substeps) + TEMPORARY)) + starts * state_bytes + others
 
-def _step_bytes(solver: Solver, state: ParticleState) -> int:
-    """What a further step of a trajectory adds: its start, and the derivative in its actuation."""
-    return _state_bytes(state) + _field_bytes(solver, state)
-
-
-def _eager(state: ParticleState, graph: int, substeps: int, segment: Segment) -> int:
-    """Bytes of an eager step with its backward pass, from those that the graph of one substep takes."""
-    segment = SEGMENT if segment == "auto" else segment
-    if segment is None or segment >= substeps:
-        return int(graph * (substeps + WITH_GRAPH))
-    return int(graph * (segment + WITH_GRAPH)) + _state_bytes(state) * -(-substeps // segment)
+    return need
 
 
 def _graph_bytes(solver: Solver, state: ParticleState) -> int:
@@ -161,9 +137,9 @@ def _graph_bytes(solver: Solver, state: ParticleState) -> int:
     return sizes[1] - sizes[0]
 
 
-def _occupied(solver: Solver, state: ParticleState | tuple[int, int, torch.dtype]) -> float:
-    """Share of the nodes that a state reaches, with a margin for a step's motion; all where only sizes are known."""
-    if not isinstance(state, ParticleState) or not bool(state.x.isfinite().all()):
+def _occupied(solver: Solver, state: ParticleState) -> float:
+    """Share of the nodes that a state reaches, with a margin for a step's motion."""
+    if not bool(state.x.isfinite().all()):
         return 1.0
     extent = state.x.detach().amax(1) - state.x.detach().amin(1)
     nodes = (extent / solver.grid.h + 5.0).clamp(max=solver.grid.width)
@@ -171,46 +147,20 @@ def _occupied(solver: Solver, state: ParticleState | tuple[int, int, torch.dtype
 
 
 def _native(
-    solver: Solver,
-    state: ParticleState,
-    substeps: int,
-    segment: Segment,
-    env_steps: int,
-    backward: bool,
-    share: float,
-) -> int:
-    planes = state.x.new_empty(PLANES, state.batch_size, state.num_particles)
-    length = min(substeps, solver.kernels.tape_limit(planes, segment)) if backward else substeps
-    scratch = _scratch_bytes(solver, state, length, backward)
-    if not backward:
-        return scratch + 2 * _state_bytes(state)
-    # The tape has room for all nodes, but memory that is never written to takes none.
-    teams = max(1, round(scratch / _scratch_bytes(solver, state[0], length, backward)))
-    scratch -= int((1.0 - share) * 3 * solver.grid.width**2 * state.x.element_size() * length * teams)
+    solver: Solver, state: ParticleState, substeps: int, env_steps: int, share: float
+) -> Callable[[Segment], int]:
+    planes, (state_bytes, field_bytes) = state.stack(), _sizes(solver, state)
+    # Each team of threads has two states of its own, some grids, and a tape. Memory of nodes that no particle comes
+    # near is never written to and takes none.
+    team = 2 * state_bytes // state.batch_size + int(share * GRIDS * solver.grid.width**2 * planes.element_size())
+    wants_values = any(value.requires_grad for name, value in solver.constants.items() if name != "gravity")
     # Alive at once in a backward pass: every call's start, one result, and derivatives in both on their way.
-    calls = env_steps * -(-substeps // length)
-    values_bar = 8 * _state_bytes(state) // PLANES if _differentiates_values(solver) else 0
-    derivatives = 3 * _state_bytes(state) + values_bar
-    return scratch + (calls + 1) * _state_bytes(state) + derivatives + env_steps * _field_bytes(solver, state)
+    others = 4 * state_bytes + env_steps * field_bytes + (8 * state_bytes // PLANES if wants_values else 0)
 
+    def need(segment: Segment) -> int:
+        length = min(substeps, solver.kernels.tape_limit(planes, segment))
+        tape = length * solver.kernels.tape_bytes(planes, share)
+        starts = env_steps * -(-substeps // length) * state_bytes
+        return min(state.batch_size, torch.get_num_threads()) * (team + tape) + starts + others
 
-def _differentiates_values(solver: Solver) -> bool:
-    """Whether a material value, mass or volume has a gradient."""
-    return any(value.requires_grad for name, value in solver.constants.items() if name != "gravity")
-
-
-def _scratch_bytes(solver: Solver, state: ParticleState, substeps: int, backward: bool) -> int:
-    """Scratch memory that the kernels ask for."""
-    batch, count, nodes = state.batch_size, state.num_particles, solver.grid.resolution
-    empty = state.x.new_empty
-    with torch.no_grad():
-        values = solver.kernels.values(state.Jp)
-    field, pair, planes = empty(batch, 2, nodes, nodes), empty(batch, 2), empty(PLANES, batch, count)
-    inputs = Inputs(planes, field, pair, pair, values, torch.empty(batch, 2, dtype=torch.int64))
-    outputs = {"result": planes}
-    if backward:
-        outputs = dict.fromkeys(("planes_bar", "field_bar"), planes)
-        outputs |= dict.fromkeys(("origin_bar", "gravity_bar"), pair)
-        if _differentiates_values(solver):
-            outputs["values_bar"] = planes
-    return call.scratch_bytes(inputs, solver.kernels.handle, substeps, **outputs)
+    return need

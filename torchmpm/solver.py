@@ -187,15 +187,7 @@ class Solver:
         return ParticleState.from_planes(repeated(run, state.planes(), substeps, segment=segment, reads=reads))
 
     def substep(self, scene: Scene, planes: Planes) -> Planes:
-        """One substep, see :func:`torchmpm.substep.substep`; a subclass may compute it in another way.
-
-        Args:
-            scene: What the substeps of a step share.
-            planes: The 13 component planes, (B, N) each, see :meth:`ParticleState.planes`.
-
-        Returns:
-            The new planes, (B, N) each.
-        """
+        """One substep of a scene, from 13 planes (B, N) to new ones; a subclass may compute it in another way."""
         return substep(scene, planes)
 
     def substep_function(self) -> Any:
@@ -203,14 +195,10 @@ class Solver:
         return compiled(type(self).substep) if self.backend == "compile" else type(self).substep
 
     def runs_native(self, state: ParticleState, *fields: Tensor | None) -> bool:
-        """Whether a step from this state runs in the kernels of ``torchmpm.native``.
+        """Whether a step from this state, which also depends on the ``fields`` (B, ...), runs in the native kernels.
 
         ``"auto"`` chooses them on the CPU wherever they work; where they do not, the reason is logged once. On CUDA
         they run only if ``"native"`` is asked for.
-
-        Args:
-            state: The current state.
-            fields: Other tensors (B, ...) that the step depends on.
 
         Raises:
             ValueError: The backend is ``"native"``, or ``"compile"``, and cannot run this.
@@ -250,12 +238,9 @@ class Solver:
         return "it has no forward-mode derivatives" if reason is None and tangents else reason
 
     def scene(self, state: ParticleState, actuation: Tensor | None = None, origin: Tensor | None = None) -> Scene:
-        """Check the arguments of a step and prepare what its substeps share; see :meth:`step`.
+        """Check the arguments of a step and prepare what its substeps share.
 
-        Args:
-            state: The current state.
-            actuation: (B, 2, G, G), Pa, or ``None``.
-            origin: (B, 2), m, or ``None``.
+        The state, the actuation (B, 2, G, G), Pa, and the origin (B, 2), m, are those of :meth:`step`.
         """
         origin, nodes = self._check_arguments(state, actuation, origin), self.grid.resolution
         exists = pad(state.Jp.new_ones(nodes, nodes), [PAD] * 4).flatten()[None]

@@ -11,34 +11,20 @@ from torchmpm.grid import PAD, Grid
 
 
 def quadratic_weights(f: Tensor) -> Tensor:
-    """Weights of the three nodes around a point (Jiang et al., "The affine particle-in-cell method", 2015).
-
-    Args:
-        f: (..., N) distance from the first of the three nodes in cells, in [0.5, 1.5) for an interior point.
-
-    Returns:
-        (..., 3, N) weights; they sum to one for every ``f``.
-    """
+    """Weights (..., 3, N) of three nodes at f cells, (..., N), from the first (Jiang et al., 2015); they sum to one."""
     return torch.stack((0.5 * (1.5 - f).square(), 0.75 - (f - 1.0).square(), 0.5 * (f - 0.5).square()), dim=-2)
 
 
 @dataclass(frozen=True, eq=False)
 class Stencil:
-    """The 3x3 nodes around each particle.
+    """The 3x3 nodes around each particle."""
 
-    Attributes:
-        ids: (B, 9N) addresses in the padded grid, first offset p (x) slowest, then q (y), then particle.
-        wx, wy: (B, 3, N) weights per axis.
-        fx, fy: (B, N) distance from the first node in cells.
-        cells: Number of addresses.
-    """
-
-    ids: Tensor
-    wx: Tensor
+    ids: Tensor  # (B, 9N) addresses in the padded grid: first offset p (x) slowest, then q (y), then particle
+    wx: Tensor  # (B, 3, N) weights along each axis
     wy: Tensor
-    fx: Tensor
+    fx: Tensor  # (B, N) distance from the first node in cells
     fy: Tensor
-    cells: int
+    cells: int  # number of addresses
 
     @property
     def weights(self) -> Tensor:
@@ -55,16 +41,10 @@ class Stencil:
 
 
 def stencil(grid: Grid, x: Tensor, y: Tensor, origin: Tensor) -> Stencil:
-    """Find the nodes and weights of particles.
+    """Nodes and weights of particles at (x, y), (B, N) each, m, in windows at origin (B, 2), m.
 
     The base node is ``trunc(u - 1/2)`` like in the reference implementation of DittoGym: in the outermost half
     cell of the window the weights are extrapolated from the first three nodes.
-
-    Args:
-        grid: The window.
-        x: (B, N) horizontal positions, m.
-        y: (B, N) vertical positions, m.
-        origin: (B, 2) lower left corner of the window, m.
     """
     node, weight, fraction = [], [], []
     for position, start in ((x, origin[:, 0:1]), (y, origin[:, 1:2])):

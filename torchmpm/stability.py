@@ -17,14 +17,6 @@ def stable_dt(bodies: Sequence[Body], h: float, actuation: Value = 0.0) -> float
     ``h / sqrt((k + 2 |a|) V / m)``, least over all particles, with the stiffness k = 2 (mu + lam) and the actuation a.
     It holds for any arrangement of particles: the strain rate C of a particle cannot exceed what the kinetic energy of
     its nodes allows, ``h^2/4 |C|^2 <= sum w |v_i|^2``, and a particle alone reaches that.
-
-    Args:
-        bodies: The bodies.
-        h: Distance between nodes, m.
-        actuation: Of the muscles, Pa; a number or a tensor of shape (), (B,) or (B, count).
-
-    Raises:
-        ValueError: Shapes of a body's values do not go together, or they are not finite or have a wrong sign.
     """
     rates, pull = [0.0], torch.as_tensor(detached_column(actuation), dtype=torch.float64, device="cpu").abs()
     for k, body in enumerate(bodies):

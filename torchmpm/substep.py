@@ -29,49 +29,28 @@ Planes = tuple[Tensor, ...]
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What stays the same during one step, in the form that a substep needs.
-
-    Attributes:
-        grid: The window.
-        bodies: The particles in their order.
-        dt: Duration of a substep, s.
-        origin: (B, 2) lower left corner of the window, m.
-        mass: (B or 1, N) particle masses, kg.
-        exists: (1, cells) 1 on nodes that exist, 0 on the padding.
-        gravity: (2, B or 1, cells) velocity gained by gravity in a substep, m/s.
-        damping: Factor on node velocities in a substep.
-        faces: Velocity rules as masks.
-        actuation: (2, B, cells) muscle actuation on the nodes, Pa, or ``None``.
-    """
+    """What stays the same during one step, in the form that a substep needs."""
 
     grid: Grid
     bodies: tuple[Body, ...]
-    dt: float
-    origin: Tensor
-    mass: Tensor
-    exists: Tensor
-    gravity: Tensor
-    damping: float
-    faces: tuple[Face, ...]
-    actuation: Tensor | None
+    dt: float  # s
+    origin: Tensor  # (B, 2) lower left corner of the window, m
+    mass: Tensor  # (B or 1, N) kg
+    exists: Tensor  # (1, cells) 1 on nodes that exist, 0 on the padding
+    gravity: Tensor  # (2, B or 1, cells) velocity gained by gravity in a substep, m/s
+    damping: float  # factor on node velocities in a substep
+    faces: tuple[Face, ...]  # velocity rules as masks
+    actuation: Tensor | None  # (2, B, cells) on the nodes, Pa
 
 
 class Scattered(NamedTuple):
-    """Result of the first half of a substep.
-
-    Attributes:
-        nodes: The stencils.
-        inside: (B, N) which particles take part.
-        F: Planes (B, N) of the returned deformation gradient.
-        Jp: (B, N) plastic volume ratio.
-        momentum: (3, B, cells) mass (kg) and momentum (kg m/s) on the nodes.
-    """
+    """Result of the first half of a substep."""
 
     nodes: Stencil
-    inside: Tensor
-    F: Mat2
-    Jp: Tensor
-    momentum: Tensor
+    inside: Tensor  # (B, N) which particles take part
+    F: Mat2  # planes (B, N) of the returned deformation gradient
+    Jp: Tensor  # (B, N) plastic volume ratio
+    momentum: Tensor  # (3, B, cells) mass (kg) and momentum (kg m/s) on the nodes
 
 
 def substep(scene: Scene, planes: Planes) -> Planes:
@@ -118,10 +97,7 @@ def _deform(scene: Scene, nodes: Stencil, trial: Mat2, Jp: Tensor) -> tuple[Mat2
 
 
 def grid_velocity(scene: Scene, momentum: Tensor) -> Tensor:
-    """Velocity of the nodes before the boundary: normalise, accelerate, damp.
-
-    From mass and momentum (3, B, cells) to (2, B, cells), m/s; zero on padding nodes.
-    """
+    """Velocity (2, B, cells), m/s, of the nodes before the boundary; zero on the padding."""
     velocity = free_velocity(scene, momentum) + scene.gravity
     return velocity * scene.damping if scene.damping != 1.0 else velocity
 

@@ -11,30 +11,13 @@ from torchmpm.spline import Stencil, gather, scatter
 
 
 def particles_to_grid(
-    grid: Grid,
-    stencil: Stencil,
-    active: Tensor,
-    v: tuple[Tensor, Tensor],
-    C: Mat2,
-    mass: Tensor,
-    stress_momentum: Sym2,
+    grid: Grid, stencil: Stencil, active: Tensor, v: tuple[Tensor, Tensor], C: Mat2, mass: Tensor, stress_momentum: Sym2
 ) -> Tensor:
-    """Mass and momentum on the nodes after the internal forces of one substep.
+    """Mass and momentum (3, B, cells) on the nodes after the internal forces of one substep.
 
     A node at the offset d from a particle receives ``w m`` and ``w (m v + P d)`` with ``P = m C - dt V 4/h^2 tau``
-    (Hu et al., "A moving least squares material point method", 2018).
-
-    Args:
-        grid: The window.
-        stencil: Stencils of the particles.
-        active: (B, N) 1 for particles that take part, else 0.
-        v: Planes of the velocity.
-        C: Planes of the affine velocity matrix.
-        mass: (1 or B, N) particle masses, kg.
-        stress_momentum: Planes of ``-dt V 4/h^2 tau``, kg/s.
-
-    Returns:
-        (3, B, cells): mass, momentum in x, momentum in y.
+    (Hu et al., "A moving least squares material point method", 2018). ``active`` (B, N) is 1 for particles that take
+    part, else 0; ``stress_momentum`` is ``-dt V 4/h^2 tau``, kg/s.
     """
     offset = torch.arange(3, device=active.device, dtype=active.dtype)[:, None]
     dx, dy = (offset - stencil.fx[:, None]) * grid.h, (offset - stencil.fy[:, None]) * grid.h
@@ -48,13 +31,7 @@ def particles_to_grid(
 
 
 def grid_to_particles(grid: Grid, stencil: Stencil, velocity: Tensor) -> tuple[tuple[Tensor, Tensor], Mat2]:
-    """New velocity and affine matrix of particles: ``v = sum w v_i``, ``C = 4/h sum w v_i (offset in cells)^T``.
-
-    Args:
-        grid: The window.
-        stencil: The stencils of the scatter.
-        velocity: (2, B, cells) velocity on the nodes, m/s.
-    """
+    """Planes of ``v = sum w v_i`` and ``C = 4/h sum w v_i (offset in cells)^T`` from node velocities (2, B, cells)."""
     nodes = gather(stencil, velocity)
     offset = torch.arange(3, device=velocity.device, dtype=velocity.dtype)[:, None]
     wy_dy = stencil.wy * (offset - stencil.fy[:, None])
@@ -67,14 +44,6 @@ def grid_to_particles(grid: Grid, stencil: Stencil, velocity: Tensor) -> tuple[t
 
 
 def interpolate(stencil: Stencil, field: Tensor) -> tuple[Tensor, Tensor]:
-    """Values of a field at the particles, for example of the muscle actuation.
-
-    Args:
-        stencil: Stencils of the particles.
-        field: (2, B, cells) two components on the padded grid.
-
-    Returns:
-        Two planes (B, N).
-    """
+    """Two planes (B, N) of a field (2, B, cells) at the particles, for example of the muscle actuation."""
     first, second = (stencil.weights * gather(stencil, field)).sum((2, 3))
     return first, second

@@ -1,4 +1,4 @@
-"""Reference policies of a comparison: muscles at rest, random actions, a moving wave. Nothing is learned."""
+"""Reference policies: zero actions, random actions and a travelling wave. Nothing is learned."""
 
 from __future__ import annotations
 
@@ -76,11 +76,6 @@ def wave(steps: int, size: int, layout: ActionIndexing) -> Tensor:
 
     In step t = 1, 2, ... the muscle of direction c in column x and row y of the action grid, counted to the right and
     upwards, is driven with ``sin(0.3 t + 0.7 x + 1.1 y + 2 c)``, the same in the world for every layout.
-
-    Args:
-        steps: T.
-        size: R.
-        layout: Of the actions.
     """
     t, c, x, y = np.ogrid[1 : steps + 1, 0:2, 0:size, 0:size]
     drive = np.sin(0.3 * t + 0.7 * x + 1.1 * y + 2.0 * c)
@@ -88,14 +83,10 @@ def wave(steps: int, size: int, layout: ActionIndexing) -> Tensor:
 
 
 class RandomActions:
-    """Uniform actions in [-1, 1], independent in every cell and step, from torch's generator.
-
-    Args:
-        resolution: Action grid R.
-    """
+    """Uniform actions in [-1, 1], independent in every cell and step, from torch's generator."""
 
     deterministic_by_default = False
-    sees_image = False
+    uses_image = False
 
     def __init__(self, resolution: int) -> None:
         self.resolution = resolution

@@ -7,13 +7,13 @@ from typing import Literal
 
 from baselines.common.grid import SEEDED
 from baselines.planning.gradient import GradientPlannerConfig
-from cfp.config import LadderConfig, check_training_layouts
+from cfp.config import StagedConfig, check_training_layouts
 from cfp.sections import Particles
 from cfp.validation import check_at_least, check_fraction, check_positive
 
 
 @dataclass(frozen=True)
-class DistillConfig(LadderConfig):
+class DistillConfig(StagedConfig):
     """A distillation; num_envs robots move side by side. Levels are listed coarsest first.
 
     The environment options say where the student is evaluated; train_particles, where it is taught.
@@ -60,7 +60,7 @@ class DistillConfig(LadderConfig):
         return super().ineffective() | planner | SEEDED
 
     def check(self) -> None:
-        """Check what the types cannot, see `LadderConfig.check`."""
+        """Check what the types cannot, see `StagedConfig.check`."""
         super().check()
         check_at_least(1, rollout_steps=self.rollout_steps, updates=self.updates, batch_size=self.batch_size)
         check_at_least(1, switch_every=self.switch_every, capacity=self.capacity)

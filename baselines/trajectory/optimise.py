@@ -251,8 +251,8 @@ class Gradient(OpenLoopAlgorithm):
         Raises:
             ConfigError: No such task or preset.
         """
-        quick, horizon = name == "quick", make_spec(task).horizon
         environment = cfp.preset(task, name).environment
+        quick, horizon = name == "quick", make_spec(task).horizon
         config = GradientConfig(
             task=task,
             preset="quick" if quick else "paper",

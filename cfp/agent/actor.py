@@ -53,15 +53,9 @@ def squashed_log_prob(noise: Tensor, std: Tensor, action: Tensor) -> Tensor:
 
 
 def sample_squashed_gaussian(mean: Tensor, raw_std: Tensor, deterministic: bool) -> tuple[Tensor, Tensor]:
-    """Sample tanh(m + s eps) with eps ~ N(0, I).
+    """Sample tanh(m + s eps) with eps ~ N(0, I), or eps = 0 if ``deterministic``, and its log-density (B,).
 
-    Args:
-        mean: Network output z_m, (B, ...); the mean m before tanh.
-        raw_std: Network output z_s of the same shape; s = clip(softplus(3 z_s - 1), 0.1, 6).
-        deterministic: Use eps = 0.
-
-    Returns:
-        The action, of the same shape, and its log-density (B,).
+    m is the network output ``mean`` (B, ...) and s = clip(softplus(3 raw_std - 1), 0.1, 6).
     """
     std = F.softplus(3 * raw_std - 1).clamp(*STD_BOUNDS)
     noise = torch.zeros_like(mean) if deterministic else torch.randn_like(mean)
@@ -100,7 +94,6 @@ class Actor(SquashedActor):
     """Actor of stage 1: a squashed Gaussian over (2, R, R), given the observation."""
 
     def __init__(self, resolution: int) -> None:
-        """Create the encoder, of width 32 in every task, and the heads for mean and standard deviation."""
         super().__init__()
         self.resolution = resolution
         self.encoder: nn.Module = Encoder(3, 32)
@@ -125,7 +118,6 @@ class ResidualActor(Actor):
     """
 
     def __init__(self, coarse: Actor, resolution: int, gate_bias: float, spec: ActorSpec) -> None:
-        """Wrap and freeze ``coarse``."""
         super().__init__(resolution)
         self.interpolation = spec.interpolation
         self.action_size = spec.patch or resolution

@@ -17,15 +17,12 @@ IMAGE_SHAPE = (3, IMAGE_SIZE, IMAGE_SIZE)
 
 
 def check_images(observation: object) -> None:
-    """Check the observation of an image policy, whose networks would take other numbers as normalised already.
-
-    Raises:
-        ValueError: It is neither an image nor a batch of images.
-    """
-    found = type(observation).__name__
-    if isinstance(observation, np.ndarray):
-        if observation.dtype == np.uint8 and observation.shape[-3:] == IMAGE_SHAPE and observation.ndim in (3, 4):
-            return
+    """Refuse anything but a uint8 image or a batch of them: networks take other numbers as normalised already."""
+    if not isinstance(observation, np.ndarray):
+        found = type(observation).__name__
+    elif observation.dtype == np.uint8 and observation.shape[-3:] == IMAGE_SHAPE and observation.ndim in (3, 4):
+        return
+    else:
         found = f"{observation.dtype} array of shape {observation.shape}"
     raise ValueError(f"observation must be a uint8 array of shape (3, 64, 64) or (B, 3, 64, 64), got {found}")
 
@@ -38,7 +35,7 @@ class ActorPolicy(nn.Module):
         deterministic_by_default: Whether the run that trained it evaluates it without noise.
     """
 
-    sees_image = True
+    uses_image = True
 
     def __init__(self, spec: ActorSpec, deterministic_by_default: bool = False) -> None:
         super().__init__()
@@ -55,7 +52,7 @@ class ActorPolicy(nn.Module):
         return self.spec.action_size
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> Tensor:
-        """Actions (B, 2, R, R) for uint8 observations (B, 3, 64, 64)."""
+        """Actions (B, 2, R, R) for a uint8 ``observation`` (B, 3, 64, 64), without noise if ``deterministic``."""
         action: Tensor = self.actor(observation, deterministic)
         return action
 
@@ -71,15 +68,15 @@ class ActorPolicy(nn.Module):
 
         Args:
             observation: (3, 64, 64) or (B, 3, 64, 64) uint8.
-            state: Returned as it is: the policy has no memory.
-            episode_start: Without effect.
+            state: Hidden state with leading B, returned as it is: the policy has no memory.
+            episode_start: (B,) bool, without effect.
             deterministic: Act without noise.
 
         Returns:
             Actions (2, R, R) or (B, 2, R, R) float32, and ``state``.
 
         Raises:
-            ValueError: The observation is something else.
+            ValueError: The observation is neither an image nor a batch of images.
         """
         check_images(observation)
         assert isinstance(observation, np.ndarray)

@@ -20,19 +20,14 @@ def blend(coarse: Tensor, residual: Tensor, gate: Tensor, enlarge: Callable[[Ten
 
 @dataclass(frozen=True)
 class Composition:
-    """Layout of a vector that holds the parts of a composed action, from which the action is rebuilt.
+    """Structure of a vector that holds the parts of a composed action, from which the action is rebuilt.
 
     The parts are the action of the first stage, then residual action and gate of each further stage, on the action
     grids of their stages. Together they are smaller than the composed action on its patch.
-
-    Attributes:
-        resolutions: Action grid R of each stage, coarsest first.
-        size: Rows and columns A of the composed action.
-        interpolation: Upsampling of the parts.
     """
 
-    resolutions: tuple[int, ...]
-    size: int
+    resolutions: tuple[int, ...]  # Action grid R of each stage, coarsest first
+    size: int  # Rows and columns A of the composed action
     interpolation: Interpolation
 
     @classmethod

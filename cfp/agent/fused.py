@@ -23,17 +23,10 @@ class EncoderLayers(Protocol):
 
 
 def encode(encoders: Sequence[EncoderLayers], *images: Tensor) -> Tensor:
-    """Evaluate n encoders on the same images.
+    """Evaluate n encoders of the same shape on the same images (B, c, 64, 64); returns latents (B, n w, 4, 4).
 
     The first layer is linear in its channels, so it is evaluated for each image separately and summed: this avoids
     stacking the images with a batch of constant coordinates, and the gradients of images that need none.
-
-    Args:
-        encoders: Encoders of the same shape.
-        images: (B, c, 64, 64) each, as in `cfp.agent.networks.Encoder`.
-
-    Returns:
-        Latents (B, n w, 4, 4), concatenated along the channels.
     """
     sizes = [image.shape[1] for image in images]
     weight, bias = _concatenated([encoder.first for encoder in encoders])

@@ -39,11 +39,7 @@ class LearningConfig:
     """Initialise critics and reward statistics of each stage from the previous one, instead of anew."""
 
     def check(self) -> None:
-        """Check the ranges that the types do not express.
-
-        Raises:
-            ConfigError: A value is out of range.
-        """
+        """Raise a `ConfigError` for values out of range."""
         check_at_least(2, batch_size=self.batch_size)  # rewards are divided by their deviation in the batch
         check_at_least(
             1, buffer_size=self.buffer_size, gradient_steps=self.gradient_steps, update_start=self.update_start

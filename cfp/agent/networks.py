@@ -59,21 +59,16 @@ def initialise(module: nn.Module) -> nn.Module:
 
 
 class Encoder(nn.Module):
-    """Three convolutions from (B, C, 64, 64) to a latent image (B, w, 4, 4).
+    """Three convolutions from (B, C, 64, 64) to a latent image (B, w, 4, 4), with w, 2w and w channels.
 
     Two constant channels, (row - 32)/32 and (column - 32)/32, are appended to the input (the paper's "position
     embedding channel"); they are neither trained nor saved.
-
-    Args:
-        channels: Channels C of the input.
-        width: Channels w of the first and last layer; the middle one has 2w.
     """
 
     patches: Tensor
     """Coordinate channels in the receptive fields of the first layer, unfolded to (2 x 8 x 8, 225)."""
 
     def __init__(self, channels: int, width: int) -> None:
-        """Create the layers."""
         super().__init__()
         self.first = nn.Conv2d(channels + 2, width, 8, stride=4)
         self.rest = nn.Sequential(
@@ -95,12 +90,11 @@ class Encoder(nn.Module):
 class PairEncoder(nn.Module):
     """Encode observation and action together, to a latent of (B, 32, 4, 4).
 
-    Merged, the action is stacked after the observation's channels. Split, two narrow encoders are used and their
-    latents concatenated, for tasks in which action and observation show different places.
+    One encoder of width 32 takes the action stacked after the observation's channels. With ``split``, two encoders of
+    width 16 are used and their latents concatenated, for tasks in which the two images show different places.
     """
 
     def __init__(self, split: bool) -> None:
-        """Create one encoder (5 channels, width 32) or two (3 and 2 channels, width 16)."""
         super().__init__()
         widths = ((3, 16), (2, 16)) if split else ((5, 32),)
         self.encoders = nn.ModuleList(Encoder(channels, width) for channels, width in widths)
@@ -133,10 +127,9 @@ def make_head(resolution: int) -> nn.Sequential:
 
 
 class Critic(nn.Module):
-    """An action-value network with its own encoder."""
+    """An action-value network: an encoder of its own and a 512-256-256-1 perceptron."""
 
     def __init__(self, split: bool) -> None:
-        """Create the encoder and a 512-256-256-1 perceptron."""
         super().__init__()
         self.encoder = PairEncoder(split)
         self.value = nn.Sequential(
@@ -156,18 +149,11 @@ class Critic(nn.Module):
 
 
 class TwinCritic(nn.Module):
-    """Two critics that share no parameters with each other or with the actor.
-
-    Args:
-        resolution: Rows and columns R of the actions.
-        split: Separate encoders for observation and action.
-        interpolation: See `cfp.agent.spec.ActorSpec`.
-    """
+    """Two critics of actions (2, R, R) that share no parameters with each other or with the actor."""
 
     optimizer: torch.optim.Optimizer
 
     def __init__(self, resolution: int, split: bool, interpolation: Interpolation) -> None:
-        """Create both critics."""
         super().__init__()
         self.resolution, self.interpolation = resolution, interpolation
         self.critics = nn.ModuleList(Critic(split) for _ in range(2))

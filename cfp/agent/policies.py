@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac import policies as sac_policies
 from torch import nn
 
@@ -22,16 +22,8 @@ from cfp.agent.spec import ActorSpec
 class NetworkPolicy(sac_policies.SACPolicy, ABC):
     """Base class of the policies that `cfp.agent.sac.CFP` trains; subclasses create actor and critics.
 
-    Args:
-        observation_space: Observations, which the networks read as they are (``normalize_images`` is off).
-        action_space: Actions in [-1, 1].
-        lr_schedule: Learning rate of both optimisers as a function of the remaining progress.
-        use_sde: Accepted because stable-baselines3 passes it; must be False.
-        optimizer_class: Optimiser of actor and critics.
-        optimizer_kwargs: Options of the optimiser except the learning rate; None: a fused Adam.
-
-    Raises:
-        ValueError: ``use_sde`` is set.
+    Networks read observations as they are (``normalize_images`` is off). ``use_sde`` must be False; without
+    ``optimizer_kwargs`` the optimiser is a fused Adam.
     """
 
     def __init__(
@@ -43,7 +35,6 @@ class NetworkPolicy(sac_policies.SACPolicy, ABC):
         optimizer_class: type[torch.optim.Optimizer] = torch.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
-        """Build the networks and their optimisers."""
         if use_sde:
             raise ValueError("use_sde must be False, got True: the actor has its own exploration noise")
         super().__init__(
@@ -108,7 +99,6 @@ class CFPPolicy(NetworkPolicy):
         spec: ActorSpec | None = None,
         **options: Any,
     ) -> None:
-        """Build the networks and their optimisers."""
         self.spec = spec or ActorSpec((action_space.shape[-1],))
         size = self.spec.action_size
         if action_space.shape != (2, size, size):
@@ -126,27 +116,11 @@ class CFPPolicy(NetworkPolicy):
         """Create critics of the executed action."""
         return TwinCritic(self.spec.action_size, self.spec.split, self.spec.interpolation)
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Choose actions, see `cfp.agent.actor_policy.ActorPolicy.predict`.
-
-        Raises:
-            ValueError: The observation is neither an image nor a batch of images.
-        """
+    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
+        """The ``observation``, uint8 (3, 64, 64) or (B, 3, 64, 64), as a batch (B, 3, 64, 64), and if it was one."""
         check_images(observation)
-        return super().predict(observation, state, episode_start, deterministic)
+        return super().obs_to_tensor(observation)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {
-            "observation_space": self.observation_space,
-            "action_space": self.action_space,
-            "lr_schedule": self._dummy_schedule,
-            "spec": self.spec,
-            "optimizer_class": self.optimizer_class,
-            "optimizer_kwargs": self.optimizer_kwargs,
-        }
+        names = ("observation_space", "action_space", "spec", "optimizer_class", "optimizer_kwargs")
+        return {name: getattr(self, name) for name in names} | {"lr_schedule": self._dummy_schedule}

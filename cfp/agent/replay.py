@@ -16,17 +16,7 @@ from cfp.agent.composition import Composition
 class ReplayRing(ReplayBuffer):
     """stable-baselines3's replay buffer, with batches drawn without replacement from a generator of its own.
 
-    Args:
-        buffer_size: See stable-baselines3's `ReplayBuffer`.
-        observation_space: See there.
-        action_space: Space of the executed actions.
-        args: See there.
-        seed: Seed of the generator.
-        composition: Store actions as vectors of this composition and rebuild them in each batch; None stores actions.
-        kwargs: See there.
-
-    Raises:
-        ValueError: ``optimize_memory_usage`` is set.
+    With a ``composition``, actions are stored as vectors of their parts and rebuilt in each batch.
     """
 
     def __init__(

@@ -60,7 +60,6 @@ class RewardStatistics(nn.Module):
     variance: Tensor
 
     def __init__(self, momentum: float = 0.99) -> None:
-        """Start at mean 0 and variance 1."""
         super().__init__()
         self.momentum = momentum
         self.register_buffer("mean", torch.zeros(()))
@@ -108,7 +107,6 @@ class CFP(SAC):
         hyperparameters: Hyperparameters = Hyperparameters(),  # noqa: B008  (it is immutable)
         **sac_options: Any,
     ) -> None:
-        """Create networks, replay buffer and reward statistics."""
         self.hyperparameters = hyperparameters
         self.origin: Actor | None = None
         spec = (sac_options.get("policy_kwargs") or {}).get("spec")
@@ -133,19 +131,14 @@ class CFP(SAC):
     def _setup_model(self) -> None:
         super()._setup_model()
         self.reward_statistics = RewardStatistics(self.hyperparameters.reward_momentum).to(self.device)
-        self.update_average = get_ema_multi_avg_fn(1 - self.tau)
 
     def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
-        """Actor, critics and target critics with their own types."""
+        """Actor, critics and target critics."""
         assert isinstance(self.policy, NetworkPolicy)
         return self.policy.networks()
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Perform updates of critics, actor and target critics.
-
-        Args:
-            gradient_steps: Number of updates.
-            batch_size: Transitions in each.
+        """Perform ``gradient_steps`` updates, each with ``batch_size`` transitions.
 
         Raises:
             NonFiniteError: A loss is not finite; the optimiser step is not taken.
@@ -165,13 +158,13 @@ class CFP(SAC):
         self.logger.record("train/n_updates", self._n_updates)
 
     def update(self, batch: ReplayBufferSamples) -> dict[str, Tensor]:
-        """Perform one update; returns scalars by name, see `METRICS`."""
+        """Perform one update with a ``batch``; returns scalars by name, see `METRICS`."""
         obs, next_obs = normalise_image(batch.observations), normalise_image(batch.next_observations)
         scalars = self._update_critic(obs, next_obs, batch)
         if self.num_timesteps >= self.hyperparameters.actor_start:
             scalars |= self._update_actor(obs)
         _, critic, target = self.networks()
-        self.update_average(list(target.parameters()), list(critic.parameters()), 1)
+        get_ema_multi_avg_fn(1 - self.tau)(list(target.parameters()), list(critic.parameters()), 1)
         scalars["reward_mean"] = self.reward_statistics.mean
         scalars["reward_std"] = self.reward_statistics.variance.sqrt()
         return scalars
@@ -211,10 +204,10 @@ class CFP(SAC):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Actions to execute, and their form in the replay buffer."""
         composition: Composition | None = getattr(self.replay_buffer, "composition", None)
-        if self.num_timesteps < self.hyperparameters.random_steps:
+        random_steps = self.hyperparameters.random_steps
+        if self.num_timesteps < random_steps:
             # stable-baselines3 ends its random phase where updates start; here the two are independent.
-            actions, stored = super()._sample_action(self.hyperparameters.random_steps, action_noise, n_envs)
-            return self._on_action_grid(actions, stored, composition)
+            return self._on_action_grid(*super()._sample_action(random_steps, action_noise, n_envs), composition)
         if composition is not None:
             actions, stored = self._act_in_parts(composition)
         else:
@@ -225,10 +218,7 @@ class CFP(SAC):
     def _on_action_grid(
         self, actions: np.ndarray, stored: np.ndarray, composition: Composition | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Coarsen uniform actions to the action grid of the stage.
-
-        Of independent values for each pixel of a larger patch little would be left in the force field.
-        """
+        """Coarsen uniform actions to the action grid of the stage; independent pixels of a patch would average out."""
         if not isinstance(self.policy, CFPPolicy):
             return actions, stored
         grid, size = self.networks()[0].resolution, self.policy.spec.action_size
@@ -273,4 +263,4 @@ class CFP(SAC):
         return [*modules, "reward_statistics"], tensors
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "reward_statistics", "origin", "update_average"]
+        return [*super()._excluded_save_params(), "reward_statistics", "origin"]

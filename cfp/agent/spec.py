@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from cfp.errors import ConfigError
 from dittogym.geometry import NODES
 
 Interpolation = Literal["half_pixel", "aligned"]
@@ -31,7 +32,7 @@ class ActorSpec:
             the size of the environment's patch.
 
     Raises:
-        ValueError: A resolution has no decoder, resolutions do not increase, or ``gate_bias`` or ``patch`` do not
+        ConfigError: A resolution has no decoder, resolutions do not increase, or ``gate_bias`` or ``patch`` do not
             match them.
     """
 
@@ -51,12 +52,12 @@ class ActorSpec:
         """Check that the fields match each other."""
         increasing = list(self.resolutions) == sorted(set(self.resolutions))
         if not self.resolutions or not increasing or not set(self.resolutions) <= set(RESOLUTIONS):
-            raise ValueError(f"resolutions must be increasing values of {RESOLUTIONS}, got {self.resolutions}")
+            raise ConfigError(f"resolutions must be increasing values of {RESOLUTIONS}, got {self.resolutions}")
         if len(self.gate_bias) != len(self.resolutions) - 1:
-            raise ValueError(
+            raise ConfigError(
                 f"gate_bias must have {len(self.resolutions) - 1} values for resolutions {self.resolutions}, "
                 f"got {len(self.gate_bias)}"
             )
         finest = self.resolutions[-1]
         if self.patch is not None and not (isinstance(self.patch, int) and finest <= self.patch <= NODES):
-            raise ValueError(f"patch must be between {finest} (the finest action grid) and {NODES}, got {self.patch}")
+            raise ConfigError(f"patch must be between {finest} (the finest action grid) and {NODES}, got {self.patch}")

@@ -49,9 +49,9 @@ class Case:
     friction: float | None = None
 
 
-def reason_without_effect(case: Case, spec: TaskSpec, sees_image: bool = True) -> str:
+def reason_without_effect(case: Case, spec: TaskSpec, uses_image: bool = True) -> str:
     """Why a case has no effect on a policy in a task; empty if it has one."""
-    if case.observation_dropout and not sees_image:
+    if case.observation_dropout and not uses_image:
         return "the policy does not use the image"
     if "gravity" in case.physics and not any(spec.gravity):
         return f"{spec.name} has no gravity"
@@ -113,8 +113,8 @@ class Disturbed(VecEnvWrapper):
 
     def _restart(self) -> None:
         self.generator = np.random.default_rng(self.noise_seed)
-        zeros = np.zeros((self.num_envs, 2, self.size, self.size), np.float32)
-        self._delayed = deque(zeros.copy() for _ in range(self.case.latency))
+        shape = (self.num_envs, 2, self.size, self.size)
+        self._delayed = deque(np.zeros(shape, np.float32) for _ in range(self.case.latency))
 
     def reset(self) -> VecEnvObs:
         """Start new episodes, and the sequence of disturbances anew."""
@@ -122,7 +122,7 @@ class Disturbed(VecEnvWrapper):
         return self._disturb_observation(self.venv.reset())
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Pass on the disturbed actions (B, 2, A, A)."""
+        """Pass on disturbed actions (B, 2, A, A)."""
         self._delayed.append(np.array(actions, np.float32))
         actions = self._delayed.popleft()
         if self.grid:
@@ -168,10 +168,11 @@ def make_cases(
     friction: tuple[float, ...] = (0.0, 0.5, math.inf),
 ) -> list[Case]:
     """The cases of a robustness report, the unperturbed one first; constants are multiplied by 1 -+ ``shift``."""
+    percent = f"{100 * dropout:g}%"
     cases = [
         Case("unperturbed"),
-        Case(f"action dropout {100 * dropout:g}%", action_dropout=dropout),
-        Case(f"observation dropout {100 * dropout:g}%", observation_dropout=dropout),
+        Case(f"action dropout {percent}", action_dropout=dropout),
+        Case(f"observation dropout {percent}", observation_dropout=dropout),
         Case(f"action noise {noise:g}", action_noise=noise),
         Case(f"latency {latency} step{'s' if latency > 1 else ''}", latency=latency),
     ]

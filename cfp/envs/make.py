@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import torch
@@ -16,11 +15,7 @@ from dittogym import TorchEnv
 
 
 def choose_device(name: str) -> str:
-    """Resolve ``"auto"`` to CUDA if available, else to the CPU.
-
-    Raises:
-        ConfigError: The name is unknown, or CUDA is requested but not available.
-    """
+    """Resolve ``"auto"`` to CUDA if available, else to the CPU."""
     if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     try:
@@ -38,24 +33,11 @@ def make_env(config: RunConfig, resolution: int, num_envs: int | None = None) ->
 
 
 def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = None, **changes: Any) -> TorchEnv:
-    """Create the environment of a run.
-
-    Args:
-        config: The run's options.
-        resolution: Action grid R.
-        num_envs: Number of robots; None: that of the run.
-        changes: Further options of `dittogym.TorchEnv`, such as ``obstacles``.
-
-    Raises:
-        ConfigError: The environment refuses an option.
-    """
-    options = dataclasses.asdict(config.environment)
-    default = options.pop("num_envs")
-    for name in TASK_OPTIONS:
-        options.pop(name)
+    """Create the environment of a run; ``changes`` are further options of `dittogym.TorchEnv`."""
+    options = {name: value for name, value in vars(config.environment).items() if name not in TASK_OPTIONS}
     options |= config.environment.task_options() | changes
-    device = choose_device(config.device)
+    options |= {"num_envs": num_envs or options["num_envs"], "device": choose_device(config.device)}
     try:
-        return TorchEnv(config.task, num_envs or default, resolution, device=device, **options)
+        return TorchEnv(config.task, resolution=resolution, **options)
     except (ValueError, TypeError, OSError) as error:
         raise ConfigError(" ".join(str(error).split())) from error

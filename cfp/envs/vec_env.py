@@ -46,8 +46,7 @@ class TorchVecEnv(VecEnv):
             uint8 (B, 3, 64, 64).
 
         Raises:
-            ValueError: The environment refuses the options, or they differ between elements. Values for each element
-                are given within one dictionary of options, see `dittogym.TorchEnv.reset`.
+            ValueError: The options are not one dictionary for all elements, see `dittogym.TorchEnv.reset`.
         """
         options = self._options[0] if self._options else {}
         shared = len(self._options) == self.num_envs and all(other is options for other in self._options)
@@ -63,7 +62,7 @@ class TorchVecEnv(VecEnv):
         """Set the actions (B, 2, R, R), float, of the next step.
 
         Raises:
-            NonFiniteError: An action is NaN or infinite, because the policy has diverged.
+            NonFiniteError: An action is NaN or infinite.
         """
         if not np.isfinite(actions).all():
             raise NonFiniteError("an action is not finite: the policy has diverged; the last checkpoint is untouched")
@@ -93,11 +92,13 @@ class TorchVecEnv(VecEnv):
         return infos
 
     def state_dict(self) -> list[Tensor]:
-        """Tensors of the episodes in progress; see `load_state_dict`."""
+        """Tensors of the episodes in progress, with a leading B; see `load_state_dict`."""
         return [value.detach().cpu().clone() for value in tree.leaves(self.torch_env.env_state)]
 
     def load_state_dict(self, state: list[Tensor]) -> None:
-        """Restore a state of `state_dict`; call ``reset`` with the same seed before, so that later resets agree too.
+        """Restore a state of `state_dict`, tensors with a leading B.
+
+        Call ``reset`` with the same seed before, so that later resets agree too.
 
         Raises:
             ValueError: The state is not one of this environment.
@@ -144,7 +145,7 @@ class TorchVecEnv(VecEnv):
         return [result for _ in self._indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        """Always False: elements are not wrapped one by one."""
+        """Always False, for any ``wrapper_class``: elements are not wrapped one by one."""
         return [False for _ in self._indices(indices)]
 
 

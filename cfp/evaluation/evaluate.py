@@ -100,11 +100,7 @@ def evaluation_seed(config: RunConfig) -> int:
 
 
 class ZeroPolicy:
-    """Leaves every muscle slack.
-
-    Args:
-        resolution: Action grid R.
-    """
+    """Leaves every muscle slack."""
 
     def __init__(self, resolution: int) -> None:
         self.resolution = resolution
@@ -124,12 +120,7 @@ class ZeroPolicy:
 
 
 class RandomPolicy(ZeroPolicy):
-    """Uniform actions in [-1, 1], independent in every cell and step.
-
-    Args:
-        resolution: Action grid R.
-        seed: Seed of its own generator.
-    """
+    """Uniform actions in [-1, 1], independent in every cell and step."""
 
     def __init__(self, resolution: int, seed: int) -> None:
         super().__init__(resolution)
@@ -204,17 +195,17 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, no
     seed = evaluation_seed(config)
     untrained = {"zero action": ZeroPolicy(coarsest), "random action": RandomPolicy(coarsest, config.seed)}
 
-    def judged(name: str, policy: Policy | ZeroPolicy | RandomPolicy, deterministic: bool) -> Result:
+    def evaluated(name: str, policy: Policy | ZeroPolicy | RandomPolicy, deterministic: bool) -> Result:
         env = make_env(config, policy.resolution, episodes)
         return evaluate(name, policy, env, episodes, deterministic=deterministic, seed=seed)
 
-    results = [judged(name, policy, True) for name, policy in untrained.items()]
+    results = [evaluated(name, policy, True) for name, policy in untrained.items()]
     for name, trained in policies.items():
         deterministic = trained.deterministic_by_default if noise == "default" else noise == "without"
         grid = trained.description.get("resolution", trained.resolution)
         for quiet in (False, True) if noise == "both" else (deterministic,):
             label = f"{name}, {'mean' if quiet else 'noisy'}" if noise == "both" else name
-            results.append(replace(judged(label, trained, quiet), resolution=grid))
+            results.append(replace(evaluated(label, trained, quiet), resolution=grid))
         if "layout" in trained.description:
             alone, own = make_env(config, trained.resolution, 1), trained.description["layout"]
             results.append(evaluate("  own layout", trained, alone, 1, deterministic=deterministic, seed=own))

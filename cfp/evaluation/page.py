@@ -24,11 +24,6 @@ HEADER = ("policy", "action", "episodes", "mean return", "95 % interval", "std",
 def write_page(folder: Path, config: RunConfig, results: Sequence[Result]) -> Path:
     """Write ``index.html`` beside the other files of a finished run, which it shows by their relative names.
 
-    Args:
-        folder: Of the run.
-        config: Its options.
-        results: Rows of the final table.
-
     Returns:
         The path of the page.
     """

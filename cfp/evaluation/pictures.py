@@ -22,12 +22,7 @@ SIZE = 192
 
 @torch.no_grad()
 def policy_pictures(actor: Actor, observation: Tensor) -> dict[str, np.ndarray]:
-    """Pictures, uint8 (H, W, 3), of one observation and what an actor makes of it without noise.
-
-    Args:
-        actor: The network; no random number is drawn.
-        observation: uint8 (1, 3, 64, 64).
-    """
+    """Pictures, uint8 (H, W, 3), of one observation and what an actor makes of it without noise."""
     sample = actor.sample(observation, deterministic=True)
     pictures = {
         "picture/observation": _enlarged(observation[0].permute(1, 2, 0).cpu().numpy()),

@@ -15,12 +15,7 @@ from cfp.tables import read_table
 
 
 def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Path:
-    """Draw ``curve.png``: training and evaluation returns over environment steps, all levels after one another.
-
-    Args:
-        run: The run folder with ``progress.csv`` and ``evaluations.csv``.
-        config: The run's options.
-        baselines: Mean returns of untrained policies by name, drawn as horizontal lines.
+    """Draw ``curve.png``: training and evaluation returns over environment steps, all stages after one another.
 
     Returns:
         The path of the picture.

@@ -47,15 +47,7 @@ def film(config: RunConfig, policy: Policy) -> Iterator[np.ndarray]:
 def film_episode(
     config: RunConfig, policy: PolicyPredictor, size: int, deterministic: bool, seed: int
 ) -> Iterator[np.ndarray]:
-    """Pictures of one episode, uint8 (512, 512, 3): the start, then one per environment step, as they are asked for.
-
-    Args:
-        config: The run's options.
-        policy: Acts.
-        size: Rows and columns of its actions.
-        deterministic: Act without noise.
-        seed: Of layout and noise; torch's own generator is left as it was, also between two pictures.
-    """
+    """Pictures of one episode, uint8 (512, 512, 3): the start, then one per environment step, as they are asked for."""
     venv = make_env(config, size, 1).venv
     assert isinstance(venv, TorchVecEnv)
     acting = SingleThreaded(attached(policy, venv))

@@ -76,12 +76,7 @@ class Stage:
 
 
 class StageCallback(BaseCallback):
-    """Acts every so many environment steps of the run.
-
-    Args:
-        stage: In training.
-        every: Environment steps; 0: never.
-    """
+    """Acts every so many environment steps of the run."""
 
     def __init__(self, stage: Stage, every: int) -> None:
         super().__init__()
@@ -109,11 +104,7 @@ class StageCallback(BaseCallback):
 
 
 class ProgressBarCallback(BaseCallback):
-    """Shows on the standard error how far the run has come.
-
-    Args:
-        stage: In training.
-    """
+    """Shows on the standard error how far the run has come."""
 
     def __init__(self, stage: Stage) -> None:
         super().__init__()
@@ -144,12 +135,7 @@ class ProgressBarCallback(BaseCallback):
 
 
 class LogCallback(StageCallback):
-    """Writes rows to the logger of the algorithm: ``progress.csv``, TensorBoard, and Weights & Biases if asked for.
-
-    Args:
-        stage: In training.
-        bar: Shows the return of training episodes.
-    """
+    """Writes rows to the logger of the algorithm: ``progress.csv``, TensorBoard, and Weights & Biases if asked for."""
 
     def __init__(self, stage: Stage, bar: ProgressBarCallback) -> None:
         super().__init__(stage, stage.config.report.log_every)
@@ -182,12 +168,6 @@ class EvaluationCallback(StageCallback):
     """Evaluates the policy and keeps the best one of the stage as ``policy.safetensors``.
 
     A stage that begins with a trained policy is evaluated before its first step: it must do better than that.
-
-    Args:
-        stage: In training.
-        table: Gets a row for each evaluation.
-        tracker: Gets its scalars and images.
-        bar: Shows its mean return.
 
     Attributes:
         means: Mean returns of the stage's evaluations so far, those of earlier sessions included.
@@ -243,12 +223,7 @@ class EvaluationCallback(StageCallback):
 
 
 class FilmCallback(StageCallback):
-    """Films one episode on the first layout of the evaluations, into ``videos/``.
-
-    Args:
-        stage: In training.
-        tracker: Gets the film.
-    """
+    """Films one episode on the first layout of the evaluations, into ``videos/``."""
 
     def __init__(self, stage: Stage, tracker: Tracker) -> None:
         super().__init__(stage, stage.config.report.video_every)
@@ -267,12 +242,6 @@ class CheckpointCallback(StageCallback):
     """Writes a checkpoint: at intervals, after each evaluation, and before the run is stopped.
 
     Without evaluations the newest policy is written along with it.
-
-    Args:
-        stage: In training.
-        checkpoint: Where.
-        evaluation: Comes before this callback.
-        signals: Whether the user wants to stop.
     """
 
     def __init__(
@@ -300,13 +269,7 @@ class CheckpointCallback(StageCallback):
 
 
 class StopCallback(StageCallback):
-    """Stops the run when the user wants to, and the stage when its evaluations no longer improve.
-
-    Args:
-        stage: In training.
-        evaluation: Knows whether they do.
-        signals: Whether the user wants to stop.
-    """
+    """Stops the run when the user wants to, and the stage when its evaluations no longer improve."""
 
     def __init__(self, stage: Stage, evaluation: EvaluationCallback, signals: StopSignals) -> None:
         super().__init__(stage, 0)

@@ -25,9 +25,6 @@ class Checkpoint:
 
     The state file is replaced in one move, and names its replay chunks, which are immutable: a crash at any moment
     leaves the previous checkpoint whole. Reading runs no code from the file.
-
-    Args:
-        folder: ``RUN/checkpoint``.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -39,13 +36,7 @@ class Checkpoint:
         return self.path.exists()
 
     def save(self, algorithm: Algorithm, config: RunConfig, position: Position) -> None:
-        """Replace the checkpoint.
-
-        Args:
-            algorithm: Between two updates, so that every step taken is stored.
-            config: The run's options, compared at resume.
-            position: Where the run stands.
-        """
+        """Replace the checkpoint."""
         state = {
             "version": VERSION,
             "config": json.dumps(to_json(config)),

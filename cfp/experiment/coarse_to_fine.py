@@ -1,4 +1,4 @@
-"""Soft actor-critic as an algorithm of a run, and with it CFP: one level after another, each frozen under the next."""
+"""Soft actor-critic as an algorithm of a run, and the stages of CFP."""
 
 from __future__ import annotations
 
@@ -36,13 +36,7 @@ ROLLOUT_METRICS: dict[str, str] = {
 
 
 class SACAlgorithm(Algorithm):
-    """Trains a `cfp.agent.sac.CFP` with whatever networks; a subclass makes it and knows its policies.
-
-    Args:
-        config: Options of the run.
-        stage: Which stage, 1 is the first.
-        model: As the stage begins.
-    """
+    """Trains a `cfp.agent.sac.CFP` with whatever networks; a subclass makes it and knows its policies."""
 
     def __init__(self, config: Any, stage: int, model: CFP) -> None:
         self.config, self.stage, self.model = config, stage, model
@@ -67,15 +61,7 @@ class SACAlgorithm(Algorithm):
         networks: dict[str, Any],
         hyperparameters: Hyperparameters,
     ) -> CFP:
-        """Create the model of a stage.
-
-        Args:
-            config: Options of the run.
-            env: Environment to train in.
-            policy: Class of the networks.
-            networks: Options of the networks.
-            hyperparameters: Of the stage.
-        """
+        """Create the model of a stage."""
         model = CFP(
             policy,
             env,
@@ -146,7 +132,7 @@ class SACAlgorithm(Algorithm):
 
 
 class CoarseToFine(SACAlgorithm):
-    """The levels of the coarse-to-fine policy, each over the frozen policy of the coarser one (paper, Section 4.2)."""
+    """The stages of the coarse-to-fine policy, each over the frozen policy of the coarser one (paper, Section 4.2)."""
 
     config: Config
 
@@ -157,23 +143,23 @@ class CoarseToFine(SACAlgorithm):
 
     @classmethod
     def initialize(cls, config: Config, folder: Path) -> Position:
-        """Take the first levels from a policy if the options say so; its steps count as those before its handover.
+        """Take the first stages from a policy if the options say so; its steps count as those before its handover.
 
         Raises:
-            ConfigError: It does not fit these levels.
+            ConfigError: It does not fit these stages.
             CheckpointError: It is missing, damaged, or of another kind.
         """
         if config.start_from is None:
             return Position()
         policy, refine = policy_for(config, config.start_from), config.refine
-        levels, resolutions = len(policy.spec.resolutions), config.resolutions
-        if policy.spec.resolutions != resolutions[:levels] or (levels == len(resolutions) and not refine):
+        stages, resolutions = len(policy.spec.resolutions), config.resolutions
+        if policy.spec.resolutions != resolutions[:stages] or (stages == len(resolutions) and not refine):
             allowed = f"the first resolutions of {resolutions}" + ("" if refine else ", but not all")
             raise ConfigError(f"start_from must be a policy of {allowed}, got {policy.spec.resolutions}")
-        if levels > 1 and policy.spec != (allowed_spec := config.actor_spec(levels)):
+        if stages > 1 and policy.spec != (allowed_spec := config.actor_spec(stages)):
             raise ConfigError(f"start_from must have networks {allowed_spec}, got {policy.spec}")
-        stage = levels if refine else levels + 1
-        copy = _start_path(folder) if refine else policy_path(folder, levels)
+        stage = stages if refine else stages + 1
+        copy = _start_path(folder) if refine else policy_path(folder, stages)
         write_policy(copy, *read_policy(config.start_from))
         return Position(stage, (0, *config.handover)[stage - 1])
 
@@ -208,7 +194,7 @@ class CoarseToFine(SACAlgorithm):
         return load(path, device)
 
     def warm_start(self, previous: CoarseToFine) -> None:
-        """Warm critics: those of the level before, with the reward statistics in whose units their values are."""
+        """Take critics and reward statistics from the ``previous`` stage, if the options say so."""
         if not self.config.learning.warm_critic:
             return
         for mine, theirs in zip(self.model.networks()[1:], previous.model.networks()[1:], strict=True):

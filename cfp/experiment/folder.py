@@ -35,10 +35,6 @@ def holds_run(folder: Path) -> bool:
 def read_config(folder: Path, configure: Callable[[dict[str, Any]], RunConfig]) -> RunConfig:
     """Options of the run in a folder.
 
-    Args:
-        folder: Of the run.
-        configure: From JSON values to options.
-
     Raises:
         CheckpointError: There is no run, or its ``config.json`` cannot be read.
     """

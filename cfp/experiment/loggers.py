@@ -47,12 +47,7 @@ class ProgressTable(KVWriter):
 
 
 class EventFile(TensorBoardOutputFormat):
-    """TensorBoard events that, on a resumed run, replace what was logged past the checkpoint.
-
-    Args:
-        folder: Where event files go.
-        step: The step this session starts at.
-    """
+    """TensorBoard events that, on a resumed run, replace what was logged past the checkpoint."""
 
     def __init__(self, folder: Path, step: int) -> None:
         """Open a new event file."""
@@ -92,11 +87,7 @@ def import_wandb(mode: str) -> ModuleType:
 
 
 class WandbWriter(KVWriter):
-    """A logger output to Weights & Biases; a resumed run goes on in the same curve.
-
-    Args:
-        config: The run's options; its ``report`` says whether anything leaves the machine.
-        folder: Of the run; keeps the identity of the curve and, offline, all of it.
+    """A logger output to Weights & Biases; a resumed run continues the same curve.
 
     Raises:
         ConfigError: The package is not installed.
@@ -140,11 +131,6 @@ class WandbWriter(KVWriter):
 
 class Tracker:
     """The places to which a run's rows go besides its tables, and pictures and films that only they take.
-
-    Args:
-        config: The run's options.
-        folder: Of the run.
-        step: The step this session starts at.
 
     Attributes:
         writers: For stable-baselines3's logger.

@@ -37,12 +37,7 @@ def peak_memory() -> int | None:
 
 
 class Stopped(Exception):
-    """A signal asked the program to stop, and all work done so far has been saved.
-
-    Args:
-        number: The signal.
-        hint: How to continue, for the message.
-    """
+    """A signal asked the program to stop, and all work done so far has been saved."""
 
     def __init__(self, number: int, hint: str = "") -> None:
         super().__init__(f"stopped by {signal.Signals(number).name}" + (f"; {hint}" if hint else ""))

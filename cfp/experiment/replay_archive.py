@@ -32,10 +32,6 @@ class ReplayArchive:
 
     A checkpoint names its chunks; a chunk is written before the checkpoint that names it and deleted after the first
     one that does not, so that a crash at any moment leaves every chunk that the last checkpoint needs.
-
-    Args:
-        folder: Where the chunks are.
-        stage: Number of the stage, counted from 1; part of the file names.
     """
 
     def __init__(self, folder: Path, stage: int) -> None:
@@ -44,12 +40,7 @@ class ReplayArchive:
         self.chunks: list[Chunk] = []
 
     def save(self, buffer: ReplayBuffer, rows: int) -> list[dict[str, Any]]:
-        """Write the rows that no chunk has yet, and return the list of chunks for the checkpoint.
-
-        Args:
-            buffer: The ring.
-            rows: Rows stored since the beginning of the stage, overwritten ones included.
-        """
+        """Write the rows that no chunk has yet, and return the list of chunks for the checkpoint."""
         oldest = max(0, rows - buffer.buffer_size)
         start = max(oldest, self.chunks[-1].stop if self.chunks else 0)
         if start < rows:

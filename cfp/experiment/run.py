@@ -129,11 +129,7 @@ class Run:
             self.logger.close()
 
     def _create(self, previous: Algorithm | None) -> Algorithm:
-        """The algorithm of the present stage: at its beginning, or as the checkpoint holds it.
-
-        Args:
-            previous: That of the stage before, if this session has trained it.
-        """
+        """The algorithm of the present stage: at its beginning, or as the checkpoint holds it."""
         resumed = self.state is not None
         try:
             algorithm = self.algorithm.create(self.config, self.position.stage, self.folder, resumed)
@@ -206,14 +202,7 @@ class Run:
 
 
 def make_video(config: RunConfig, policy: Policy, path: Path, to_stderr: bool = False) -> None:
-    """Film one episode of a policy; without the optional packages, print how to install them.
-
-    Args:
-        config: The run's options.
-        policy: Acts.
-        path: Of the MP4 file.
-        to_stderr: Print to the standard error, where the standard output is for a program to read.
-    """
+    """Film one episode of a policy; without the optional packages, print how to install them."""
     output = sys.stderr if to_stderr else sys.stdout
     try:
         write_video(path, film(config, policy))

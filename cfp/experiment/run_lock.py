@@ -26,10 +26,6 @@ def run_lock(folder: Path, timeout: float = 0.0) -> Iterator[None]:
     The system releases the lock when the process ends, however it ends. On a shared file system this holds between
     machines too if that knows ``flock`` (NFS 4, Lustre with ``-o flock``).
 
-    Args:
-        folder: Of a run.
-        timeout: Seconds to wait for another process.
-
     Raises:
         FolderInUse: It is still held by another process.
         OSError: The folder cannot be written.

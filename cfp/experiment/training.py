@@ -46,16 +46,16 @@ class Program:
 
 @dataclass(frozen=True)
 class Command:
-    """Defaults come from the preset of the task; a --config file goes over them, the command line over both.
+    """Default values come from the preset of the task, then from the --config file, then from the command line.
 
-    Ctrl-C writes a checkpoint and stops; --resume goes on.
+    Ctrl-C writes a checkpoint and stops the run; --resume continues it.
     """
 
     run: RunConfig
     out: Path | None = None
     """Folder of the run; in runs/, named by algorithm, task, preset and seed, if not given."""
     resume: bool = False
-    """Go on with the run in the folder; an empty or missing folder starts afresh."""
+    """Continue the run in the folder; in an empty or missing folder, start a new run."""
     config: Path | None = None
     """JSON file with options, in the form of a run's config.json; it may hold only some of them."""
     dry_run: bool = False
@@ -76,11 +76,6 @@ class _Choice:
 
 def parse(program: Program, arguments: Sequence[str], started: str | None = None) -> Command:
     """Read a command line.
-
-    Args:
-        program: Whose it is.
-        arguments: The words.
-        started: How the help calls the program; by its module if not given.
 
     Raises:
         ConfigError: An option is wrong.
@@ -153,7 +148,7 @@ def _train(program: Program, arguments: Sequence[str], started: str) -> None:
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"out must be a folder, got the file {folder}")
     if command.resume and not holds_run(folder):
-        print(f"{folder} holds no run yet: starting afresh")
+        print(f"{folder} holds no run yet: starting a new one")
     if command.dry_run:
         check_options(config)
         print(json.dumps(to_json(config), indent=2))

@@ -71,16 +71,13 @@ def _figure(body: str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, fl
 
 def _mask(body: str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, float]]) -> np.ndarray:
     if not isinstance(body, (str, os.PathLike)):
-        kinds = "a path, an array, an outline (K, 2), a Shape or a BodySpec"
         try:
-            body = np.asarray(body)
+            body = np.atleast_2d(np.asarray(body))
         except ValueError as error:  # rows of different lengths
-            raise ValueError(f"body must be {kinds}, got {body!r}") from error
-        if body.ndim < 2:
-            raise ValueError(f"body must be {kinds}, got {body.tolist()!r}")
-        if body.ndim == 2 and body.shape[1] == 2 and body.dtype.kind in "fiu":
+            raise ValueError(f"body must be a path, an array, a Shape or a BodySpec, got {body!r}") from error
+        if body.shape[1:] == (2,) and body.dtype.kind in "fiu":
             return _filled(body.astype(np.float64))
-    grey = read_grey(body, "body", others="an outline (K, 2)")
+    grey = read_grey(body, "body", others="an outline (K, 2), ")
     mask: np.ndarray = grey > THRESHOLD
     if not mask.any():
         raise ValueError(f"body must have pixels brighter than {THRESHOLD}, got none")

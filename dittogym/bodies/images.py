@@ -16,15 +16,15 @@ LARGEST = 2**22
 PictureLike: TypeAlias = "str | os.PathLike[str] | np.ndarray"
 
 
-def read_grey(picture: PictureLike, name: str, others: str = "") -> np.ndarray:
+def read_grey(picture: PictureLike, name: str, others: str) -> np.ndarray:
     """A picture as grey values (H, W) uint8, row 0 at the top; what is transparent is black."""
     if isinstance(picture, np.ndarray):
         return _grey(picture, name)
     if not isinstance(picture, (str, os.PathLike)):
-        raise ValueError(f"{name} must be {_join(others)}an array or a path, got {type(picture).__name__}")
+        raise ValueError(f"{name} must be {others}an array or a path, got {type(picture).__name__}")
     path = os.fspath(picture)
     if not os.path.isfile(path):
-        raise ValueError(f"{name} must be {_join(others)}an array or the path of an image; no such file: {path!r}")
+        raise ValueError(f"{name} must be {others}an array or the path of an image; no such file: {path!r}")
     width, height = _claimed_size(path, name)
     if width * height > LARGEST:
         raise ValueError(f"{name} {path!r} must have at most {LARGEST} pixels, got {width} x {height}")
@@ -50,10 +50,6 @@ def _claimed_size(path: str, name: str) -> tuple[int, int]:
         raise ValueError(f"{name} {path!r} cannot be read as an image ({error})") from error
 
 
-def _join(others: str) -> str:
-    return others + ", " if others else ""
-
-
 def _grey(image: np.ndarray, name: str) -> np.ndarray:
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (3, 4)) or 0 in image.shape:
         raise ValueError(f"{name} array must have shape (H, W), (H, W, 3) or (H, W, 4), got {image.shape}")
@@ -70,6 +66,4 @@ def _grey(image: np.ndarray, name: str) -> np.ndarray:
     if image.ndim == 2:
         return image
     grey = cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_BGR2GRAY)
-    if image.shape[2] == 3:
-        return grey
-    return (grey.astype(np.uint16) * image[..., 3] // 255).astype(np.uint8)
+    return grey if image.shape[2] == 3 else (grey.astype(np.uint16) * image[..., 3] // 255).astype(np.uint8)

@@ -57,7 +57,7 @@ class Disc:
     draws: int = 4
 
     def __post_init__(self) -> None:
-        _check_pair("corner", self.corner)
+        check_pair("corner", self.corner)
         checks.number("diameter", self.diameter, above=0.0)
 
     @property
@@ -93,8 +93,8 @@ class Rectangle:
     draws: int = 4
 
     def __post_init__(self) -> None:
-        _check_pair("corner", self.corner)
-        _check_pair("size", self.size, above=0.0)
+        check_pair("corner", self.corner)
+        check_pair("size", self.size, above=0.0)
 
     @property
     def area(self) -> float:
@@ -113,10 +113,7 @@ class Lattice(Rectangle):
     draws: int = 0
 
     def positions(self, numbers: Points) -> Points:
-        """World positions (N, 2) in m; a square number of particles makes a square lattice.
-
-        Other numbers are spread over rows that differ by at most one particle.
-        """
+        """World positions (N, 2) in m, in rows that differ by at most one particle."""
         count = len(numbers)
         rows = max(1, round(math.sqrt(count * self.size[1] / self.size[0])))
         rank = np.arange(count)
@@ -145,7 +142,7 @@ class Figure:
     draws: int = 2
 
     def __post_init__(self) -> None:
-        _check_pair("corner", self.corner)
+        check_pair("corner", self.corner)
         checks.number("pixel", self.pixel, above=0.0)
         if not isinstance(self.mask, np.ndarray) or self.mask.ndim != 2 or not self.mask.any():
             raise ValueError(f"mask must be an array (rows, columns) with a pixel set, got {np.shape(self.mask)}")
@@ -165,7 +162,8 @@ class Figure:
         return sampling.image(numbers, self.mask, self.corner, self.size)
 
 
-def _check_pair(name: str, given: tuple[float, float], above: float | None = None) -> None:
+def check_pair(name: str, given: tuple[float, ...], above: float | None = None) -> None:
+    """Refuse what is not two numbers, x and y."""
     if not isinstance(given, tuple | list) or len(given) != 2:
         raise ValueError(f"{name} must be two numbers (x, y), got {given!r}")
     for axis, number in zip("xy", given, strict=True):

@@ -10,17 +10,9 @@ import torch
 from torch import Tensor
 
 from dittogym.geometry import Box
-from dittogym.observation import native
+from dittogym.observation import native, raster
 from dittogym.observation.image import CLIP, encode, quantise
-from dittogym.observation.raster import (
-    Background,
-    RasterInput,
-    crop_corner,
-    draw_boxes,
-    draw_fixed_boxes,
-    pixel_means,
-    splat_means,
-)
+from dittogym.observation.raster import Background, RasterInput
 from dittogym.observation.smooth import box_fraction, smooth_crop_corner
 from dittogym.window import GRID, Centre, Window, centre_in_window
 from torchmpm.backends import transforming, warn_eager
@@ -73,43 +65,32 @@ class Camera:
 
     def draw(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
         """:meth:`observe` in torch operations."""
-        row, column = crop_corner(centre_in_window(self.view, centre, origin))
-        background = self._background(origin, row, column)
-        shown = self.raster_input(x, v, origin, row, column, background)
-        return quantise(pixel_means(shown) if self.pixels else splat_means(shown))
+        row, column = raster.crop_corner(centre_in_window(self.view, centre, origin))
+        shown = self.raster_input(x, v, origin, row, column)
+        shown = shown._replace(background=self._background(origin, row, column))
+        return quantise(raster.pixel_means(shown) if self.pixels else raster.splat_means(shown))
 
     def observe_smoothly(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
         """The image in the units of the uint8 one as a smooth function of its arguments.
 
-        Particles are spread over image pixels by quadratic B-splines at every tier, and crop and background move with
-        the robot without steps. Like in the uint8 image, occupancy lies between 0 and 255 and velocities saturate at 0
-        and 255, where their derivative is zero. The derivative is continuous except at these ends, at the cap on
-        velocities (5 m/s), for particles at the edge of the simulated window, and where edges of boxes meet edges of
-        pixels.
+        Particles are splats at every tier, and crop and background move with the robot without steps. The derivative is
+        continuous except where values saturate at 0 and 255, at the cap on velocities (5 m/s), for particles at the
+        edge of the simulated window, and where edges of boxes meet edges of pixels.
         """
         follows = (self.view[0] is None and not self.window.moves, self.view[1] is None)
         row, column = smooth_crop_corner(centre_in_window(self.view, centre, origin), follows)
-        means = splat_means(self.raster_input(x, v, origin, row, column))
+        means = raster.splat_means(self.raster_input(x, v, origin, row, column))
         if self.boxes:
             free = 1.0 - box_fraction(self.boxes, origin, row, column)
             means = torch.cat((1.0 - free[:, None] * (1.0 - means[:, :1]), means[:, 1:]), dim=1)
         return encode(means)
 
-    def raster_input(
-        self,
-        x: Tensor,
-        v: Tensor,
-        origin: Tensor,
-        row: Tensor,
-        column: Tensor,
-        background: Background | None = None,
-    ) -> RasterInput:
-        """What an image with its corner in a fine ``row`` and ``column`` (B, 1) shows."""
+    def raster_input(self, x: Tensor, v: Tensor, origin: Tensor, row: Tensor, column: Tensor) -> RasterInput:
+        """The particles that an image with its corner in a fine ``row`` and ``column`` (B, 1) shows."""
         finite = torch.isfinite((x + v).detach().sum(-1))
         visible = finite & GRID.contains(x[..., 0], origin[:, 0:1])
-        hidden = None
-        if any(self.hidden_velocity):
-            hidden = per_particle(self.counts, self.hidden_velocity, torch.bool, x.device)
+        some = any(self.hidden_velocity)
+        hidden = per_particle(self.counts, self.hidden_velocity, torch.bool, x.device) if some else None
         moving = visible if hidden is None else visible & ~hidden
         return RasterInput(
             position=x - origin[:, None],
@@ -119,14 +100,13 @@ class Camera:
             hidden_velocity=hidden,
             row=row,
             column=column,
-            background=background,
         )
 
     def _background(self, origin: Tensor, row: Tensor, column: Tensor) -> Background | None:
         if not self.boxes or self.window.moves or None in self.view:
-            return draw_boxes(self.boxes, origin, row, column)
+            return raster.draw_boxes(self.boxes, origin, row, column)
         corner = int(row[0, 0]), int(column[0, 0])
-        return draw_fixed_boxes(self.boxes, (self.window.left, 0.0), *corner, origin.dtype, origin.device)
+        return raster.draw_fixed_boxes(self.boxes, (self.window.left, 0.0), *corner, origin.dtype, origin.device)
 
 
 @functools.lru_cache(maxsize=64)

@@ -46,7 +46,7 @@ class RasterInput(NamedTuple):
     hidden_velocity: Tensor | None  # (N,) bool, particles that only the occupancy channel shows; None for none
     row: Tensor  # First fine row of the crop, (B, 1)
     column: Tensor  # First fine column of the crop, (B, 1)
-    background: Background | None  # What obstacles and goals set; None for nothing
+    background: Background | None = None  # What obstacles and goals set; None for nothing
 
 
 def draw_boxes(boxes: Sequence[Box], origin: Tensor, row: Tensor, column: Tensor) -> Background | None:
@@ -97,7 +97,7 @@ def pixel_means(shown: RasterInput) -> Tensor:
     last = torch.full((batch, width * width), -1, dtype=torch.int64, device=r.device)
     last = last.scatter_reduce(1, fine, order, "amax")
     wins = visible & (last.gather(1, fine) == order)
-    new = wins
+    new = wins  # the background has not set its pixel
     if background is not None:
         new = wins & ~background.mask.flatten(1).expand(batch, -1).gather(1, fine)
     values = torch.stack((new.to(velocity.dtype), *(wins * v for v in velocity.unbind(-1))))

@@ -21,7 +21,7 @@ ROBOT, OBJECT, GROUND_BODY = (38, 121, 140), (222, 122, 60), (150, 118, 86)
 CONTRACT, RELAX, EXPAND = np.array((206, 60, 52)), np.array((190, 190, 190)), np.array((52, 92, 200))
 #: Distance of the marks on the ground that show how far the window has moved, m.
 MARK = 0.1
-#: Radius of a dot at full size, m.
+#: Radius of a dot at full size, just large enough to close a body at its initial density, m.
 FULL_SIZE_RADIUS = 0.0015
 #: Pictures are drawn this many times larger, then averaged down.
 OVERSAMPLING = 2
@@ -35,8 +35,7 @@ def frame(model: Model, state: EnvState, index: int, actuation: Tensor | None, s
         raise IndexError(f"index must be between 0 and {len(state.steps) - 1}, got {index!r}")
     index = int(index)
     checks.whole("size", size, 16, LARGEST)
-    spec = model.spec
-    particles = state.particles[index].detach()
+    spec, particles = model.spec, state.particles[index].detach()
     origin = state.origin[index].detach().cpu().double().numpy()
     canvas = Canvas(size * OVERSAMPLING, origin)
     canvas.marks()
@@ -55,7 +54,8 @@ def frame(model: Model, state: EnvState, index: int, actuation: Tensor | None, s
         colours[: model.num_robot_particles] = _muscle_colours(model, state, index, actuation)
     parts = [part for _, part in slices(model.solver.bodies)]
     for part, weight in reversed(list(zip(parts, model.particle_weight, strict=True))):  # the robot last, on top
-        canvas.dots(x[part], colours[part], radius=_radius(weight, size * OVERSAMPLING))
+        radius = max(1, round(FULL_SIZE_RADIUS * np.sqrt(weight) * canvas.pixels))
+        canvas.dots(x[part], colours[part], radius)
     return cv2.resize(canvas.image, (size, size), interpolation=cv2.INTER_AREA)
 
 
@@ -116,19 +116,12 @@ class Canvas:
                 self.image[r[ok], c[ok]] = colours[ok]
 
 
-def _radius(weight: float, pixels: int) -> int:
-    """Dots just large enough to close a body at its initial density."""
-    return max(1, round(FULL_SIZE_RADIUS * np.sqrt(weight) * pixels))
-
-
 def _muscle_colours(model: Model, state: EnvState, index: int, actuation: Tensor) -> np.ndarray:
-    spec = model.spec
-    one = slice(index, index + 1)
+    spec, one = model.spec, slice(index, index + 1)
     centre = centre_in_window(spec.reach, state.centre[one], state.origin[one])
     nodes = place(actuation[one], centre, model.solver.grid.resolution)[0].sum(0).cpu().double().numpy()
-    relative = (
-        (state.particles.x[index, : model.num_robot_particles] - state.origin[index]).detach().cpu().double().numpy()
-    )
+    robot_x = state.particles.x[index, : model.num_robot_particles] - state.origin[index]
+    relative = robot_x.detach().cpu().double().numpy()
     finite = np.isfinite(relative).all(1, keepdims=True)
     at = np.clip(np.where(finite, relative, 0.0) * len(nodes), 0, len(nodes) - 1).astype(int)
     strength = float(state.physics["max_actuation"][index]) if "max_actuation" in state.physics else spec.max_actuation

@@ -61,7 +61,7 @@ def load_target(target: TargetLike) -> np.ndarray:
         for outline in _OUTLINES[target]:
             cv2.fillPoly(grey, [np.array(outline)], 255)
     else:
-        grey = read_grey(target, "target", others=", ".join(repr(name) for name in _OUTLINES))
+        grey = read_grey(target, "target", others="".join(f"{name!r}, " for name in _OUTLINES))
     if grey.shape != (SIZE, SIZE):
         grey = cv2.resize(grey, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
     mask = grey >= THRESHOLD

@@ -16,7 +16,6 @@ TINY = (
     "--batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 --eval-every 0 --eval-episodes 1 "
     "--checkpoint-every 10 --log-every 10 --no-video --device cpu --backend eager"
 )
-"""Options of a training that takes seconds, if it is not refused."""
 
 
 class Refused(Exception):
@@ -24,39 +23,27 @@ class Refused(Exception):
 
 
 class Desk:
-    """A folder for one case, and what can be laid out there before it.
-
-    Args:
-        folder: Empty.
-        trained: A finished run of `TINY`.
-    """
+    """An empty folder for one case, and what can be laid out there before it."""
 
     def __init__(self, folder: Path, trained: Path) -> None:
         self.folder, self.trained, self.before = folder, trained, snapshot(folder)
 
-    def file(self, name: str, content: bytes | str) -> Path:
-        """A file."""
-        path = self.folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    def file(self, name: str, content: bytes | str) -> None:
+        """Write a file."""
+        (self.folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
         self.before = snapshot(self.folder)
-        return path
 
-    def run(self, change: Callable[[Path], object] = lambda folder: None) -> Path:
-        """A copy of the finished run, with something done to it."""
-        folder = self.folder / "run"
-        shutil.copytree(self.trained, folder)
-        change(folder)
+    def run(self, change: Callable[[Path], object] = lambda folder: None) -> None:
+        """Copy the trained run and change the copy."""
+        shutil.copytree(self.trained, self.folder / "run")
+        change(self.folder / "run")
         self.before = snapshot(self.folder)
-        return folder
 
-    def policy(self, changes: dict | None = None, weights: Callable[[dict], dict] = lambda tensors: tensors) -> Path:
-        """The shipped policy of RUN with another description and other weights."""
+    def policy(self, changes: dict | None = None, weights: Callable[[dict], dict] = lambda tensors: tensors) -> None:
+        """Write the shipped policy of RUN with another description and other weights."""
         tensors, description = read_policy(SHIPPED / "run.safetensors")
-        path = self.folder / "stranger.safetensors"
-        write_policy(path, weights(tensors), {**description, **(changes or {})})
+        write_policy(self.folder / "stranger.safetensors", weights(tensors), {**description, **(changes or {})})
         self.before = snapshot(self.folder)
-        return path
 
 
 def snapshot(folder: Path) -> dict[str, bytes | None]:
@@ -66,15 +53,7 @@ def snapshot(folder: Path) -> dict[str, bytes | None]:
 
 @dataclass(frozen=True)
 class Case:
-    """Bad input.
-
-    Attributes:
-        name: What is wrong.
-        call: Does it.
-        words: What the message must contain: the argument, what was given, what is allowed.
-        error: Type of the exception.
-        leaves: Beginning of the paths that it may add.
-    """
+    """A call with bad input, what its message must contain, and the beginning of the paths that it may add."""
 
     name: str
     call: Callable[[Desk], object]
@@ -83,23 +62,17 @@ class Case:
     leaves: str = "nothing"
 
     def message(self, desk: Desk) -> str:
-        """What the user is told, in one line and with the folder left out.
-
-        Raises:
-            AssertionError: It was accepted, or something else was raised.
-        """
+        """What the user is told, in one line and with the folder left out."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
                 self.call(desk)
             except self.error as error:
                 return " ".join(str(error).split()).replace(str(desk.folder) + "/", "")
-            except Exception as error:
-                raise AssertionError(f"raised {type(error).__name__}: {error}") from error
         raise AssertionError("was accepted")
 
 
-def command(main: Callable[[list[str]], int], arguments: str) -> Callable[[Desk], None]:
+def command(main: Callable[[list[str]], int], arguments: str, exit_code: int = 2) -> Callable[[Desk], None]:
     """A call of a command line; ``{folder}`` in the arguments stands for the desk's."""
 
     def call(desk: Desk) -> None:
@@ -110,6 +83,7 @@ def command(main: Callable[[list[str]], int], arguments: str) -> Callable[[Desk]
             except SystemExit as error:
                 code = error.code
         if code:
+            assert code == exit_code
             raise Refused(printed.getvalue())
 
     return call

@@ -46,15 +46,9 @@ IMAGES = [
     Case(
         "image missing", lambda desk: make_spec("shapematch", target="no.png"), ("target must be", "no such", "no.png")
     ),
-    Case("image is a folder", lambda desk: make_spec("shapematch", target=desk.folder), ("target must be", "no such")),
-    target("empty", b"", "cannot be read as an image"),
     target("of text", "hello", "cannot be read as an image"),
-    target("cut short", picture(np.eye(64) * 255)[:40], "cannot be read as an image"),
-    target("of zero pixels", png(0, 5), "cannot be read as an image"),
     target("all white", picture(np.full((64, 64), 255)), "pixels of the shape and of the ground, got 4096 of 4096"),
-    target("all black", picture(np.zeros((64, 64))), "pixels of the shape and of the ground, got 0 of 4096"),
     target("that would fill the memory", png(10_000, 10_000), "at most 4194304 pixels, got 10000 x 10000"),
-    target("that would fill it twice", png(30_000, 30_000), "cannot be read as an image", "900000000 pixels"),
     target("that would fill any memory", png(2**31 - 1, 2**31 - 1), "cannot be read as an image"),
 ]
 
@@ -98,53 +92,28 @@ POLICIES = [
         ("nobody.safetensors", "(catch, grow, run, "),
         CheckpointError,
     ),
-    Case(
-        "policy in an empty folder",
-        lambda desk: cfp.load(desk.folder),
-        ("there is no policy", "run, "),
-        CheckpointError,
-    ),
-    policy("empty", "damaged", content=b""),
     policy("of text", "damaged", content="hello, I am a policy"),
     policy("cut short", "damaged", content=SHIPPED[: len(SHIPPED) // 2]),
-    policy("cut in its header", "damaged", content=SHIPPED[:100]),
     policy("with a header of terabytes", "damaged", content=struct.pack("<Q", 2**42) + b"{}"),
     policy("with a tensor of terabytes", "damaged", content=header(HUGE)),
     policy("without a description", "must have a cfp-policy description", content=header({})),
-    policy("with a broken description", "damaged", content=header({"__metadata__": {"cfp-policy": "{"}})),
     policy(
         "with a deep description", "nested too deeply", content=header({"__metadata__": {"cfp-policy": "[" * 99_999}})
     ),
-    policy("with a list for a description", "must have a", content=header({"__metadata__": {"cfp-policy": "[1]"}})),
     policy("of another version", "description of version 1", changes={"version": 2}),
     policy("of another kind", "kind must be 'cfp', got 'mpc'", changes={"kind": "mpc"}),
     policy("of a task by number", "task must be a string, got 3", changes={"task": 3}),
     policy("of no grid", "resolution must be between 1 and 128, got 0", changes={"resolution": 0}),
-    policy("of a grid of True", "resolution must be between 1 and 128, got True", changes={"resolution": True}),
     policy("of stage -1", "stage must be between 1 and", changes={"stage": -1}),
-    policy("that is maybe deterministic", "deterministic must be true or false,", changes={"deterministic": "yes"}),
-    policy("for a layout by name", "layout must be between 0 and", changes={"layout": "x"}),
-    policy("for no environment", "environment must be an object, got None", changes={"environment": None}),
     policy("for an unknown environment", "environment.colour is not an option", changes={"environment": {"colour": 1}}),
     policy("without a network", "do not match", changes={"network": {}}),
     policy("with an unknown network", "do not match", "network.colour is not an", changes={"network": {"colour": 1}}),
     policy("with a grid of 7", "resolutions must be increasing values of", changes={"network": {"resolutions": [7]}}),
-    policy("with grids in a text", "do not match", changes={"network": {"resolutions": "8, 16"}}),
     policy("with a patch of a mile", "and 128, got 1000", changes={"network": {"resolutions": [8], "patch": 10**6}}),
-    policy("with another ladder", "do not match", changes={"network": {"resolutions": [16]}}),
     policy("of NaN", "got NaN or infinity", weights=first(lambda tensor: tensor * float("nan"))),
     policy("of other shapes", "do not match", "size mismatch", weights=first(lambda tensor: tensor[..., :1])),
     policy(
         "with a tensor too many", "do not match", "extra", weights=lambda tensors: {**tensors, "extra": torch.zeros(1)}
-    ),
-    policy(
-        "with a tensor too few", "do not match", "Missing key", weights=lambda tensors: dict(list(tensors.items())[1:])
-    ),
-    policy(
-        "of shac with a mile of inputs",
-        "do not match",
-        load=baselines.load,
-        changes={"kind": "shac", "inputs": 10**12, "features": {}, "noise": 0.1},
     ),
     policy(
         "of segments without number",
@@ -225,8 +194,6 @@ def chunk_of_objects(folder):
 
 RUNS = [
     resumed("a checkpoint cut short", cut("checkpoint/state.pt"), "state.pt: the checkpoint is damaged"),
-    resumed("an empty checkpoint", write("checkpoint/state.pt", b""), "state.pt: the checkpoint is damaged"),
-    resumed("a checkpoint of text", write("checkpoint/state.pt", "hello"), "state.pt: the checkpoint is damaged"),
     resumed(
         "a checkpoint that runs code",
         lambda folder: torch.save({"version": 2, "x": Stranger()}, folder / "checkpoint" / "state.pt"),
@@ -236,14 +203,11 @@ RUNS = [
     resumed("a checkpoint without a model", state(algorithm=None), "does not fit this program (KeyError: 'algorithm')"),
     resumed("a checkpoint before its time", state(offset=-5), "does not fit this program", "negative"),
     resumed("a checkpoint of stage 8", state(stage=8), "does not fit this program", "it is of stage 8"),
-    resumed("a checkpoint of broken options", state(config="{"), "does not fit this program (JSONDecodeError"),
     resumed("a checkpoint of another task", state(config='{"task": "run"}'), "task: the run was started with 'run'"),
     resumed("a chunk outside", chunk_outside, "chunks must be files in this folder, got '../../../secret.npz'"),
     resumed("a chunk of objects", chunk_of_objects, "this part of the replay buffer is missing or damaged"),
     resumed("broken options", write("config.json", "{"), "config.json: cannot be read"),
-    resumed("a task that is not", options(task="swim"), "config.json: cannot be read (task must be catch"),
     evaluated("no options", lambda folder: (folder / "config.json").unlink(), "there is no run (no config.json)"),
-    evaluated("options of a list", write("config.json", "[1]"), "config.json: cannot be read (it must hold an"),
     evaluated("unknown options", options(colour=1), "config.json: cannot be read (colour is not an option"),
     evaluated("no policy", lambda folder: (folder / "policy.safetensors").unlink(), "no policy has been written yet"),
     evaluated("a policy cut short", cut("policy.safetensors"), "policy.safetensors: the policy is damaged"),
@@ -258,7 +222,6 @@ def file_of_options(name, content, *words, main=cfp.train.main, option="config")
 
 
 CONFIGS = [
-    file_of_options("empty", "", "config: options.json cannot be read as JSON"),
     file_of_options("broken", '{"steps": 3,}', "config: options.json cannot be read as JSON", "line 1"),
     file_of_options("in another encoding", b"\xff\xfe{\x00}\x00", "options.json cannot be read", "utf-8"),
     file_of_options("nested too deeply", "[" * 99_999, "options.json cannot be read as JSON (it is nested too deeply)"),
@@ -266,26 +229,13 @@ CONFIGS = [
     file_of_options("of a list", "[1]", "cannot be read as JSON (it must hold an object, got list"),
     file_of_options("with an unknown name", '{"stepz": 1}', "stepz is not an option"),
     file_of_options("with a group of nothing", '{"learning": null}', "learning must be an object, got None"),
-    file_of_options("with a task of a list", '{"task": ["run"]}', "task must be catch, dig"),
-    file_of_options("with a preset of a list", '{"preset": [1]}', "preset must be quick or paper for shapematch,"),
     file_of_options("with steps as text", '{"steps": "x"}', "steps must be an integer, got 'x'"),
-    file_of_options("with steps without end", '{"steps": 1e999}', "steps must be an integer, got inf"),
     file_of_options("with a rate of NaN", '{"learning": {"learning_rate": NaN}}', "learning_rate must be finite,"),
-    file_of_options("with an infinite temperature", '{"alpha": [Infinity, 0]}', "alpha must be finite, got (inf, 0.0)"),
     file_of_options("with half particles", '{"environment": {"particles": [1.5, 2]}}', "a list of 2, each an integer"),
-    file_of_options("with a dtype in a list", '{"environment": {"dtype": ["float32"]}}', "'float32' or 'float64'"),
-    file_of_options("with a target of a number", '{"environment": {"target": 3}}', "target must be a string or"),
-    file_of_options("that says where to write", '{"out": "/etc"}', "out is not an option"),
     Case(
         "config file missing",
         command(cfp.train.main, "--config no.json --out run --dry-run"),
         ("config: no.json cannot be read", "No such file"),
-        Refused,
-    ),
-    Case(
-        "config file is a folder",
-        command(cfp.train.main, "--config {folder} --out run --dry-run"),
-        ("cannot be read as JSON (it is not a file)",),
         Refused,
     ),
     Case(

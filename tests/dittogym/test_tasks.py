@@ -16,13 +16,7 @@ FLOOR, LOW, HIGH = ("stick", -INF, INF, -INF, 19), ("+y", -INF, INF, 119, INF), 
 #: Rules (kind, first i, last i, first j, last j) in world node indices, in the reference's order.
 TABLES = {
     "shapematch": [FLOOR, LOW],
-    "run": [
-        ("+x", 32, 34, 61, INF),
-        ("-x", 46, 47, 61, INF),
-        FLOOR,
-        LOW,
-        ("+y", 33, 46, 59, 60),
-    ],
+    "run": [("+x", 32, 34, 61, INF), ("-x", 46, 47, 61, INF), FLOOR, LOW, ("+y", 33, 46, 59, 60)],
     "grow": [
         ("+x", 32, 34, -INF, 39),
         ("-x", -34, -32, -INF, 39),
@@ -38,12 +32,7 @@ TABLES = {
         ("+y", -30, 2, 54, 54),
     ],
     "kick": [FLOOR, HIGH],
-    "dig": [
-        ("+x", 32, 34, -INF, INF),
-        ("-x", -34, -32, -INF, INF),
-        ("-y", -INF, INF, -INF, 19),
-        HIGH,
-    ],
+    "dig": [("+x", 32, 34, -INF, INF), ("-x", -34, -32, -INF, INF), ("-y", -INF, INF, -INF, 19), HIGH],
     "obstacle": [
         rule
         for k in range(6)

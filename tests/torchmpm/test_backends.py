@@ -189,18 +189,6 @@ def test_a_trace_leaves_nothing_behind() -> None:
     assert type(solver.step(state, substeps=2).x) is Tensor
 
 
-def test_auto_without_a_compiler(
-    fresh_process: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setenv("PATH", "")
-    monkeypatch.delenv("CXX", raising=False)
-    state = lively(30)
-    results = [robot(30, backend=backend).step(state, substeps=2) for backend in ("auto", "eager")]
-    assert_identical(*results)
-    (message,) = messages(caplog)
-    assert "needs a C++ compiler (g++, clang++ or $CXX), found none" in message
-
-
 def test_auto_with_a_compiler_that_fails(
     fresh_process: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:

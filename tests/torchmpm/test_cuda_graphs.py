@@ -15,7 +15,7 @@ from torch import Tensor
 from torchmpm import tree
 from torchmpm.backends import compiler_found
 from torchmpm.native import operator
-from torchmpm.native.inputs import Inputs
+from torchmpm.native.tables import Inputs
 
 pytestmark = [
     pytest.mark.skipif(not compiler_found(), reason="no C++ compiler"),

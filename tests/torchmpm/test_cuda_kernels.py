@@ -22,7 +22,6 @@ from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
 from torchmpm.backends import compiler_found
-from torchmpm.native.kernels import Kernels
 
 pytestmark = [
     pytest.mark.skipif(not compiler_found(), reason="no C++ compiler"),
@@ -181,19 +180,3 @@ def test_a_broken_element_harms_no_other(name: str, value: float) -> None:
     assert_close(together, apart, 1e-12)
     for one, other in zip(of_all, of_some, strict=True):
         torch.testing.assert_close(one[[0, 2]], other[[0, 2]], rtol=0, atol=1e-10 * other.abs().max().item())
-
-
-def test_long_steps_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Into calls whose tape stays within bounds; the gradients are the same."""
-    monkeypatch.setattr(Kernels, "tape_limit", lambda *_: 2)
-    given = state_leaves(15, 1)
-    both_gradients(lambda _: solvers(15, 1)["three bodies"], given, ("x", "v", "actuation", "origin"), 5)
-
-
-def test_second_derivatives_are_refused() -> None:
-    state = lively(6).to(DEVICE)
-    v = state.v.clone().requires_grad_()
-    final = robot(6, backend="native").step(replace(state, v=v))
-    (first,) = torch.autograd.grad(final.x.square().sum(), v, create_graph=True)
-    with pytest.raises(RuntimeError, match="backend 'native' has no second derivatives: use backend 'eager'"):
-        torch.autograd.grad(first.sum(), v)

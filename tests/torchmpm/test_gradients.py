@@ -8,7 +8,7 @@ import torch
 from scenes import lively, normal, positions, robot
 from torch import Tensor
 
-from torchmpm import Body, Elastic, ParticleState, VelocityRule, VonMises
+from torchmpm import Body, ParticleState, VelocityRule, VonMises
 
 pytestmark = pytest.mark.usefixtures("backend")
 
@@ -119,37 +119,9 @@ def test_single_precision_gradients_are_near_double() -> None:
         assert error <= 1e-3, f"{name}: {error:.1e}"
 
 
-def test_simulations_have_separate_gradients() -> None:
-    """A loss on one simulation leaves the others' inputs alone."""
-    state, actuation = lively(N, 3), (40.0 * normal(3, 2, 16, 16, seed=1)).requires_grad_()
-    v = state.v.clone().requires_grad_()
-    final = robot(N).step(replace(state, v=v), actuation, substeps=3)
-    for gradient in torch.autograd.grad(final.x[1].square().sum(), (v, actuation)):
-        assert gradient[1].abs().max() > 0
-        assert (gradient[[0, 2]] == 0).all()
-
-
 def test_frozen_particles_pass_their_gradient_through() -> None:
     state = lively(10)
     x = (state.x + torch.tensor([3.0, 0.0], dtype=torch.float64)).requires_grad_()
     final = robot(10).step(replace(state, x=x), substeps=4)
     (gradient,) = torch.autograd.grad(final.x.sum(), x)
     assert torch.equal(gradient, torch.ones_like(x))
-
-
-def test_gradient_descent_finds_a_stiffness() -> None:
-    """What gradients are for: recover mu from the motion it caused."""
-    state, true = lively(60, strain=0.08), 420.0
-
-    def final(mu: Tensor | float) -> Tensor:
-        return robot(60, bodies=(Body(60, Elastic(mu, 50.0)),)).step(state, substeps=30).v
-
-    target, mu = final(true), torch.tensor(600.0, dtype=torch.float64)
-    for _ in range(4):  # Gauss-Newton in one unknown
-        mu.requires_grad_()
-        residual = final(mu) - target
-        (gradient,) = torch.autograd.grad(0.5 * residual.square().sum(), mu)
-        with torch.no_grad():
-            tangent = (final(mu + 1e-3) - target - residual) / 1e-3
-            mu = mu - gradient / tangent.square().sum()
-    assert mu.item() == pytest.approx(true, rel=1e-3)

@@ -27,10 +27,6 @@ def test_too_few_nodes(resolution: int) -> None:
         Grid(resolution)
 
 
-def test_four_nodes_are_enough() -> None:
-    assert Grid(4).resolution == 4
-
-
 @pytest.mark.parametrize("spacing", [0.0, -1.0, math.nan])
 def test_spacing_must_be_positive(spacing: float) -> None:
     with pytest.raises(ValueError, match="spacing must be positive"):
@@ -42,11 +38,6 @@ def test_contains_tests_the_open_interval_inside_the_margin(origin: float) -> No
     offsets = torch.tensor([[-0.1, 0.0, 0.9e-5, 1.1e-5, 0.5, 1 - 1.1e-5, 1 - 0.9e-5, 1.0, 1.2]], dtype=torch.float64)
     found = Grid(64).contains(offsets + origin, torch.full((1, 1), origin, dtype=torch.float64))
     assert found.tolist() == [[False, False, False, True, True, True, False, False, False]]
-
-
-def test_contains_uses_the_origin_of_each_simulation() -> None:
-    x = torch.tensor([[0.2, 1.2], [0.2, 1.2]])
-    assert Grid(8).contains(x, torch.tensor([[0.0], [1.0]])).tolist() == [[True, False], [False, True]]
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])

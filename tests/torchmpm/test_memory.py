@@ -1,10 +1,8 @@
 """Predicted against measured memory of gradients."""
 
-import contextlib
 import gc
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,39 +41,12 @@ def measured(solver: Solver, batch: int, substeps: int, segment: int | None, env
 
 @pytest.mark.parametrize(
     ("count", "batch", "substeps", "segment", "env_steps"),
-    [
-        (300, 1, 8, None, 1),
-        (300, 1, 12, 3, 1),
-        (1000, 1, 6, 2, 1),
-        (150, 3, 4, None, 1),
-        (300, 1, 3, None, 4),
-    ],
+    [(300, 1, 8, None, 1), (300, 1, 12, 3, 1), (1000, 1, 6, 2, 1), (150, 3, 4, None, 1), (300, 1, 3, None, 4)],
 )
 def test_eager(count: int, batch: int, substeps: int, segment: int | None, env_steps: int) -> None:
     solver, options = robot_and_ball(count - 50, 50), {"substeps": substeps, "segment": segment, "env_steps": env_steps}
     predicted = estimate_memory(solver, (batch, count, torch.float64), **options)
     assert predicted == pytest.approx(measured(solver, batch, substeps, segment, env_steps), rel=0.25)
-
-
-@needs_compiler
-@pytest.mark.parametrize(
-    ("count", "batch", "substeps", "env_steps"), [(300, 1, 4, 1), (2000, 2, 20, 1), (900, 1, 5, 6)]
-)
-def test_native(count: int, batch: int, substeps: int, env_steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Much nearer than a quarter."""
-    asked, scratch = [], call._scratch
-
-    @contextlib.contextmanager
-    def watched(size: int) -> Iterator[int]:
-        asked.append(size)
-        with scratch(size) as address:
-            yield address
-
-    monkeypatch.setattr(call, "_scratch", watched)
-    solver = robot(count, backend="native")
-    predicted = estimate_memory(solver, (batch, count, torch.float64), substeps=substeps, env_steps=env_steps)
-    tensors = measured(solver, batch, substeps, None, env_steps)
-    assert predicted == pytest.approx(max(asked) + tensors, rel=0.1)
 
 
 PROGRAM = """
@@ -161,13 +132,6 @@ def test_a_budget_that_nothing_fits_into(backend: str) -> None:
         ValueError, match=r"budget must be at least [\d,]+ bytes for 2 step\(s\) of 20 .* got 10,000: take"
     ):
         segment_for(robot(300, backend=backend), lively(300), substeps=20, budget=10_000, env_steps=2)
-
-
-@pytest.mark.parametrize("backend", ["eager", pytest.param("native", marks=needs_compiler)])
-def test_without_gradients(backend: str) -> None:
-    solver, state = robot(300, backend=backend), lively(300)
-    less = estimate_memory(solver, state, substeps=20, backward=False)
-    assert 0 < less < 0.5 * estimate_memory(solver, state, substeps=20)
 
 
 def test_bad_arguments() -> None:

@@ -69,11 +69,6 @@ def test_state_in_other_strides() -> None:
     assert_close(*both(robot(60), state, transposed, substeps=5, origin=origin.T.contiguous().T), 1e-12)
 
 
-def test_all_outside_keep_everything() -> None:
-    state = lively(30, corner=(3.0, 0.4))
-    assert_identical(robot(30, backend="native").step(state, substeps=10), state)
-
-
 @pytest.mark.parametrize("batch", [1, 3])
 def test_threads_make_no_difference(batch: int) -> None:
     """Bit by bit: sums are taken in one order, however many threads share them."""
@@ -108,16 +103,6 @@ def test_beside_other_programs() -> None:
             process.wait()
     for result in results[1:]:
         assert_identical(result, results[0])
-
-
-def test_an_element_of_a_batch_is_the_same_alone() -> None:
-    """Bit by bit."""
-    state, field, origin = moving(1500, 4)
-    solver = replace(solvers(1500, 4)["three bodies"], backend="native")
-    together = solver.step(state, field, substeps=20, origin=origin)
-    for i in range(4):
-        alone = solver.step(state[i], field[i : i + 1], substeps=20, origin=origin[i : i + 1])
-        assert_identical(alone, together[i])
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

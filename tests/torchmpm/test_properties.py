@@ -89,9 +89,6 @@ def cases(draw: st.DrawFn, **options: object) -> Case:
     return Case(solver, state, 40.0 * normal(batch, 2, resolution, resolution), origin)
 
 
-# --- balances -------------------------------------------------------------------------------------------------------
-
-
 @settings(max_examples=15)
 @given(cases())
 def test_momentum_changes_by_the_impulses(case: Case) -> None:
@@ -103,19 +100,6 @@ def test_momentum_changes_by_the_impulses(case: Case) -> None:
     size = (diagnostics.masses(solver, case.state)[..., None] * case.state.v.abs()).sum((1, 2)).max().item()
     torch.testing.assert_close(change, sum(impulses.values()), rtol=1e-8, atol=1e-8 * (1.0 + size))
     assert torch.equal(diagnostics.mass(solver, after), diagnostics.mass(solver, case.state))
-
-
-@settings(max_examples=15)
-@given(cases(**FREE))
-def test_gravity_adds_its_share_of_momentum(case: Case) -> None:
-    """g t m, whatever matter does inside, until a wall is reached."""
-    change = diagnostics.momentum(case.solver, case.run()) - diagnostics.momentum(case.solver, case.state)
-    mass, seconds = diagnostics.mass(case.solver, case.state), SUBSTEPS * case.solver.dt
-    weight = mass[:, None] * torch.tensor(case.solver.gravity, dtype=torch.float64)
-    torch.testing.assert_close(change, seconds * weight, rtol=1e-7, atol=1e-7 * mass.max().item())
-
-
-# --- symmetries -----------------------------------------------------------------------------------------------------
 
 
 def transformed(case: Case, Q: Tensor, rules: tuple[VelocityRule, ...], field: Tensor) -> Case:
@@ -194,9 +178,6 @@ def test_uniform_motion_goes_unnoticed(case: Case, across: float, up: float) -> 
         resting = replace(resting, state=resting.run(1))
     back = replace(moving.state, x=moving.state.x - way, v=moving.state.v - speed)
     assert_close(back, resting.state, 1e-6)
-
-
-# --- batches --------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=15)

@@ -56,12 +56,6 @@ def test_a_seed_decides_and_nothing_global_is_touched(kind: str) -> None:
     assert torch.equal(before[2], after[2])
 
 
-def test_uniform_goes_on_with_its_generator() -> None:
-    generator = np.random.default_rng(0)
-    together = np.concatenate([sampling.uniform(3, generator), sampling.uniform(4, generator)])
-    assert np.array_equal(together, np.random.default_rng(0).random((7, 2)))
-
-
 @pytest.mark.parametrize("count", [0, -3])
 def test_counts_below_one(count: int) -> None:
     for kind in ("uniform", "sobol"):
@@ -95,11 +89,6 @@ def test_chord_disc_is_uniform_in_x_and_on_each_chord(numbers: np.ndarray) -> No
     np.testing.assert_allclose(offset.mean(0), 0.0, atol=tolerance(0.12))
     assert offset[:, 0].var() == pytest.approx(D**2 / 12, abs=tolerance(0.012))
     assert offset[:, 1].var() == pytest.approx(D**2 / 18, abs=tolerance(0.012))
-
-
-def test_chord_disc_at_its_ends() -> None:
-    ends = sampling.chord_disc(np.array([[0.0, 0.3], [1.0, 0.3], [0.5, 0.0], [0.5, 1.0]]), (1.0, 2.0), 0.5)
-    np.testing.assert_allclose(ends, [[0.5, 2.0], [1.5, 2.0], [1.0, 1.5], [1.0, 2.5]], atol=1e-12)
 
 
 def test_lattice_fills_rows_from_below() -> None:

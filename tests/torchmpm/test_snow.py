@@ -42,26 +42,12 @@ def test_clamp_against_svd(cutoff: float) -> None:
     np.testing.assert_allclose(squeezed[0].numpy(), [e[1] for e in expected], rtol=1e-13)
 
 
-def test_inside_the_range_nothing_changes() -> None:
-    F = deformations(100, LOW + 1e-9, HIGH - 1e-9, seed=3)
-    mapped, Jp = soil(shear_cutoff=0.0).return_map(planes(F), torch.full((1, 100), 0.9, dtype=torch.float64))
-    torch.testing.assert_close(matrix(mapped), F, rtol=0, atol=1e-15)
-    torch.testing.assert_close(Jp, torch.full_like(Jp, 0.9), rtol=1e-14, atol=0)
-
-
 def test_shear_cutoff_forgets_small_shear_only() -> None:
     small, large = (torch.tensor([[[[1.0, s], [s, 1.0]]]], dtype=torch.float64) for s in (0.9e-5, 1.1e-5))
     Jp = torch.ones(1, 1, dtype=torch.float64)
     for F, kept in ((small, 0.0), (large, 1.1e-5)):
         assert matrix(soil().return_map(planes(F), Jp)[0])[0, 0, 0, 1].item() == pytest.approx(kept, abs=1e-15)
     assert matrix(soil(shear_cutoff=0.0).return_map(planes(small), Jp)[0])[0, 0, 0, 1].item() == pytest.approx(0.9e-5)
-
-
-def test_area_that_stretches_lose_goes_into_jp() -> None:
-    F = deformations(200, 0.9, 1.1, seed=4)
-    mapped, Jp = soil().return_map(planes(F), torch.ones(1, 200, dtype=torch.float64))
-    before, after = (torch.linalg.det(f).abs() for f in (F, matrix(mapped)))
-    torch.testing.assert_close(Jp * after, before, rtol=1e-8, atol=0)  # the cutoff changes areas by 1e-10
 
 
 def test_a_grain_pulled_apart_for_ever_stays_finite() -> None:

@@ -116,13 +116,6 @@ def test_other_indices_select_along_the_batch(index: object) -> None:
         assert torch.equal(getattr(picked, name), getattr(state, name)[index])
 
 
-def test_where_takes_whole_simulations() -> None:
-    mine, other = lively(4, 3, seed=1), lively(4, 3, seed=2)
-    mixed = mine.where(torch.tensor([True, False, True]), other)
-    assert_identical(mixed[[0, 2]], mine[[0, 2]])
-    assert_identical(mixed[1], other[1])
-
-
 def test_clone_is_independent_and_detach_leaves_the_graph() -> None:
     state = lively(4)
     copy = state.clone()

@@ -88,10 +88,6 @@ def detached_column(value: Value) -> Value:
 
 
 def check_not_negative(material: object, *names: str) -> None:
-    """Check constants of a material.
-
-    Raises:
-        ValueError: One of them is negative or not a number.
-    """
+    """Raise a ValueError if a constant of a material is negative or not a number."""
     for name in names:
         checks.value(name, getattr(material, name), least=0.0)

@@ -55,16 +55,7 @@ def slices(bodies: Sequence[Body]) -> Iterator[tuple[Body, slice]]:
 
 
 def per_particle(bodies: Sequence[Body], name: str, like: Tensor) -> Tensor:
-    """A constant of the bodies as a plane over all particles.
-
-    Args:
-        bodies: The bodies.
-        name: ``"mass"`` (kg) or ``"volume"`` (m^2).
-        like: (B, N), gives shape, dtype and device.
-
-    Returns:
-        (1, N) or (B, N).
-    """
+    """The constant ``name`` of the bodies as a plane (1, N) or (B, N) over all particles; ``like`` is (B, N)."""
     like = like.detach()
     columns = []
     for body, part in slices(bodies):

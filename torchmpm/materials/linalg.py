@@ -21,19 +21,13 @@ Sym2: TypeAlias = tuple[Tensor, Tensor, Tensor]
 
 
 class Parts(NamedTuple):
-    """A matrix as its rotation and reflection part.
+    """A matrix as its rotation and reflection part."""
 
-    Attributes:
-        m1, m2: The longer of the two vectors.
-        n1, n2: The shorter one.
-        proper: Whether the longer one belongs to the rotation, as it does where det F >= 0.
-    """
-
-    m1: Tensor
+    m1: Tensor  # the longer of the two vectors
     m2: Tensor
-    n1: Tensor
+    n1: Tensor  # the shorter one
     n2: Tensor
-    proper: Tensor
+    proper: Tensor  # whether the longer one belongs to the rotation, as it does where det F >= 0
 
 
 def split(F: Mat2) -> Parts:

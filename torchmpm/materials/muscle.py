@@ -8,16 +8,9 @@ from torchmpm.materials.linalg import Mat2, Sym2
 
 
 def muscle_stress(F: Mat2, actuation: tuple[Tensor, Tensor]) -> Sym2:
-    """Kirchhoff stress F diag(a) F^T (DittoGym, Huang et al., 2024, section 3). Positive actuation contracts.
+    """Kirchhoff stress F diag(a) F^T (DittoGym, Huang et al., 2024, section 3), planes (B, N), Pa.
 
-    Between two F the muscle directions turn and stretch with the material: they are material directions.
-
-    Args:
-        F: Deformation gradient, planes (B, N).
-        actuation: Planes (B, N) along material x and y, Pa.
-
-    Returns:
-        Planes (B, N), Pa.
+    Positive actuation a, Pa, contracts. Its directions turn and stretch with the material.
     """
     a, b, c, d = F
     ax, ay = actuation

@@ -20,19 +20,10 @@ LARGEST_JP = 1e30
 
 
 def snow_return(F: Mat2, low: Value, high: Value, shear_cutoff: float = 0.0) -> tuple[Mat2, Tensor]:
-    """Bring both principal stretches of F into [low, high].
+    """Bring both principal stretches of F into [low, high]; the new F, and |det F| before over after, (B, N).
 
-    Sum and difference of the new stretches rescale the two parts of F (see ``torchmpm.materials.linalg``).
-
-    Args:
-        F: Trial deformation gradient, planes (B, N).
-        low: Smallest stretch, broadcastable to (B, N).
-        high: Largest stretch.
-        shear_cutoff: An off-diagonal entry of S in F = R S below this is dropped first, as in the reference
-            implementation.
-
-    Returns:
-        The new F, and the factor by which its area |det F| was reduced, |det F| before over after, (B, N).
+    Sum and difference of the new stretches rescale the two parts of F (see ``torchmpm.materials.linalg``). First, an
+    off-diagonal entry of S in F = R S below ``shear_cutoff`` is dropped, as in the reference implementation.
     """
     parts = split(F)
     total, cos, sin = direction(parts)

@@ -23,29 +23,16 @@ LARGEST_DIFFERENCE = 40.0
 
 
 class YieldSurface(NamedTuple):
-    """Functions of d, the difference of the principal logarithmic strains at yield.
+    """Functions of d, the difference of the principal logarithmic strains at yield."""
 
-    Attributes:
-        tanh: tanh(d/2), difference over sum of the principal stretches.
-        exp: e^d, ratio of the principal stretches.
-        cosh2: 2 cosh(d/2), sum of the principal stretches of area one.
-        sinh2: 2 sinh(d/2), their difference.
-    """
-
-    tanh: Value
-    exp: Value
-    cosh2: Value
-    sinh2: Value
+    tanh: Value  # tanh(d/2), difference over sum of the principal stretches
+    exp: Value  # e^d, ratio of the principal stretches
+    cosh2: Value  # 2 cosh(d/2), sum of the principal stretches of area one
+    sinh2: Value  # 2 sinh(d/2), their difference
 
 
 def yield_surface(limit: Value) -> YieldSurface:
-    """Constants of the yield test and the return map.
-
-    Computed from e^d - 1, which keeps the digits that e^d would lose for small d.
-
-    Args:
-        limit: Deviatoric strain at yield, yield stress / (2 mu).
-    """
+    """Constants of the return map for a deviatoric strain at yield, by e^d - 1, which keeps the digits of small d."""
     square = 2.0 * (limit * limit - NORM_EPSILON)
     expm1: Value
     root: Value

@@ -1,7 +1,7 @@
 """The kernels as operators of torch with an adjoint, for tensors on the CPU and on CUDA.
 
 ``native_step`` advances all simulations by some substeps: it takes the tensors of
-:class:`torchmpm.native.inputs.Inputs`, a handle of :func:`torchmpm.native.tables.make_tables` and the number of
+:class:`torchmpm.native.tables.Inputs`, a handle of :func:`torchmpm.native.tables.make_tables` and the number of
 substeps, and returns the planes (13, B, N) of the new state. ``native_step_backward`` replays the substeps, then goes
 back through them.
 """
@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from torchmpm.native.cpu import call
-from torchmpm.native.inputs import Inputs
-from torchmpm.native.tables import VALUES, bodies_of
+from torchmpm.native.tables import VALUES, Inputs, bodies_of
 
 _INPUTS = "Tensor planes, Tensor? field, Tensor origin, Tensor gravity, Tensor values, Tensor shift"
 _NUMBERS = "int handle, int substeps"

@@ -1,4 +1,4 @@
-"""A solver as the kernels see it: typed tables built once, and one table of its constants."""
+"""What the kernels read: a solver as typed tables built once, a table of its constants, and the tensors of a call."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import ctypes
 import math
 import threading
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -69,18 +69,25 @@ class Tables(ctypes.Structure):
     ]
 
 
+class Inputs(NamedTuple):
+    """Tensors of a call, a tree for ``torchmpm.tree``."""
+
+    planes: Tensor  # (13, B, N) components of the state, see ParticleState.planes
+    field: Tensor | None  # (B, 2, G, G) muscle actuation on the nodes, Pa
+    origin: Tensor  # (B, 2) lower left corner of the window, m
+    gravity: Tensor  # (B, 2) acceleration, m/s^2
+    values: Tensor  # (8, 1 or B, columns) from make_values
+    shift: Tensor  # (B, 2) int64, nodes between the world's origin and the window's
+    result_bar: Tensor | None = None  # (13, B, N) derivative of a loss in the new planes, for the adjoint
+
+
 _lock = threading.Lock()
 _handles: dict[bytes, int] = {}
 _by_handle: list[Tables] = []
 
 
 def make_tables(grid: Grid, bodies: Sequence[Body], rules: Sequence[VelocityRule], dt: float, damping: float) -> int:
-    """Describe a solver, of materials in :data:`KINDS`, to the kernels.
-
-    Returns:
-        A handle for :func:`tables_of`, because operators of torch take numbers and tensors only; the same one for
-        solvers that differ in their values only.
-    """
+    """Describe a solver to the kernels; its handle, which operators of torch can take, is for :func:`tables_of`."""
     directions = list(dict.fromkeys(rule.direction for rule in rules))
     rule_tables = (RuleTable * len(rules))(*(_rule_table(rule, directions.index(rule.direction)) for rule in rules))
     body_tables = (BodyTable * len(bodies))(*_body_tables(bodies))
@@ -157,11 +164,7 @@ def make_values(bodies: Sequence[Body], dt: float, h: float, like: Tensor) -> Te
 
 
 def _rows(body: Body, factor: float, like: Tensor) -> list[Value]:
-    """The eight values of a body in the order of ``struct Values``.
-
-    Computed in double precision, from tensors as from numbers: a value does not depend on the form in which it was
-    given.
-    """
+    """The eight values of a body in the order of ``struct Values``, computed in double precision in any case."""
     material = body.material
     assert isinstance(material, Elastic)
     wide = like.new_empty((), dtype=torch.float64).expand(like.shape)

@@ -43,11 +43,7 @@ class Picture(ctypes.Structure):
 
 
 def drawing(
-    view: Centre,
-    boxes: Sequence[Box],
-    bodies: Sequence[tuple[int, float, bool]],
-    pixels: bool,
-    dtype: torch.dtype,
+    view: Centre, boxes: Sequence[Box], bodies: Sequence[tuple[int, float, bool]], pixels: bool, dtype: torch.dtype
 ) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
     """A function that draws what a :class:`dittogym.observation.camera.Camera` sees, for tensors on the CPU."""
     function = getattr(build(_SOURCE, *_OPTIONS), _FUNCTIONS[dtype])
@@ -69,20 +65,10 @@ def drawing(
         x, v = (t.movedim(-1, 0).contiguous() for t in (x, v))
         origin, centre = origin.contiguous(), centre.contiguous()
         image = torch.empty(x.shape[1], *SHAPE, dtype=torch.uint8, device="cpu")
-        call = Picture(
-            batch=x.shape[1],
-            particles=x.shape[2],
-            threads=torch.get_num_threads(),
-            body=body.data_ptr(),
-            box=box.data_ptr(),
-            x=x.data_ptr(),
-            v=v.data_ptr(),
-            origin=origin.data_ptr(),
-            centre=centre.data_ptr(),
-            image=image.data_ptr(),
-            **constants,
-            **thread_pool(),
-        )
+        arrays = {"body": body, "box": box, "x": x, "v": v, "origin": origin, "centre": centre, "image": image}
+        pointers = {name: array.data_ptr() for name, array in arrays.items()}
+        sizes = {"batch": x.shape[1], "particles": x.shape[2], "threads": torch.get_num_threads()}
+        call = Picture(**sizes, **pointers, **constants, **thread_pool())
         if function(ctypes.byref(call)):
             raise MemoryError("there is not enough memory to draw the observation")
         return image

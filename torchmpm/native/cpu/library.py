@@ -86,22 +86,15 @@ def cache_folder() -> str:
 
 
 def load(real: str) -> ctypes.CDLL:
-    """The compiled kernels for the scalar type ``"float"`` or ``"double"``, see :func:`build`.
-
-    Raises:
-        ValueError: There is no compiler, or it failed; the message holds what it said.
-    """
+    """The compiled kernels for the scalar type ``"float"`` or ``"double"``, see :func:`build`."""
     return build(_SOURCES / "native.cpp", f"-DTORCHMPM_REAL={real}")
 
 
 def build(source: Path, *options: str) -> ctypes.CDLL:
     """Compile a C++ file, which may include the headers of this folder and of its own, and load it.
 
-    The first call on a machine compiles it, which takes some seconds; later processes find it in
-    :func:`cache_folder`. If that folder cannot be written, each process compiles its own.
-
-    Raises:
-        ValueError: There is no compiler, or it failed; the message holds what it said.
+    The first call on a machine takes some seconds; later processes find the library in :func:`cache_folder`, if that
+    can be written. Raises a ValueError where there is no compiler, or it failed; the message holds what it said.
     """
     library = _loaded.get((source, options))
     if library is None:

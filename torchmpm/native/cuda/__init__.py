@@ -22,7 +22,7 @@ from torchmpm import tree
 from torchmpm.native.cuda.graphs import KEPT_SHARE, cache
 from torchmpm.native.cuda.programs import Backward, Forward, Program
 from torchmpm.native.cuda.tables import device_tables
-from torchmpm.native.inputs import Inputs
+from torchmpm.native.tables import Inputs
 
 __all__ = ["backward", "cache", "forward"]
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchmpm import tree
 from torchmpm.native.cuda.programs import Program
-from torchmpm.native.inputs import Inputs
+from torchmpm.native.tables import Inputs
 
 #: At most so many graphs are kept, and at most this share of the device's memory in their buffers together; the longest
 #: unused go first. A call that needs more than that is launched kernel by kernel each time.

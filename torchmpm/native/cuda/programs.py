@@ -13,8 +13,7 @@ from torchmpm.native.cuda.grid import ADJOINT, SUMS, node_adjoint, node_velociti
 from torchmpm.native.cuda.step import particles_pass
 from torchmpm.native.cuda.tables import DeviceTables
 from torchmpm.native.cuda.transfer import NOWHERE
-from torchmpm.native.inputs import Inputs
-from torchmpm.native.tables import VALUES
+from torchmpm.native.tables import VALUES, Inputs
 
 #: Particles, or nodes, of a program: one per thread.
 BLOCK = 128

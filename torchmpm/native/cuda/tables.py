@@ -15,22 +15,15 @@ from torchmpm.native.tables import BodyTable, Tables, bodies_of, tables_of
 
 @dataclass(frozen=True, eq=False)
 class DeviceTables:
-    """Everything constant about a solver, on a device.
-
-    Attributes:
-        tables: The description.
-        bodies: Its bodies.
-        slots: Number of directions that have velocity rules.
-        constants: h, 1/h, dt, margin and extent of the window, damping, mass epsilon, stretch floor, largest Jp; then
-            for each body the bounds of hardening and the shear cutoff, from :meth:`bounds_of`.
-        rules: (rules, 9) float64: the numbers of each rule.
-    """
+    """Everything constant about a solver, on a device."""
 
     tables: Tables
     bodies: tuple[BodyTable, ...]
-    slots: int
+    slots: int  # number of directions that have velocity rules
+    #: h, 1/h, dt, margin and extent of the window, damping, mass epsilon, stretch floor, largest Jp; then for each body
+    #: the bounds of hardening and the shear cutoff, from :meth:`bounds_of`.
     constants: Tensor
-    rules: Tensor
+    rules: Tensor  # (rules, 9) float64: the numbers of each rule
 
     @property
     def width(self) -> int:

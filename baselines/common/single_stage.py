@@ -1,4 +1,4 @@
-"""Ablations of the coarse-to-fine policy: one level of its ladder, trained alone for the whole budget."""
+"""Ablations of the coarse-to-fine policy: a single stage, trained alone for the whole budget."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from dittogym.tasks import task_name
 
 
 @dataclass(frozen=True)
-class LevelConfig(Config):
-    """One level: `cfp.config.Config` without a second. ``--resolutions 4``, 8 or 16 is the study of resolutions."""
+class SingleStageConfig(Config):
+    """Options of a single stage. ``--resolutions 4``, 8 or 16 is the study of resolutions."""
 
     @property
     def name(self) -> str:
@@ -31,44 +31,39 @@ class LevelConfig(Config):
         super().check()
 
 
-def single_level_preset(algo: Literal["coarse", "fine"], task: str, name: str) -> LevelConfig:
+def single_stage_preset(algo: Literal["coarse", "fine"], task: str, name: str) -> SingleStageConfig:
     """The first stage of `cfp.preset`, for all its steps, on the task's coarse or fine action grid.
-
-    Args:
-        algo: ``"coarse"``: stage 1 goes on and on; ``"fine"``: from scratch on the finest grid, no coarse policy.
-        task: Which task.
-        name: Of the preset.
 
     Raises:
         ConfigError: No such task or preset.
     """
-    ladder = cfp.preset(task, name)
-    level = replace(
-        ladder,
+    base = cfp.preset(task, name)
+    single = replace(
+        base,
         algo=algo,
         handover=(),
-        resolutions=ladder.resolutions[:1] if algo == "coarse" else ladder.resolutions[-1:],
-        random_steps=ladder.random_steps[:1],
-        alpha=ladder.alpha[:1],
+        resolutions=base.resolutions[:1] if algo == "coarse" else base.resolutions[-1:],
+        random_steps=base.random_steps[:1],
+        alpha=base.alpha[:1],
         gate_bias=(),
         gate_penalty=(),
     )
-    return LevelConfig(**{option.name: getattr(level, option.name) for option in fields(level)})
+    return SingleStageConfig(**{option.name: getattr(single, option.name) for option in fields(single)})
 
 
 class Coarse(CoarseToFine):
     """The first stage of CFP, for all its steps."""
 
     @staticmethod
-    def preset(task: str, name: str) -> LevelConfig:
-        """Default options for a task, see `single_level_preset`."""
-        return single_level_preset("coarse", task, name)
+    def preset(task: str, name: str) -> SingleStageConfig:
+        """Default options for a task, see `single_stage_preset`."""
+        return single_stage_preset("coarse", task, name)
 
 
 class Fine(CoarseToFine):
     """CFP's finest grid from scratch, without a coarse policy."""
 
     @staticmethod
-    def preset(task: str, name: str) -> LevelConfig:
-        """Default options for a task, see `single_level_preset`."""
-        return single_level_preset("fine", task, name)
+    def preset(task: str, name: str) -> SingleStageConfig:
+        """Default options for a task, see `single_stage_preset`."""
+        return single_stage_preset("fine", task, name)
