@@ -13,8 +13,8 @@ class Policy(PolicyPredictor, Protocol):
     """A trained policy of any kind, as it comes from its file."""
 
     @property
-    def sees_image(self) -> bool:
-        """Whether it looks at the pixels of the observation."""
+    def uses_image(self) -> bool:
+        """Whether it uses the pixels of the observation."""
 
     @property
     def resolution(self) -> int:

@@ -84,7 +84,7 @@ def check_words(cases: Sequence[Case], words: Sequence[str], spec: TaskSpec, pol
     """Check that each word chooses a case that changes something."""
     for word in words:
         reasons = {
-            case.name: reason_without_effect(case, spec, policy.sees_image) for case in cases[1:] if word in case.name
+            case.name: reason_without_effect(case, spec, policy.uses_image) for case in cases[1:] if word in case.name
         }
         if all(reasons.values()):
             explained = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
@@ -101,7 +101,7 @@ def report(
     grid = 0 if isinstance(policy, DisturbablePolicy) else policy.description.get("resolution", policy.resolution)
     results = []
     for case in cases:
-        if reason_without_effect(case, spec, policy.sees_image):
+        if reason_without_effect(case, spec, policy.uses_image):
             continue
         env = disturbed_env(config, policy.resolution, episodes, case, seed, grid)
         acting = policy.through(env.disturb) if isinstance(policy, DisturbablePolicy) else policy

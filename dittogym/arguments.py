@@ -38,10 +38,10 @@ def find_mask(name: str, given: Any, num_envs: int, device: torch.device) -> Ten
         return torch.ones(num_envs, dtype=torch.bool, device=device)
     try:
         mask = torch.as_tensor(given, device=device)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{name} must be bool of shape ({num_envs},), got {given!r}") from error
-    if mask.dtype != torch.bool or mask.shape != (num_envs,):
-        raise ValueError(f"{name} must be bool of shape ({num_envs},), got {mask.dtype} of shape {tuple(mask.shape)}")
+    except (TypeError, ValueError, RuntimeError):
+        mask = None
+    if mask is None or mask.dtype != torch.bool or mask.shape != (num_envs,):
+        raise ValueError(f"{name} must be bool of shape ({num_envs},), got {given!r}")
     return mask
 
 
@@ -61,12 +61,12 @@ def find_device(device: str | torch.device) -> torch.device:
 
 def reset_options(options: Any) -> dict[str, Any]:
     """The options of a reset, of which there are :data:`RESET_OPTIONS`."""
-    if options is not None and not isinstance(options, Mapping):
+    options = {} if options is None else options
+    if not isinstance(options, Mapping):
         raise ValueError(f"options must be a mapping that may hold {', '.join(RESET_OPTIONS)}, got {options!r}")
-    for name in options or {}:
-        if name not in RESET_OPTIONS:
-            raise ValueError(f"options may hold {', '.join(RESET_OPTIONS)}, got {name!r}")
-    return dict(options or {})
+    if unknown := options.keys() - set(RESET_OPTIONS):
+        raise ValueError(f"options may hold {', '.join(RESET_OPTIONS)}, got {', '.join(map(repr, unknown))}")
+    return dict(options)
 
 
 def check_action(action: Tensor, shape: tuple[int, ...]) -> Tensor:
@@ -76,7 +76,6 @@ def check_action(action: Tensor, shape: tuple[int, ...]) -> Tensor:
         raise ValueError(f"action must be a floating point tensor, got {kind}")
     if tuple(action.shape) != shape:
         raise ValueError(f"action must have shape {shape}, got {tuple(action.shape)}")
-    if not bool(torch.isfinite(action).all()):
-        count = int((~torch.isfinite(action)).sum())
-        raise ValueError(f"action must be finite, got {count} entries that are NaN or infinite")
+    if wrong := int((~torch.isfinite(action)).sum()):
+        raise ValueError(f"action must be finite, got {wrong} entries that are NaN or infinite")
     return action

@@ -111,13 +111,12 @@ Memory: TypeAlias = Mapping[str, Tensor]
 
 def check_memory(task: str, memory: object, stale: tuple[str, ...], batch: int) -> None:
     """Refuse what a task must not return as its initial memory."""
+    who = f"initial_memory of task {task!r}"
     if not isinstance(memory, Mapping):
-        raise TypeError(f"initial_memory of task {task!r} must return tensors by name, got {_kind(memory)}")
-    _check_leading(f"initial_memory of task {task!r}", "memory", memory, batch)
+        raise TypeError(f"{who} must return tensors by name, got {_kind(memory)}")
+    _check_leading(who, "memory", memory, batch)
     if missing := [name for name in stale if name not in memory]:
-        raise ValueError(
-            f"stale_memory of task {task!r} must be names that initial_memory returns, {sorted(memory)}, got {missing}"
-        )
+        raise ValueError(f"{who} must return what stale_memory names, got {sorted(memory)} without {missing}")
 
 
 def check_outcome(
@@ -134,32 +133,24 @@ def check_outcome(
     names = (tuple(outcome.terms), *optional, outcome.terminated is None, outcome.success is None)
     if names in checked:
         return
-    for part in ("terms", "info", "memory"):
-        if (given := getattr(outcome, part)) is not None and not isinstance(given, Mapping):
-            raise TypeError(f"{who} must return {part} by name, got {_kind(given)}")
     info = outcome.info or {}
     for part, taken in (("terms", ENGINE_TERMS & outcome.terms.keys()), ("info", ENGINE_INFO & info.keys())):
         if taken:
             raise ValueError(f"{who} must not return the engine's own {part}, got {sorted(taken)}")
     if missing := [name for name in outcome.terms if name not in weights]:
         raise ValueError(f"weights of task {task!r} must hold every term of reward_fn, got none for {missing}")
-    _check_shapes(who, outcome, batch)
+    for name, value in outcome.terms.items():
+        if not isinstance(value, Tensor) or value.shape != (batch,):
+            raise ValueError(f"{who} must return terms of shape (B,), got {_kind(value)} for {name!r}")
+    for name, flag in (("terminated", outcome.terminated), ("success", outcome.success)):
+        if flag is not None and not (isinstance(flag, Tensor) and (flag.dtype, *flag.shape) == (torch.bool, batch)):
+            raise ValueError(f"{who} must return {name} as bool of shape (B,), got {_kind(flag)}")
     _check_leading(who, "info", info, batch)
     if outcome.memory is not None:
         before, after = ({name: _kind(value) for name, value in m.items()} for m in (memory, outcome.memory))
         if before != after:
             raise ValueError(f"{who} must return memory like that of initial_memory, {before}, got {after}")
     checked.add(names)
-
-
-def _check_shapes(who: str, outcome: Outcome, batch: int) -> None:
-    for name, value in outcome.terms.items():
-        if not isinstance(value, Tensor) or value.shape != (batch,):
-            raise ValueError(f"{who} must return terms of shape (B,), got {_kind(value)} for {name!r}")
-    for name in ("terminated", "success"):
-        value = getattr(outcome, name)
-        if value is not None and not (isinstance(value, Tensor) and (value.dtype, *value.shape) == (torch.bool, batch)):
-            raise ValueError(f"{who} must return {name} as bool of shape (B,), got {_kind(value)}")
 
 
 def _check_leading(who: str, what: str, values: Mapping[str, object], batch: int) -> None:

@@ -9,7 +9,6 @@ import gymnasium
 
 from dittogym.spec import TaskSpec
 from dittogym.tasks import TASKS
-from torchmpm import checks
 
 ENTRY_POINT = "dittogym.env:Env"
 
@@ -26,15 +25,11 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
             of the old one are removed.
 
     Raises:
-        ValueError: The name belongs to another function, differs from that in the specification or is not one word, or
-            the version is negative.
+        ValueError: The name belongs to another function, differs from that in the specification or is not one word.
         TypeError: ``make`` is not a function, or does not return a :class:`dittogym.TaskSpec`.
     """
     if not isinstance(task, str) or re.fullmatch(r"\w+", task) is None:
         raise ValueError(f"task must be a name of letters, digits and underscores, got {task!r}")
-    if not callable(make):
-        raise TypeError(f"make must be a function that returns a TaskSpec, got {make!r}")
-    checks.whole("version", version, 0)
     if not isinstance(namespace, str) or re.fullmatch(r"[\w:-]+", namespace) is None:
         raise ValueError(f"namespace must be a name of letters, digits, underscores and dashes, got {namespace!r}")
     spec = make()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -49,9 +50,7 @@ def observation_resolution(env: AnyEnv, size: int) -> Any:
     box = _box(env, "observation_space")
     size = checks.whole("size", size, 1, box.shape[-1])
 
-    def reduce(observation: np.ndarray) -> np.ndarray:
-        return _resized(observation, size, cv2.INTER_AREA)
-
+    reduce = functools.partial(_resized, size=size, interpolation=cv2.INTER_AREA)
     small = gymnasium.spaces.Box(0, 255, (3, size, size), np.uint8)
     if isinstance(env, VectorEnv):
         return _VectorObservation(env, reduce, small)

@@ -8,8 +8,6 @@ import torch
 from torch import Tensor
 
 from torchmpm import checks
-from torchmpm.native.cpu import call
-from torchmpm.native.tables import Inputs
 from torchmpm.rollout import SEGMENT, Segment, check_repetition
 from torchmpm.solver import Solver
 from torchmpm.state import ParticleState
@@ -19,6 +17,8 @@ from torchmpm.substep import Planes, substep
 PLANES = 13
 #: Largest temporary memory of an eager substep, in units of the graph that it leaves.
 TEMPORARY = 0.4
+#: Numbers of a node in the grids of a native step.
+GRIDS = 16
 
 #: Where a step starts, or (B, N, dtype) of a state on the CPU.
 Start = ParticleState | tuple[int, int, torch.dtype]
@@ -30,8 +30,8 @@ def estimate_memory(
     """Bytes that :meth:`torchmpm.Solver.step` and a backward pass through it need beyond their inputs.
 
     For the eager backend, the graph of a substep is measured on tensors without memory, and the result is extrapolated.
-    A compiled substep keeps less than an eager one, so there this is an upper bound. The native backend reports the
-    size of its scratch memory. The estimate is the largest number of bytes alive at once, with gradients in state and
+    A compiled substep keeps less than an eager one, so there this is an upper bound. For the native backend, the
+    size of its tape is known. The estimate is the largest number of bytes alive at once, with gradients in state and
     actuation; what an allocator rounds up, or keeps for later, is not included.
 
     Args:
@@ -149,29 +149,18 @@ def _occupied(solver: Solver, state: ParticleState) -> float:
 def _native(
     solver: Solver, state: ParticleState, substeps: int, env_steps: int, share: float
 ) -> Callable[[Segment], int]:
-    state_bytes, field_bytes = _sizes(solver, state)
+    planes, (state_bytes, field_bytes) = state.stack(), _sizes(solver, state)
+    # Each team of threads has two states of its own, some grids, and a tape. Memory of nodes that no particle comes
+    # near is never written to and takes none.
+    team = 2 * state_bytes // state.batch_size + int(share * GRIDS * solver.grid.width**2 * planes.element_size())
     wants_values = any(value.requires_grad for name, value in solver.constants.items() if name != "gravity")
     # Alive at once in a backward pass: every call's start, one result, and derivatives in both on their way.
     others = 4 * state_bytes + env_steps * field_bytes + (8 * state_bytes // PLANES if wants_values else 0)
 
     def need(segment: Segment) -> int:
-        length = min(substeps, solver.kernels.tape_limit(state.stack(), segment))
-        scratch, of_one = (_scratch_bytes(solver, state, n, length, wants_values) for n in (state.batch_size, 1))
-        # The tapes of all teams have room for all nodes, but memory that is never written to takes none.
-        tapes = max(1, round(scratch / of_one)) * 3 * solver.grid.width**2 * state.x.element_size() * length
-        return scratch - int((1.0 - share) * tapes) + env_steps * -(-substeps // length) * state_bytes + others
+        length = min(substeps, solver.kernels.tape_limit(planes, segment))
+        tape = length * solver.kernels.tape_bytes(planes, share)
+        starts = env_steps * -(-substeps // length) * state_bytes
+        return min(state.batch_size, torch.get_num_threads()) * (team + tape) + starts + others
 
     return need
-
-
-def _scratch_bytes(solver: Solver, state: ParticleState, batch: int, substeps: int, wants_values: bool) -> int:
-    """Scratch memory that the adjoint of ``batch`` of the simulations asks for."""
-    nodes, empty = solver.grid.resolution, state.x.new_empty
-    field, pair, planes = empty(batch, 2, nodes, nodes), empty(batch, 2), empty(PLANES, batch, state.num_particles)
-    with torch.no_grad():
-        values = solver.kernels.values(state.Jp)[:, :batch].contiguous()
-    inputs = Inputs(planes, field, pair, pair, values, torch.empty(batch, 2, dtype=torch.int64))
-    bars = {"planes_bar": planes, "field_bar": field, "origin_bar": pair, "gravity_bar": pair}
-    if wants_values:
-        bars["values_bar"] = planes
-    return call.scratch_bytes(inputs, solver.kernels.handle, substeps, **bars)

@@ -37,8 +37,7 @@ def _checkpointed(function: Callable[[State], State], state: State, reads: Mappi
     """Run a function so that autograd keeps only its input and replays it in the backward pass.
 
     ``torch.utils.checkpoint`` does not notice when a tensor is changed in place before the replay, which would give a
-    wrong gradient; this raises an error. The transforms of ``torch.func`` do not support checkpoints: under them the
-    whole graph is kept.
+    wrong gradient; this raises an error. The transforms of ``torch.func`` do not support checkpoints.
     """
     if not torch.is_grad_enabled() or transforming():
         return function(state)
@@ -125,15 +124,15 @@ def trajectory(
     Raises:
         RuntimeError: In the backward pass: a state or an input was changed in place before the replay of its step.
     """
+
+    def apply(value: Input, state: State) -> State:
+        return step(state, value)
+
     outputs = []
     for value in inputs:
         if checkpointed:
-            state = _checkpointed(partial(_apply, step, value), state, {"input": value})
+            state = _checkpointed(partial(apply, value), state, {"input": value})
         else:
             state = step(state, value)
         outputs.append(observe(state))
     return state, outputs
-
-
-def _apply(step: Callable[[State, Input], State], value: Input, state: State) -> State:
-    return step(state, value)

@@ -11,13 +11,7 @@ from torchmpm.spline import Stencil, gather, scatter
 
 
 def particles_to_grid(
-    grid: Grid,
-    stencil: Stencil,
-    active: Tensor,
-    v: tuple[Tensor, Tensor],
-    C: Mat2,
-    mass: Tensor,
-    stress_momentum: Sym2,
+    grid: Grid, stencil: Stencil, active: Tensor, v: tuple[Tensor, Tensor], C: Mat2, mass: Tensor, stress_momentum: Sym2
 ) -> Tensor:
     """Mass and momentum (3, B, cells) on the nodes after the internal forces of one substep.
 

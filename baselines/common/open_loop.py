@@ -25,7 +25,7 @@ class OpenLoop:
     """
 
     deterministic_by_default = True
-    sees_image = False
+    uses_image = False
 
     def __init__(self, actions: Tensor, description: dict[str, Any] | None = None) -> None:
         if actions.ndim != 4 or actions.shape[1] != 2 or actions.shape[2] != actions.shape[3]:

@@ -26,7 +26,7 @@ class StateBasedPolicy(ABC):
         description: What it is and where it comes from, see `cfp.weights.describe_run`.
     """
 
-    sees_image = False
+    uses_image = False
     env: TorchEnv | None = None
 
     def __init__(self, description: dict[str, Any] | None = None) -> None:

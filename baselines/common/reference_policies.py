@@ -86,7 +86,7 @@ class RandomActions:
     """Uniform actions in [-1, 1], independent in every cell and step, from torch's generator."""
 
     deterministic_by_default = False
-    sees_image = False
+    uses_image = False
 
     def __init__(self, resolution: int) -> None:
         self.resolution = resolution

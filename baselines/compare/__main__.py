@@ -13,9 +13,8 @@ import tyro
 
 from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare.evaluations import Noise, Protocol, Robustness
-from baselines.compare.executor import Executor, Resources, execute
+from baselines.compare.executor import Executor, InProcessExecutor, LocalExecutor, Resources, execute
 from baselines.compare.jobs import Job, check_folder, make_jobs
-from baselines.compare.local import InProcessExecutor, LocalExecutor
 from baselines.compare.plan import Plan
 from baselines.compare.ray import RayExecutor
 from baselines.compare.report import write_report

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
+
+import numpy as np
 
 from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare import paper
@@ -36,40 +37,33 @@ Entry = dict[str, Any]
 
 @dataclass(frozen=True)
 class Protocol:
-    """How policies are evaluated; but for the episodes in SLOT the same for all policies of a comparison.
+    """How policies are evaluated; but for the episodes in SLOT the same for all policies of a comparison."""
 
-    Attributes:
-        episodes: Number of episodes, on the same layouts for all policies.
-        tier: Particles, see `cfp.sections.EnvironmentConfig`.
-        robustness: Disturbed cases: none, those of the paper, or all of `cfp.envs.disturbances.make_cases`.
-        noise: Whether policies act with their action noise; ``paper``: except in the tasks in `paper.WITHOUT_NOISE`.
-    """
-
-    episodes: int
+    episodes: int  # on the same layouts for all policies
     tier: Particles = "lite"
     robustness: Robustness = "paper"
-    noise: Noise = "paper"
+    noise: Noise = "paper"  # whether policies act with their noise; paper: except in `paper.WITHOUT_NOISE`
 
-    def cases(self) -> list[Case]:
-        """Cases of the robustness table; the first one is unperturbed, the evaluation on the common layouts."""
-        return [] if self.robustness == "none" else make_cases()[: PAPER_CASES if self.robustness == "paper" else None]
+    def disturbed_cases(self) -> list[Case]:
+        """Cases of the robustness table."""
+        last = {"none": 1, "paper": PAPER_CASES, "all": None}[self.robustness]
+        return make_cases()[1:last]
 
     def deterministic(self, task: str) -> bool:
         """Whether policies act without noise in a task."""
         return task in paper.WITHOUT_NOISE if self.noise == "paper" else self.noise == "without"
-
-    def batches(self) -> list[tuple[int, int]]:
-        """First layout and number of layouts of each batch of episodes."""
-        return [(first, min(BATCH, self.episodes - first)) for first in range(0, self.episodes, BATCH)]
 
     def key(self, task: str, layouts: str, case: Case | None = None) -> str:
         """Key of an entry in the record; other particles or other noise make another entry."""
         noise = "without" if self.deterministic(task) else "with"
         return f"{f'{case.name}, ' if case else ''}{layouts}, particles {self.tier}, {noise} noise"
 
-    def batch_keys(self, task: str, case: Case | None = None) -> list[str]:
-        """Keys of all batches of episodes, unperturbed or in a disturbed case."""
-        return [self.key(task, f"layouts {first} to {first + count - 1}", case) for first, count in self.batches()]
+    def batches(self, task: str, case: Case | None = None) -> dict[str, tuple[int, int]]:
+        """First layout and number of layouts of each batch of episodes, by the key of its entry."""
+        spans = [(first, min(BATCH, self.episodes - first)) for first in range(0, self.episodes, BATCH)]
+        return {
+            self.key(task, f"layouts {first} to {first + count - 1}", case): (first, count) for first, count in spans
+        }
 
 
 @dataclass(frozen=True)
@@ -81,6 +75,11 @@ class FinalEvaluation:
     own_layout: float | None  # return on the one layout that the policy was made for, if there is one
     cases: dict[str, float | None]  # mean returns; None if a case has no effect or is not complete
     complete: bool
+
+    @property
+    def mean(self) -> float:
+        """Mean return on the common layouts."""
+        return float(np.mean(self.returns))
 
 
 class Record:
@@ -107,7 +106,7 @@ def read_record(path: Path, **types: type) -> dict[str, Any]:
         record: dict[str, Any] = parse_json(path.read_text())
         for name, kind in types.items():
             if not isinstance(record[name], kind):
-                raise ValueError(f"{name} must be of type {kind.__name__}, got {json.dumps(record[name])}")
+                raise TypeError(f"{name} must be of type {kind.__name__}, got {record[name]!r}")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CheckpointError(f"{path}: cannot be read ({type(error).__name__}: {error})") from error
     return record
@@ -138,38 +137,15 @@ def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop
         results = report(replace(config, seed=first), policy, [case], count, deterministic=deterministic)
         return _entry(results[0]) if results else None
 
-    for key, (first, count) in zip(protocol.batch_keys(task), protocol.batches(), strict=True):
+    for key, (first, count) in protocol.batches(task).items():
         check_stop()
         record.add(key, partial(play, evaluation_seed(config) + first, count))
     if "layout" in policy.description:
         record.add(protocol.key(task, "own layout"), partial(play, policy.description["layout"], 1))
-    for case in protocol.cases()[1:]:
-        for key, (first, count) in zip(protocol.batch_keys(task, case), protocol.batches(), strict=True):
+    for case in protocol.disturbed_cases():
+        for key, (first, count) in protocol.batches(task, case).items():
             check_stop()
             record.add(key, partial(play_disturbed, first, count, case))
-
-
-def read_evaluation(config: RunConfig, folder: Path, protocol: Protocol) -> FinalEvaluation | None:
-    """What has been found so far; None without a whole batch of episodes."""
-    task = config.task
-    entries, cases, batches = Record(config, folder).entries, protocol.cases(), len(protocol.batches())
-
-    def find(case: Case | None = None) -> list[Entry | None]:
-        return [entries[key] for key in protocol.batch_keys(task, case) if key in entries]
-
-    parts = [part for part in find() if part is not None]
-    if not parts:
-        return None
-    returns, successes = _returns(parts), [part["successes"] for part in parts]
-    own, disturbed = entries.get(protocol.key(task, "own layout")), {case.name: find(case) for case in cases[1:]}
-    means = {name: _mean(_returns(found)) if len(found) == batches else None for name, found in disturbed.items()}
-    return FinalEvaluation(
-        returns=tuple(returns),
-        successes=None if None in successes else sum(successes),
-        own_layout=own and own["returns"][0],
-        cases={case.name: _mean(returns) for case in cases[:1]} | means,
-        complete=len(parts) == batches and all(len(found) == batches for found in disturbed.values()),
-    )
 
 
 def _entry(result: Result) -> Entry:
@@ -177,9 +153,24 @@ def _entry(result: Result) -> Entry:
     return {"returns": list(result.returns), "successes": successes}
 
 
-def _returns(parts: list[Entry] | list[Entry | None]) -> list[float]:
-    return [value for part in parts if part is not None for value in part["returns"]]
-
-
-def _mean(values: list[float]) -> float | None:
-    return sum(values) / len(values) if values else None
+def read_evaluation(config: RunConfig, folder: Path, protocol: Protocol) -> FinalEvaluation | None:
+    """What has been found so far; None without a whole batch of episodes."""
+    task, entries, complete = config.task, Record(config, folder).entries, True
+    parts = [entries[key] for key in protocol.batches(task) if key in entries]
+    if not parts:
+        return None
+    cases: dict[str, float | None] = {}
+    for case in protocol.disturbed_cases():
+        keys = protocol.batches(task, case)
+        returns = [value for key in keys if entries.get(key) for value in entries[key]["returns"]]
+        whole = all(key in entries for key in keys)
+        cases[case.name] = float(np.mean(returns)) if whole and returns else None
+        complete = complete and whole
+    own = entries.get(protocol.key(task, "own layout"))
+    return FinalEvaluation(
+        returns=tuple(value for part in parts for value in part["returns"]),
+        successes=None if parts[0]["successes"] is None else sum(part["successes"] for part in parts),
+        own_layout=own and own["returns"][0],
+        cases=cases,
+        complete=complete and len(parts) == len(protocol.batches(task)),
+    )

@@ -1,18 +1,34 @@
-"""What carries out runs: one interface for this process, processes of this machine, and the nodes of a cluster."""
+"""What carries out runs: one interface for this process, processes of this machine, and (in `ray`) a cluster."""
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 
 from baselines.compare.jobs import Job
-from baselines.compare.worker import Outcome
+from baselines.compare.worker import EXIT_CODES, Outcome, carry_out, encode
 from cfp.experiment.process import StopSignals
+from cfp.files import write_text
 
-POLL = 0.5
-"""Seconds between two looks at the stop signals."""
+WORKER = (sys.executable, "-m", "baselines.compare.worker")
+POLL = 0.2  # seconds between two looks at the processes and at the stop signals
+
+
+class ProcessKilled(Exception):
+    """The process of a run was killed by a signal."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+
+    def __str__(self) -> str:
+        return f"killed by {signal.Signals(self.args[0]).name}; see log.txt"
 
 
 @dataclass(frozen=True)
@@ -64,3 +80,116 @@ def execute(
         complete = True
     finally:
         executor.shutdown(kill=not complete)
+
+
+class InProcessExecutor(Executor):
+    """Carries out each run in this process when it is submitted."""
+
+    def __init__(self, signals: StopSignals, resources: Resources) -> None:
+        self.signals, self.lock_timeout = signals, resources.lock_timeout
+
+    def submit(self, job: Job) -> Future[Outcome]:
+        """Carry out a run, see `Executor.submit`."""
+        future: Future[Outcome] = Future()
+        stopped = self.signals.number
+        future.set_result("stopped" if stopped else carry_out(job, self.signals, self.lock_timeout, own_process=False))
+        return future
+
+    def stop(self) -> None:
+        """Runs look at the signals themselves."""
+
+    def shutdown(self, kill: bool) -> None:
+        """Nothing is in progress."""
+
+
+class LocalExecutor(Executor):
+    """Carries out runs in processes of this machine."""
+
+    def __init__(self, workers: int, resources: Resources) -> None:
+        self.threads = resources.cpus or max(1, (os.cpu_count() or 1) // workers)
+        self.resources = resources
+        self._pool = ThreadPoolExecutor(workers)
+        self._stop, self._kill = threading.Event(), threading.Event()
+
+    def submit(self, job: Job) -> Future[Outcome]:
+        """Queue a run, see `Executor.submit`."""
+        return self._pool.submit(self._run, job)
+
+    def stop(self) -> None:
+        """Ask the processes to stop with a checkpoint."""
+        self._stop.set()
+
+    def shutdown(self, kill: bool) -> None:
+        """Wait for the processes; ``kill`` ends them at once."""
+        if kill:
+            self._stop.set()
+            self._kill.set()
+        self._pool.shutdown()
+
+    def _run(self, job: Job) -> Outcome:
+        for attempt in range(1 + self.resources.retries):
+            if self._stop.is_set():
+                return "stopped"
+            try:
+                return run_process(job, self.threads, self.resources.lock_timeout, self._urgency)
+            except ProcessKilled as error:
+                reason = f"{error} ({attempt + 1} times)"
+        write_text(job.folder / "error.txt", reason + "\n")
+        return "failed"
+
+    def _urgency(self) -> int:
+        return self._stop.is_set() + self._kill.is_set()
+
+
+def run_process(job: Job, threads: int, lock_timeout: float, urgency: Callable[[], int] = lambda: 0) -> Outcome:
+    """Carry out a run in a process of its own, whose output is appended to ``log.txt`` in the run folder.
+
+    The process is in a session of its own: Ctrl-C reaches this process only, which then asks it to stop, once.
+    ``urgency`` tells whether to stop it: 0 not, 1 with a checkpoint, 2 at once. If something else kills it, this raises
+    `ProcessKilled`.
+    """
+    folder = job.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "error.txt").unlink(missing_ok=True)
+    environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, "OMP_NUM_THREADS": str(threads)}
+    with open(folder / "log.txt", "ab") as log:
+        log_start = log.tell()
+        process = subprocess.Popen(
+            WORKER, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment, start_new_session=True
+        )
+    assert process.stdin is not None
+    try:
+        process.stdin.write(encode(job, lock_timeout))
+        process.stdin.flush()
+    except BrokenPipeError:
+        pass  # the process has ended already; its exit code says how
+    code = _wait(process, urgency)
+    if code < 0 and not urgency():
+        raise ProcessKilled(-code)
+    outcome: Outcome = "stopped" if code < 0 else {code: name for name, code in EXIT_CODES.items()}.get(code, "failed")
+    if outcome == "failed" and not (folder / "error.txt").exists():  # it failed outside of the run itself
+        with open(folder / "log.txt", "rb") as log:
+            log.seek(log_start)
+            last_line = log.read().decode(errors="replace").strip().rpartition("\n")[2]
+        write_text(folder / "error.txt", f"{last_line or 'no output'} (exit code {code}; see log.txt)\n")
+    return outcome
+
+
+def _wait(process: subprocess.Popen[bytes], urgency: Callable[[], int]) -> int:
+    """Wait for a process, pass on requests to stop, and return its exit code."""
+    asked = 0
+    try:
+        while True:
+            try:
+                return process.wait(POLL)
+            except subprocess.TimeoutExpired:
+                if urgency() > asked:
+                    asked = urgency()
+                    process.send_signal(signal.SIGTERM if asked == 1 else signal.SIGKILL)
+    except BaseException:  # this process is ended by force, or a task of a cluster is cancelled
+        process.terminate()
+        process.wait()
+        raise
+    finally:
+        assert process.stdin is not None
+        process.stdin.close()

@@ -20,8 +20,7 @@ from cfp.sections import TASK_OPTIONS
 from cfp.weights import is_of_another_task, is_same_task, read_policy
 from dittogym.tasks import task_name
 
-LARGEST_SEED = EVALUATION_SEED - 1001
-"""Larger seeds would train on the layouts of the final evaluation."""
+LARGEST_SEED = EVALUATION_SEED - 1001  # larger ones would train on the layouts of the final evaluation
 IRRELEVANT_OPTIONS = ("device", "environment.backend", "report.video", "report.checkpoint_every", "report.log_every")
 """Options that change neither what a run learns nor which policy it keeps."""
 TASK_DEFINING_OPTIONS = ("substeps", "dtype", "parity", "resample", "target", "variant")
@@ -88,9 +87,8 @@ def make_jobs(
     """
     for name, values in (("tasks", tasks), ("algos", labels), ("seeds", seeds)):
         if not values or len(set(values)) < len(values):
-            raise ConfigError(
-                f"{name} must be one or more different values, got {' '.join(map(str, values)) or 'none'}"
-            )
+            given = " ".join(map(str, values)) or "none"
+            raise ConfigError(f"{name} must be one or more different values, got {given}")
     for seed in seeds:
         if not 0 <= seed <= LARGEST_SEED:
             raise ConfigError(f"seeds must be between 0 and {LARGEST_SEED}, got {seed}")
@@ -108,22 +106,19 @@ def make_jobs(
 
 def resolve(plan: Plan, label: str, task: str, preset: str, seed: int, steps: int | None, device: str) -> RunConfig:
     """Options of a run: from the preset, then the plan file, then the command line."""
-    values = plan.options(label, task)
-    variant_of = values.pop("algo", label)
-    algo = label if label in {*ALGORITHMS, *ALIASES, *REFERENCE_POLICIES} else variant_of
-    algo = plan.own_options(label, task).get("algo", algo)
+    values, own = plan.options(label, task), plan.own_options(label, task)
+    algo = values.pop("algo", label)  # that of all runs is for variants only
+    if label in {*ALGORITHMS, *ALIASES, *REFERENCE_POLICIES}:
+        algo = own.get("algo", label)
     start: dict[str, Any] = {"algo": algo, "task": task, "preset": preset}
     base = configure(start)
     if steps is not None and hasattr(base, "steps"):
         values.setdefault("steps", steps)
-    report = {"video": False, **values.pop("report", {})}
+    values["report"] = {"video": False, **values.get("report", {})}
     try:
-        config = configure({**start, "seed": seed, "device": device, **values, "report": report}).with_derived(
-            base, values
-        )
+        config = configure({**start, "seed": seed, "device": device, **values}).with_derived(base, values)
         config.check()
-        # Options for all algorithms may have no effect on some of them.
-        config.check_effect(base, flatten(plan.own_options(label, task)))
+        config.check_effect(base, flatten(own))  # options for all algorithms may have no effect on some of them
     except ConfigError as error:
         raise ConfigError(f"{label} on {task}: {error}") from error
     return config
@@ -132,13 +127,12 @@ def resolve(plan: Plan, label: str, task: str, preset: str, seed: int, steps: in
 def _check_same_task(jobs: Sequence[Job]) -> None:
     first: dict[str, Job] = {}
     for job in jobs:
-        task = job.config.task
-        other = first.setdefault(task, job)
+        other = first.setdefault(job.config.task, job)
         for name in TASK_DEFINING_OPTIONS:
             mine, theirs = (getattr(each.config.environment, name) for each in (job, other))
-            if mine != theirs and not _names_default(task, name, mine, theirs):
+            if mine != theirs and not _names_default(job.config.task, name, mine, theirs):
                 raise ConfigError(
-                    f"{name} must be the same for all algorithms on {task}, got {mine!r} for {job.label} "
+                    f"{name} must be the same for all algorithms on {job.config.task}, got {mine!r} for {job.label} "
                     f"and {theirs!r} for {other.label}"
                 )
 
@@ -165,8 +159,8 @@ def check_folder(job: Job) -> None:
                 f"{name} must be {old.get(name)!r} as in the run in {job.folder}, got {new.get(name)!r}; or name "
                 "another --out"
             )
-    policy = job.folder / "policy.safetensors"
-    if policy.exists() and is_of_another_task(read_policy(policy)[1], job.config.task):
+    path = job.folder / "policy.safetensors"
+    if path.exists() and is_of_another_task(read_policy(path)[1], job.config.task):
         raise ConfigError(
             f"task: the file that defines {job.config.task!r} has changed since the run in {job.folder} was trained; "
             "name another --out"

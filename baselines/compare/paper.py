@@ -14,26 +14,21 @@ TIER: Particles = "full"
 COLUMNS = ("cfp", "coarse", "fine", "gnn-16", "gnn-64", "transformer-16", "transformer-64")
 """Names that the paper's methods have here, in the order of `CURVES`."""
 
-CURVES: dict[str, tuple[int, tuple[tuple[float, float], ...]]] = {
-    "shapematch": (400_000, ((306, 4), (285, 6), (154, 10), (55, 4), (57, 3), (69, 3), (71, 2))),
-    "run": (550_000, ((8650, 420), (6870, 960), (2750, 630), (2520, 110), (2420, 20), (1820, 2060), (2200, 1480))),
-    "grow": (600_000, ((5530, 130), (4810, 900), (3950, 530), (3480, 410), (4550, 110), (3250, 480), (4310, 690))),
-    "kick": (550_000, ((16200, 1400), (2020, 910), (4600, 1300), (890, 50), (870, 40), (1720, 1070), (1440, 880))),
-    "dig": (780_000, ((4360, 90), (3220, 440), (570, 40), (1740, 750), (1010, 110), (570, 120), (790, 50))),
-    "obstacle": (
-        700_000,
-        ((12300, 1200), (9750, 2600), (4890, 1200), (2080, 180), (2360, 60), (1920, 530), (3300, 1440)),
-    ),
-    "catch": (
-        380_000,
-        ((6890, 460), (6420, 1790), (1780, 1290), (3610, 460), (5980, 1410), (5530, 1520), (7200, 1260)),
-    ),
-    "slot": (
-        600_000,
-        ((65000, 2600), (49800, 9300), (12800, 2100), (6480, 2310), (5120, 1610), (26000, 5400), (23300, 6600)),
-    ),
+CURVES: dict[str, tuple[tuple[float, float], ...]] = {
+    "shapematch": ((306, 4), (285, 6), (154, 10), (55, 4), (57, 3), (69, 3), (71, 2)),
+    "run": ((8650, 420), (6870, 960), (2750, 630), (2520, 110), (2420, 20), (1820, 2060), (2200, 1480)),
+    "grow": ((5530, 130), (4810, 900), (3950, 530), (3480, 410), (4550, 110), (3250, 480), (4310, 690)),
+    "kick": ((16200, 1400), (2020, 910), (4600, 1300), (890, 50), (870, 40), (1720, 1070), (1440, 880)),
+    "dig": ((4360, 90), (3220, 440), (570, 40), (1740, 750), (1010, 110), (570, 120), (790, 50)),
+    "obstacle": ((12300, 1200), (9750, 2600), (4890, 1200), (2080, 180), (2360, 60), (1920, 530), (3300, 1440)),
+    "catch": ((6890, 460), (6420, 1790), (1780, 1290), (3610, 460), (5980, 1410), (5530, 1520), (7200, 1260)),
+    "slot": ((65000, 2600), (49800, 9300), (12800, 2100), (6480, 2310), (5120, 1610), (26000, 5400), (23300, 6600)),
 }
-"""Task to steps of its curves, and return and band of every method."""
+"""Task to return and band of every method."""
+
+_STEPS = (400_000, 550_000, 600_000, 550_000, 780_000, 700_000, 380_000, 600_000)
+STEPS: dict[str, int] = dict(zip(CURVES, _STEPS, strict=True))
+"""Task to environment steps of its curves."""
 
 EXPERTS: dict[str, dict[int, tuple[float, float]]] = {
     "shapematch": {4: (255, 6), 8: (297, 7), 16: (317, 5)},
@@ -65,17 +60,9 @@ FAULTS: dict[str, tuple[float, float]] = {
 }
 """Ratio to the unperturbed return of CFP when 20 % of the observation, of the action are set to zero."""
 
-REST: dict[str, float] = {
-    "shapematch": 21,
-    "run": 2500,
-    "grow": 3100,
-    "kick": 890,
-    "dig": -1500,
-    "obstacle": 2400,
-    "catch": -1900,
-    "slot": 7000,
-}
-"""Return of a robot that does not move (SHAPE MATCH: 12 to 30, by the particles)."""
+_REST = (21, 2500, 3100, 890, -1500, 2400, -1900, 7000)
+REST: dict[str, float] = dict(zip(CURVES, _REST, strict=True))
+"""Task to the return of a robot that does not move (SHAPE MATCH: 12 to 30, by the particles)."""
 
 WITHOUT_NOISE = ("shapematch",)
 """Tasks in which the paper evaluates policies without action noise; in all others they act with it."""
@@ -83,9 +70,9 @@ WITHOUT_NOISE = ("shapematch",)
 
 def curve(algo: str, task: str) -> tuple[float, float] | None:
     """The paper's return and band of a method, None where it has none."""
-    return CURVES[task][1][COLUMNS.index(algo)] if task in CURVES and algo in COLUMNS else None
+    return CURVES[task][COLUMNS.index(algo)] if task in CURVES and algo in COLUMNS else None
 
 
 def normalised(task: str, value: float) -> float:
     """A return on a scale where a resting robot has 0 and the paper's CFP 1."""
-    return (value - REST[task]) / (CURVES[task][1][0][0] - REST[task])
+    return (value - REST[task]) / (CURVES[task][0][0] - REST[task])

@@ -19,18 +19,11 @@ COMMAND_LINE_OPTIONS = ("device", "preset", "seed", "task")
 
 @dataclass(frozen=True)
 class Plan:
-    """Options of runs beyond their presets.
-
-    Attributes:
-        common: For every run.
-        tasks: By task.
-        algos: By algorithm. Any other name makes a variant, whose options give its ``algo``. Options under ``tasks`` of
-            an algorithm hold in these tasks only.
-    """
+    """Options of runs beyond their presets."""
 
     common: Options = field(default_factory=dict)
     tasks: dict[str, Options] = field(default_factory=dict)
-    algos: dict[str, Options] = field(default_factory=dict)
+    algos: dict[str, Options] = field(default_factory=dict)  # also by variant; ``tasks`` in them hold there only
 
     @classmethod
     def read(cls, path: Path | None) -> Plan:
@@ -43,14 +36,8 @@ class Plan:
             raise ConfigError(f"plan: {path} cannot be read as JSON ({error})") from error
         if not set(values) <= {"common", "tasks", "algos"}:
             raise ConfigError(f"plan: {path} must hold common, tasks and algos only, got {', '.join(values)}")
-        _check_options("common", values.get("common", {}))
-        for part in ("tasks", "algos"):
-            for name, options in _check_object(part, values.get(part, {})).items():
-                own = dict(_check_object(f"{part}.{name}", options))
-                by_task = own.pop("tasks", {}) if part == "algos" else {}
-                _check_options(f"{part}.{name}", own)
-                for task, special in _check_object(f"{part}.{name}.tasks", by_task).items():
-                    _check_options(f"{part}.{name}.tasks.{task}", special)
+        for part, options in values.items():
+            _check_options(part, options, named=part != "common")
         return cls(**values)
 
     def options(self, label: str, task: str) -> Options:
@@ -71,16 +58,15 @@ class Plan:
         return {part: sorted(names) for part, names in parts.items() if names}
 
 
-def _check_object(name: str, value: Any) -> Options:
+def _check_options(name: str, value: Any, named: bool) -> None:
+    """Check options of runs, or if ``named`` such options by the name of a task or an algorithm."""
     if not isinstance(value, dict):
         raise ConfigError(f"plan: {name} must be a JSON object, got {value!r}")
-    return value
-
-
-def _check_options(name: str, value: Any) -> None:
-    for option in COMMAND_LINE_OPTIONS:
-        if option in _check_object(name, value):
-            raise ConfigError(f"plan: {name} must not hold {option}, which the command line gives")
+    for key, item in value.items():
+        if named or key == "tasks":
+            _check_options(f"{name}.{key}", item, named=not named)
+        elif key in COMMAND_LINE_OPTIONS:
+            raise ConfigError(f"plan: {name} must not hold {key}, which the command line gives")
 
 
 def _merge(base: Options, values: Options) -> Options:

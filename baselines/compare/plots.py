@@ -12,7 +12,6 @@ from matplotlib.lines import Line2D
 
 from baselines.compare.results import Group
 from baselines.compare.stats import align_curves, bootstrap_interval, interquartile_mean
-from baselines.compare.table import Row
 
 COLOURS = (
     "#0173b2 #de8f05 #029e73 #d55e00 #cc78bc #ca9161 #56b4e9 #949494 #8c564b #bcbd22 #17becf #7f3c8d #e377c2 #1b5e20"
@@ -25,8 +24,6 @@ LINES: dict[str, tuple[Any, str]] = {
 }
 """Line and marker by what is observed."""
 BAND_RESAMPLES = 2_000
-
-
 Styles = dict[tuple[str, str], dict[str, Any]]
 """Keywords of matplotlib's lines, by algorithm and observation."""
 
@@ -39,8 +36,9 @@ def _styles(groups: Sequence[Group]) -> Styles:
     return styles
 
 
-def _panels(tasks: Sequence[str], height: float, handles: list[Line2D]) -> tuple[Figure, dict[str, Axes]]:
+def _panels(tasks: Sequence[str], height: float, styles: Styles) -> tuple[Figure, dict[str, Axes]]:
     """A figure with a panel of some height in inches for each task, and a legend below."""
+    handles = [Line2D([], [], **style, label=f"{label} (observes {seen})") for (label, seen), style in styles.items()]
     columns = min(len(tasks), 3)
     rows, legend_columns = math.ceil(len(tasks) / columns), max(3, 2 * columns)
     size = (max(6.5, 4.6 * columns), height * rows + 0.3 * math.ceil(len(handles) / legend_columns) + 0.2)
@@ -53,30 +51,16 @@ def _panels(tasks: Sequence[str], height: float, handles: list[Line2D]) -> tuple
     return figure, panels
 
 
-def _legend(styles: Styles) -> list[Line2D]:
-    return [Line2D([], [], **style, label=_name(*name)) for name, style in styles.items()]
-
-
-def _name(label: str, observes: str) -> str:
-    return f"{label} (observes {observes})"
-
-
-def _bar_names(axes: Axes, names: Sequence[str]) -> None:
-    """Name horizontal bars or marks, from top to bottom."""
-    axes.set_yticks(range(len(names)), names, fontsize=8)
-    axes.set_ylim(len(names) - 0.5, -0.5)
-
-
 def learning_curves(groups: Sequence[Group], *, minutes: bool = False) -> Figure:
     """Evaluations during training: interquartile mean over seeds and its 95 % band, over steps or time."""
     styles = _styles(groups)
     shown = [group for group in groups if group.curves and (group.speed or not minutes)]
-    figure, panels = _panels(list(dict.fromkeys(group.task for group in shown)), 3.4, _legend(styles))
+    figure, panels = _panels(list(dict.fromkeys(group.task for group in shown)), 3.4, styles)
     for group in shown:
         axes, style = panels[group.task], styles[group.label, group.observes]
         steps, values = align_curves(group.curves)
         if minutes and group.speed:
-            steps = (group.teacher_seconds + steps / group.speed) / 60
+            steps = (group.mean_cost("teacher_seconds") + steps / group.speed) / 60
         axes.plot(steps, interquartile_mean(values), **style, markersize=3, linewidth=1.5)
         if len(steps) and (band := bootstrap_interval([values], BAND_RESAMPLES)) is not None:
             axes.fill_between(steps, *band, color=style["color"], alpha=0.15, linewidth=0)
@@ -92,7 +76,7 @@ def final_returns(groups: Sequence[Group]) -> Figure:
     for group in groups:
         if group.scores:
             members.setdefault(group.task, []).append(group)
-    figure, panels = _panels(list(members), 1.2 + 0.3 * max(map(len, members.values())), _legend(styles))
+    figure, panels = _panels(list(members), 1.2 + 0.3 * max(map(len, members.values())), styles)
     for task, axes in panels.items():
         shown = members[task]
         for place, group in enumerate(shown):
@@ -103,32 +87,7 @@ def final_returns(groups: Sequence[Group]) -> Figure:
             axes.plot(interquartile_mean(group.scores), place, **style, markersize=8, markeredgecolor="black")
             if place and group.observes != shown[place - 1].observes:
                 axes.axhline(place - 0.5, color="black", linewidth=1)
-        _bar_names(axes, [f"{group.label} ({group.observes})" for group in shown])
+        axes.set_yticks(range(len(shown)), [f"{group.label} ({group.observes})" for group in shown], fontsize=8)
+        axes.set_ylim(len(shown) - 0.5, -0.5)
         axes.set_xlabel("return")
-    return figure
-
-
-def robustness_ratios(groups: Sequence[Group], rows: Sequence[Row]) -> Figure:
-    """Ratio in each disturbed case: a bar for each algorithm with the range of its seeds; the paper's as a line."""
-    styles, rows = _styles(groups), [row for row in rows if row["ratio"] is not None]
-    names = list(dict.fromkeys((row["algo"], row["sees"]) for row in rows))
-    cases: dict[str, list[str]] = {}
-    for row in rows:
-        if row["case"] not in cases.setdefault(row["task"], []):
-            cases[row["task"]].append(row["case"])
-    handles = [Line2D([], [], color=styles[name]["color"], linewidth=6, label=_name(*name)) for name in names]
-    handles.append(Line2D([], [], color="black", linewidth=2.5, label="the paper's CFP"))
-    figure, panels = _panels(list(cases), 1.0 + max(map(len, cases.values())) * max(0.4, 0.16 * len(names)), handles)
-    height = 0.8 / len(names)
-    for row in rows:
-        axes, name = panels[row["task"]], (row["algo"], row["sees"])
-        place = cases[row["task"]].index(row["case"]) + (names.index(name) - (len(names) - 1) / 2) * height
-        seeds = [[row["ratio"] - row["low"]], [row["high"] - row["ratio"]]]
-        axes.barh(place, row["ratio"], height, xerr=seeds, color=styles[name]["color"], error_kw={"linewidth": 1})
-        if row["paper"] is not None:
-            axes.plot([row["paper"]] * 2, [place - height / 2, place + height / 2], color="black", linewidth=2.5)
-    for task, axes in panels.items():
-        axes.axvline(1, color="black", linewidth=1, linestyle="--")
-        _bar_names(axes, [case.replace(" dropout", "\ndropout") for case in cases[task]])
-        axes.set_xlabel("ratio to the unperturbed return")
     return figure

@@ -7,9 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from baselines.compare.executor import Executor, Resources
+from baselines.compare.executor import Executor, ProcessKilled, Resources, run_process
 from baselines.compare.jobs import Job
-from baselines.compare.local import ProcessKilled, run_process
 from baselines.compare.worker import Outcome
 from cfp.errors import ConfigError
 from cfp.files import write_text
@@ -18,18 +17,15 @@ from cfp.files import write_text
 class RayExecutor(Executor):
     """Carries out runs as tasks of a Ray cluster.
 
-    The run folders must be on a file system that all nodes share, and all nodes must have this package. A run whose
-    node is lost continues on another one from its last checkpoint; the lock on its folder keeps two nodes from working
-    on it at once. Ray counts lost nodes and killed processes together, so that ``retries`` bounds their sum.
+    A run whose node is lost continues on another one from its last checkpoint; the lock on its folder keeps two nodes
+    from working on it at once. Ray counts lost nodes and killed processes together.
     """
 
     def __init__(self, address: str | None, resources: Resources) -> None:
         try:
             import ray
         except ImportError as error:
-            raise ConfigError(
-                "executor ray requires Ray, which is not installed: pip install 'torchmpm[ray]'"
-            ) from error
+            raise ConfigError("executor ray requires Ray: pip install 'torchmpm[ray]'") from error
         self._ray: Any = ray
         self._owned = not ray.is_initialized()
         if self._owned:
@@ -66,16 +62,14 @@ class RayExecutor(Executor):
 
     def _finish(self, future: Future[Outcome], folder: Path, done: Future[Outcome]) -> None:
         """Pass on the result of a task; an exception that a callback raised would be lost."""
-        try:
-            future.set_result(self._outcome(folder, done))
-        except BaseException as error:
-            future.set_exception(error)
-
-    def _outcome(self, folder: Path, done: Future[Outcome]) -> Outcome:
         error = done.exception()
-        if isinstance(error, self._ray.exceptions.TaskCancelledError):
-            return "stopped"
-        if isinstance(error, ProcessKilled | self._ray.exceptions.RayError):
-            write_text(folder / "error.txt", f"{type(error).__name__}: {' '.join(str(error).split())}\n")
-            return "failed"
-        return done.result()
+        try:
+            if isinstance(error, self._ray.exceptions.TaskCancelledError):
+                future.set_result("stopped")
+            elif isinstance(error, ProcessKilled | self._ray.exceptions.RayError):
+                write_text(folder / "error.txt", f"{type(error).__name__}: {' '.join(str(error).split())}\n")
+                future.set_result("failed")
+            else:
+                future.set_result(done.result())
+        except BaseException as unexpected:
+            future.set_exception(unexpected)

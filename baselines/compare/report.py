@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 
@@ -41,10 +41,8 @@ def write_report(folder: Path, runs: Sequence[RunResult], protocol: Protocol, de
     for table in complete:
         write_text(folder / f"{table.name}.csv", table.to_csv())
     shown = {table.name: table for table in complete if table.rows}
-    runs_table = complete[0]
-    unfinished = tables.unfinished(runs_table.rows)
-    shown["runs"] = Table("runs", runs_table.title, runs_table.description, runs_table.columns, unfinished)
-    pictures = _make_pictures(groups, shown.get("robustness"))
+    shown["runs"] = replace(complete[0], rows=tables.unfinished(complete[0].rows))
+    pictures = _make_pictures(groups)
     for picture in pictures.values():
         write_figure(folder / picture.file, picture.figure)
     head = f"{description} {_describe_protocol(protocol)} {_describe_observations(groups)}"
@@ -88,7 +86,7 @@ def _describe_observations(groups: Sequence[Group]) -> str:
     return f"What policies observe – {'; '.join(parts)}."
 
 
-def _make_pictures(groups: Sequence[Group], robustness: Table | None) -> dict[str, Picture]:
+def _make_pictures(groups: Sequence[Group]) -> dict[str, Picture]:
     """Figures that have something to show, by the table that each stands above."""
     pictures: dict[str, Picture] = {}
     if any(group.scores for group in groups):
@@ -101,10 +99,6 @@ def _make_pictures(groups: Sequence[Group], robustness: Table | None) -> dict[st
         caption = "The same over the time of training, without that of evaluations, at the mean speed over seeds."
         figure = plots.learning_curves(groups, minutes=True)
         pictures["cost"] = Picture("minutes.png", "Learning curves over time", caption, figure)
-    if robustness is not None and any(row["ratio"] is not None for row in robustness.rows):
-        caption = "Mean over seeds and their range; black: the paper's CFP."
-        figure = plots.robustness_ratios(groups, robustness.rows)
-        pictures["robustness"] = Picture("robustness.png", "Robustness", caption, figure)
     return pictures
 
 
@@ -127,7 +121,7 @@ def _markdown(shown: dict[str, Table], pictures: dict[str, Picture], head: str) 
     for name, table in shown.items():
         if picture := pictures.get(name):
             parts.append(f"![{picture.title}]({picture.file})\n\n{picture.caption}")
-        parts.append(table.to_markdown().rstrip())
+        parts.append(table.to_markdown())
     return "\n\n".join(parts) + "\n"
 
 

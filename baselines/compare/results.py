@@ -12,7 +12,6 @@ import numpy as np
 from baselines.compare.evaluations import FinalEvaluation, read_evaluation, read_record
 from baselines.compare.jobs import Job, read_sessions
 from baselines.compare.stats import Curve, interquartile_mean, score_interval
-from cfp.errors import CheckpointError
 from cfp.sections import Particles
 from cfp.tables import read_table
 
@@ -36,23 +35,19 @@ class Cost:
 
 @dataclass(frozen=True)
 class RunResult:
-    """A run of the comparison with all that is known of it.
-
-    ``state`` is that of `Job.state`, or ``unevaluated`` if training has ended but the final evaluation is not complete;
-    ``error`` tells why it failed; ``curve`` holds the mean returns of the evaluations during training.
-    """
+    """A run of the comparison with all that is known of it."""
 
     job: Job
-    state: str
-    error: str
-    curve: Curve
+    state: str  # that of the job, or "unevaluated" if the final evaluation of a trained policy is not complete
+    error: str  # why it failed
+    curve: Curve  # mean returns of the evaluations during training
     cost: Cost | None
     evaluation: FinalEvaluation | None
 
     @property
     def score(self) -> float | None:
         """Mean return on the common layouts."""
-        return None if self.evaluation is None else float(np.mean(self.evaluation.returns))
+        return None if self.evaluation is None else self.evaluation.mean
 
 
 @dataclass(frozen=True)
@@ -75,14 +70,14 @@ class Group:
         return [run.evaluation for run in self.runs if run.evaluation is not None]
 
     @property
+    def scores(self) -> list[float]:
+        """Mean returns of the runs that have been evaluated."""
+        return [each.mean for each in self.evaluations]
+
+    @property
     def own_layouts(self) -> list[float]:
         """Returns on the only layout that policies were made for."""
         return [each.own_layout for each in self.evaluations if each.own_layout is not None]
-
-    @property
-    def scores(self) -> list[float]:
-        """Mean returns of the runs that have been evaluated."""
-        return [run.score for run in self.runs if run.score is not None]
 
     @property
     def iqm(self) -> float | None:
@@ -100,6 +95,17 @@ class Group:
         return self.job.config.environment.particles
 
     @property
+    def train_particles(self) -> Particles:
+        """Particles of training itself."""
+        particles: Particles | None = getattr(self.job.config, "train_particles", None)
+        return self.particles if particles is None else particles
+
+    @property
+    def curves(self) -> list[Curve]:
+        """Curves of the runs that have one."""
+        return [run.curve for run in self.runs if len(run.curve[0])]
+
+    @property
     def costs(self) -> list[Cost]:
         """Costs of the runs of which a session has ended in order."""
         return [run.cost for run in self.runs if run.cost is not None]
@@ -110,20 +116,9 @@ class Group:
         costs = self.costs
         return sum(cost.steps for cost in costs) / sum(cost.seconds for cost in costs) if costs else None
 
-    @property
-    def teacher_seconds(self) -> float:
-        """Mean wall time of the training of the runs' teachers."""
-        return float(np.mean([cost.teacher_seconds for cost in self.costs])) if self.costs else 0.0
-
-    @property
-    def evaluation_seconds(self) -> float:
-        """Mean wall time of the evaluations during training."""
-        return sum(cost.evaluation_seconds for cost in self.costs) / len(self.costs)
-
-    @property
-    def curves(self) -> list[Curve]:
-        """Curves of the runs that have one."""
-        return [run.curve for run in self.runs if len(run.curve[0])]
+    def mean_cost(self, name: str) -> float:
+        """Mean of a field of the costs, of which there must be some."""
+        return float(np.mean([getattr(cost, name) for cost in self.costs]))
 
 
 def read_result(job: Job) -> RunResult:
@@ -149,30 +144,29 @@ def group_results(runs: Sequence[RunResult]) -> list[Group]:
 def _read_curve(folder: Path) -> Curve:
     """At a handover there are two evaluations at the same step; the later one counts, from which training continues."""
     rows = read_table(folder / "evaluations.csv", ("step", "mean"))
-    values = {float(row["step"]): float(row["mean"]) for row in rows}
-    steps = np.array(sorted(values))
-    return steps, np.array([values[step] for step in steps])
+    values = sorted({float(row["step"]): float(row["mean"]) for row in rows}.items())
+    steps, means = np.array(values).reshape(-1, 2).T
+    return steps, means
 
 
 def _read_cost(folder: Path) -> Cost | None:
     sessions = read_sessions(folder)["sessions"]
-    try:
-        steps = sum(session["to"] - session["from"] for session in sessions)
-        if not steps:
-            return None
-        evaluation = sum(session["evaluation_seconds"] for session in sessions)
-        teacher: dict[str, Any] = {"steps": 0, "seconds": 0.0, "evaluation_seconds": 0.0}
-        if (folder / "teacher" / "cost.json").exists():
-            teacher = read_record(folder / "teacher" / "cost.json")
-        return Cost(
-            last_step=sessions[-1]["to"],
-            steps=steps,
-            seconds=max(sum(session["seconds"] for session in sessions) - evaluation - teacher["seconds"], 1e-9),
-            evaluation_seconds=evaluation + teacher["evaluation_seconds"],
-            teacher_seconds=teacher["seconds"] - teacher["evaluation_seconds"],
-            teacher_steps=teacher["steps"],
-            memory=max((session["memory"] for session in sessions if session["memory"]), default=None),
-            device="/".join(sorted({session["device"] for session in sessions})),
-        )
-    except (KeyError, TypeError) as error:
-        raise CheckpointError(f"{folder / 'sessions.json'}: cannot be read ({error})") from error
+
+    def total(name: str) -> float:
+        return sum(session[name] for session in sessions)
+
+    if not sessions or total("to") == total("from"):
+        return None
+    teacher: dict[str, Any] = {"steps": 0, "seconds": 0.0, "evaluation_seconds": 0.0}
+    if (folder / "teacher" / "cost.json").exists():
+        teacher = read_record(folder / "teacher" / "cost.json")
+    return Cost(
+        last_step=sessions[-1]["to"],
+        steps=int(total("to") - total("from")),
+        seconds=max(total("seconds") - total("evaluation_seconds") - teacher["seconds"], 1e-9),
+        evaluation_seconds=total("evaluation_seconds") + teacher["evaluation_seconds"],
+        teacher_seconds=teacher["seconds"] - teacher["evaluation_seconds"],
+        teacher_steps=teacher["steps"],
+        memory=max((session["memory"] for session in sessions if session["memory"]), default=None),
+        device="/".join(sorted({session["device"] for session in sessions})),
+    )

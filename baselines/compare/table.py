@@ -10,23 +10,17 @@ from typing import Any
 from cfp.tables import csv_text
 
 Row = Mapping[str, Any]
+"""Values by the key of their column; None, or a missing key, is a value that does not exist."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table.
+    """A column of a table."""
 
-    Attributes:
-        key: Key of its values in the rows, and its name in the CSV file.
-        title: Heading; an empty one restricts the column to the CSV file.
-        format: Format specification of numbers; columns without one hold text.
-        value: From the subject of a row to its value, for `make_row`.
-    """
-
-    key: str
-    title: str = ""
-    format: str = ""
-    value: Callable[[Any], Any] | None = None
+    key: str  # in the rows, and the name in the CSV file
+    title: str = ""  # an empty one restricts the column to the CSV file
+    format: str = ""  # of numbers; columns without one hold text
+    value: Callable[[Any], Any] | None = None  # from the subject of a row to its value, for `make_row`
 
     def text(self, row: Row) -> str:
         """The value of a row, for readers."""
@@ -48,10 +42,7 @@ def make_row(columns: Sequence[Column], subject: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of plain values by the key of their column; None, or a missing key, is a value that does not exist.
-
-    ``name`` is that of the CSV file, without its suffix; ``title`` and ``description`` are for readers.
-    """
+    """Rows of plain values; ``name`` is that of the CSV file, ``title`` and ``description`` are for readers."""
 
     name: str
     title: str
@@ -70,13 +61,13 @@ class Table:
 
     def to_markdown(self) -> str:
         """Heading, description and visible columns."""
-        lines = [f"## {self.title}", "", self.description, ""]
+        lines = [f"## {self.title}", "", self.description]
         if self.rows:
-            lines.append(_markdown_line(column.title for column in self.visible))
+            lines += ["", _markdown_line(column.title for column in self.visible)]
             lines.append(_markdown_line("---:" if column.format else "---" for column in self.visible))
             for row in self.rows:
                 lines.append(_markdown_line(column.text(row).replace("|", "\\|") for column in self.visible))
-        return "\n".join(lines) + "\n"
+        return "\n".join(lines)
 
     def to_html(self) -> str:
         """Heading, description and visible columns."""
@@ -85,8 +76,7 @@ class Table:
             return head
         rows = ["".join(_html_cell("th", column, column.title) for column in self.visible)]
         rows += ["".join(_html_cell("td", column, column.text(row)) for column in self.visible) for row in self.rows]
-        body = "".join(f"<tr>{row}</tr>" for row in rows)
-        return f"{head}<div class='wide'><table>{body}</table></div>"
+        return f"{head}<div class='wide'><table>{''.join(f'<tr>{row}</tr>' for row in rows)}</table></div>"
 
 
 def _html_cell(tag: str, column: Column, text: str) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from baselines.compare import paper
-from baselines.compare.results import Cost, Group, RunResult
+from baselines.compare.results import Group, RunResult
 from baselines.compare.stats import align_curves, first_step_at, interquartile_mean, score_interval, wilson_interval
 from baselines.compare.table import Column, Row, Table, columns, make_row
 from cfp.sections import Particles
@@ -20,10 +20,6 @@ GROUP = (
     Column("task", "task", value=lambda group: group.task),
     Column("sees", "observes", value=lambda group: group.observes),
     Column("algo", "algorithm", value=lambda group: group.label),
-)
-RANKING = (
-    "Ranks are within a task and among policies that observe the same: image, state, simulator and nothing are never "
-    "ranked together."
 )
 
 
@@ -37,6 +33,10 @@ def _rank(rows: Iterable[dict[str, Any]], within: tuple[str, ...]) -> None:
 
 def _mean(values: Sequence[float]) -> float | None:
     return float(np.mean(values)) if values else None
+
+
+def _labels(groups: Iterable[Group]) -> str:
+    return ", ".join(dict.fromkeys(group.label for group in groups))
 
 
 RUNS = (
@@ -55,9 +55,9 @@ RUNS = (
 def runs_table(runs: Sequence[RunResult]) -> Table:
     """Every run, and why it is not finished."""
     rows = [make_row(RUNS, run) for run in runs]
-    finished = len(rows) - len(unfinished(rows))
-    description = f"{finished} of {len(rows)} runs are finished and evaluated"
-    return Table("runs", "Runs", description + ("." if finished == len(rows) else "; the others:"), RUNS, rows)
+    others = len(unfinished(rows))
+    description = f"{len(rows) - others} of {len(rows)} runs are finished and evaluated{'; the others:' * bool(others)}"
+    return Table("runs", "Runs", description if others else f"{description}.", RUNS, rows)
 
 
 def unfinished(rows: Sequence[Row]) -> list[Row]:
@@ -83,13 +83,14 @@ def returns_table(groups: Sequence[Group], episodes: int) -> Table:
     """Interquartile mean of the final evaluation over seeds."""
     rows = [make_row(RETURNS, group) for group in groups]
     _rank(rows, ("task", "sees"))
-    untrained = ", ".join(dict.fromkeys(group.label for group in groups if group.job.untrained))
+    untrained = _labels(group for group in groups if group.job.untrained)
     description = (
         f"Each policy plays the same layouts, which neither trained nor selected it ({episodes}, more in SLOT). "
         "The score of a run is its mean return; IQM is the interquartile mean over seeds (up to three seeds: the mean) "
         "with a 95 % bootstrap interval; std is that of the scores. The interval is about other trainings on these "
         f"layouts, not about other layouts. {f'One run stands for all seeds of {untrained}. ' if untrained else ''}"
-        f"{RANKING} Own layout: the return on the only layout that a policy was made for."
+        "Ranks are within a task and among policies that observe the same: image, state, simulator and nothing are "
+        "never ranked together. Own layout: the return on the only layout that a policy was made for."
     )
     return Table("returns", "Final evaluation", description, RETURNS, rows)
 
@@ -104,17 +105,17 @@ AGGREGATE = (
 
 def aggregate_table(groups: Sequence[Group]) -> Table:
     """Interquartile mean of normalised scores over tasks and seeds."""
-    published = [group for group in groups if group.task in paper.REST]
-    tasks, rows = {group.task for group in published}, []
-    for observes, label in dict.fromkeys((group.observes, group.label) for group in published):
-        members = [each for each in published if (each.observes, each.label) == (observes, label) and each.scores]
-        strata = [[paper.normalised(each.task, score) for score in each.scores] for each in members]
-        if not strata:
-            continue
-        scores, (low, high) = [score for scores in strata for score in scores], score_interval(strata)
-        row = {"sees": observes, "algo": label, "tasks": len(strata), "runs": len(scores)}
-        row |= {"iqm": float(interquartile_mean(scores)), "low": low, "high": high, "all": len(strata) == len(tasks)}
-        rows.append(row)
+    groups = [group for group in groups if group.task in paper.REST]
+    strata: dict[tuple[str, str], list[list[float]]] = {}
+    for group in groups:
+        if group.scores:
+            scores = [paper.normalised(group.task, score) for score in group.scores]
+            strata.setdefault((group.observes, group.label), []).append(scores)
+    rows, tasks = [], {group.task for group in groups}
+    for (observes, label), by_task in strata.items():
+        scores, (low, high) = [score for scores in by_task for score in scores], score_interval(by_task)
+        row = {"sees": observes, "algo": label, "tasks": len(by_task), "runs": len(scores), "low": low, "high": high}
+        rows.append(row | {"iqm": float(interquartile_mean(scores)), "all": len(by_task) == len(tasks)})
     _rank([row for row in rows if row["all"]], ("sees",))
     description = (
         "Interquartile mean over all runs of all tasks, with a bootstrap of trainings (not of layouts) by task "
@@ -127,19 +128,21 @@ def aggregate_table(groups: Sequence[Group]) -> Table:
 EFFICIENCY = (
     *GROUP,
     *columns(".1f", rest="rest", best="best"),
-    Column("steps_50%", "steps to 50%", ",.0f"),
-    Column("reached_50%", "seeds"),
-    Column("steps_75%", "steps to 75%", ",.0f"),
-    Column("reached_75%", "seeds"),
-    Column("steps_90%", "steps to 90%", ",.0f"),
-    Column("reached_90%", "seeds"),
+    *(
+        column
+        for part in MILESTONES
+        for column in (
+            Column(f"steps_{part:.0%}", f"steps to {part:.0%}", ",.0f"),
+            Column(f"reached_{part:.0%}", "seeds"),
+        )
+    ),
     Column("seeds"),
 )
 
 
 def efficiency_table(groups: Sequence[Group], tier: Particles) -> Table:
     """Steps until evaluations with ``tier`` particles reach the milestones between rest and the best curve."""
-    rest = {group.task: group.iqm for group in groups if group.job.config.algo == "zero" and group.scores}
+    rest = {group.task: group.iqm for group in groups if group.job.config.algo == "zero"}
     trained = [group for group in groups if group.curves and not group.job.untrained]
     best: dict[tuple[str, str], float] = {}
     for group in trained:
@@ -158,9 +161,9 @@ def efficiency_table(groups: Sequence[Group], tier: Particles) -> Table:
         "final evaluation of zero) to the highest point of any mean curve among the algorithms that observe the same "
         "in this task: median of the seeds that reach it, and their number. No entry where no curve rises above rest."
     )
-    if unknown := ", ".join(dict.fromkeys(group.task for group in trained if group.task not in rest)):
+    if unknown := ", ".join(dict.fromkeys(group.task for group in trained if rest.get(group.task) is None)):
         description += f" The return at rest is unknown in {unknown}: add zero to --algos."
-    if others := ", ".join(dict.fromkeys(group.label for group in trained if group.particles != tier)):
+    if others := _labels(group for group in trained if group.particles != tier):
         description += f" No entry for {others}, evaluated during training with particles other than {tier}."
     return Table("efficiency", "Sample efficiency", description, EFFICIENCY, rows)
 
@@ -183,32 +186,27 @@ def highest_point(group: Group) -> float:
     return max(float(curve.max()) for _, curve in group.curves)
 
 
-def _peak_memory(costs: Sequence[Cost]) -> float | None:
-    return max((cost.memory / 2**20 for cost in costs if cost.memory), default=None)
-
-
 def _paper_cost(group: Group) -> tuple[float, float] | tuple[None, None]:
     return paper.COST.get(group.label, (None, None)) if group.task == "run" else (None, None)
 
 
-def _train_particles(group: Group) -> str:
-    particles = getattr(group.job.config, "train_particles", None)
-    return str(group.particles if particles is None else particles)
+def _peak_memory(group: Group) -> float | None:
+    return max((cost.memory / 2**20 for cost in group.costs if cost.memory), default=None)
 
 
 COST = (
     *GROUP,
     Column("device", "device", value=lambda group: "/".join(sorted({cost.device for cost in group.costs}))),
-    Column("particles", "particles", value=_train_particles),
+    Column("particles", "particles", value=lambda group: str(group.train_particles)),
     Column("robots", "robots", "d", lambda group: group.job.config.environment.num_envs),
     Column("steps", "steps", ",d", lambda group: max(cost.last_step for cost in group.costs)),
-    Column("minutes", "minutes", ".1f", lambda group: sum(c.seconds for c in group.costs) / len(group.costs) / 60),
-    Column("teacher", "teacher (min)", ".1f", lambda group: group.teacher_seconds / 60 or None),
+    Column("minutes", "minutes", ".1f", lambda group: group.mean_cost("seconds") / 60),
+    Column("teacher", "teacher (min)", ".1f", lambda group: group.mean_cost("teacher_seconds") / 60 or None),
     Column("teacher_steps", value=lambda group: max(cost.teacher_steps for cost in group.costs) or None),
-    Column("judging", "evaluations (min)", ".1f", lambda group: group.evaluation_seconds / 60),
+    Column("judging", "evaluations (min)", ".1f", lambda group: group.mean_cost("evaluation_seconds") / 60),
     Column("speed", "steps/s", ".1f", lambda group: group.speed),
     Column("episode", "s/episode", ".1f", lambda group: make_spec(group.task).horizon / group.speed),
-    Column("memory", "MiB", ".0f", lambda group: _peak_memory(group.costs)),
+    Column("memory", "MiB", ".0f", _peak_memory),
     Column("paper_episode", "paper s/episode", ".0f", lambda group: _paper_cost(group)[0]),
     Column("paper_memory", "paper MB", ".0f", lambda group: _paper_cost(group)[1]),
 )
@@ -261,16 +259,20 @@ ROBUSTNESS = (
 
 def robustness_table(groups: Sequence[Group]) -> Table:
     """Ratio of the returns in disturbed cases to the unperturbed return."""
+    effective = {
+        (group.task, case)
+        for group in groups
+        for evaluation in group.evaluations
+        for case, value in evaluation.cases.items()
+        if value is not None
+    }
     rows = []
     for group in groups:
-        results = [each.cases for each in group.evaluations]
-        # A case that changes nothing for any policy, such as gravity in a task without it, has no row.
-        others = [each.cases for other in groups if other.task == group.task for each in other.evaluations]
-        for case in list(results[0])[1:] if results else []:
-            if all(cases[case] is None for cases in others):
-                continue
-            pairs = [(cases[case], cases["unperturbed"]) for cases in results]
-            ratios = [value / base for value, base in pairs if value is not None and base is not None and base > 0]
+        for case in group.evaluations[0].cases if group.evaluations else ():
+            if (group.task, case) not in effective:
+                continue  # such as gravity in a task without it
+            pairs = [(each.cases[case], each.mean) for each in group.evaluations]
+            ratios = [value / base for value, base in pairs if value is not None and base > 0]
             row = make_row(GROUP, group) | {"case": case, "seeds": len(ratios), "paper": _published_ratio(group, case)}
             row |= {"ratio": _mean(ratios), "low": min(ratios, default=None), "high": max(ratios, default=None)}
             rows.append(row)
@@ -310,7 +312,7 @@ def paper_table(groups: Sequence[Group]) -> Table:
             continue
         row = make_row(GROUP, group) | {"grid": grid, "ours": iqm, "ours_steps": config.ends()[-1], "rest": rest}
         if published is not None:
-            row |= {"paper": published[0], "band": published[1], "paper_steps": paper.CURVES[group.task][0]}
+            row |= {"paper": published[0], "band": published[1], "paper_steps": paper.STEPS[group.task]}
         rows.append(row | {"expert": expert[0] if expert else None})
     description = (
         "Ours: interquartile mean of the final evaluation. Paper: mean of the last tenth of its training curves and "

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import sys
 import threading
 import time
@@ -99,8 +98,6 @@ def train(job: Job, signals: StopSignals, own_process: bool = True) -> None:
             "evaluation_seconds": run.evaluation_seconds,
             "memory": peak_memory() if own_process else None,
             "device": choose_device(job.config.device),
-            "host": socket.gethostname(),
-            "process": os.getpid(),
             "finished": finished,
         }
         end = job.config.ends()[-1] if finished else False

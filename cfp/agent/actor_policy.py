@@ -35,7 +35,7 @@ class ActorPolicy(nn.Module):
         deterministic_by_default: Whether the run that trained it evaluates it without noise.
     """
 
-    sees_image = True
+    uses_image = True
 
     def __init__(self, spec: ActorSpec, deterministic_by_default: bool = False) -> None:
         super().__init__()

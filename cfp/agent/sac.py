@@ -204,10 +204,10 @@ class CFP(SAC):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Actions to execute, and their form in the replay buffer."""
         composition: Composition | None = getattr(self.replay_buffer, "composition", None)
-        if self.num_timesteps < self.hyperparameters.random_steps:
+        random_steps = self.hyperparameters.random_steps
+        if self.num_timesteps < random_steps:
             # stable-baselines3 ends its random phase where updates start; here the two are independent.
-            actions, stored = super()._sample_action(self.hyperparameters.random_steps, action_noise, n_envs)
-            return self._on_action_grid(actions, stored, composition)
+            return self._on_action_grid(*super()._sample_action(random_steps, action_noise, n_envs), composition)
         if composition is not None:
             actions, stored = self._act_in_parts(composition)
         else:

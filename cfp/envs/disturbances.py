@@ -49,9 +49,9 @@ class Case:
     friction: float | None = None
 
 
-def reason_without_effect(case: Case, spec: TaskSpec, sees_image: bool = True) -> str:
+def reason_without_effect(case: Case, spec: TaskSpec, uses_image: bool = True) -> str:
     """Why a case has no effect on a policy in a task; empty if it has one."""
-    if case.observation_dropout and not sees_image:
+    if case.observation_dropout and not uses_image:
         return "the policy does not use the image"
     if "gravity" in case.physics and not any(spec.gravity):
         return f"{spec.name} has no gravity"

@@ -13,14 +13,14 @@ import cv2
 import numpy as np
 import torch
 
-from dittogym.bodies.images import read_grey
+from dittogym.bodies.images import PictureLike, read_grey
 from dittogym.bodies.shapes import Figure, Shape
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.window import contains
 from torchmpm import sampling
 
 #: A path or an array (picture), (K, 2) corners (outline), a shape, or a body.
-BodyLike: TypeAlias = "str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, float]] | Shape | BodySpec"
+BodyLike: TypeAlias = "PictureLike | Sequence[tuple[float, float]] | Shape | BodySpec"
 
 #: Grey values above this belong to the robot.
 THRESHOLD = 127
@@ -59,7 +59,7 @@ def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
     return spec
 
 
-def _figure(body: str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, float]], own: Shape) -> Figure:
+def _figure(body: PictureLike | Sequence[tuple[float, float]], own: Shape) -> Figure:
     """A picture or an outline with the area and in the place of another shape."""
     mask = _mask(body)
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
@@ -69,7 +69,7 @@ def _figure(body: str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, fl
     return Figure(mask, (left, own.corner[1]), pixel)
 
 
-def _mask(body: str | os.PathLike[str] | np.ndarray | Sequence[tuple[float, float]]) -> np.ndarray:
+def _mask(body: PictureLike | Sequence[tuple[float, float]]) -> np.ndarray:
     if not isinstance(body, (str, os.PathLike)):
         try:
             body = np.atleast_2d(np.asarray(body))

@@ -46,9 +46,8 @@ def particle_counts(spec: TaskSpec, particles: Particles) -> tuple[int, ...]:
     elif isinstance(particles, (tuple, list)) and len(particles) == len(full):
         counts = tuple(checks.whole(f"particles[{i}]", n, 1) for i, n in enumerate(particles))
     else:
-        bodies = " and ".join("robot" if i == 0 else "object" for i in range(len(full)))
         raise ValueError(
-            f"particles must be 'full', 'lite', a number, or {len(full)} number(s) for {bodies}, got {particles!r}"
+            f"particles must be 'full', 'lite', a number, or {len(full)} number(s), one a body, got {particles!r}"
         )
     if min(counts) < 1:
         raise ValueError(f"particles must be at least 1 for every body, got {particles!r}")
@@ -58,10 +57,8 @@ def particle_counts(spec: TaskSpec, particles: Particles) -> tuple[int, ...]:
 class PositionSampler:
     """Draws the initial positions of one batch element; holds its random generator.
 
-    At full size particles are placed at random as in the reference implementation: the positions of seed s are those
-    that it draws after ``numpy.random.seed(s)``. With fewer particles random positions would leave holes in the body,
-    so there they come from a scrambled Sobol sequence.
-    A seed of ``None`` is taken from the operating system.
+    ``random`` positions are those that the reference implementation draws after ``numpy.random.seed(seed)``. With few
+    particles they would leave holes in the body; a scrambled Sobol sequence does not.
     """
 
     def __init__(self, spec: TaskSpec, counts: tuple[int, ...], seed: int | None, *, random: bool) -> None:
@@ -101,10 +98,7 @@ class PositionSampler:
 
 @dataclass(frozen=True)
 class InitialPositions:
-    """Initial positions of a batch: drawn at a seeded reset, kept until the next, or given by the user.
-
-    A draw returns a new object and leaves this one as it was, so that a reset that fails changes nothing.
-    """
+    """Initial positions of a batch; a draw returns a new object, so that a reset that fails changes nothing."""
 
     spec: TaskSpec  # The task
     counts: tuple[int, ...]  # Particles of each body

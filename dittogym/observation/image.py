@@ -17,9 +17,8 @@ RASTER = 1024
 SHAPE = (3, SIZE, SIZE)
 #: Velocities are doubled and clipped to this before averaging.
 CLIP = 10.0
-#: Occupancy of a cell in which n full-size particles are expected: 1 - exp(-n / SATURATION). Thrown at random into the
-#: 64 fine pixels of a cell they would give 63.5. Fitted so that the silhouette (occupancy >= 80 / 255) begins at
-#: n = 25, where it differs least from the silhouette of the pixel raster.
+#: Occupancy of a cell in which n full-size particles are expected: 1 - exp(-n / SATURATION). Fitted so that the
+#: silhouette (occupancy >= 80 / 255) begins at n = 25, where it differs least from that of the pixel raster.
 SATURATION = 66.4
 #: A pixel belongs to the silhouette if its occupancy code reaches this (21 of 64 fine pixels hit).
 OCCUPIED = 80

@@ -113,8 +113,8 @@ def pixel_means(shown: RasterInput) -> Tensor:
 def splat_means(shown: RasterInput) -> Tensor:
     """What the reference's raster of full-size bodies would show on average, (B, 3, 64, 64), from fewer particles.
 
-    Particles are spread over image pixels by quadratic B-splines, which gives the number n of full-size particles to
-    expect in a pixel; the fraction of its fine pixels that they hit is ``1 - exp(-n / SATURATION)``.
+    Quadratic B-splines give the number n of full-size particles to expect in a pixel, which hit the fraction
+    ``1 - exp(-n / SATURATION)`` of its fine pixels.
     """
     hidden, background = shown.hidden_velocity, shown.background
     weight, ids = _splat_weights(shown)

@@ -1,8 +1,4 @@
-"""Crop and background of the observation as smooth functions, for losses on what the robot looks like.
-
-The uint8 image counts fine pixels that are hit, so it has no derivative. How far the smooth image is from it:
-``docs/concepts/gradients.md``.
-"""
+"""Crop and background of the observation as smooth functions; see ``docs/concepts/gradients.md``."""
 
 from __future__ import annotations
 
@@ -15,9 +11,7 @@ from dittogym.geometry import Box
 from dittogym.observation.image import BLOCK, RASTER, SIZE
 from dittogym.observation.raster import crop_corner
 
-#: Fine pixels by which truncation shifts a moving crop on average, and by which the rule of
-#: :func:`dittogym.observation.raster.draw_boxes` (left and upper edge in the box) shifts a box to the right and
-#: downwards.
+#: Fine pixels by which truncation shifts a moving crop, and the rule of ``draw_boxes`` a box, on average.
 HALF = 0.5
 
 

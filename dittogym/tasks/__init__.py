@@ -20,6 +20,7 @@ from dittogym.tasks.obstacle import obstacle
 from dittogym.tasks.run import run
 from dittogym.tasks.shapematch import shapematch
 from dittogym.tasks.slot import slot
+from torchmpm import checks
 
 #: Functions by task name; their keyword arguments are the task's own options.
 TASKS: dict[str, Callable[..., TaskSpec]] = {
@@ -94,15 +95,13 @@ def make_spec(
             raise ValueError(f"task must be one of {allowed}, got {task!r}")
         make = TASKS[task_name(task)]
         known = list(inspect.signature(make).parameters)
-        for name in options:
-            if name not in known:
-                names = ", ".join(("body", "obstacles", *known))
-                raise TypeError(
-                    f"task {task!r} has no option {name!r}; besides the arguments of TorchEnv it has: {names}"
-                )
+        if unknown := [name for name in options if name not in known]:
+            names = ", ".join(("body", "obstacles", *known))
+            raise TypeError(
+                f"task {task!r} has no option {unknown[0]!r}; besides the arguments of TorchEnv it has: {names}"
+            )
         spec = make(**options)
     if obstacles is not None:
-        if not isinstance(obstacles, Sequence) or not all(isinstance(item, Obstacle) for item in obstacles):
-            raise TypeError(f"obstacles must be a sequence of Obstacle, got {obstacles!r}")
+        checks.instances("obstacles", obstacles, Obstacle)
         spec = replace(spec, obstacles=tuple(obstacles))
     return spec if body is None else with_body(spec, body)

@@ -16,9 +16,8 @@ from test_compare import COMMON, MPC, PLAN, compare, sessions
 
 from baselines.compare.__main__ import main
 from baselines.compare.evaluations import Protocol
-from baselines.compare.executor import Resources, execute
+from baselines.compare.executor import LocalExecutor, Resources, execute, run_process
 from baselines.compare.jobs import Job
-from baselines.compare.local import LocalExecutor, run_process
 from baselines.compare.ray import RayExecutor
 from baselines.registry import configure
 from cfp.experiment.process import StopSignals
@@ -43,7 +42,7 @@ def job(tmp_path, monkeypatch):
 
 @pytest.fixture
 def use_program(monkeypatch):
-    return lambda program: monkeypatch.setattr("baselines.compare.local.WORKER", (sys.executable, "-c", program))
+    return lambda program: monkeypatch.setattr("baselines.compare.executor.WORKER", (sys.executable, "-c", program))
 
 
 class FakeRay(types.ModuleType):

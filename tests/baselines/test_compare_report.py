@@ -56,10 +56,10 @@ def write_run(job, scores, curve, *, successes=0, seconds=100.0, cases=(0.8, 0.5
     session |= {"device": "cpu"}
     write_json(job.folder / "sessions.json", {"finished": True, "sessions": [session]})
     protocol, task = replace(job.protocol, episodes=len(scores)), job.config.task
-    (first,) = protocol.batch_keys(task)
+    (first,) = protocol.batches(task)
     entries = {first: {"returns": scores, "successes": successes}}
-    for case, share in zip(protocol.cases()[1:], cases, strict=True):
-        (key,) = protocol.batch_keys(task, case)
+    for case, share in zip(protocol.disturbed_cases(), cases, strict=True):
+        (key,) = protocol.batches(task, case)
         found = share and {"returns": [share * sum(scores) / len(scores)], "successes": 0}
         entries[key] = found
     policy = "zero" if job.untrained else hashlib.sha256(newest.read_bytes()).hexdigest()
@@ -248,7 +248,7 @@ def test_failures_are_named(report):
 
 def test_page_shows_only_files_beside_it(report):
     page = (report / "index.html").read_text()
-    for name in ("curves.png", "minutes.png", "returns.png", "robustness.png", "returns.csv", "cost.csv"):
+    for name in ("curves.png", "minutes.png", "returns.png", "returns.csv", "cost.csv"):
         assert f'"{name}"' in page and (report / name).stat().st_size > 0
     assert "http" not in page
     balance = TagBalance()

@@ -253,4 +253,4 @@ def test_robustness_is_reported_whatever_trained_it(finished):
     rows = json.loads((folder / "robustness.json").read_text())
     assert rows[0]["case"] == "unperturbed" and rows[0]["ratio"] in (1, None)
     assert {row["episodes"] for row in rows} == {1}
-    assert baselines.load(folder).sees_image == any("observation" in row["case"] for row in rows)
+    assert baselines.load(folder).uses_image == any("observation" in row["case"] for row in rows)

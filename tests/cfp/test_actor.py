@@ -63,14 +63,6 @@ def test_small_actions_have_the_exact_log_prob():
     torch.testing.assert_close(log_prob, squashed.log_prob(action).flatten(1).sum(1), rtol=1e-5, atol=1e-3)
 
 
-def test_deterministic_action_is_the_tanh_of_the_mean():
-    actor = build_actor(ActorSpec((8,)))
-    image = images()
-    expected = torch.tanh(actor.mean(actor.encoder(normalise_image(image))))
-    torch.testing.assert_close(actor(image, deterministic=True), expected, rtol=1e-4, atol=1e-5)
-    assert not torch.equal(actor(image), expected)
-
-
 @pytest.mark.parametrize(("split", "scale"), [(False, 1.0), (True, 0.25)])
 @pytest.mark.parametrize("interpolation", ["half_pixel", "aligned"])
 def test_gate_blends_residual_and_coarse(split, scale, interpolation):
@@ -129,17 +121,6 @@ def test_closed_gates_leave_the_coarsest_field(task):
         assert 0 < share < 0.9
         for field in fields[1:]:
             torch.testing.assert_close(field, fields[0], rtol=0, atol=1e-5 * float(fields[0].abs().max()))
-
-
-def test_open_gate_leaves_the_residual_field():
-    torch.manual_seed(0)
-    actor = build_actor(ActorSpec((8, 16), (100.0,), patch=64))
-    image = images()
-    action, _, gate, _ = actor.sample(image, deterministic=True)
-    latent = actor.encoder(normalise_image(image), upsample(actor.coarse(image, True), 64, "half_pixel"))
-    torch.testing.assert_close(gate, torch.ones_like(gate))
-    expected = upsample(torch.tanh(actor.mean(latent)), 64, "half_pixel")
-    torch.testing.assert_close(action, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_composed_action_is_not_clipped():

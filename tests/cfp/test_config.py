@@ -69,50 +69,13 @@ def test_paper_presets_hold_the_published_numbers():
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"resolutions": (16, 8)}, "resolutions must be increasing"),
-        ({"resolutions": (8, 20)}, "resolutions"),
-        ({"alpha": (0.1,)}, "alpha must have 2 values"),
-        ({"gate_bias": (0.1, 0.2)}, "gate_bias must have 1 values"),
-        ({"handover": (30_000,)}, "handover"),
-        ({"steps": 0}, "steps must be at least 1, got 0"),
-    ],
-)
-def test_impossible_options_are_named(changes, message):
-    with pytest.raises(ConfigError, match=message):
-        replace(preset("run"), **changes).check()
-
-
-@pytest.mark.parametrize(
-    ("group", "changes", "message"),
-    [
-        ("environment", {"num_envs": 0}, "num_envs must be at least 1, got 0"),
-        ("learning", {"gamma": 1.5}, "gamma must be between 0 and 1, got 1.5"),
-        ("learning", {"learning_rate": 0.0}, "learning_rate"),
-        ("report", {"eval_episodes": 0}, "eval_episodes"),
-        ("report", {"video_every": -1}, "video_every must be at least 0, got -1"),
-    ],
-)
-def test_numbers_out_of_range_are_named(group, changes, message):
-    config = preset("run")
-    with pytest.raises(ConfigError, match=message):
-        replace(config, **{group: replace(getattr(config, group), **changes)}).check()
-
-
-@pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"stepz": 3}, "stepz is not an option"),
         ({"learning": {"gama": 3}}, "learning.gama is not an option"),
-        ({"steps": "many"}, "steps must be an integer, got 'many'"),
         ({"steps": True}, "steps"),
-        ({"learning": 3}, "learning must be an object, got 3"),
         ({"alpha": [0.1, "x"]}, "alpha must be a number, got 'x'"),
         ({"environment": {"dtype": "float16"}}, "dtype must be"),
         ({"environment": {"particles": [1, 2, 3]}}, "particles"),
-        ({"task": "jump"}, "task must be catch, dig"),
-        ({"preset": "slow"}, "preset must be quick or paper for shapematch, got 'slow'"),
     ],
 )
 def test_wrong_json_is_named(values, message):
@@ -151,25 +114,6 @@ def test_fewer_steps_shorten_every_level():
     assert half.handover == (config.handover[0] // 2,)
     explicit = parse(PROGRAM, ["--task", "run", "--steps", "1000", "--handover", "900"]).run
     assert explicit.handover == (900,)
-
-
-def test_what_was_given_stays_even_if_it_is_the_presets_value(tmp_path):
-    handover = preset("run").handover
-    given = ["--handover", str(handover[0])]
-    assert parse(PROGRAM, ["--task", "run", "--steps", "9600", *given]).run.handover == handover
-    paper = parse(PROGRAM, "--task run --preset paper --steps 1000000 --handover=301000".split()).run
-    assert paper.handover == (301_000,)
-    file = tmp_path / "options.json"
-    file.write_text(json.dumps({"task": "run", "handover": handover}))
-    assert parse(PROGRAM, ["--config", str(file), "--steps", "9600"]).run.handover == handover
-
-
-@pytest.mark.parametrize("options", [{"steps": 2400}, {"resolutions": [4, 8, 16]}, {"resolutions": [16], "steps": 99}])
-def test_the_rest_follows_a_file_as_it_follows_the_command_line(tmp_path, options):
-    file = tmp_path / "options.json"
-    file.write_text(json.dumps(options))
-    words = [f"--{name} {' '.join(map(str, np.atleast_1d(value)))}" for name, value in options.items()]
-    assert parse(PROGRAM, ["--config", str(file)]).run == parse(PROGRAM, " ".join(words).split()).run
 
 
 def test_ladder_of_any_length_can_be_asked_for():

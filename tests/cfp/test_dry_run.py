@@ -20,11 +20,6 @@ def test_dry_run_prints_the_options_and_writes_nothing(tmp_path, capsys, monkeyp
     assert (config.steps, config.handover, config.environment.particles) == (400, (267,), 100)
 
 
-def test_dry_run_refuses_what_the_run_would(capsys):
-    assert train.main(["--particles", "0", "--dry-run"]) == 2
-    assert "particles" in capsys.readouterr().err
-
-
 def test_stages_that_learn_nothing_are_named(tmp_path):
     def warnings(*options, first_stage=1):
         config = parse(train.PROGRAM, [*TINY, "--task", "run", *options]).run

@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from cfp.errors import CheckpointError
-from cfp.experiment.loggers import ProgressTable
 from cfp.files import write_atomically, write_json
 from cfp.tables import Table, read_table
 
@@ -60,19 +59,6 @@ def test_damaged_table_is_named(tmp_path, content):
         CheckpointError, match=r"evaluations\.csv: (column step must hold numbers, got 'abc'|cannot be read)"
     ):
         Table(path, last_step=30)
-
-
-def test_row_without_a_number_is_named(tmp_path):
-    (tmp_path / "t.csv").write_text("step,mean\n10,1.5\n20,\n")
-    assert len(read_table(tmp_path / "t.csv")) == 2
-    with pytest.raises(CheckpointError, match=r"t\.csv: column mean must hold numbers, got ''"):
-        read_table(tmp_path / "t.csv", ("step", "mean"))
-
-
-def test_progress_leaves_out_what_is_excluded(tmp_path):
-    writer = ProgressTable(Table(tmp_path / "p.csv"))
-    writer.write({"b": 1.0, "time/speed": 3.0}, {"b": ("",), "time/speed": ("csv",)}, step=5)
-    assert read_table(tmp_path / "p.csv") == [{"step": "5", "b": "1.0"}]
 
 
 def test_links_in_a_folder_of_a_stranger_are_not_written_through(tmp_path):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_train import run
+from tiny import run
 
 from cfp import train
 from cfp.evaluation.evaluate import evaluate
@@ -44,11 +44,6 @@ def test_plateau_hands_over_and_ends_the_run(scripted, tmp_path, capsys):
     assert rows == [(int(row["step"]), int(row["stage"])) for row in read_table(folder / "evaluations.csv")]
 
 
-def test_patience_needs_evaluations(tmp_path, capsys):
-    assert run(tmp_path / "a", "--patience", "2", "--eval-every", "0") == 2
-    assert "patience must be 0 without evaluations" in capsys.readouterr().err
-
-
 @pytest.fixture(scope="module")
 def coarse(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "coarse"
@@ -74,17 +69,10 @@ def test_second_level_starts_from_a_policy(coarse, tmp_path, name):
     ("options", "message"),
     [
         (["--task", "run"], "start_from must be a policy for run, got one for shapematch"),
-        (["--resolutions", "8", "16"], "start_from must be a policy of the first resolutions of (8, 16)"),
+        (["--refine", "--resolutions", "8", "16"], "start_from must be a policy of the first resolutions of (8, 16)"),
         (["--warm-critic"], "warm_critic must be False with start_from"),
         (["--start-from", "no/such"], "there is no policy"),
-        (["--action-layout", "grid"], "start_from must be a policy for action_layout grid, got image"),
         (["--target", "T"], "start_from must be a policy for the target T, got None"),
-        (["--substeps", "2"], "start_from must be a policy for substeps 2, got 1"),
-        (["--parity", "reference"], "start_from must be a policy for action_layout grid, got image"),
-        (
-            ["--refine", "--resolutions", "8", "16"],
-            "start_from must be a policy of the first resolutions of (8, 16)",
-        ),
     ],
 )
 def test_policy_that_does_not_fit_is_refused(coarse, tmp_path, capsys, options, message):
@@ -165,8 +153,3 @@ def test_refining_goes_on_with_the_weights_of_a_policy(coarse, tmp_path):
     assert {row["stage"] for row in read_table(tmp_path / "b" / "progress.csv")} == {"2"}
     fine, frozen = (PROGRAM.load(place).actor.state_dict() for place in (tmp_path / "b", coarse))
     assert all(torch.equal(fine[f"coarse.{key}"], value) for key, value in frozen.items())
-
-
-def test_refining_needs_a_policy(tmp_path, capsys):
-    assert run(tmp_path / "a", "--refine") == 2
-    assert "refine requires start_from" in capsys.readouterr().err

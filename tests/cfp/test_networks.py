@@ -4,7 +4,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from cfp.agent.actor import Actor, build_actor
-from cfp.agent.networks import Encoder, TwinCritic, make_head, normalise_image, upsample
+from cfp.agent.networks import Encoder, TwinCritic, make_head, upsample
 from cfp.agent.spec import ActorSpec
 
 
@@ -63,35 +63,6 @@ def test_upsampling_is_bicubic(before, after, interpolation):
     action = torch.randn(2, 2, before, before, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     expected = F.interpolate(action, size=(after, after), mode="bicubic", align_corners=interpolation == "aligned")
     torch.testing.assert_close(upsample(action, after, interpolation), expected, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("grad", [False, True])
-def test_encoder_equals_three_convolutions_over_the_stacked_image(grad):
-    torch.manual_seed(0)
-    encoder = Encoder(5, 32).double()
-    image = torch.rand(2, 3, 64, 64, dtype=torch.float64)
-    action = torch.rand(2, 2, 64, 64, dtype=torch.float64, requires_grad=grad)
-    line = (torch.arange(64, dtype=torch.float64) - 32) / 32
-    rows, columns = line[:, None].expand(64, 64), line[None].expand(64, 64)
-    stacked = torch.cat([image, action, rows.expand(2, 1, 64, 64), columns.expand(2, 1, 64, 64)], dim=1)
-    second, third = encoder.rest[1], encoder.rest[3]
-    expected = F.elu(F.conv2d(stacked, encoder.first.weight, encoder.first.bias, stride=4))
-    expected = F.elu(F.conv2d(expected, second.weight, second.bias, stride=2))
-    expected = F.elu(F.conv2d(expected, third.weight, third.bias))
-    latent = encoder(image, action)
-    assert latent.shape == (2, 32, 4, 4)
-    torch.testing.assert_close(latent, expected, rtol=0, atol=1e-12)
-    if grad:
-        (wanted,) = torch.autograd.grad(expected.square().sum(), action)
-        (got,) = torch.autograd.grad(latent.square().sum(), action)
-        torch.testing.assert_close(got, wanted, rtol=1e-10, atol=1e-12)
-
-
-def test_pixels_become_minus_one_to_one():
-    pixels = torch.tensor([0, 51, 255], dtype=torch.uint8)
-    torch.testing.assert_close(normalise_image(pixels), torch.tensor([-1.0, -0.6, 1.0]))
-    mapped = torch.tensor([0.25])
-    assert normalise_image(mapped) is mapped
 
 
 def test_linear_layers_are_xavier_and_constants_are_not_saved():

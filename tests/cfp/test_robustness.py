@@ -10,7 +10,6 @@ import torch
 from fakes import FakeEnv
 from scipy import stats
 
-import cfp
 from cfp import robustness
 from cfp.agent.actor import build_actor
 from cfp.config import to_json
@@ -25,7 +24,6 @@ from cfp.train import PROGRAM
 from cfp.weights import describe, save_policy
 from dittogym import make_spec
 from dittogym.action import bicubic
-from dittogym.geometry import floor
 from dittogym.tasks import TASKS
 
 
@@ -76,19 +74,10 @@ def test_blended_actions_are_disturbed_on_the_grid_that_they_were_decided_on():
     np.testing.assert_allclose(fine, bicubic(torch.from_numpy(coarse), 16).numpy(), atol=1e-6)
 
 
-def test_policy_of_two_levels_is_disturbed_on_its_finer_grid(tmp_path, monkeypatch):
-    config, grids = preset("run"), []
-    save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(2)), describe(config, 2, 0))
-    monkeypatch.setattr(robustness, "disturbed_env", lambda *given: grids.append(given[1:2] + given[5:]) or given)
-    monkeypatch.setattr(robustness, "evaluate", lambda *_, **__: None)
-    robustness.report(config, cfp.load(tmp_path), make_cases()[:1], 1)
-    assert grids == [(64, 16)]
-
-
 def test_lost_pixels_are_no_case_for_a_policy_without_eyes(folder):
     config, policies = open_run(PROGRAM, folder, "cpu")
     blind = policies["stage 2"]
-    blind.sees_image = False
+    blind.uses_image = False
     names = [result.name for result in robustness.report(config, blind, make_cases()[:4], 1)]
     assert names == ["unperturbed", "action dropout 20%", "action noise 0.2"]
 
@@ -125,10 +114,9 @@ def test_cases_that_change_nothing_in_a_task_are_left_out():
     assert "floor friction sticky" not in names["run"] and "floor friction 0" in names["run"]
 
 
-@pytest.mark.parametrize("degrees", [1, 2, 4, 30])
-def test_interval_is_student_s(degrees):
-    returns = np.random.default_rng(0).normal(size=degrees + 1)
-    low, high = stats.t.interval(0.95, degrees, returns.mean(), stats.sem(returns))
+def test_interval_is_student_s():
+    returns = np.random.default_rng(0).normal(size=5)
+    low, high = stats.t.interval(0.95, 4, returns.mean(), stats.sem(returns))
     assert Result("", 8, tuple(returns)).interval == pytest.approx((high - low) / 2, rel=1e-5)
     assert Result("", 8, (1.0,)).interval is None
 
@@ -210,29 +198,9 @@ def test_chosen_cases_that_change_nothing_are_refused(folder):
         robustness.check_words(make_cases(), words, replace(run, obstacles=tuple(ground)), policy)
     with pytest.raises(ConfigError, match="floor friction sticky: the floor of run has this friction"):
         robustness.check_words(make_cases(), ["sticky"], run, policy)
-    policy.sees_image = False
+    policy.uses_image = False
     with pytest.raises(ConfigError, match="observation dropout 20%: the policy does not use the image"):
         robustness.check_words(make_cases(), ["observation"], run, policy)
-
-
-def test_floor_counts_with_all_its_rules():
-    run, (slippery,) = make_spec("run"), floor(0.0).velocity_rules
-    rough = replace(slippery, friction=0.5)
-    for rules, reason in (
-        ((), "the floor of run has no rules"),
-        ((slippery,), "the floor of run has this friction"),
-        ((slippery, rough), ""),
-    ):
-        ground = replace(floor(), rules=rules)
-        assert reason_without_effect(Case("ice", friction=0.0), replace(run, obstacles=(ground,))) == reason
-
-
-WHAT = ("action", "observation")
-
-
-def test_cases_are_named_by_their_whole_share():
-    for share, name in ((0.004, "0.4%"), (0.125, "12.5%"), (0.2, "20%"), (0.07, "7%")):
-        assert [case.name for case in make_cases(share)[1:3]] == [f"{what} dropout {name}" for what in WHAT]
 
 
 def test_ratios_need_a_positive_return():
@@ -240,25 +208,3 @@ def test_ratios_need_a_positive_return():
     assert [row["ratio"] for row in rows] == [None, None]
     config = preset("dig")
     assert "not positive" in robustness.to_markdown(config, rows)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--dropout", "1.5"], "dropout must be between 0 and 1, got 1.5"),
-        (["--latency", "0"], "latency must be at least 1, got 0"),
-        (["--noise", "nan"], "noise must be positive and finite, got nan"),
-        (["--friction", "-1"], "friction must be at least 0 (inf sticks), got (-1.0,)"),
-        (["--device", "abacus"], "device must be auto, cpu or cuda, got 'abacus'"),
-        (["--cases", "noise", "gravity"], "that change something, got 'gravity'"),
-    ],
-)
-def test_wrong_option_is_one_line_and_exit_code_two(folder, capsys, arguments, message):
-    assert robustness.main([str(folder), *arguments]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and message in error
-
-
-def test_folder_without_a_run_is_an_error(tmp_path, capsys):
-    assert robustness.main([str(tmp_path)]) == 2
-    assert "there is no run" in capsys.readouterr().err

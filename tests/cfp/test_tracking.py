@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from test_train import run
+from tiny import assert_same_run, run
 
 from cfp import train
 from cfp.agent.actor import build_actor
@@ -23,102 +23,13 @@ from cfp.experiment.folder import EVALUATION_COLUMNS
 from cfp.experiment.loggers import EVALUATION_METRICS
 from cfp.tables import read_table
 
-SHORT = "--steps 110 --handover 70 --eval-every 70 --log-every 10".split()  # an episode ends in the first stage
 PAGE = (Path(__file__).parents[2] / "docs" / "scalars.md").read_text()
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("runs") / "short"
-    assert run(folder, *SHORT) == 0
-    return folder
-
-
 def events(folder):
-    read = EventAccumulator(str(folder / "tensorboard"))
+    read = EventAccumulator(str(folder / "tensorboard"), {"images": 0})
     read.Reload()
     return read
-
-
-def test_everything_written_is_explained_and_everything_explained_is_written(finished):
-    rows, wall_clock = METRICS | LOG_METRICS | ROLLOUT_METRICS, {"time/steps_per_second"}
-    columns = set(read_table(finished / "progress.csv")[0])
-    assert columns - {"step"} == set(rows) - wall_clock
-    read = events(finished)
-    assert set(read.Tags()["scalars"]) == set(rows) | set(EVALUATION_METRICS)
-    assert set(read.Tags()["images"]) == set(PICTURES)
-    assert set(read_table(finished / "evaluations.csv")[0]) == set(EVALUATION_COLUMNS)
-
-
-@pytest.mark.parametrize("package", ["cfp", "baselines"])
-def test_page_shows_every_table_of_names(package):
-    shown = set(" ".join(re.findall(r"\{names-table\} (.*)", PAGE)).split())
-    written = set()
-    root = Path(__file__).parents[2]
-    for path in (root / package).rglob("*.py"):
-        for name in re.findall(r"^([A-Z_]*(?:METRICS|PICTURES|COLUMNS)): dict\[str, str\]", path.read_text(), re.M):
-            written.add(".".join((*path.relative_to(root).with_suffix("").parts, name)))
-    assert written and written == {path for path in shown if path.startswith(f"{package}.")}
-    for path in written:
-        module, _, name = path.rpartition(".")
-        assert all(isinstance(text, str) and text for text in getattr(importlib.import_module(module), name).values())
-
-
-def test_evaluations_and_pictures_stand_at_their_steps(finished):
-    read, rows = events(finished), read_table(finished / "evaluations.csv")
-    points = [(event.step, event.value) for event in read.Scalars("eval/return")]
-    assert [step for step, _ in points] == [int(row["step"]) for row in rows] == [70, 70, 110]
-    np.testing.assert_allclose([value for _, value in points], [float(row["mean"]) for row in rows], rtol=1e-5)
-    assert [event.step for event in read.Images("picture/action")] == [70, 70, 110]
-    gates = read.Images("picture/gate")
-    assert [(event.step, event.height) for event in gates] == [(70, 192), (110, 192)]  # the first stage has none
-
-
-def test_muscles_are_red_where_they_pull_and_blue_where_they_push():
-    image = torch.zeros(2, 4, 4)
-    image[0, 0, 3], image[1, 2, 1] = 1.0, -0.5
-    picture = muscles(image)
-    assert picture.shape == (192, 386, 3) and picture.dtype == np.uint8
-    assert picture[20, 170].tolist() == [255, 0, 0]
-    assert picture[110, 194 + 70].tolist() == [128, 128, 255]
-    assert picture[100, 20].tolist() == [255, 255, 255]
-
-
-def test_pictures_show_the_mean_action_and_draw_no_random_number():
-    torch.manual_seed(0)
-    actor = build_actor(ActorSpec((8, 16), (100.0,), patch=64))
-    observation = torch.randint(0, 256, (1, 3, 64, 64), dtype=torch.uint8)
-    before = torch.get_rng_state()
-    pictures = policy_pictures(actor, observation)
-    assert torch.equal(torch.get_rng_state(), before)
-    assert set(pictures) == set(PICTURES)
-    expected = muscles(actor(observation, deterministic=True)[0].detach())
-    np.testing.assert_array_equal(pictures["picture/action"], expected)
-    assert pictures["picture/gate"][..., 0].min() == 0  # the line between the two
-    assert (pictures["picture/gate"][:, :192] == [255, 0, 0]).all()
-    assert pictures["picture/observation"][0, 0].tolist() == observation[0, :, 0, 0].tolist()
-
-
-def test_films_at_intervals_leave_learning_as_it_was(finished, tmp_path):
-    imageio = pytest.importorskip("imageio.v2")
-    pytest.importorskip("imageio_ffmpeg")
-    assert run(tmp_path / "run", *SHORT, "--video-every", "50") == 0
-    films = sorted((tmp_path / "run" / "videos").iterdir())
-    assert [film.name for film in films] == ["step000000050.mp4", "step000000100.mp4"]
-    with imageio.get_reader(films[1]) as film:
-        assert film.get_meta_data()["duration"] == pytest.approx(4.1, abs=0.15)
-    for name in ("progress.csv", "evaluations.csv", "results.json"):
-        assert (tmp_path / "run" / name).read_bytes() == (finished / name).read_bytes()
-    assert 'href="videos/step000000050.mp4"' in (tmp_path / "run" / "index.html").read_text()
-    assert "videos/" not in (finished / "index.html").read_text()
-
-
-def test_films_without_the_packages_are_refused_at_once(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("cfp.evaluation.video.find_spec", lambda name: None)
-    assert run(tmp_path / "run", "--video-every", "30") == 2
-    error = capsys.readouterr().err
-    assert "got 30" in error and "pip install 'torchmpm[video]'" in error
-    assert not (tmp_path / "run").exists()
 
 
 class FakeWandb(types.ModuleType):
@@ -155,9 +66,81 @@ def wandb(monkeypatch):
     return fake
 
 
+def test_everything_written_is_explained_and_everything_explained_is_written(finished):
+    rows, wall_clock = METRICS | LOG_METRICS | ROLLOUT_METRICS, {"time/steps_per_second"}
+    columns = set(read_table(finished / "progress.csv")[0])
+    assert columns - {"step"} == set(rows) - wall_clock
+    read = events(finished)
+    assert set(read.Tags()["scalars"]) == set(rows) | set(EVALUATION_METRICS)
+    assert set(read.Tags()["images"]) == set(PICTURES)
+    assert set(read_table(finished / "evaluations.csv")[0]) == set(EVALUATION_COLUMNS)
+
+
+@pytest.mark.parametrize("package", ["cfp", "baselines"])
+def test_page_shows_every_table_of_names(package):
+    shown = set(" ".join(re.findall(r"\{names-table\} (.*)", PAGE)).split())
+    written = set()
+    root = Path(__file__).parents[2]
+    for path in (root / package).rglob("*.py"):
+        for name in re.findall(r"^([A-Z_]*(?:METRICS|PICTURES|COLUMNS)): dict\[str, str\]", path.read_text(), re.M):
+            written.add(".".join((*path.relative_to(root).with_suffix("").parts, name)))
+    assert written and written == {path for path in shown if path.startswith(f"{package}.")}
+    for path in written:
+        module, _, name = path.rpartition(".")
+        assert all(isinstance(text, str) and text for text in getattr(importlib.import_module(module), name).values())
+
+
+def test_evaluations_and_pictures_stand_at_their_steps(finished):
+    read, rows = events(finished), read_table(finished / "evaluations.csv")
+    points = [(event.step, event.value) for event in read.Scalars("eval/return")]
+    assert [step for step, _ in points] == [int(row["step"]) for row in rows] == [60, 70, 70, 120, 150]
+    np.testing.assert_allclose([value for _, value in points], [float(row["mean"]) for row in rows], rtol=1e-5)
+    assert [event.step for event in read.Images("picture/action")] == [60, 70, 70, 120, 150]
+    gates = read.Images("picture/gate")  # the first stage has none
+    assert [(event.step, event.height) for event in gates] == [(70, 192), (120, 192), (150, 192)]
+
+
+def test_pictures_show_the_mean_action_and_draw_no_random_number():
+    torch.manual_seed(0)
+    actor = build_actor(ActorSpec((8, 16), (100.0,), patch=64))
+    observation = torch.randint(0, 256, (1, 3, 64, 64), dtype=torch.uint8)
+    before = torch.get_rng_state()
+    pictures = policy_pictures(actor, observation)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert set(pictures) == set(PICTURES)
+    expected = muscles(actor(observation, deterministic=True)[0].detach())
+    np.testing.assert_array_equal(pictures["picture/action"], expected)
+    assert pictures["picture/gate"][..., 0].min() == 0  # the line between the two
+    assert (pictures["picture/gate"][:, :192] == [255, 0, 0]).all()
+    assert pictures["picture/observation"][0, 0].tolist() == observation[0, :, 0, 0].tolist()
+
+
+def test_films_at_intervals_leave_learning_as_it_was(finished, wandb, tmp_path):
+    imageio = pytest.importorskip("imageio.v2")
+    pytest.importorskip("imageio_ffmpeg")
+    assert run(tmp_path / "run", "--video-every", "70", "--wandb", "online") == 0
+    films = sorted((tmp_path / "run" / "videos").iterdir())
+    assert [film.name for film in films] == ["step000000070.mp4", "step000000140.mp4"]
+    with imageio.get_reader(films[1]) as film:
+        assert film.get_meta_data()["duration"] == pytest.approx(4.1, abs=0.15)
+    assert_same_run(tmp_path / "run", finished)
+    assert 'href="videos/step000000070.mp4"' in (tmp_path / "run" / "index.html").read_text()
+    assert "videos/" not in (finished / "index.html").read_text()
+    sent = [(point["step"], point["video"][1]) for point in wandb.points if "video" in point]
+    assert sent == [(70, films[0].name), (140, films[1].name)]
+
+
+def test_films_without_the_packages_are_refused_at_once(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("cfp.evaluation.video.find_spec", lambda name: None)
+    assert run(tmp_path / "run", "--video-every", "30") == 2
+    error = capsys.readouterr().err
+    assert "got 30" in error and "pip install 'torchmpm[video]'" in error
+    assert not (tmp_path / "run").exists()
+
+
 def test_weights_and_biases_get_what_tensorboard_gets(wandb, finished, tmp_path):
     folder = tmp_path / "run"
-    assert run(folder, *SHORT, "--wandb", "offline", "--wandb-project", "mine") == 0
+    assert run(folder, "--wandb", "offline", "--wandb-project", "mine") == 0
     (options,) = wandb.started
     assert (options["mode"], options["project"], options["dir"]) == ("offline", "mine", str(folder))
     assert options["name"] == "cfp-shapematch-quick-0" and options["config"]["learning"]["batch_size"] == 4
@@ -166,32 +149,16 @@ def test_weights_and_biases_get_what_tensorboard_gets(wandb, finished, tmp_path)
     tags = events(finished).Tags()
     assert names == set(tags["scalars"]) | set(tags["images"])
     last = [point for point in wandb.points if "picture/gate" in point][-1]
-    assert last["step"] == 110 and last["picture/gate"] == ("image", (192, 386, 3))
+    assert last["step"] == 150 and last["picture/gate"] == ("image", (192, 386, 3))
     assert all(value is not None for point in wandb.points for value in point.values())
     assert (folder / "progress.csv").read_bytes() == (finished / "progress.csv").read_bytes()
-    assert train.main(["--out", str(folder), "--resume", "--steps", "130"]) == 0
+    assert train.main(["--out", str(folder), "--resume", "--steps", "170"]) == 0
     assert wandb.started[1]["id"] == options["id"] and wandb.started[1]["resume"] == "allow"
 
 
-def test_weights_and_biases_get_films(wandb, tmp_path):
-    pytest.importorskip("imageio_ffmpeg")
-    assert run(tmp_path / "run", "--steps", "30", "--handover", "20", "--video-every", "20", "--wandb", "online") == 0
-    assert wandb.started[0]["mode"] == "online"
-    assert [point for point in wandb.points if "video" in point] == [
-        {"step": 20, "video": ("video", "step000000020.mp4", "mp4")}
-    ]
-
-
-def test_nothing_is_imported_unless_asked_for(monkeypatch, tmp_path, capsys):
+def test_weights_and_biases_that_is_not_installed_is_refused_at_once(monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(sys.modules, "wandb", None)  # importing it raises ImportError
-    assert run(tmp_path / "off", "--steps", "30", "--handover", "20") == 0
     assert run(tmp_path / "on", "--wandb", "online") == 2
     error = capsys.readouterr().err
     assert "got 'online'" in error and "pip install 'torchmpm[wandb]'" in error
     assert not (tmp_path / "on").exists()
-
-
-def test_dry_run_sends_and_films_nothing(wandb, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert run(tmp_path / "run", "--wandb", "online", "--dry-run") == 0
-    assert not wandb.started and not list(tmp_path.iterdir())

@@ -3,7 +3,7 @@ import pytest
 import torch
 from fakes import FakeEnv
 
-from cfp.envs.vec_env import TorchVecEnv, monitored
+from cfp.envs.vec_env import TorchVecEnv
 
 
 def actions(env, value=0.0):
@@ -91,15 +91,6 @@ def test_options_that_differ_are_refused(others):
     env.set_options([{"physics": {"mu": np.full(3, 1.0)}}, *others])
     with pytest.raises(ValueError, match="options must be one dictionary for all 2 elements"):
         env.reset()
-
-
-def test_episode_sums_arrive_in_info():
-    env = monitored(FakeEnv(num_envs=2, horizon=2))
-    env.reset()
-    _, first, _, _ = env.step(actions(env))
-    _, second, _, infos = env.step(actions(env))
-    assert infos[1]["episode"]["r"] == pytest.approx(first[1] + second[1])
-    assert infos[1]["episode"]["l"] == 2
 
 
 def test_episode_in_progress_can_be_put_back():

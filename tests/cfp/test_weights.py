@@ -13,7 +13,7 @@ from cfp.agent.actor import build_actor
 from cfp.agent.networks import normalise_image
 from cfp.agent.policies import CFPPolicy
 from cfp.agent.spec import ActorSpec
-from cfp.errors import CheckpointError, ConfigError
+from cfp.errors import ConfigError
 from cfp.presets import preset
 from cfp.sections import EnvironmentConfig
 from cfp.weights import check_trained_for, describe, save_policy
@@ -51,8 +51,6 @@ def test_loaded_policy_acts_as_the_saved_one(saved, name):
     [
         (np.zeros((3, 64, 64), np.float32), r"float32 array of shape \(3, 64, 64\)"),  # such as a soft observation
         (np.zeros((64, 64, 3), np.uint8), r"uint8 array of shape \(64, 64, 3\)"),
-        (np.zeros((64, 64), np.uint8), r"uint8 array of shape \(64, 64\)"),
-        (np.zeros((1, 1, 3, 64, 64), np.uint8), r"uint8 array of shape \(1, 1, 3, 64, 64\)"),
         (torch.zeros(3, 64, 64, dtype=torch.uint8), "Tensor"),
     ],
 )
@@ -93,25 +91,6 @@ def test_default_of_a_task_may_be_named_or_not(task, option, one, other, same):
             else pytest.raises(ConfigError, match=f"must be a policy for the {option} {wanted}, got {given}")
         ):
             check_trained_for("start_from", description, task, EnvironmentConfig(**{option: wanted}))
-
-
-@pytest.mark.parametrize("damage", ["missing", "cut", "garbage", "foreign", "misfit"])
-def test_file_that_is_no_policy_is_refused(saved, damage):
-    folder, actor = saved
-    path = folder / "policy.safetensors"
-    content = path.read_bytes()
-    if damage == "missing":
-        path.unlink()
-    elif damage == "cut":
-        path.write_bytes(content[:-100])
-    elif damage == "garbage":
-        path.write_bytes(b"\x80\x04K\x01.")
-    elif damage == "foreign":
-        save_policy(path, actor, {"format": "other"})
-    else:
-        save_policy(path, actor, describe(replace(preset("shapematch"), resolutions=(8, 32)), 2, 0))
-    with pytest.raises(CheckpointError, match=r"policy\.safetensors: "):
-        cfp.load(path)
 
 
 def images(count=3):

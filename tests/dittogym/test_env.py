@@ -9,15 +9,11 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
+from tiny import SMALL, make_vec
 
 import dittogym
 
 IDS = [f"dittogym/{task}-{resolution}-v0" for task in dittogym.TASKS for resolution in ("coarse", "fine")]
-SMALL = {"particles": 200, "substeps": 2}
-
-
-def make_vec(num_envs: int = 2, name: str = IDS[0], **options) -> gymnasium.vector.VectorEnv:
-    return gymnasium.make_vec(name, num_envs=num_envs, vectorization_mode="vector_entry_point", **{**SMALL, **options})
 
 
 @pytest.mark.parametrize("name", IDS)
@@ -48,7 +44,7 @@ def test_step_and_info() -> None:
     assert reward == pytest.approx(sum(info["reward_terms"].values()), abs=1e-5)
     assert set(info["reward_terms"]) == {"location", "velocity", "split", "action", "alive", "failure"}
     assert info["is_success"] is False
-    assert env.unwrapped.state.x.shape == (1, 200, 2)
+    assert env.unwrapped.state.x.shape == (1, 120, 2)
 
 
 def episode(vector: gymnasium.vector.VectorEnv, steps: int) -> list[tuple]:
@@ -71,14 +67,7 @@ def test_same_step_autoreset() -> None:
 
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
 def test_info_of_a_new_episode_is_that_of_its_reset(mode: str) -> None:
-    vector = gymnasium.make_vec(
-        "dittogym/kick-coarse-v0",
-        num_envs=2,
-        vectorization_mode="vector_entry_point",
-        autoreset_mode=mode,
-        max_episode_steps=2,
-        **SMALL,
-    )
+    vector = make_vec("kick", autoreset_mode=mode, max_episode_steps=2)
     _, start = vector.reset(seed=0)
     action = np.ones(vector.action_space.shape, np.float32)
     info = [vector.step(action)[-1] for _ in range(3)][1 if mode == "SameStep" else 2]
@@ -90,7 +79,7 @@ def test_info_of_a_new_episode_is_that_of_its_reset(mode: str) -> None:
 
 
 def test_a_batch_without_a_time_limit() -> None:
-    rows = episode(make_vec(name="dittogym/shapematch-coarse-v0", max_episode_steps=-1, substeps=1), 31)
+    rows = episode(make_vec("shapematch", max_episode_steps=-1, substeps=1), 31)
     assert not any(row[3].any() for row in rows[1:])
     with pytest.raises(ValueError, match="max_episode_steps must be at least 1, got -2"):
         make_vec(max_episode_steps=-2)

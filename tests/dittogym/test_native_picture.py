@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny import TASKS, actions, tiny
+from tiny import TASKS, actions, set_particles, tiny
 
 import dittogym
 from dittogym import core
-from torchmpm import ParticleState
 from torchmpm.backends import compiler_found
 
 pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
@@ -20,12 +19,6 @@ def both(env: dittogym.TorchEnv) -> tuple[torch.Tensor, torch.Tensor]:
     assert env.model.camera.native
     plain = replace(env.model, camera=replace(env.model.camera, native=False, _drawings={}))
     return core.observe(env.model, env.env_state), core.observe(plain, env.env_state)
-
-
-def put(env: dittogym.TorchEnv, x: torch.Tensor, v: torch.Tensor) -> None:
-    """Replace positions and velocities."""
-    old = env.state
-    env.env_state = replace(env.env_state, particles=ParticleState(x, v, old.C, old.F, old.Jp))
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -40,7 +33,7 @@ def test_same_bytes(task: str, parity: str, dtype: str) -> None:
             env.step(action)
     generator = torch.Generator().manual_seed(0)
     x = env.state.x + 0.1 * torch.rand(env.state.x.shape, generator=generator, dtype=env.dtype)
-    put(env, x, 4.0 * torch.randn(x.shape, generator=generator, dtype=env.dtype))
+    set_particles(env, x=x, v=4.0 * torch.randn(x.shape, generator=generator, dtype=env.dtype))
     ours, plain = both(env)
     assert len(ours.unique()) > 20
     assert (ours.int() - plain.int()).abs().max() <= (env.model.camera.pixels is False)
@@ -55,7 +48,7 @@ def test_what_is_not_drawn(parity: str) -> None:
     x[0, 0, 0], x[0, 1, 1], v[0, 2, 0], v[0, 3, 1] = math.nan, math.inf, -math.inf, math.nan
     x[1, :5] = torch.tensor([[9.0, 0.3], [-9.0, 0.3], [0.0, 1e30], [0.0, -0.5], [1e-9, 1.0]], dtype=env.dtype)
     x[1, 5:10, 1] += 0.9
-    put(env, x, v)
+    set_particles(env, x=x, v=v)
     ours, plain = both(env)
     assert torch.equal(ours, plain)
 

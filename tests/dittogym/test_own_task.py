@@ -12,7 +12,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
-from tiny import SMALL, actions, assert_same_bits, everything, tiny
+from tiny import SMALL, actions, assert_same_bits, everything, make_vec, tiny
 
 import dittogym
 from dittogym.bodies.shapes import Disc, Rectangle
@@ -81,7 +81,7 @@ def test_its_own_reward_term_ending_and_success() -> None:
 
 def test_through_make_vec_and_torch() -> None:
     dittogym.register("hop", hop)
-    env = gymnasium.make_vec("dittogym/hop-coarse-v0", num_envs=3, vectorization_mode="vector_entry_point", **SMALL)
+    env = make_vec("hop", 3)
     single = gymnasium.make("dittogym/hop-coarse-v0", **SMALL)
     env.reset(seed=0)
     single.reset(seed=2)
@@ -142,24 +142,13 @@ def test_the_name_is_that_of_the_specification() -> None:
     assert "leap" not in dittogym.TASKS
 
 
-def test_the_horizon_of_an_option_counts_for_the_batch() -> None:
-    dittogym.register("hop", hop)
-    env = tiny("hop", horizon=2, substeps=1)
-    env.reset(seed=0)
-    assert [bool(env.step(action)[3]) for action in actions(env, 3)] == [False, True, True]
-
-
-def test_namespace_and_version() -> None:
+def test_namespace_and_versions() -> None:
+    for version in (0, 1):
+        dittogym.register("hop", hop, version=version)
+    assert {"dittogym/hop-coarse-v0", "dittogym/hop-coarse-v1"} <= set(gymnasium.registry)
     dittogym.register("hop", hop, namespace="mine", version=3)
     assert {"mine/hop-coarse-v3", "mine/hop-fine-v3"} <= set(gymnasium.registry)
-    assert "dittogym/hop-coarse-v0" not in gymnasium.registry
     assert gymnasium.make("mine/hop-fine-v3", **SMALL).action_space.shape == (2, 8, 8)
-
-
-def test_a_second_version_of_the_same_function() -> None:
-    dittogym.register("hop", hop)
-    dittogym.register("hop", hop, version=1)
-    assert {"dittogym/hop-coarse-v0", "dittogym/hop-coarse-v1"} <= set(gymnasium.registry)
 
 
 def test_a_taken_name_is_refused() -> None:
@@ -237,12 +226,6 @@ def test_memory_and_objects_of_a_task_of_ones_own() -> None:
     assert "is_success" not in info
 
 
-def test_an_outcome_without_info() -> None:
-    env = tiny(dataclasses.replace(hop(), reward_fn=lambda moment, spec: height(moment, spec)._replace(info=None)))
-    env.reset(seed=0)
-    assert set(env.step(actions(env, 1)[0])[-1]) == {"reward_terms", "com", "split", "finite", "is_success"}
-
-
 def test_a_reset_of_some_elements_leaves_the_others_alone() -> None:
     """Only the positions and images of the elements that are reset are computed."""
     sizes = []
@@ -315,16 +298,10 @@ def test_a_target_that_is_replaced_is_rewarded() -> None:
             "initial_memory of task 'hop' must return tensors by name, got NoneType",
         ),
         (
-            lambda moment, spec: moment.now.com,
-            TypeError,
-            r"must return tensors by name, got torch.float64 of shape \(1, 2\)",
-        ),
-        (
             lambda moment, spec: {"peak": 1.0},
             ValueError,
             r"must return memory of shape \(B, ...\), got float for 'peak'",
         ),
-        (lambda moment, spec: {"peak": torch.tensor(1.0)}, ValueError, r"got torch.float32 of shape \(\) for 'peak'"),
     ],
 )
 def test_memory_that_cannot_be_kept_is_refused(remembered: object, error: type, message: str) -> None:
@@ -334,9 +311,7 @@ def test_memory_that_cannot_be_kept_is_refused(remembered: object, error: type, 
 
 def test_names_that_a_reset_cannot_leave_stale_are_refused() -> None:
     spec = dataclasses.replace(hop(), initial_memory=initial_peak, stale_memory=("summit",))
-    with pytest.raises(
-        ValueError, match=r"stale_memory of task 'hop' must be names that initial_memory returns, .* \['summit'\]"
-    ):
+    with pytest.raises(ValueError, match=r"stale_memory names, got \['peak'\] without \['summit'\]"):
         tiny(spec).reset(seed=0)
     with pytest.raises(TypeError, match="stale_memory must be a sequence of str, got 'summit'"):
         dataclasses.replace(hop(), stale_memory="summit")
@@ -389,12 +364,10 @@ def test_a_longer_limit_than_the_horizon() -> None:
         ({"terms": {"alive": torch.zeros(2)}}, r"must not return the engine's own terms, got \['alive'\]"),
         ({"info": {"com": torch.zeros(2)}}, r"must not return the engine's own info, got \['com'\]"),
         ({"info": {"risen": 1.0}}, r"must return info of shape \(B, ...\), got float for 'risen'"),
-        ({"info": {"risen": torch.tensor(1.0)}}, r"got torch.float32 of shape \(\) for 'risen'"),
         (
             {"memory": {"best": torch.zeros(2)}},
             r"memory like that of initial_memory, {'first': .*got {'best': 'torch.float32",
         ),
-        ({"memory": {}}, r"memory like that of initial_memory, {'first': .*, got {}"),
         ({"memory": {"first": torch.zeros(2)}}, r"{'first': 'torch.float64 of shape \(2, 2\)'}, got {'first': 'torch"),
     ],
 )
@@ -414,9 +387,7 @@ def test_an_outcome_that_would_do_harm_later_is_refused(changes: dict, message: 
 def test_a_horizon_among_the_options_holds_through_gymnasium() -> None:
     dittogym.register("hop", hop)
     single = gymnasium.make("dittogym/hop-coarse-v0", horizon=3, **SMALL)
-    batch = gymnasium.make_vec(
-        "dittogym/hop-coarse-v0", num_envs=2, vectorization_mode="vector_entry_point", horizon=3, **SMALL
-    )
+    batch = make_vec("hop", horizon=3)
     single.reset(seed=0)
     batch.reset(seed=0)
     ends = [single.step(np.zeros((2, 4, 4), np.float32))[3] for _ in range(3)]

@@ -7,13 +7,12 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from tiny import SMALL, TASKS, actions, assert_same_bits, everything, stir, tiny
+from tiny import SMALL, TASKS, actions, assert_same_bits, everything, make_vec, set_particles, stir, tiny
 
 import dittogym
 from dittogym import TorchEnv
 from dittogym.physics import NAMES
 from dittogym.render.frame import CONTRACT
-from torchmpm import ParticleState
 
 DT = 1e-4
 OWN = {name: getattr(dittogym.make_spec("kick"), name) for name in NAMES if name != "mass"} | {"mass": 1.0}
@@ -30,13 +29,6 @@ def alike(env: TorchEnv, **physics: object) -> TorchEnv:
     env.reset(seed=0)
     env.reset(options={"physics": physics, "positions": env.state.x[0].clone()})
     return env
-
-
-def set_particles(env: TorchEnv, **fields: torch.Tensor) -> None:
-    """Put other values in place of fields of the particles."""
-    own = env.state
-    values = {name: fields.get(name, getattr(own, name)) for name in ("x", "v", "C", "F", "Jp")}
-    env.env_state = replace(env.env_state, particles=ParticleState(**values))
 
 
 def drive(env: TorchEnv, level: float = 1.0) -> torch.Tensor:
@@ -90,9 +82,7 @@ def test_through_gymnasium() -> None:
     env = gymnasium.make("dittogym/run-coarse-v0", **SMALL)
     env.reset(seed=0, options={"physics": {"gravity": (0.0, 0.0), "mu": 100}})
     assert env.unwrapped.torch_env.env_state.physics["mu"].tolist() == [100.0]
-    vector = gymnasium.make_vec(
-        "dittogym/run-coarse-v0", num_envs=2, vectorization_mode="vector_entry_point", max_episode_steps=2, **SMALL
-    )
+    vector = make_vec(max_episode_steps=2)
     vector.reset(seed=0, options={"physics": {"mu": np.array([100.0, 200.0])}})
     for _ in range(3):  # through an autoreset
         vector.step(np.zeros(vector.action_space.shape, np.float32))
@@ -319,7 +309,6 @@ def test_gradients_stay_with_the_masked_elements() -> None:
         ({"mu": [1.0, -2.0]}, r"physics\['mu'\] must be finite, positive, got -2.0"),
         ({"yield_stress": -1.0}, r"physics\['yield_stress'\] must be finite, not negative"),
         ({"mu": float("nan")}, r"physics\['mu'\] must be finite, positive, got nan"),
-        ({"lam": float("inf")}, r"physics\['lam'\] must be finite, got inf"),
         ({"lam": -1e6}, "stiffness not negative"),
         ({"gravity": (0.0, float("nan"))}, r"physics\['gravity'\] must be finite, got nan"),
     ],

@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from tiny import SMALL, TASKS, actions, assert_same_bits, everything, stir, tiny
+from tiny import SMALL, TASKS, actions, assert_same_bits, everything, make_vec, stir, tiny
 
 from dittogym import TorchEnv
 from dittogym.torch_env import Snapshot
@@ -47,9 +47,11 @@ def test_a_loaded_moment_goes_on_as_it_would_have(task: str, dtype: str) -> None
 
 
 @pytest.mark.parametrize("task", ["grow", "catch", "slot", "run"])
-def test_through_gymnasium_make(task: str) -> None:
-    """The future from a moment, behind all wrappers."""
-    env = gymnasium.make(f"dittogym/{task}-coarse-v0", **SMALL)
+@pytest.mark.parametrize("mode", [None, "SameStep", "NextStep", "Disabled"])
+def test_through_gymnasium(task: str, mode: str | None) -> None:
+    """The future from a moment, behind all wrappers, and of a batch in each mode."""
+    single = gymnasium.make(f"dittogym/{task}-coarse-v0", **SMALL)
+    env = single if mode is None else make_vec(task, autoreset_mode=mode)
     env.reset(seed=2)
     env.action_space.seed(0)
     drive = [env.action_space.sample() for _ in range(2 + STEPS)]
@@ -62,32 +64,9 @@ def test_through_gymnasium_make(task: str) -> None:
     assert_same_bits([env.step(action) for action in drive[2:]], future)
 
 
-@pytest.mark.parametrize("task", ["grow", "catch", "slot", "run"])
-@pytest.mark.parametrize("mode", ["SameStep", "NextStep", "Disabled"])
-def test_through_make_vec(task: str, mode: str) -> None:
-    name = f"dittogym/{task}-coarse-v0"
-    env = gymnasium.make_vec(name, num_envs=2, vectorization_mode="vector_entry_point", autoreset_mode=mode, **SMALL)
-    env.reset(seed=2)
-    env.action_space.seed(0)
-    drive = [env.action_space.sample() for _ in range(2 + STEPS)]
-    seen = [env.step(action) for action in drive[:2]][-1][0]
-    moment = env.unwrapped.save()
-    future = [env.step(action) for action in drive[2:]]
-    env.reset(seed=8)
-    assert np.array_equal(env.unwrapped.load(moment), seen)
-    assert_same_bits([env.step(action) for action in drive[2:]], future)
-
-
 def test_an_ended_element_goes_on_from_a_loaded_moment() -> None:
     """Its reset, due in the next call, is off; the step count of the moment is back."""
-    env = gymnasium.make_vec(
-        "dittogym/run-coarse-v0",
-        num_envs=2,
-        vectorization_mode="vector_entry_point",
-        max_episode_steps=3,
-        autoreset_mode="NextStep",
-        **SMALL,
-    )
+    env = make_vec(max_episode_steps=3, autoreset_mode="NextStep")
     env.reset(seed=0)
     action = np.ones(env.action_space.shape, np.float32)
     env.step(action)
@@ -172,19 +151,6 @@ def test_a_snapshot_is_not_changed_by_what_follows() -> None:
     env.load(moment, mask=[True, False])
     env.state.x[:] += 0.1
     assert_same_bits(contents(moment), wanted)
-
-
-@torch.no_grad()
-def test_the_step_count_is_part_of_a_moment() -> None:
-    env = tiny("shapematch", substeps=1, particles=20)
-    env.reset(seed=0)
-    still = torch.zeros(1, *env.action_shape, dtype=env.dtype)
-    for _ in range(28):
-        env.step(still)
-    moment = env.save()
-    env.reset()
-    env.load(moment)
-    assert [bool(env.step(still)[3]) for _ in range(2)] == [False, True]
 
 
 @torch.no_grad()

@@ -7,23 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tiny import actions
 
 import dittogym
 from dittogym import TorchEnv
 from dittogym.core import FAILURE_REWARD
 from dittogym.observation.camera import per_particle
 
-TASKS = ("run", "shapematch")
-
 
 def small(task: str = "run", num_envs: int = 1, **options) -> TorchEnv:
     options = {"particles": 300, "substeps": 10, "dtype": "float64", **options}
     return TorchEnv(task, num_envs, **options)
-
-
-def actions(env: TorchEnv, steps: int, seed: int = 0) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return 2 * torch.rand(steps, env.num_envs, *env.action_shape, generator=generator, dtype=env.dtype) - 1
 
 
 def test_layouts_follow_seeds() -> None:
@@ -237,13 +231,6 @@ def test_the_centre_of_a_broken_simulation_is_the_last_that_was_finite() -> None
     for spoilt in (torch.nan, 1e30):
         env.env_state = replace(env.env_state, particles=replace(state.particles, x=state.particles.x * spoilt))
         assert env.render(0).shape == (512, 512, 3)
-
-
-def test_truncation_at_the_horizon() -> None:
-    env = small("shapematch", substeps=1, particles=20)
-    env.reset(seed=0)
-    limits = [bool(env.step(torch.zeros(1, *env.action_shape, dtype=env.dtype))[3]) for _ in range(31)]
-    assert limits == [False] * 29 + [True] * 2
 
 
 def test_image_layout_acts_where_it_looks() -> None:

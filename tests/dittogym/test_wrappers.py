@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import wrappers
-from tiny import SMALL
+from tiny import SMALL, make_vec
 from torch.nn.functional import interpolate
 
 from dittogym.wrappers import action_resolution, observation_resolution
@@ -21,9 +21,8 @@ def single(**options) -> gymnasium.Env:
     return gymnasium.make(NAME, **{**SMALL, **options})
 
 
-def batch(num_envs: int = 2, autoreset_mode: str = "NextStep", **options) -> gymnasium.vector.VectorEnv:
-    options = {**SMALL, "autoreset_mode": autoreset_mode, **options}
-    return gymnasium.make_vec(NAME, num_envs=num_envs, vectorization_mode="vector_entry_point", **options)
+def batch(autoreset_mode: str = "NextStep", **options) -> gymnasium.vector.VectorEnv:
+    return make_vec(autoreset_mode=autoreset_mode, **options)
 
 
 def bicubic(action: np.ndarray, size: int) -> np.ndarray:
@@ -33,29 +32,15 @@ def bicubic(action: np.ndarray, size: int) -> np.ndarray:
     return large.reshape(*action.shape[:-2], size, size).numpy()
 
 
-@pytest.mark.parametrize("size", [1, 3, 4, 8])
-def test_spaces_of_actions(size: int) -> None:
-    env, vector = action_resolution(single(), size), action_resolution(batch(3), size)
-    assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (2, size, size), np.float32)
-    assert vector.single_action_space == env.action_space
-    assert vector.action_space.shape == (3, 2, size, size) and vector.num_envs == 3
-    assert env.observation_space.shape == (3, 64, 64)
-    env.reset(seed=0)
-    vector.reset(seed=0)
+@pytest.mark.parametrize("make", [single, batch])
+@pytest.mark.parametrize(("size", "pixels"), [(1, 1), (3, 48), (8, 64)])
+def test_spaces(make, size: int, pixels: int) -> None:
+    env = observation_resolution(action_resolution(make(), size), pixels)
+    prefix = "single_" if make is batch else ""
+    assert getattr(env, prefix + "action_space") == gymnasium.spaces.Box(-1.0, 1.0, (2, size, size), np.float32)
+    assert getattr(env, prefix + "observation_space") == gymnasium.spaces.Box(0, 255, (3, pixels, pixels), np.uint8)
+    assert env.observation_space.contains(env.reset(seed=0)[0])
     assert env.observation_space.contains(env.step(env.action_space.sample())[0])
-    assert vector.observation_space.contains(vector.step(vector.action_space.sample())[0])
-
-
-@pytest.mark.parametrize("size", [1, 16, 48, 64])
-def test_spaces_of_observations(size: int) -> None:
-    env, vector = observation_resolution(single(), size), observation_resolution(batch(3), size)
-    assert env.observation_space == gymnasium.spaces.Box(0, 255, (3, size, size), np.uint8)
-    assert vector.single_observation_space == env.observation_space
-    assert vector.observation_space.shape == (3, 3, size, size)
-    for e in (env, vector):
-        first, _ = e.reset(seed=0)
-        assert e.observation_space.contains(first)
-        assert e.observation_space.contains(e.step(e.action_space.sample())[0])
 
 
 @pytest.mark.parametrize("size", [1, 3, 4, 8])
@@ -177,11 +162,8 @@ def test_a_real_video(tmp_path: Path) -> None:
 
 
 def test_observations_of_environments_that_reset_in_the_same_step() -> None:
-    plain, small = (
-        batch(autoreset_mode="SameStep", max_episode_steps=2),
-        batch(autoreset_mode="SameStep", max_episode_steps=2),
-    )
-    small = observation_resolution(small, 16)
+    plain, whole_size = (batch(autoreset_mode="SameStep", max_episode_steps=2) for _ in range(2))
+    small = observation_resolution(whole_size, 16)
     plain.reset(seed=0)
     assert small.reset(seed=0)[0].shape == (2, 3, 16, 16)
     action = np.zeros(plain.action_space.shape, np.float32)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 
 import dittogym
-from torchmpm import tree
+from torchmpm import ParticleState, tree
 
 TASKS = tuple(dittogym.TASKS)
 #: Tasks whose window stays where it is.
@@ -20,6 +22,13 @@ SMALL = {"particles": 120, "substeps": 4}
 def tiny(task: str | dittogym.TaskSpec, num_envs: int = 1, **options: Any) -> dittogym.TorchEnv:
     """A batch in float64 with few particles."""
     return dittogym.TorchEnv(task, num_envs, **{**SMALL, "dtype": "float64", **options})
+
+
+def make_vec(task: str = "run", num_envs: int = 2, **options: Any) -> gymnasium.vector.VectorEnv:
+    """The same task behind Gymnasium's vector interface."""
+    name = f"dittogym/{task}-coarse-v0"
+    options = {**SMALL, **options}
+    return gymnasium.make_vec(name, num_envs=num_envs, vectorization_mode="vector_entry_point", **options)
 
 
 def actions(env: dittogym.TorchEnv, steps: int, seed: int = 0) -> torch.Tensor:
@@ -34,6 +43,12 @@ def stir(env: dittogym.TorchEnv, seed: int = 0) -> None:
     for i in range(env.num_envs):
         generator = torch.Generator().manual_seed(seed + i)
         env.state.v[i] += torch.randn(env.state.v[i].shape, generator=generator, dtype=torch.float64).to(env.dtype)
+
+
+def set_particles(env: dittogym.TorchEnv, **fields: torch.Tensor) -> None:
+    """Put other values in place of fields of the particles."""
+    own = {name: fields.get(name, getattr(env.state, name)) for name in ("x", "v", "C", "F", "Jp")}
+    env.env_state = replace(env.env_state, particles=ParticleState(**own))
 
 
 def leaves(value: Any, path: str = "") -> Iterator[tuple[str, np.ndarray]]:

@@ -27,12 +27,7 @@ def positions(count: int, batch: int = 1, corner: tuple[float, float] = (0.35, 0
 
 
 def lively(
-    count: int,
-    batch: int = 1,
-    *,
-    corner: tuple[float, float] = (0.35, 0.35),
-    strain: float = 0.05,
-    seed: int = 0,
+    count: int, batch: int = 1, *, corner: tuple[float, float] = (0.35, 0.35), strain: float = 0.05, seed: int = 0
 ) -> ParticleState:
     """Particles in a box with random velocities, affine matrices and deformations (det F > 0)."""
     draw = generator(seed)

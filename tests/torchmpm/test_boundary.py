@@ -146,9 +146,7 @@ def sequential(rules: tuple[VelocityRule, ...], velocity: Tensor, origin: Tensor
 
 
 END = st.none() | st.integers(-3, R + 2)
-RANGE = st.tuples(END, END).map(
-    lambda ends: ends if None in ends or ends[0] <= ends[1] else (ends[1], ends[0]),
-)
+RANGE = st.tuples(END, END).map(lambda ends: ends if None in ends or ends[0] <= ends[1] else (ends[1], ends[0]))
 DIRECTION = st.sampled_from(["+x", "-x", "+y", "-y"])
 FRAME = st.sampled_from(["world", "window"])
 

@@ -145,8 +145,7 @@ def test_a_state_lasts_until_its_replay() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "changed"),
-    [("mu", r"bodies\[0\].material.mu"), ("volume", r"bodies\[0\].volume"), ("origin",) * 2],
+    ("name", "changed"), [("mu", r"bodies\[0\].material.mu"), ("volume", r"bodies\[0\].volume"), ("origin",) * 2]
 )
 def test_a_step_reads_the_same_in_the_backward_pass(name: str, changed: str) -> None:
     """Eagerly its segments are replayed; no change, or one after the gradient, is no error."""

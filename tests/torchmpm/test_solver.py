@@ -10,17 +10,7 @@ import numpy as np
 import pytest
 import scenes
 import torch
-from scenes import (
-    GRID,
-    assert_close,
-    assert_identical,
-    generator,
-    lively,
-    normal,
-    positions,
-    robot,
-    robot_and_ball,
-)
+from scenes import GRID, assert_close, assert_identical, generator, lively, normal, positions, robot, robot_and_ball
 from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VelocityRule, VonMises, diagnostics, fixed

@@ -118,14 +118,16 @@ class Kernels:
 
     def tape_limit(self, planes: Tensor, segment: Segment = "auto") -> int:
         """How many substeps of planes (13, B, N) the adjoint can replay at once, at most ``segment``."""
-        rows, batch, particles = planes.shape
         if planes.is_cuda:
-            limit = CUDA_TAPE_BYTES // (planes.element_size() * rows * particles * batch)
+            limit = CUDA_TAPE_BYTES // (planes.element_size() * planes.numel())
         else:
-            nodes = 3 * self.grid.width**2
-            substep = planes.element_size() * (rows * particles + nodes) * min(batch, torch.get_num_threads())
-            limit = call.KEPT_BYTES // substep
+            limit = call.KEPT_BYTES // (self.tape_bytes(planes) * min(planes.shape[1], torch.get_num_threads()))
         return max(1, min(limit, segment) if isinstance(segment, int) else limit)
+
+    def tape_bytes(self, planes: Tensor, share: float = 1.0) -> int:
+        """Bytes of a substep of one simulation on the tape on the CPU, with this share of the nodes near particles."""
+        rows, _, particles = planes.shape
+        return planes.element_size() * (rows * particles + int(share * 3 * self.grid.width**2))
 
 
 @functools.cache

@@ -1,7 +1,6 @@
 """The observation as one C++ function, for CPUs with a compiler.
 
-It is compiled, kept and loaded like the kernels of ``torchmpm.native``. With the pixel raster it yields the same bytes
-as ``dittogym.observation.raster``; splats are summed in another order, so that a byte may differ by one.
+With the pixel raster it yields the same bytes as ``dittogym.observation.raster``; splats may differ by one.
 """
 
 from __future__ import annotations

@@ -106,7 +106,8 @@ template <class Real> struct Drawing {
         }
     }
 
-    static bool between(Real value, Real low, Real high, bool closed) {
+    static bool between(Real value, const double* ends, bool closed) {
+        const Real low = Real(ends[0]), high = Real(ends[1]);
         return closed ? value >= low && value <= high : value > low && value < high;
     }
 
@@ -117,10 +118,10 @@ template <class Real> struct Drawing {
             const double* box = picture.box + 5 * b;
             std::array<uint64_t, WORDS> across{};
             for (int c = 0; c < FINE; ++c)
-                if (between(Real(float(column + c) / RASTER) + left, Real(box[0]), Real(box[1]), box[4] != 0))
+                if (between(Real(float(column + c) / RASTER) + left, box, box[4] != 0))
                     across[c / 64] |= uint64_t(1) << (c % 64);
             for (int r = 0; r < FINE; ++r)
-                if (between(Real(float(RASTER - row - r) / RASTER) + bottom, Real(box[2]), Real(box[3]), box[4] != 0))
+                if (between(Real(float(RASTER - row - r) / RASTER) + bottom, box + 2, box[4] != 0))
                     for (int w = 0; w < WORDS; ++w) covered[r * WORDS + w] |= across[w];
         }
         const uint8_t* bytes = reinterpret_cast<const uint8_t*>(covered.data());

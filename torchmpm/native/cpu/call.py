@@ -40,33 +40,13 @@ def library_for(dtype: torch.dtype) -> ctypes.CDLL:
 
 
 def run(inputs: Inputs, handle: int, substeps: int, **outputs: Tensor) -> None:
-    """Advance all simulations and write ``result``, or go back through the substeps and write some of :data:`BARS`."""
-    call, library = _make_call(inputs, handle, substeps, outputs), library_for(inputs.planes.dtype)
-    function = getattr(library, f"torchmpm_{_direction(outputs)}")
-    with _scratch(_measure(call, inputs.planes.dtype, outputs)) as scratch:
-        if function(ctypes.byref(call), ctypes.c_void_p(scratch)):
-            raise MemoryError("backend 'native' ran out of memory")
+    """Advance all simulations and write ``result``, or go back through the substeps and write some of :data:`BARS`.
 
-
-def scratch_bytes(inputs: Inputs, handle: int, substeps: int, **outputs: Tensor) -> int:
-    """Bytes of scratch memory that :func:`run` asks for; only the sizes of the tensors count."""
-    return _measure(_make_call(inputs, handle, substeps, outputs), inputs.planes.dtype, outputs)
-
-
-def _direction(outputs: dict[str, Tensor]) -> str:
-    return "forward" if "result" in outputs else "backward"
-
-
-def _measure(call: _Call, dtype: torch.dtype, outputs: dict[str, Tensor]) -> int:
-    measure = getattr(library_for(dtype), f"torchmpm_{_direction(outputs)}_bytes")
-    measure.restype = ctypes.c_size_t
-    return int(measure(ctypes.byref(call)))
-
-
-def _make_call(inputs: Inputs, handle: int, substeps: int, outputs: dict[str, Tensor]) -> _Call:
-    batch, particles = inputs.planes.shape[1:]
-    tensors = inputs._asdict() | outputs
-    return _Call(
+    All tensors are contiguous.
+    """
+    name = "torchmpm_forward" if "result" in outputs else "torchmpm_backward"
+    library, (_, batch, particles) = library_for(inputs.planes.dtype), inputs.planes.shape
+    call = _Call(
         batch=batch,
         particles=particles,
         substeps=substeps,
@@ -75,13 +55,13 @@ def _make_call(inputs: Inputs, handle: int, substeps: int, outputs: dict[str, Te
         values_batch=inputs.values.shape[1],
         columns=inputs.values.shape[2],
         **thread_pool(),
-        **{name: _address(tensor) for name, tensor in tensors.items()},
+        **{name: tensor.data_ptr() for name, tensor in (inputs._asdict() | outputs).items() if tensor is not None},
     )
-
-
-def _address(tensor: Tensor | None) -> int | None:
-    assert tensor is None or tensor.is_contiguous()
-    return None if tensor is None else tensor.data_ptr()
+    function, measure = getattr(library, name), getattr(library, f"{name}_bytes")
+    measure.restype = ctypes.c_size_t
+    with _scratch(measure(ctypes.byref(call))) as scratch:
+        if function(ctypes.byref(call), ctypes.c_void_p(scratch)):
+            raise MemoryError("backend 'native' ran out of memory")
 
 
 @contextmanager
