@@ -91,7 +91,11 @@ class RunConfig:
                     raise ConfigError(f"{name.split('.')[-1]} requires {required}, got {value!r} without it")
 
     def check(self) -> None:
-        """Raise a `ConfigError` for options that are wrong."""
+        """Check what the types do not express.
+
+        Raises:
+            ConfigError: An option is wrong.
+        """
         check_task(self.task)
         _check_finite(self)
         if not 0 <= self.seed <= LARGEST_SEED:
@@ -168,7 +172,7 @@ class StagedConfig(RunConfig):
         return super().ineffective() | single
 
     def check(self) -> None:
-        """Raise a `ConfigError` for options that are wrong."""
+        """Check what the types do not express."""
         super().check()
         if max(self.resolutions, default=0) > (patch := make_spec(self.task).patch):
             raise ConfigError(f"resolutions must be at most {patch} in {self.task}, got {self.resolutions}")
@@ -224,11 +228,7 @@ class Config(StagedConfig):
         return super().ineffective() | anchor | warm
 
     def check(self) -> None:
-        """Check what the types do not express.
-
-        Raises:
-            ConfigError: An option is wrong.
-        """
+        """Check what the types do not express."""
         super().check()
         for name in ("random_steps", "alpha", "gate_penalty"):
             for value in getattr(self, name):

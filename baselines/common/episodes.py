@@ -8,21 +8,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from baselines.common.stateful import Stateful
 from cfp.envs.vec_env import TorchVecEnv
 from dittogym import TorchEnv
 
 
-class Episodes:
+class Episodes(Stateful):
     """Ends the episodes of an environment and starts new ones.
 
     Episodes are truncated after ``max_episode_steps``; the first one of element i of the batch already after a fraction
     ``(i + 1) / B`` of them, so that the simulations are of different ages. A simulation that is not finite ends like
     any other, and is counted.
-
-    Attributes:
-        recent_returns: Undiscounted returns of the episodes that ended since the list was last emptied.
-        counts: Episodes so far, and how they ended.
     """
+
+    values = ("limit", "returns", "num_started", "counts", "recent_returns")
 
     def __init__(self, env: TorchEnv, seed: int, max_episode_steps: int, num_layouts: int) -> None:
         self.env, self.num_layouts = env, num_layouts
@@ -32,7 +31,7 @@ class Episodes:
         self.max_steps = min(max_episode_steps, env.spec.horizon)
         self.limit = torch.tensor([max(1, self.max_steps * (i + 1) // count) for i in range(count)], device=env.device)
         self.returns = torch.zeros(count, device=env.device)
-        self.recent_returns: list[float] = []
+        self.recent_returns: list[float] = []  # undiscounted; of the episodes since the list was last emptied
         self.num_started = count
         self.counts = {"episodes": 0, "terminated": 0, "nonfinite": 0}
 
@@ -63,18 +62,9 @@ class Episodes:
 
     def state_dict(self) -> dict[str, Any]:
         """The episodes in progress, and what the next ones depend on."""
-        return {
-            "env": TorchVecEnv(self.env).state_dict(),
-            "limit": self.limit.cpu(),
-            "returns": self.returns.cpu(),
-            "num_started": self.num_started,
-            "counts": dict(self.counts),
-            "recent_returns": list(self.recent_returns),
-        }
+        return super().state_dict() | {"env": TorchVecEnv(self.env).state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state of `state_dict`."""
+        super().load_state_dict(state)
         TorchVecEnv(self.env).load_state_dict(state["env"])
-        self.limit, self.returns = state["limit"].to(self.limit), state["returns"].to(self.returns)
-        self.num_started, self.counts = state["num_started"], dict(state["counts"])
-        self.recent_returns = list(state["recent_returns"])

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from baselines.common.episodes import Episodes
+from baselines.common.stateful import Stateful
 from baselines.distillation.teachers import Teacher, project
 from cfp.envs import disturbances
 from dittogym import TorchEnv
@@ -19,15 +20,10 @@ from torchmpm import tree
 
 
 class Labels(NamedTuple):
-    """Observations and the teacher's actions.
+    """Observations and the teacher's actions."""
 
-    Attributes:
-        observations: (n, 3, 64, 64) uint8.
-        actions: (n, 2, R, R) on the teacher's grid, or on the student's where that is smaller.
-    """
-
-    observations: Tensor
-    actions: Tensor
+    observations: Tensor  # (n, 3, 64, 64) uint8
+    actions: Tensor  # (n, 2, R, R) on the teacher's grid, or on the student's where that is smaller
 
 
 class Dataset:
@@ -89,12 +85,15 @@ def drop_entries(values: Tensor, probability: float, grid: int | None = None) ->
     return disturbances.drop(values, mask.to(values.device))
 
 
-class Collector:
+class Collector(Stateful):
     """Lets a mixture of student and teacher act, and labels the states by the teacher.
 
     Who controls a robot is drawn anew every ``switch_every`` steps. A label is kept where the teacher's action was
     computed from that very state, or is part of a plan which the robot has followed from its beginning.
     """
+
+    parts = ("episodes", "teacher")
+    values = ("steps_since_switch", "teacher_acts", "left_plan")
 
     def __init__(
         self,
@@ -150,21 +149,3 @@ class Collector:
             self.left_plan = self.left_plan | done
             observation = dynamics.observe(self.env.model, self.env.env_state)
         return observation
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything besides the student that the next round depends on."""
-        return {
-            "episodes": self.episodes.state_dict(),
-            "teacher": self.teacher.state_dict(),
-            "steps_since_switch": self.steps_since_switch,
-            "teacher_acts": self.teacher_acts.cpu(),
-            "left_plan": self.left_plan.cpu(),
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
-        self.episodes.load_state_dict(state["episodes"])
-        self.teacher.load_state_dict(state["teacher"])
-        self.steps_since_switch = state["steps_since_switch"]
-        self.teacher_acts = state["teacher_acts"].to(self.teacher_acts)
-        self.left_plan = state["left_plan"].to(self.left_plan)

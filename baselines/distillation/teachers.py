@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from baselines.common.open_loop import OpenLoop
+from baselines.common.stateful import Stateful
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.registry import load
 from cfp.policy import Policy, SeesState
@@ -21,28 +22,15 @@ from dittogym import TorchEnv, make_spec
 from dittogym.action import ActionIndexing, bicubic_matrix, from_grid_indexing, to_grid_indexing
 
 
-class Teacher(ABC):
-    """Labels the present states of an environment with actions.
+class Teacher(Stateful, ABC):
+    """Labels the present states of an environment with actions."""
 
-    Attributes:
-        resolution: Action grid R.
-        fresh: Whether the last actions were computed from the states themselves. Otherwise they are part of a plan and
-            right only for robots that have followed it.
-    """
-
-    resolution: int
-    fresh: bool = True
+    resolution: int  # action grid R
+    fresh: bool = True  # or the last actions are part of a plan, and right only for robots that have followed it
 
     @abstractmethod
     def act(self, env: TorchEnv, observation: Tensor) -> Tensor:
         """Actions (B, 2, R, R) for the present states, whose images are (B, 3, 64, 64)."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything besides the environment that the next actions depend on."""
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:  # noqa: B027  (most have no state)
-        """Restore a state of `state_dict`."""
 
 
 class PolicyTeacher(Teacher):
@@ -82,6 +70,8 @@ class PlannerTeacher(Teacher):
     It plans for all robots at once, every `PlannerConfig.commit` steps, each plan from what is left of the last one.
     """
 
+    parts = ("planner",)
+
     def __init__(self, env: TorchEnv, config: GradientPlannerConfig, seed: int) -> None:
         env.reset(seed=seed)
         self.env, self.resolution = env, env.action_resolution
@@ -93,14 +83,6 @@ class PlannerTeacher(Teacher):
         action = self.planner.act()
         self.fresh = self.planner.has_replanned
         return action.float()
-
-    def state_dict(self) -> dict[str, Any]:
-        """The plans."""
-        return self.planner.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
-        self.planner.load_state_dict(state)
 
 
 def project(actions: Tensor, resolution: int, patch: int) -> Tensor:

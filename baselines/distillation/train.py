@@ -19,6 +19,7 @@ from baselines.common.episodes import Episodes
 from baselines.common.grid import grid_size
 from baselines.common.policies import image_policy
 from baselines.common.schedules import linear_decay, stage_progress
+from baselines.common.stateful import Stateful
 from baselines.distillation import teacher_training
 from baselines.distillation.config import DistillConfig
 from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entries
@@ -51,7 +52,7 @@ METRICS: dict[str, str] = {
 """Every scalar that `Distill.update` logs, and what it means."""
 
 
-class Distill(Algorithm):
+class Distill(Stateful, Algorithm):
     """Supervised learning of the teacher's actions in the states that the student visits, by DAgger.
 
     The mean action is learned, by least squares after tanh: small differences in the muscles cost little. The standard
@@ -65,6 +66,7 @@ class Distill(Algorithm):
     """
 
     sees: ClassVar[Sees] = "image"
+    parts, values = ("actor", "adam", "dataset", "collector"), ("rounds",)
 
     def __init__(
         self, config: DistillConfig, stage: int = 1, start: ActorPolicy | None = None, teacher: Path | None = None
@@ -258,14 +260,3 @@ class Distill(Algorithm):
     def load(cls, path: Path, device: str = "cpu") -> ActorPolicy:
         """Load a policy."""
         return load(path, device)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Networks, optimiser, labels, episodes in progress and the teacher's state."""
-        parts = ("actor", "adam", "dataset", "collector")
-        return {name: getattr(self, name).state_dict() for name in parts} | {"rounds": self.rounds}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
-        for name in ("actor", "adam", "dataset", "collector"):
-            getattr(self, name).load_state_dict(state[name])
-        self.rounds = state["rounds"]

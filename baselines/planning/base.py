@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
 
-from baselines.common.rollout import StepFunction, rollout, soft_step
+from baselines.common.rollout import StepFunction, rollout, soft_step, split_cost
+from baselines.common.stateful import Stateful
 from cfp.errors import ConfigError
 from cfp.validation import check_at_least
 from dittogym import TorchEnv
@@ -38,7 +39,7 @@ class PlannerConfig:
     """Cost of a robot's spread beyond 80 % of the limit at which it counts as torn, per squared fraction of it."""
 
     def check(self) -> None:
-        """Check what the types cannot.
+        """Check what the types do not express.
 
         Raises:
             ConfigError: An option is out of range.
@@ -51,7 +52,7 @@ class PlannerConfig:
 Config = TypeVar("Config", bound=PlannerConfig)
 
 
-class Planner(ABC, Generic[Config]):
+class Planner(Stateful, ABC, Generic[Config]):
     """Plans the next actions of every simulation of an environment, each simulation by itself.
 
     Plans are tried in the simulator that the environment itself runs on, from its present state, so a planner sees
@@ -73,6 +74,7 @@ class Planner(ABC, Generic[Config]):
     """
 
     config_type: type[Config]
+    values = ("_plan", "_step", "num_failed", "num_plans", "generator")
 
     def __init__(
         self, env: TorchEnv, config: Config | None = None, *, step: StepFunction = soft_step, seed: int = 0
@@ -139,8 +141,8 @@ class Planner(ABC, Generic[Config]):
         result, limit = self.step(model, state, action), model.spec.split_limit
         if limit is None:
             return result
-        excess = measure(result.state.particles, model.num_robot_particles).split / limit - SPLIT_MARGIN
-        cost = self.config.split_weight * excess.clamp_min(0.0).square()
+        split = measure(result.state.particles, model.num_robot_particles).split
+        cost = split_cost(split, limit, SPLIT_MARGIN, self.config.split_weight)
         reward, true_reward = result.reward - cost, result.true_reward - cost.detach()
         return result._replace(reward=reward, true_reward=true_reward)
 
@@ -153,35 +155,13 @@ class Planner(ABC, Generic[Config]):
         noise = torch.randn(shape, generator=self.generator, dtype=self.env.dtype).to(self.env.device)
         return (self.config.noise * noise).clamp(-1.0, 1.0)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything besides the environment that the next action depends on."""
-        return {
-            "plan": self._plan.cpu(),
-            "counts": [self._step, self.num_failed, self.num_plans],
-            "generator": self.generator.get_state(),
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict` in a planner with the same options."""
-        self._plan = state["plan"].to(self._plan)
-        self._step, self.num_failed, self.num_plans = state["counts"]
-        self.generator.set_state(state["generator"])
-
 
 class BestPlans:
-    """The plan with the highest finite value so far, of every simulation.
-
-    Args:
-        like: Plans (T, B, 2, R, R) of the same shape, dtype and device.
-
-    Attributes:
-        plan: (T, B, 2, R, R); zero where no value was finite.
-        value: (B,); minus infinity where no value was finite.
-    """
+    """The plan with the highest finite value so far, of every simulation; zero where no value was finite."""
 
     def __init__(self, like: Tensor) -> None:
-        self.plan = torch.zeros_like(like)
-        self.value = like.new_full((like.shape[1],), -torch.inf)
+        self.plan = torch.zeros_like(like)  # (T, B, 2, R, R)
+        self.value = like.new_full((like.shape[1],), -torch.inf)  # (B,)
 
     def update(self, plan: Tensor, value: Tensor) -> None:
         """Take over plans (T, B, 2, R, R) whose values (B,) are finite and better."""

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from baselines.common.rollout import split_cost
 from cfp.validation import check_at_least, check_positive
 from dittogym import TorchEnv
 from torchmpm import tree
@@ -40,28 +41,20 @@ class RewardConfig:
 
     def check(self) -> None:
         """Check what the types cannot."""
-        check_at_least(
-            0, split_weight=self.split_weight, split_margin=self.split_margin, integrity_weight=self.integrity_weight
-        )
+        check_at_least(0, split_weight=self.split_weight, split_margin=self.split_margin)
+        check_at_least(0, integrity_weight=self.integrity_weight)
         check_positive(scale=self.scale)
 
 
 @tree.register
 @dataclass(frozen=True)
 class Neighbours:
-    """Pairs of a robot's particles that were close to each other; tearing shows in them before the body is split.
+    """Pairs of a robot's particles that were close to each other; tearing shows in them before the body is split."""
 
-    Attributes:
-        index: (B, K) sampled particles, numbers.
-        neighbours: (B, K, M) their nearest other samples, numbers among the samples.
-        distance: (B, K, M), m, when they were found.
-        is_close: (B, K, M) bool, whether they were nearer than `RADIUS`.
-    """
-
-    index: Tensor
-    neighbours: Tensor
-    distance: Tensor
-    is_close: Tensor
+    index: Tensor  # (B, K) numbers of the sampled particles
+    neighbours: Tensor  # (B, K, M) their nearest other samples, numbers among the samples
+    distance: Tensor  # (B, K, M), m, when they were found
+    is_close: Tensor  # (B, K, M) bool, whether they were nearer than `RADIUS`
 
     @classmethod
     @torch.no_grad()
@@ -100,8 +93,7 @@ def training_reward(
             reward = reward + terms["action"]
     limit = env.spec.split_limit
     if limit is not None and config.split_weight:
-        excess = (info["split"] / limit - config.split_margin).clamp_min(0.0)
-        reward = reward - config.split_weight * excess.square()
+        reward = reward - split_cost(info["split"], limit, config.split_margin, config.split_weight)
     if config.integrity_weight:
         reward = reward - config.integrity_weight * neighbours.drift(env.state.x[:, : env.model.num_robot_particles])
     return config.scale * torch.where(info["finite"], reward, terms["failure"])

@@ -3,40 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from baselines.common.episodes import Episodes
+from baselines.common.stateful import Stateful
 from baselines.shac.reward import Neighbours, RewardConfig, training_reward
 from cfp.errors import NonFiniteError
 from torchmpm import tree
 
 
 class Window(NamedTuple):
-    """T control steps of B simulations, with their autograd graph.
+    """T control steps of B simulations, with their autograd graph."""
 
-    Attributes:
-        observations: (T, B, ...) inputs of the networks, detached.
-        rewards: (T, B) training rewards.
-        next_values: (T, B) values of the states after each step; 0 where the task has ended the episode.
-        done: (T, B) bool, whether the episode was over after the step.
-        true_reward: Mean of the task's own rewards.
-    """
-
-    observations: Tensor
-    rewards: Tensor
-    next_values: Tensor
-    done: Tensor
-    true_reward: float
+    observations: Tensor  # (T, B, ...) inputs of the networks, detached
+    rewards: Tensor  # (T, B) training rewards
+    next_values: Tensor  # (T, B) values of the states after each step; 0 where the task has ended the episode
+    done: Tensor  # (T, B) bool, whether the episode was over after the step
+    true_reward: float  # mean of the task's own rewards
 
 
-class Rollout:
+class Rollout(Stateful):
     """Collects windows from simulations that an actor drives.
 
     Gradients with respect to the action of one simulation in one step that are not finite are left out and counted.
     """
+
+    parts, values = ("episodes",), ("generator",)
 
     def __init__(
         self,
@@ -53,11 +48,7 @@ class Rollout:
         self.episodes.counts["dropped"] = 0
 
     def collect(self, actor: Callable[[Tensor], Tensor], value: Callable[[Tensor], Tensor]) -> Window:
-        """Collect the next window.
-
-        The actor maps observations to mean actions before tanh, (B, 2, R, R), ``value`` to values (B,). A
-        `NonFiniteError` tells of an actor whose actions are not finite.
-        """
+        """Collect the next window; ``actor`` maps observations to means before tanh, ``value`` maps them to values."""
         env, true_reward = self.env, 0.0
         steps: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
         observation, neighbours = self.observe(), Neighbours.find(self._robot_positions())
@@ -79,11 +70,9 @@ class Rollout:
         return Window(observations, rewards, next_values, done, true_reward / self.steps)
 
     def _robot_positions(self) -> Tensor:
-        """The robots' particles (B, N, 2), m."""
         return self.env.state.x[:, : self.env.model.num_robot_particles].detach()
 
     def _act(self, mean: Tensor) -> Tensor:
-        """Actions with noise, which stop gradients that are not finite."""
         noise = torch.randn(mean.shape, generator=self.generator).to(mean)
         action = (mean + self.noise * noise).tanh()
         if not bool(action.isfinite().all()):
@@ -96,12 +85,3 @@ class Rollout:
         finite = gradient.isfinite().flatten(1).all(1)
         self.episodes.counts["dropped"] += int((~finite).sum())
         return torch.where(finite[:, None, None, None], gradient, 0.0)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything besides the networks that the next window depends on."""
-        return {"episodes": self.episodes.state_dict(), "generator": self.generator.get_state()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
-        self.episodes.load_state_dict(state["episodes"])
-        self.generator.set_state(state["generator"])

@@ -15,6 +15,7 @@ from baselines.common.episodes import Episodes
 from baselines.common.grid import GridConfig
 from baselines.common.policies import StateBasedPolicy, image_policy
 from baselines.common.schedules import linear_decay, stage_progress
+from baselines.common.stateful import Stateful
 from baselines.shac.features import StateFeatures
 from baselines.shac.networks import ImageActor, StateActor, StatePolicy, fix_std, image_critic, state_critic
 from baselines.shac.reward import RewardConfig
@@ -120,7 +121,7 @@ class ShacConfig(GridConfig):
         check_at_least(0, noise=self.noise)
 
 
-class Shac(Algorithm):
+class Shac(Stateful, Algorithm):
     """Actor and critic on windows of differentiable simulation.
 
     The actor maximises the discounted rewards of a window plus the target critic's value of its end, through the
@@ -128,6 +129,8 @@ class Shac(Algorithm):
     """
 
     sees: ClassVar[Sees] = "state"
+    parts = ("actor", "critic", "target", "actor_adam", "critic_adam", "rollout")
+    values = ("skipped", "skipped_in_a_row")
 
     def __init__(self, config: ShacConfig, stage: int = 1, start: Policy | None = None) -> None:
         self.config = config
@@ -296,19 +299,6 @@ class Shac(Algorithm):
     def load(cls, path: Path, device: str = "cpu") -> StatePolicy | ActorPolicy:
         """Load a policy of either kind."""
         return load(path, device) if read_policy(path)[1]["kind"] == KIND else StatePolicy.load(path, device)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Networks, optimisers, episodes in progress, generators and counts."""
-        parts = ("actor", "critic", "target", "actor_adam", "critic_adam", "rollout")
-        return {name: getattr(self, name).state_dict() for name in parts} | {
-            "skipped": [self.skipped, self.skipped_in_a_row]
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
-        for name in ("actor", "critic", "target", "actor_adam", "critic_adam", "rollout"):
-            getattr(self, name).load_state_dict(state[name])
-        self.skipped, self.skipped_in_a_row = state["skipped"]
 
 
 def actor_loss(window: Window, gamma: float) -> Tensor:

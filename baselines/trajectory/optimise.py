@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ import cfp
 from baselines.common.grid import Grid, GridConfig, grid_size
 from baselines.common.open_loop import OpenLoop, OpenLoopAlgorithm
 from baselines.common.schedules import cosine_decay, stage_progress
+from baselines.common.stateful import Stateful
 from baselines.trajectory.objective import make_objective
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
@@ -105,22 +106,15 @@ class GradientConfig(GridConfig):
 
 
 class Episode(NamedTuple):
-    """Result of one iteration.
+    """Result of one iteration."""
 
-    Attributes:
-        loss: Mean over layouts and steps.
-        size: Mean magnitude of the same values: a loss made of rewards and costs can be zero, this cannot.
-        total: Mean return.
-        gradient: Gradient of the loss in theta, (T, 2, R, R).
-    """
-
-    loss: float
-    size: float
-    total: float
-    gradient: Tensor
+    loss: float  # mean over layouts and steps
+    size: float  # mean magnitude of the same values: a loss made of rewards and costs can be zero, this cannot
+    total: float  # mean return
+    gradient: Tensor  # of the loss in theta, (T, 2, R, R)
 
 
-class Gradient(OpenLoopAlgorithm):
+class Gradient(Stateful, OpenLoopAlgorithm):
     """Adam on the actions of a whole episode, through the simulation.
 
     Actions are ``tanh(theta)``; theta (T, 2, R, R) starts at zero. Steps after the end of an episode do not count. An
@@ -130,6 +124,8 @@ class Gradient(OpenLoopAlgorithm):
     """
 
     sees: ClassVar[Sees] = "nothing"
+    parts = ("adam",)
+    values = ("theta", "best", "mean_norm", "best_loss", "best_size", "phase", "backoff", "failed", "failed_in_a_row")
 
     def __init__(self, config: GradientConfig, stage: int = 1, start: OpenLoop | None = None) -> None:
         self.config, self.stage, polishes = config, stage, stage > 1
@@ -261,22 +257,6 @@ class Gradient(OpenLoopAlgorithm):
             train_particles="lite" if quick else "full",
         )
         return config if task == "shapematch" else replace(config, iterations=30, grid="coarse", window=16)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that the next iteration depends on."""
-        tensors = {name: getattr(self, name).detach().cpu() for name in ("theta", "best", "mean_norm")}
-        best = [self.best_loss, self.best_size, self.phase]
-        counts = [self.backoff, self.failed, self.failed_in_a_row]
-        return tensors | {"adam": self.adam.state_dict(), "counts": best + counts}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
-        with torch.no_grad():
-            self.theta.copy_(state["theta"])
-        self.best, self.mean_norm = state["best"].to(self.theta), state["mean_norm"].to(self.theta)
-        self.adam.load_state_dict(state["adam"])
-        self.best_loss, self.best_size, self.phase, *counts = state["counts"]
-        self.backoff, self.failed, self.failed_in_a_row = counts
 
 
 def _to_theta(actions: Tensor, resolution: int) -> Tensor:
