@@ -154,7 +154,12 @@ class Distill(Stateful, Algorithm):
         return float(self.loss(labels.observations[part], labels.actions[part]))
 
     def loss(self, observations: Tensor, actions: Tensor) -> Tensor:
-        """Mean squared difference of the student's mean actions from the teacher's (any grid), on the grid in use."""
+        """Mean squared difference of the student's mean actions from the teacher's, on the grid that is carried out.
+
+        Args:
+            observations: (B, 3, 64, 64) uint8.
+            actions: (B, 2, R, R) of the teacher, on any grid.
+        """
         target = project(actions.to(self.env.device), self.spec.action_size, self.env.spec.patch)
         return (self.actor(observations.to(self.env.device), deterministic=True) - target).square().mean()
 
