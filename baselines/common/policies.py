@@ -20,11 +20,7 @@ Network = TypeVar("Network", bound=nn.Module)
 
 
 class StateBasedPolicy(ABC):
-    """A policy that acts on the state of the environment given to `attached`; the image is not looked at.
-
-    Args:
-        description: What it is and where it comes from, see `cfp.weights.describe_run`.
-    """
+    """A policy that acts on the state of the environment given to `attached`; the image is not looked at."""
 
     uses_image = False
     env: TorchEnv | None = None
@@ -101,24 +97,14 @@ class StateBasedPolicy(ABC):
 
 
 def image_policy(spec: ActorSpec, actor: nn.Module, deterministic: bool) -> ActorPolicy:
-    """Policy of the image with a copy of an actor's weights, on the actor's device.
-
-    Args:
-        spec: Networks of the actor.
-        actor: The actor.
-        deterministic: Whether it is evaluated without noise by default.
-    """
+    """Policy of the image with a copy of an actor's weights, on the actor's device."""
     policy = ActorPolicy(spec, deterministic)
     policy.actor.load_state_dict(actor.state_dict())
     return policy.to(next(actor.parameters()).device)
 
 
 def load_network(build: Callable[[], Network], tensors: Mapping[str, Tensor], device: str) -> Network:
-    """Build a network for inference from its weights; a size that a file only claims takes no memory.
-
-    Raises:
-        RuntimeError: The weights do not fit.
-    """
+    """Build a network for inference from its weights; a size that a file only claims takes no memory."""
     with torch.device("meta"):
         network = build()
     network.load_state_dict(tensors, assign=True)

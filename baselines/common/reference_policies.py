@@ -33,11 +33,7 @@ class ReferenceConfig(GridConfig):
 
 
 def reference_preset(algo: str, task: str, name: str) -> ReferenceConfig:
-    """Default options: ``quick`` evaluates with few particles, ``paper`` in the paper's environment.
-
-    Raises:
-        ConfigError: No such task or preset.
-    """
+    """Default options: ``quick`` evaluates with few particles, ``paper`` in the paper's environment."""
     base = cfp.preset(task, name)
     return ReferenceConfig(
         algo=algo,
@@ -48,26 +44,19 @@ def reference_preset(algo: str, task: str, name: str) -> ReferenceConfig:
     )
 
 
-def zero(config: ReferenceConfig) -> OpenLoop:
-    """Leaves every muscle slack."""
+def _zero(config: ReferenceConfig) -> OpenLoop:
     size = config.resolution(1)
     return OpenLoop(torch.zeros(0, 2, size, size))
 
 
-def scripted(config: ReferenceConfig) -> OpenLoop:
-    """Drives every muscle by a moving wave, see `wave`, for as long as an episode lasts."""
+def _scripted(config: ReferenceConfig) -> OpenLoop:
     return OpenLoop(wave(make_spec(config.task).horizon, config.resolution(1), config.environment.action_indexing))
 
 
-def random(config: ReferenceConfig) -> RandomActions:
-    """Acts at random, see `RandomActions`."""
-    return RandomActions(config.resolution(1))
-
-
 REFERENCE_POLICIES: dict[str, Callable[[ReferenceConfig], Policy]] = {
-    "zero": zero,
-    "random": random,
-    "scripted": scripted,
+    "zero": _zero,
+    "random": lambda config: RandomActions(config.resolution(1)),
+    "scripted": _scripted,
 }
 
 

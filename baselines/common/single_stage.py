@@ -23,20 +23,14 @@ class SingleStageConfig(Config):
         return f"{self.algo}{grid}-{task_name(self.task)}-{self.preset}-{self.seed}"
 
     def check(self) -> None:
-        """Check what the types cannot, see `cfp.config.RunConfig.check`."""
+        """Check what the types do not express."""
         if len(self.resolutions) != 1:
-            raise ConfigError(
-                f"resolutions must have one value, got {self.resolutions}; --algo cfp trains several stages"
-            )
+            raise ConfigError(f"resolutions must have one value, got {self.resolutions}; cfp trains several stages")
         super().check()
 
 
 def single_stage_preset(algo: Literal["coarse", "fine"], task: str, name: str) -> SingleStageConfig:
-    """The first stage of `cfp.preset`, for all its steps, on the task's coarse or fine action grid.
-
-    Raises:
-        ConfigError: No such task or preset.
-    """
+    """The first stage of `cfp.preset`, for all its steps, on the task's coarse or fine action grid."""
     base = cfp.preset(task, name)
     single = replace(
         base,

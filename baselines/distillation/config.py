@@ -14,7 +14,7 @@ from cfp.validation import check_at_least, check_fraction, check_positive
 
 @dataclass(frozen=True)
 class DistillConfig(StagedConfig):
-    """A distillation; num_envs robots move side by side. Levels are listed coarsest first.
+    """A distillation; num_envs robots move side by side. Stages are listed coarsest first.
 
     The environment options say where the student is evaluated; train_particles, where it is taught.
     """
@@ -60,7 +60,7 @@ class DistillConfig(StagedConfig):
         return super().ineffective() | planner | SEEDED
 
     def check(self) -> None:
-        """Check what the types cannot, see `StagedConfig.check`."""
+        """Check what the types do not express."""
         super().check()
         check_at_least(1, rollout_steps=self.rollout_steps, updates=self.updates, batch_size=self.batch_size)
         check_at_least(1, switch_every=self.switch_every, capacity=self.capacity)

@@ -88,9 +88,8 @@ class PlannerTeacher(Teacher):
 def project(actions: Tensor, resolution: int, patch: int) -> Tensor:
     """Actions on another grid that drive the muscles as similarly as possible.
 
-    The environment enlarges a grid to the patch by half-pixel bicubic interpolation, ``U``. The result has the least
-    squared difference from ``U a U^T`` there, clipped to [-1, 1]. It is exact wherever the new grid can represent the
-    field, such as for the same grid and for the patch.
+    With the environment's bicubic interpolation to the patch, ``U``, the result has the least squared difference from
+    ``U a U^T`` there, clipped to [-1, 1].
     """
     matrix = _projection(actions.shape[-1], resolution, patch).to(actions)
     return (matrix @ actions @ matrix.T).clamp(-1.0, 1.0)

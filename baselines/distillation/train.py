@@ -91,7 +91,7 @@ class Distill(Stateful, Algorithm):
             episodes,
             config.switch_every,
             config.dropout,
-            grid=self.spec.resolutions[-1],
+            self.spec.resolutions[-1],
         )
         self.dataset, self.rounds = Dataset(config.capacity), 0
 
@@ -119,9 +119,8 @@ class Distill(Stateful, Algorithm):
             NonFiniteError: The loss is not finite.
         """
         config, beta = self.config, self.config.beta_decay**self.rounds
-        learning_rate = config.student_learning_rate * linear_decay(
-            stage_progress(config, self.stage, self.num_timesteps)
-        )
+        progress = stage_progress(config, self.stage, self.num_timesteps)
+        learning_rate = config.student_learning_rate * linear_decay(progress)
         self.adam.param_groups[0]["lr"] = learning_rate
         with self._seeded():
             student = partial(self.actor, deterministic=not config.student_noise)
@@ -193,9 +192,6 @@ class Distill(Stateful, Algorithm):
 
         Both presets teach at the lite tier; ``quick`` is evaluated there, ``paper`` in the paper's environment. SHAPE
         MATCH, whose episodes are alike and whose actions are fine, gets fewer labels and more, smaller updates.
-
-        Raises:
-            ConfigError: No such task or preset.
         """
         base, shape_match = cfp.preset(task, name), task == "shapematch"
         steps = 24_000 if shape_match else 48_000

@@ -19,6 +19,7 @@ from baselines.gradlab.report import write
 from cfp.envs.make import choose_device
 from cfp.errors import ConfigError
 from cfp.experiment.cli import run_command
+from cfp.validation import check_at_least
 from dittogym import TorchEnv
 from dittogym.tasks import task_name
 
@@ -61,13 +62,8 @@ class GradLabConfig:
     """Simulations for each of the first- and zeroth-order estimates, an even number."""
 
     def check(self) -> None:
-        """Check what the types cannot.
-
-        Raises:
-            ConfigError: An option is out of range.
-        """
-        if self.warmup < 0:
-            raise ConfigError(f"warmup must not be negative, got {self.warmup}")
+        """Check what the types do not express."""
+        check_at_least(0, warmup=self.warmup)
         if self.samples < 4 or self.samples % 2:
             raise ConfigError(f"samples must be an even number and at least 4, got {self.samples}")
         if not self.horizons or any(early >= late for early, late in pairwise((0, *self.horizons))):
@@ -78,12 +74,7 @@ QUICK = GradLabConfig(quick=True, particles=200, substeps=5, horizons=(1, 2, 4),
 
 
 def parse(arguments: Sequence[str]) -> GradLabConfig:
-    """Read a command line; ``--quick`` chooses other defaults.
-
-    Raises:
-        ConfigError: An option is out of range.
-        SystemExit: ``--help``, or an option that does not exist or cannot be read (exit code 2).
-    """
+    """Read a command line; ``--quick`` chooses other defaults."""
     default = QUICK if "--quick" in arguments else GradLabConfig()
     config = tyro.cli(GradLabConfig, prog="python -m baselines.gradlab", args=list(arguments), default=default)
     config.check()

@@ -80,8 +80,7 @@ def finite_difference_errors(
 ) -> Tensor:
     """Errors (horizons, step sizes) of central differences along directions (D, T, 2, R, R) against gradients.
 
-    The root mean square difference of the directional derivatives, relative to the gradient's norm, which is the
-    expected size of a derivative in a standard normal direction.
+    Root mean square over the directions, relative to the gradient's norm, the expected size of such a derivative.
     """
     count = len(directions)
     errors = torch.empty(len(gradients), len(STEP_SIZES), dtype=actions.dtype)
@@ -100,13 +99,11 @@ def measure(
 ) -> tuple[list[Result], Tensor]:
     """Take all measurements around actions (T, 2, R, R), float64, at increasing horizons, the last of which is T.
 
-    The first half of the noise (S, T, 2, R, R), standard normal, serves the zeroth-order estimate in antithetic pairs,
-    so both estimates cost S simulations. They are compared in float32. Returns one result for each horizon, and the
-    errors of finite differences (horizons, step sizes).
+    The first half of the noise (S, T, 2, R, R) serves the zeroth-order estimate in antithetic pairs, so both estimates
+    cost S simulations. Returns a result for each horizon, and the errors of finite differences (horizons, step sizes).
     """
-    gradients = [
-        function.gradients(actions[None, :horizon])[0] for horizon in tqdm(horizons, "gradients", disable=None)
-    ]
+    progress = tqdm(horizons, "gradients", disable=None)
+    gradients = [function.gradients(actions[None, :horizon])[0] for horizon in progress]
     errors = finite_difference_errors(function, actions, gradients, directions)
     single = function.to(torch.float32)
     offsets = NOISE_STD * noise[: len(noise) // 2]

@@ -22,10 +22,7 @@ HEADS = 4
 
 
 class GraphTrunk(nn.Module):
-    """Three rounds of messages between neighbours, with the same weights in each (after Pathak et al., NeurIPS 2019).
-
-    ``h <- h + ELU(W h + V mean of the neighbours' h)``.
-    """
+    """Three rounds of messages between neighbours, with shared weights (after Pathak et al., NeurIPS 2019)."""
 
     def __init__(self, inputs: int) -> None:
         super().__init__()

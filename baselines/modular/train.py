@@ -68,7 +68,7 @@ class ModularConfig(RunConfig):
         return make_spec(self.task).patch
 
     def ineffective(self) -> dict[str, str]:
-        """Options of several levels, and of grids of actions, have no effect: segments act on nodes."""
+        """Options of several stages, and of grids of actions, have no effect: segments act on nodes."""
         needs = dict.fromkeys(("learning.anchor", "learning.warm_critic", "environment.action_layout"), "algo cfp")
         return super().ineffective() | needs
 
@@ -77,7 +77,7 @@ class ModularConfig(RunConfig):
         return Hyperparameters(**vars(self.learning), alpha=self.alpha, random_steps=self.random_steps)
 
     def check(self) -> None:
-        """Check what the types cannot, see `RunConfig.check`."""
+        """Check what the types do not express."""
         kind, _, count = self.algo.partition("-")
         if kind not in get_args(Kind) or not count.isdecimal() or int(count) < 2:
             raise ConfigError(

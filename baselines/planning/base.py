@@ -62,7 +62,8 @@ class Planner(Stateful, ABC, Generic[Config]):
     Args:
         env: The environment, after its reset. It is only read.
         config: Options; the defaults if None.
-        step: Advances the simulations. The search may climb its smooth reward; its true reward chooses the plan.
+        step: Advances the simulations, by default the task's own step. The search may climb its smooth reward; its true
+            reward chooses the plan.
         seed: Seed of the noise.
 
     Attributes:
@@ -74,14 +75,15 @@ class Planner(Stateful, ABC, Generic[Config]):
     """
 
     config_type: type[Config]
+    default_step: StepFunction = staticmethod(soft_step)
     values = ("_plan", "_step", "num_failed", "num_plans", "generator")
 
     def __init__(
-        self, env: TorchEnv, config: Config | None = None, *, step: StepFunction = soft_step, seed: int = 0
+        self, env: TorchEnv, config: Config | None = None, *, step: StepFunction | None = None, seed: int = 0
     ) -> None:
         self.config = config = config or self.config_type()
         config.check()
-        self.env, self.step = env, step
+        self.env, self.step = env, step or self.default_step
         self.generator = torch.Generator().manual_seed(seed)
         self.num_plans = self.num_failed = 0
         self.reset()

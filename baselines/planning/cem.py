@@ -9,11 +9,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from baselines.common.rollout import StepFunction
 from baselines.planning.base import BestPlans, Planner, PlannerConfig
 from cfp.errors import ConfigError
 from cfp.validation import check_positive
-from dittogym import TorchEnv, core
+from dittogym import core
 from dittogym.action import bicubic
 from dittogym.model import EnvState
 from torchmpm import tree
@@ -39,7 +38,7 @@ class CEMPlannerConfig(PlannerConfig):
     """Fraction of mean and standard deviation that each generation keeps."""
 
     def check(self) -> None:
-        """Check what the types cannot, see `PlannerConfig.check`."""
+        """Check what the types do not express."""
         super().check()
         check_positive(iterations=self.iterations, initial_std=self.initial_std, noise_grid=self.noise_grid)
         if not 2 <= self.elites <= self.candidates:
@@ -60,16 +59,7 @@ class CEMPlanner(Planner[CEMPlannerConfig]):
     """
 
     config_type = CEMPlannerConfig
-
-    def __init__(
-        self,
-        env: TorchEnv,
-        config: CEMPlannerConfig | None = None,
-        *,
-        step: StepFunction = core.step,
-        seed: int = 0,
-    ) -> None:
-        super().__init__(env, config, step=step, seed=seed)
+    default_step = staticmethod(core.step)
 
     @torch.no_grad()
     def _search(self, state: EnvState, plan: Tensor) -> Tensor:

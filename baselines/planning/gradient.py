@@ -24,7 +24,7 @@ class GradientPlannerConfig(PlannerConfig):
     """Largest gradient norm of one control step, in medians over the steps of the plan."""
 
     def check(self) -> None:
-        """Check what the types cannot, see `PlannerConfig.check`."""
+        """Check what the types do not express."""
         super().check()
         check_positive(iterations=self.iterations, learning_rate=self.learning_rate, clip=self.clip)
 

@@ -50,7 +50,7 @@ class PlannedConfig(GridConfig):
         return self.seed, 1
 
     def check(self) -> None:
-        """Check what the types cannot, see `RunConfig.check`."""
+        """Check what the types do not express."""
         super().check()
         if self.environment.num_envs != 1:
             raise ConfigError(f"num_envs must be 1 (an episode is planned by itself), got {self.environment.num_envs}")
@@ -77,14 +77,7 @@ class CEMConfig(PlannedConfig):
 
 
 def episode_preset(task: str, name: str) -> dict[str, Any]:
-    """Defaults of a task, as options of `PlannedConfig` by name.
-
-    ``quick`` carries plans out at the lite tier, ``paper`` in the paper's environment; both try them at the lite tier.
-    The episode of SHAPE MATCH is short and its reward all detail: it gets an action grid of 16.
-
-    Raises:
-        ConfigError: No such task or preset.
-    """
+    """Options of `PlannedConfig` for a task; SHAPE MATCH, whose reward is all detail, gets an action grid of 16."""
     quick = name == "quick"
     environment = cfp.preset(task, name).environment
     horizon = make_spec(task).horizon
@@ -130,11 +123,7 @@ class MPC(OpenLoopAlgorithm):
 
     @staticmethod
     def preset(task: str, name: str) -> PlannedConfig:
-        """Defaults of a task, see `episode_preset`; SHAPE MATCH gets more and smaller gradient steps.
-
-        Raises:
-            ConfigError: No such task or preset.
-        """
+        """Defaults of a task; SHAPE MATCH gets more and smaller gradient steps."""
         planner = GradientPlannerConfig(iterations=30, learning_rate=0.1) if task == "shapematch" else None
         return MPCConfig(**episode_preset(task, name), planner=planner or GradientPlannerConfig())
 
@@ -189,9 +178,5 @@ class CEM(MPC):
 
     @staticmethod
     def preset(task: str, name: str) -> CEMConfig:
-        """Defaults of a task, see `episode_preset`.
-
-        Raises:
-            ConfigError: No such task or preset.
-        """
+        """Defaults of a task."""
         return CEMConfig(**episode_preset(task, name))

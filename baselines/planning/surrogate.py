@@ -19,17 +19,13 @@ NEIGHBOURS = 16
 class Surrogate:
     """Copies the states of one environment into another of the same task with fewer particles.
 
-    Each particle of the small environment stands for one of the large: the nearest in the initial positions of both, so
-    that evenly spread particles stay evenly spread. It takes over position, velocity and deformation; masses and
-    volumes are the small environment's own.
-
-    Attributes:
-        indices: (B, n) the large environment's particles that the small one's stand for.
+    Each particle of the small environment stands for the nearest of the large in the initial positions of both, and
+    takes over its position, velocity and deformation; masses and volumes are the small environment's own.
     """
 
     def __init__(self, large: TorchEnv, small: TorchEnv) -> None:
         self.env = small
-        self.indices = _nearest_particles(large, small)
+        self.indices = _nearest_particles(large, small)  # (B, n) of the large environment's particles
         memory = small.env_state.memory
         self._particle_memory = {name: value for name, value in memory.items() if not value.is_floating_point()}
 

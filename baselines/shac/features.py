@@ -25,18 +25,12 @@ class StateFeatures:
 
     Mass, momentum and mass-weighted ``F - I`` of the robot are spread over 16 x 16 cells by quadratic B-splines, and so
     are mass and momentum of the object where the task has one. Masses are relative to the body's own, spread evenly
-    over the raster, so every particle count gives the same picture. The features are differentiable in the particles;
-    the position of the patch is not.
-
-    Attributes:
-        deformation: With the four channels of ``F - I``.
-        clock: With cosine and sine of the episode's step, for each of `PERIODS`.
-        displacement: With the robot's displacement since the reset, m.
+    over the raster, so every particle count gives the same picture. The features are differentiable in the particles.
     """
 
-    deformation: bool = True
-    clock: bool = True
-    displacement: bool = False
+    deformation: bool = True  # the four channels of F - I
+    clock: bool = True  # cosine and sine of the episode's step, for each of `PERIODS`
+    displacement: bool = False  # of the robot since the reset, m
 
     def size(self, objects: int) -> int:
         """Length D of the vector in a task with 0 or 1 objects."""

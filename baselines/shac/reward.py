@@ -40,7 +40,7 @@ class RewardConfig:
     """Factor of the whole, so that values are not far from one."""
 
     def check(self) -> None:
-        """Check what the types cannot."""
+        """Check what the types do not express."""
         check_at_least(0, split_weight=self.split_weight, split_margin=self.split_margin)
         check_at_least(0, integrity_weight=self.integrity_weight)
         check_positive(scale=self.scale)

@@ -109,7 +109,7 @@ class ShacConfig(GridConfig):
         return super().ineffective() | parts
 
     def check(self) -> None:
-        """Check what the types cannot, see `RunConfig.check`."""
+        """Check what the types do not express."""
         super().check()
         check_at_least(1, steps=self.steps, window=self.window, critic_updates=self.critic_updates)
         check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
@@ -154,7 +154,6 @@ class Shac(Stateful, Algorithm):
         self.rollout = Rollout(episodes, self.observe, config.reward, config.window, config.noise, config.seed)
 
     def _make_networks(self) -> tuple[StateActor | ImageActor, nn.Module, nn.Module]:
-        """Actor, critic and target critic."""
         size, device = self.features.size(len(self.env.spec.bodies) - 1), self.env.device
         if self.config.sees == "state":
             actor = StateActor(size, self.env.action_resolution).to(device)
@@ -257,9 +256,6 @@ class Shac(Stateful, Algorithm):
 
         ``paper`` trains four times as long in smaller steps and is evaluated in the paper's environment. Both train at
         the lite tier. RUN and OBSTACLE are trained on speed, the others on their own smooth reward.
-
-        Raises:
-            ConfigError: No such task or preset.
         """
         base = cfp.preset(task, name)
         quick, on_speed = name == "quick", task in ("run", "obstacle")
@@ -304,8 +300,7 @@ class Shac(Stateful, Algorithm):
 def actor_loss(window: Window, gamma: float) -> Tensor:
     """Negative discounted rewards of a window and final values of its episodes, mean over simulations and steps.
 
-    The sum of ``gamma^t r_t`` over the steps of an episode within the window, plus ``gamma^h V(s_h)`` after the last of
-    them (Xu et al., ICLR 2022, equation 5).
+    Of an episode within the window, the sum of ``gamma^t r_t`` plus ``gamma^h V(s_h)`` (Xu et al., equation 5).
     """
     steps = len(window.rewards)
     total, discount = torch.zeros_like(window.rewards[0]), torch.ones_like(window.rewards[0])

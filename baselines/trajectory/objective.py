@@ -47,14 +47,10 @@ class SilhouetteLoss:
     """Mean absolute difference of the soft silhouette and a target, both blurred.
 
     A wide blur pulls matter towards a target that it does not touch, a narrow one shapes the outline.
-
-    Attributes:
-        target: (64, 64), 1 inside the shape.
-        blurs: Matrices (64, 64) of `gaussian_matrix`, each used for the same fraction of the training.
     """
 
-    target: Tensor
-    blurs: tuple[Tensor, ...]
+    target: Tensor  # (64, 64), 1 inside the shape
+    blurs: tuple[Tensor, ...]  # matrices of `gaussian_matrix`, each used for the same fraction of the training
 
     def phase(self, progress: float) -> int:
         """Index of the blur."""

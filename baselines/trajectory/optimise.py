@@ -96,7 +96,7 @@ class GradientConfig(GridConfig):
         return super().ineffective() | polish | blur
 
     def check(self) -> None:
-        """Check what the types cannot, see `RunConfig.check`."""
+        """Check what the types do not express."""
         super().check()
         check_at_least(1, iterations=self.iterations)
         check_at_least(0, window=self.window, polish=self.polish)
@@ -174,10 +174,7 @@ class Gradient(Stateful, OpenLoopAlgorithm):
         return scalars | {"train/failed": float(self.failed)}
 
     def play(self, progress: float) -> Episode:
-        """Play one episode from the start, with the objective at a ``progress`` of 0 to 1 of the stage.
-
-        A robot whose episode is over no longer counts, whatever becomes of it.
-        """
+        """Play one episode from the start, with the objective at a ``progress`` of 0 to 1 of the stage."""
         env, window = self.env, self.config.window or self.horizon
         actions = self.theta.detach().tanh().requires_grad_()
         env.load(self.initial)
@@ -243,9 +240,6 @@ class Gradient(Stateful, OpenLoopAlgorithm):
 
         Both are evaluated at full size. Tasks other than SHAPE MATCH get fewer iterations of gradients that reach back
         16 steps, on the coarse grid.
-
-        Raises:
-            ConfigError: No such task or preset.
         """
         environment = cfp.preset(task, name).environment
         quick, horizon = name == "quick", make_spec(task).horizon

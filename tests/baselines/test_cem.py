@@ -73,18 +73,6 @@ def test_rest_is_tried() -> None:
     assert (planner.plan() == 0).all()
 
 
-def test_state_goes_on_the_same_and_repeats_by_seed() -> None:
-    env = small()
-    planner = CEMPlanner(env, quick())
-    planner.act()
-    state, moment = planner.state_dict(), env.save()
-    planned = [planner.act() for _ in range(4)]
-    env.load(moment)
-    other = CEMPlanner(env, quick(), seed=7)
-    other.load_state_dict(state)
-    assert all(torch.equal(other.act(), action) for action in planned)
-
-
 def test_plans_that_are_not_finite_are_counted_and_no_elites(monkeypatch) -> None:
     env = small("run", 2)
     planner = CEMPlanner(env, quick(candidates=4, elites=3))

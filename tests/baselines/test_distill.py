@@ -65,7 +65,7 @@ def segments(tmp_path_factory):
     return path
 
 
-def test_how_a_policy_is_judged_does_not_change_what_it_learns():
+def test_how_a_policy_is_evaluated_does_not_change_what_it_learns():
     def learned(quiet, **changes):
         config = make(beta_decay=0.0, **changes)
         student = Distill(replace(config, report=replace(config.report, eval_deterministic=quiet)))
@@ -75,7 +75,7 @@ def test_how_a_policy_is_judged_does_not_change_what_it_learns():
     assert torch.equal(learned(False), learned(True))
     assert not torch.equal(learned(True), learned(True, student_noise=False))
     assert Distill.preset("shapematch", "quick").student_noise
-    assert not Distill.preset("shapematch", "paper").student_noise  # which is judged without
+    assert not Distill.preset("shapematch", "paper").student_noise  # which is evaluated without noise
 
 
 class Mirror(Teacher):
@@ -166,13 +166,12 @@ def test_student_does_as_the_teacher_in_a_closed_loop():
             seen = env.step(torch.as_tensor(action))[0]
 
 
-@pytest.mark.parametrize("level", [0, 1])
-@pytest.mark.parametrize("kind", ["mpc", "privileged", "segments"])
-def test_resumed_distillation_is_the_same_to_the_last_bit(kind, level, privileged, segments):
+@pytest.mark.parametrize(("kind", "stage"), [("mpc", 1), ("privileged", 2), ("segments", 1)])
+def test_resumed_distillation_is_the_same_to_the_last_bit(kind, stage, privileged, segments):
     teacher = {"mpc": "mpc", "privileged": str(privileged["run"]), "segments": str(segments)}[kind]
     config = make(teacher=teacher, max_episode_steps=6, planner=GradientPlannerConfig(3, 3, 1))
-    start = Distill(config).policy if level else None
-    whole, first, second = (Distill(config, level + 1, start) for _ in range(3))
+    start = Distill(config).policy if stage > 1 else None
+    whole, first, second = (Distill(config, stage, start) for _ in range(3))
     whole.learn(32)
     first.learn(16)
     second.load_state_dict(first.state_dict())
@@ -242,7 +241,7 @@ def test_round_without_labels_has_no_fresh_loss():
     assert rows[-1]["train/labels"] == rows[-2]["train/labels"] and rows[-1]["train/loss"] > 0
 
 
-@pytest.mark.parametrize(("given", "wanted"), [(8, 8), (8, 16), (16, 8), (16, 32), (16, 64), (64, 64)])
+@pytest.mark.parametrize(("given", "wanted"), [(8, 8), (8, 16), (16, 8), (16, 64)])
 def test_projected_action_drives_the_muscles_alike(given, wanted):
     action = 0.5 * torch.rand(3, 2, given, given).double() - 0.25
     found = project(action, wanted, 64)

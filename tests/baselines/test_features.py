@@ -59,14 +59,6 @@ def test_object_clock_and_place_are_added():
     assert clock == pytest.approx([*map(math.cos, angles), *map(math.sin, angles)], abs=1e-6)
 
 
-def test_features_have_a_gradient():
-    env = reset()
-    action = torch.zeros(1, 2, 8, 8, dtype=torch.float64, requires_grad=True)
-    env.step(action)
-    (gradient,) = torch.autograd.grad(StateFeatures()(env).square().sum(), action)
-    assert gradient.isfinite().all() and gradient.abs().max() > 0
-
-
 def test_integrity_counts_what_drifts_apart():
     line = torch.linspace(0, 0.1, 11, dtype=torch.float64)
     x = torch.stack((line, torch.zeros(11, dtype=torch.float64)), 1)[None]

@@ -16,8 +16,7 @@ from cfp.errors import ConfigError
 from cfp.experiment.training import parse
 from cfp.files import write_json
 from cfp.tables import read_table
-from dittogym import TorchEnv
-from dittogym.action import from_grid_indexing, patch_field, to_grid_indexing
+from dittogym.action import patch_field, to_grid_indexing
 from dittogym.rewards import action_cost
 
 TINY = "--particles 100 --substeps 2 --eval-episodes 2 --no-video --device cpu".split()
@@ -63,13 +62,6 @@ def test_scripted_drives_the_whole_episode_in_the_layout_of_the_environment():
     for step in range(30):
         actions, memory = policy.predict(IMAGES, memory)
         assert np.allclose(actions[1], wave(30, 4, "grid")[step])
-
-
-def test_layouts_are_inverse():
-    action = torch.rand(2, 2, 5, 5)
-    for layout in ("image", "grid"):
-        assert torch.equal(to_grid_indexing(from_grid_indexing(action, layout), layout), action)
-        assert TorchEnv("run", particles=100, action_layout=layout).action_layout == layout
 
 
 LEARNING = (

@@ -41,10 +41,8 @@ def test_impossible_options_are_named(changes, message):
 
 
 def test_descent_improves_the_true_return():
-    algorithm, returns = (
-        Gradient(make(substeps=30, train_particles=500, learning_rate=0.2, blur=(1.0,), iterations=6)),
-        [],
-    )
+    config = make(substeps=30, train_particles=500, learning_rate=0.2, blur=(1.0,), iterations=6)
+    algorithm, returns = Gradient(config), []
     algorithm.learn(6 * 30, EachUpdate(lambda scalars: returns.append(scalars["train/return"])))
     assert len(returns) == 6 and algorithm.num_timesteps == 180
     assert returns[-1] > returns[0] + 40
@@ -169,12 +167,6 @@ def test_better_losses_below_zero_are_kept(monkeypatch, sequence, size):
     assert resumed.update()["train/failed"] == 1 and resumed.best_loss == min(sequence)
 
 
-@pytest.mark.parametrize(("task", "stage", "phases"), [("shapematch", 1, 4), ("shapematch", 2, 1), ("run", 1, 1)])
-def test_only_another_blur_begins_anew(task, stage, phases):
-    algorithm = Gradient(make(task, polish=1, substeps=1), stage)
-    assert len({algorithm.objective.phase(progress / 8) for progress in range(9)}) == phases
-
-
 def test_schedule_of_a_stage_that_gets_the_steps_of_an_earlier_one_does_not_rise_again(monkeypatch):
     algorithm = Gradient(make(polish=2, polish_grid=4, substeps=1), 2)
     found = Episode(1.0, 1.0, 0.0, torch.zeros_like(algorithm.theta))
@@ -194,7 +186,7 @@ def test_polish_starts_from_the_actions_of_the_first_stage():
     assert torch.allclose(finer.mean((2, 3)), actions.mean((2, 3)), atol=0.05)
 
 
-def test_only_polish_takes_place_where_the_result_is_judged():
+def test_only_polish_takes_place_where_the_result_is_evaluated():
     environment = EnvironmentConfig(1, 300, 4, parity="reference")
     first, polish = (
         Gradient(make("run", environment=environment, train_particles=200, polish=1), stage) for stage in (1, 2)

@@ -85,16 +85,6 @@ def test_layout_of_the_reference_is_kept() -> None:
         assert MPC(replace(CONFIG, environment=environment)).planner.env.action_layout == layout
 
 
-def test_state_goes_on_the_same() -> None:
-    first, second = MPC(CONFIG), MPC(CONFIG)
-    first.learn(3)
-    second.load_state_dict(first.state_dict())
-    second.num_timesteps = first.num_timesteps
-    for mpc in (first, second):
-        mpc.learn(4)
-    assert torch.equal(first.actions, second.actions) and first.total_reward == second.total_reward
-
-
 @pytest.mark.parametrize(
     ("change", "named"),
     [

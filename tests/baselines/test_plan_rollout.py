@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from baselines.common.rollout import repeat, rollout, soft_step, to_dtype
+from baselines.common.rollout import rollout, soft_step
 from dittogym import TorchEnv
 
 
@@ -54,12 +54,3 @@ def test_nothing_is_earned_after_the_end() -> None:
     for earned in (result.rewards, result.true_rewards):
         assert (earned[:, 0] != 0).all()
         assert (earned[:, 1] != 0).tolist() == [True, True, False, False]
-
-
-def test_copies_and_precision() -> None:
-    env = small("catch")
-    copies = to_dtype(repeat(env.env_state, 3), torch.float32)
-    assert copies.particles.x.shape == (3, env.num_particles, 2) and copies.particles.x.dtype == torch.float32
-    assert copies.steps.dtype == torch.int64 and copies.memory["object_com"].shape == (3, 2)
-    earned = rollout(env.model, copies, actions(env, 1).expand(1, 3, 2, 8, 8).float()).rewards
-    assert earned.dtype == torch.float32 and (earned == earned[:, :1]).all()

@@ -21,24 +21,20 @@ from cfp.tables import read_table
 from cfp.weights import describe, save_policy
 
 COMMON = "--particles 100 --substeps 1 --eval-episodes 2 --no-video --device cpu".split()
-LEVEL = (
-    "--num-envs 2 --resolutions 8 --steps 60 --random-steps 10 --batch-size 4 --buffer-size 60 --update-start 8 "
-    "--gradient-steps 1 --eval-every 20 --checkpoint-every 10 --log-every 10 --backend eager"
-)
 MODULAR = (
     "--num-envs 2 --steps 60 --random-steps 10 --batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 "
     "--eval-every 20 --checkpoint-every 10 --log-every 10"
 )
+SINGLE = f"{MODULAR} --resolutions 8 --backend eager"
 # A tiny run of each algorithm: options, a step at which it is stopped, its policies.
 TINY = {
     "cfp": (
-        "--num-envs 2 --resolutions 4 8 --steps 60 --handover 30 --random-steps 10 4 --batch-size 4 --buffer-size 60 "
-        "--update-start 8 --gradient-steps 1 --eval-every 20 --checkpoint-every 10 --log-every 10 --backend eager",
+        f"{MODULAR} --resolutions 4 8 --handover 30 --random-steps 10 4 --backend eager",
         44,
         ["stage 1", "stage 2"],
     ),
-    "coarse": (LEVEL, 44, ["stage 1"]),
-    "fine": (LEVEL, 44, ["stage 1"]),
+    "coarse": (SINGLE, 44, ["stage 1"]),
+    "fine": (SINGLE, 44, ["stage 1"]),
     "distill": (
         "--teacher mpc --planner-grid 4 --horizon 2 --commit 2 --iterations 1 --num-envs 2 --train-particles 100 "
         "--resolutions 4 8 --steps 60 --handover 30 --rollout-steps 5 --updates 2 --batch-size 4 --eval-every 20 "
@@ -212,7 +208,7 @@ def test_new_particles_are_refused_where_the_seed_says_them(algo):
     assert parse(train.PROGRAM, ["--algo", "gnn-16", "--resample"]).run.environment.resample
 
 
-def test_polish_is_judged_on_the_layout_it_is_made_for(finished):
+def test_polish_is_evaluated_on_the_layout_it_is_made_for(finished):
     algo, folder = finished
     rows = [row for row in read_table(folder / "evaluations.csv") if row["stage"] == "2"]
     wanted = {"cfp": {"2"}, "distill": {"2"}, "gradient": {"1"}}

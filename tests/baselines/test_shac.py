@@ -26,8 +26,6 @@ from cfp.sections import EnvironmentConfig
 from cfp.weights import describe, describe_run, save_policy
 from dittogym import TorchEnv
 
-TASKS = ("shapematch", "run", "grow", "kick", "dig", "obstacle", "catch", "slot")
-
 
 def make(task="run", **changes):
     environment = EnvironmentConfig(changes.pop("num_envs", 2), 300, changes.pop("substeps", 4))
@@ -45,11 +43,7 @@ def parameters(algorithm):
         ({"window": 0}, "window must be at least 1, got 0"),
         ({"gamma": 1.5}, "gamma must be between 0 and 1, got 1.5"),
         ({"learning_rate": 0.0}, "learning_rate"),
-        ({"noise": -0.1}, "noise must be at least 0, got -0.1"),
-        ({"reward": RewardConfig(scale=0.0)}, "scale must be positive, got 0.0"),
-        ({"reward": RewardConfig(split_weight=-1.0)}, "split_weight must be at least 0, got -1.0"),
         ({"reward": RewardConfig(split_margin=-0.5)}, "split_margin must be at least 0, got -0.5"),
-        ({"reward": RewardConfig(integrity_weight=-2.0)}, "integrity_weight must be at least 0, got -2.0"),
     ],
 )
 def test_impossible_options_are_named(changes, message):
@@ -313,11 +307,3 @@ def test_policy_of_the_state_says_what_it_needs(tmp_path):
     path.write_bytes(path.read_bytes().replace(b"inputs", b"outputs"[:6]))
     with pytest.raises(CheckpointError):
         StatePolicy.load(path)
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_every_task_has_a_gradient(task):
-    algorithm = Shac(make(task, substeps=20, grid=4, window=2))
-    rows = []
-    algorithm.learn(4, EachUpdate(rows.append))
-    assert rows[0]["train/gradient_norm"] > 0 and rows[0]["train/dropped"] == 0

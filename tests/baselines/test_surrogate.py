@@ -1,14 +1,11 @@
 """Planning in a simulation with fewer particles than the one that the plan is for."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
-from baselines import CEM, MPC, GradientPlannerConfig
-from baselines.planning.mpc import CEMConfig, MPCConfig
+from baselines import MPC, GradientPlannerConfig
+from baselines.planning.mpc import MPCConfig
 from baselines.planning.surrogate import Surrogate
-from cfp.errors import ConfigError
 from cfp.sections import EnvironmentConfig
 from dittogym import TASKS, TorchEnv
 
@@ -73,19 +70,3 @@ def test_plans_in_it_are_carried_out_in_the_other() -> None:
     for mpc in (first, second):
         mpc.learn(2)
     assert torch.equal(first.actions, second.actions) and bool(first.actions.any())
-
-
-@pytest.mark.parametrize("algorithm", [CEM, MPC])
-def test_presets(algorithm: type[MPC]) -> None:
-    quick, paper = (algorithm.preset("run", name) for name in ("quick", "paper"))
-    assert (quick.train_particles, quick.environment.particles) == (None, "lite")
-    assert (paper.train_particles, paper.environment.particles) == ("lite", "full")
-
-
-@pytest.mark.parametrize("kind", [MPCConfig, CEMConfig])
-def test_more_particles_than_there_are(kind) -> None:
-    config = kind(
-        task="run", device="cpu", grid=4, environment=replace(ENVIRONMENT, particles=100), train_particles=200
-    )
-    with pytest.raises(ConfigError, match=r"train_particles: .* at most 100 particles of a body, got 200"):
-        (CEM if kind is CEMConfig else MPC)(config)
