@@ -100,10 +100,10 @@ class ZeroPolicy:
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Actions (B, 2, R, R) for a batch of observations."""
-        return self._actions(len(observation)), state
+        return self._actions((len(observation), 2, self.resolution, self.resolution)), state
 
-    def _actions(self, count: int) -> np.ndarray:
-        return np.zeros((count, 2, self.resolution, self.resolution), np.float32)
+    def _actions(self, shape: tuple[int, ...]) -> np.ndarray:
+        return np.zeros(shape, np.float32)
 
 
 class RandomPolicy(ZeroPolicy):
@@ -113,9 +113,8 @@ class RandomPolicy(ZeroPolicy):
         super().__init__(resolution)
         self.generator = np.random.default_rng(seed)
 
-    def _actions(self, count: int) -> np.ndarray:
-        actions = self.generator.uniform(-1, 1, (count, 2, self.resolution, self.resolution))
-        return actions.astype(np.float32)
+    def _actions(self, shape: tuple[int, ...]) -> np.ndarray:
+        return self.generator.uniform(-1, 1, shape).astype(np.float32)
 
 
 def evaluate(
