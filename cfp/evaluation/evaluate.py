@@ -37,18 +37,12 @@ class SingleThreaded:
 
     policy: PolicyPredictor
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+    def predict(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Actions of the policy."""
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
         try:
-            return self.policy.predict(observation, state, episode_start, deterministic)
+            return self.policy.predict(*args, **kwargs)
         finally:
             torch.set_num_threads(threads)
 
