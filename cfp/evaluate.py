@@ -90,13 +90,13 @@ def open_run(
         raise CheckpointError(f"{folder}: no policy has been written yet")
     loaded = choose_device(device)
     policies = {name: program.load(path, loaded) for name, path in files.items()}
-    for (name, policy), path in zip(policies.items(), files.values(), strict=True):
-        found, stage = (policy.description["task"], policy.description["resolution"]), policy.description["stage"]
-        if stage > len(config.ends()):
-            raise CheckpointError(f"{path}: stage must be between 1 and {len(config.ends())}, got {stage}")
-        wanted = config.task, config.resolution(stage)
-        if found != wanted:
-            given, allowed = (f"{task} on a grid of {grid}" for task, grid in (found, wanted))
+    for name, path in files.items():
+        about = policies[name].description
+        if about["stage"] > len(config.ends()):
+            raise CheckpointError(f"{path}: stage must be between 1 and {len(config.ends())}, got {about['stage']}")
+        given = f"{about['task']} on a grid of {about['resolution']}"
+        allowed = f"{config.task} on a grid of {config.resolution(about['stage'])}"
+        if given != allowed:
             raise CheckpointError(f"{path}: {name} of this run must be a policy for {allowed}, got one for {given}")
     return config, policies
 
@@ -106,9 +106,8 @@ def open_policy(program: Program, path: str, device: str, seed: int | None) -> t
     policy = program.load(Path(path), choose_device(device))
     about = policy.description
     base = program.configure({"algo": about["kind"], "task": about["task"]})
-    config = update_from_dict(base, {"environment": about["environment"], **_stages(about)}).with_derived(
-        base, _stages(about)
-    )
+    stages = _stages(about)
+    config = update_from_dict(base, {"environment": about["environment"], **stages}).with_derived(base, stages)
     config = replace(config, device=device, seed=about["seed"] if seed is None else seed)
     config.check()
     return config, {policy_file(path).stem: policy}
@@ -117,9 +116,8 @@ def open_policy(program: Program, path: str, device: str, seed: int | None) -> t
 def _stages(about: dict[str, Any]) -> dict[str, Any]:
     """Options of the stages of a policy; in a custom task, those of the preset may not fit the networks."""
     network = about.get("network")
-    if not isinstance(network, dict):
-        return {}
-    return {name: network[name] for name in ("resolutions", "gate_bias") if name in network}
+    known = network if isinstance(network, dict) else {}
+    return {name: known[name] for name in ("resolutions", "gate_bias") if name in known}
 
 
 def run(program: Program, command: Command) -> str:

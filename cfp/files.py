@@ -57,12 +57,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object from a file of moderate size.
-
-    Raises:
-        OSError: It is missing, or not a file that can be read.
-        ValueError: It is not a JSON object in UTF-8, or larger than `LARGEST_JSON`.
-    """
+    """Read a JSON object from a file of moderate size; ``OSError`` or ``ValueError`` where that cannot be done."""
     if path.exists() and not path.is_file():
         raise OSError("it is not a file")  # a pipe or a device might never end
     with open(path, "rb") as file:

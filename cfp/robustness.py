@@ -74,9 +74,10 @@ class Command(Selection):
 
 def choose(cases: Sequence[Case], words: Sequence[str]) -> list[Case]:
     """The first case, and those whose names hold one of the words; all cases without words."""
+    names = [case.name for case in cases[1:]]
     for word in words:
-        if not any(word in case.name for case in cases[1:]):
-            raise ConfigError(f"cases must be words of {', '.join(case.name for case in cases[1:])}, got {word!r}")
+        if not any(word in name for name in names):
+            raise ConfigError(f"cases must be words of {', '.join(names)}, got {word!r}")
     return [*cases[:1], *(case for case in cases[1:] if not words or any(word in case.name for word in words))]
 
 

@@ -50,11 +50,7 @@ class Table:
 
 
 def read_table(path: Path, numbers: Sequence[str] = ("step",)) -> list[dict[str, str]]:
-    """Rows of a CSV file as text, none if it does not exist; a last line cut short by a crash is left out.
-
-    Raises:
-        CheckpointError: It is no such table.
-    """
+    """Rows of a CSV file as text, none if it does not exist; a last line cut short by a crash is left out."""
     if not path.exists():
         return []
     try:

@@ -37,18 +37,12 @@ class SingleThreaded:
 
     policy: PolicyPredictor
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+    def predict(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Actions of the policy."""
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
         try:
-            return self.policy.predict(observation, state, episode_start, deterministic)
+            return self.policy.predict(*args, **kwargs)
         finally:
             torch.set_num_threads(threads)
 
@@ -100,10 +94,10 @@ class ZeroPolicy:
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Actions (B, 2, R, R) for a batch of observations."""
-        return self._actions(len(observation)), state
+        return self._actions((len(observation), 2, self.resolution, self.resolution)), state
 
-    def _actions(self, count: int) -> np.ndarray:
-        return np.zeros((count, 2, self.resolution, self.resolution), np.float32)
+    def _actions(self, shape: tuple[int, ...]) -> np.ndarray:
+        return np.zeros(shape, np.float32)
 
 
 class RandomPolicy(ZeroPolicy):
@@ -113,9 +107,8 @@ class RandomPolicy(ZeroPolicy):
         super().__init__(resolution)
         self.generator = np.random.default_rng(seed)
 
-    def _actions(self, count: int) -> np.ndarray:
-        actions = self.generator.uniform(-1, 1, (count, 2, self.resolution, self.resolution))
-        return actions.astype(np.float32)
+    def _actions(self, shape: tuple[int, ...]) -> np.ndarray:
+        return self.generator.uniform(-1, 1, shape).astype(np.float32)
 
 
 def evaluate(

@@ -60,9 +60,10 @@ def film_episode(
             torch.cuda.set_rng_state_all(states[1])
             action, memory = acting.predict(observation, memory, start, deterministic)
             states = _generator_states()
-            tensors = venv.torch_env.step(torch.as_tensor(action, device=venv.torch_env.device))
-        observation, _, terminated, truncated, _ = (_numpy(value) for value in tensors)
-        done, start = bool(terminated[0] or truncated[0]), np.array([False])
+            seen, _, terminated, truncated, _ = venv.torch_env.step(
+                torch.as_tensor(action, device=venv.torch_env.device)
+            )
+        observation, done, start = seen.cpu().numpy(), bool(terminated[0] or truncated[0]), np.array([False])
         yield venv.torch_env.render(0)
 
 
@@ -71,16 +72,8 @@ def _generator_states() -> tuple[torch.Tensor, list[torch.Tensor]]:
     return torch.get_rng_state(), torch.cuda.get_rng_state_all()
 
 
-def _numpy(value: object) -> np.ndarray:
-    return value.cpu().numpy() if isinstance(value, torch.Tensor) else np.empty(0)
-
-
 def write_video(path: Path, frames: Iterable[np.ndarray], hold: int = FRAMES_PER_SECOND) -> None:
-    """Write an MP4 file from pictures, uint8 (H, W, 3), and repeat the last one ``hold`` times.
-
-    Raises:
-        VideoUnavailable: imageio or its ffmpeg is not installed; the message says how to install them.
-    """
+    """Write an MP4 file from pictures, uint8 (H, W, 3), and repeat the last one ``hold`` times."""
     if not available():
         raise VideoUnavailable("no video: it needs imageio with ffmpeg; pip install 'torchmpm[video]'")
     import imageio.v2 as imageio

@@ -30,15 +30,10 @@ Scalars = Mapping[str, float | None]
 
 @dataclass(frozen=True)
 class Position:
-    """Where a run stands.
+    """Where a run stands."""
 
-    Attributes:
-        stage: The stage in training, 1 is the first.
-        offset: Environment steps that the stages before it took.
-    """
-
-    stage: int = 1
-    offset: int = 0
+    stage: int = 1  # in training, 1 is the first
+    offset: int = 0  # environment steps that the stages before it took
 
 
 class Algorithm(ABC):
@@ -74,61 +69,33 @@ class Algorithm(ABC):
     @staticmethod
     @abstractmethod
     def preset(task: str, name: str) -> RunConfig:
-        """Default options for a task.
-
-        Args:
-            task: Its name.
-            name: ``"quick"`` or ``"paper"``.
-
-        Raises:
-            ConfigError: No such task or preset.
-        """
+        """Default options for a ``task``; the ``name`` of a preset is ``"quick"`` or ``"paper"``."""
 
     @classmethod
     def initialize(cls, config: Any, folder: Path) -> Position:
-        """Begin a new run: put what its first stage needs into the folder, and tell which stage that is.
-
-        Raises:
-            CFPError: An option names a policy that cannot be read or does not fit; nothing has been written.
-        """
+        """Put what the first stage of a new run needs into its ``folder``, and return which stage that is."""
         cls.initial_policy(config)
         return Position()
 
     @classmethod  # noqa: B027  (most algorithms need nothing)
     def prepare(cls, config: Any, folder: Path, signals: StopSignals) -> None:
-        """Do what must be done before the first stage, such as training a teacher.
-
-        Args:
-            config: Options of the run.
-            folder: Of the run.
-            signals: Whether the user wants to stop.
-        """
+        """Do what precedes the first stage, such as training a teacher; ``signals`` tell whether to stop."""
 
     @classmethod
     def create(cls, config: Any, stage: int, folder: Path, resumed: bool = False) -> Algorithm:
-        """The algorithm at the beginning of a stage; the policy of the stage before is in the folder.
-
-        Args:
-            config: Options of the run.
-            stage: Which stage.
-            folder: Of the run.
-            resumed: A checkpoint of this stage is going to be loaded.
-        """
+        """The algorithm at the beginning of a stage, also if it is ``resumed`` from a checkpoint loaded later."""
+        start: Policy | None = None
         if stage > 1:
-            start: Policy | None = cls.load(policy_path(folder, stage - 1), choose_device(config.device))
-        else:
-            start = None if resumed else cls.initial_policy(config)
+            start = cls.load(policy_path(folder, stage - 1), choose_device(config.device))
+        elif not resumed:
+            start = cls.initial_policy(config)
         algorithm = cls(config, stage, start)
         algorithm.starts_trained = start is not None
         return algorithm
 
     @classmethod
     def initial_policy(cls, config: Any) -> Policy | None:
-        """The trained policy that the first stage begins with, if the options name one.
-
-        Raises:
-            CFPError: It cannot be read or does not fit.
-        """
+        """The trained policy that the first stage begins with, if the options name one."""
         return None
 
     @classmethod
@@ -154,11 +121,9 @@ class Algorithm(ABC):
         return False
 
     def learn(self, total_timesteps: int, callback: BaseCallback | None = None) -> Algorithm:
-        """Take some more environment steps and learn from them.
+        """Take at least ``total_timesteps`` environment steps and learn from them.
 
-        Args:
-            total_timesteps: How many at least.
-            callback: A rollout starts before each update, and a step ends after it; may raise to stop the training.
+        For the ``callback``, a rollout starts before each update and a step ends after it; it may raise to stop.
         """
         callback = callback or CallbackList([])
         callback.init_callback(cast(BaseAlgorithm, self))
@@ -172,11 +137,7 @@ class Algorithm(ABC):
         return self
 
     def update(self) -> Scalars:
-        """Take some environment steps, add them to `num_timesteps`, and learn from them.
-
-        Returns:
-            Scalars of this update.
-        """
+        """Take some environment steps, add them to `num_timesteps`, and learn from them; returns scalars to log."""
         raise NotImplementedError
 
     def row(self) -> Scalars:
@@ -199,7 +160,7 @@ class Algorithm(ABC):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Choose actions.
+        """Choose actions as stable-baselines3's ``predict`` does.
 
         Args:
             observation: (B, 3, 64, 64) uint8.
@@ -214,12 +175,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
-        """Write the policy, see `cfp.weights.write_policy`.
-
-        Args:
-            path: The ``.safetensors`` file.
-            description: What it is and comes from.
-        """
+        """Write the policy and its ``description`` as a ``.safetensors`` file, see `cfp.weights.write_policy`."""
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:

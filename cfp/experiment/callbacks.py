@@ -1,8 +1,4 @@
-"""What happens between two updates of a stage: rows in the logs, evaluations, films, checkpoints, stopping.
-
-Each callback acts at the start of a rollout, when every step taken has been stored and learned from, and once more at
-the end of the stage.
-"""
+"""What happens between two updates of a stage: rows in the logs, evaluations, films, checkpoints, stopping."""
 
 from __future__ import annotations
 
@@ -68,7 +64,7 @@ class Stage:
 
 
 class StageCallback(BaseCallback):
-    """Acts every so many environment steps of the run."""
+    """Acts every so many environment steps: when all of them have been learned from, and at the end of the stage."""
 
     def __init__(self, stage: Stage, every: int) -> None:
         super().__init__()
@@ -127,7 +123,7 @@ class LogCallback(StageCallback):
     def __init__(self, stage: Stage, bar: ProgressBarCallback) -> None:
         super().__init__(stage, stage.config.report.log_every)
         self.bar = bar
-        self._logged, self._clock = stage.step, time.perf_counter()
+        self._logged = stage.step
 
     def _on_training_start(self) -> None:
         self._clock = time.perf_counter()
@@ -137,8 +133,7 @@ class LogCallback(StageCallback):
         speed = (step - self._logged) / max(now - self._clock, 1e-9)
         self._logged, self._clock = step, now
         scalars = self.stage.algorithm.row()
-        logger.record("stage", self.stage.number)
-        for name, value in scalars.items():
+        for name, value in {"stage": self.stage.number, **scalars}.items():
             logger.record(name, value)
         logger.record("time/steps_per_second", speed, exclude="csv")
         logger.dump(step)
@@ -151,10 +146,7 @@ class LogCallback(StageCallback):
 
 
 class EvaluationCallback(StageCallback):
-    """Evaluates the policy and keeps the best one of the stage as ``policy.safetensors``.
-
-    A stage that begins with a trained policy is evaluated before its first step: it must do better than that.
-    """
+    """Evaluates the policy, a trained one also before its first step, and keeps the best of the stage."""
 
     def __init__(self, stage: Stage, table: Table, tracker: Tracker, bar: ProgressBarCallback) -> None:
         super().__init__(stage, stage.config.report.eval_every)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -71,8 +71,7 @@ class SACAlgorithm(Algorithm):
     @classmethod
     def hyperparameters(cls, config: Any, stage: int, folder: Path) -> Hyperparameters:
         """Hyperparameters of a stage."""
-        hyperparameters: Hyperparameters = config.hyperparameters(stage)
-        return hyperparameters
+        return cast(Hyperparameters, config.hyperparameters(stage))
 
     @classmethod
     def warnings(cls, config: Any, folder: Path, first_stage: int) -> list[str]:
@@ -162,9 +161,8 @@ class CoarseToFine(SACAlgorithm):
     def create(cls, config: Config, stage: int, folder: Path, resumed: bool = False) -> CoarseToFine:
         """Networks, replay memory and environment of a stage."""
         env, spec = make_env(config, config.action_size(stage)), config.actor_spec(stage)
-        refines = _refines(config, folder, stage)
         model = cls.make_model(config, env, CFPPolicy, {"spec": spec}, cls.hyperparameters(config, stage, folder))
-        actor = model.networks()[0]
+        actor, refines = model.networks()[0], _refines(config, folder, stage)
         if refines:
             model.origin = load(_start_path(folder), str(model.device)).actor
             actor.load_state_dict(model.origin.state_dict())
@@ -192,9 +190,7 @@ class CoarseToFine(SACAlgorithm):
 
     def images(self) -> dict[str, np.ndarray]:
         """What the actor does with the observation of the first robot."""
-        assert isinstance(self.model._last_obs, np.ndarray)
-        observation, _ = self.policy.obs_to_tensor(self.model._last_obs[:1])
-        assert isinstance(observation, torch.Tensor)
+        observation = torch.as_tensor(np.asarray(self.model._last_obs)[:1], device=self.model.device)
         return policy_pictures(self.model.networks()[0], observation)
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:

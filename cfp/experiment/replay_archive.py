@@ -59,12 +59,7 @@ class ReplayArchive:
                 path.unlink()
 
     def load(self, buffer: ReplayBuffer, rows: int, chunks: list[dict[str, Any]]) -> None:
-        """Fill a fresh ring from the chunks that a checkpoint names.
-
-        Raises:
-            CheckpointError: A chunk is missing or damaged.
-            ValueError: A chunk holds rows of another shape than the ring.
-        """
+        """Fill a fresh ring from the chunks that a checkpoint names."""
         self.chunks = [Chunk(**chunk) for chunk in chunks]
         oldest = max(0, rows - buffer.buffer_size)
         covered = oldest

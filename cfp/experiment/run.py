@@ -53,11 +53,6 @@ class Run:
 
     ``policy.safetensors`` is the policy with the best evaluation of its stage so far (without evaluations: the newest);
     the next stage starts from it, and the final table evaluates it on layouts of its own.
-
-    Raises:
-        ConfigError: The folder already holds a run and ``resume`` is not set (nothing in it is touched), or the options
-            do not fit its checkpoint.
-        CheckpointError: The checkpoint is damaged.
     """
 
     def __init__(

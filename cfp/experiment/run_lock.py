@@ -19,12 +19,7 @@ class FolderInUse(CFPError):
 
 @contextmanager
 def run_lock(folder: Path, timeout: float = 0.0) -> Iterator[None]:
-    """Hold the folder of a run, which is created if need be; the system releases it however the process ends.
-
-    Raises:
-        FolderInUse: It is still held by another process after ``timeout`` seconds.
-        OSError: The folder cannot be written.
-    """
+    """Hold the folder of a run, which is created if need be; the system releases it however the process ends."""
     is_new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / ".lock"
