@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import tyro
 
@@ -50,11 +50,7 @@ class Selection:
     """cpu, cuda, or auto."""
 
     def open(self, program: Program) -> tuple[RunConfig, dict[str, Policy]]:
-        """Options to evaluate with, and policies by stage, the newest last.
-
-        Raises:
-            CFPError: An option is wrong, there is no run, it has no policy yet, or a file is damaged.
-        """
+        """Options to evaluate with, and policies by stage, the newest last."""
         check_at_least(1, episodes=self.episodes)
         if (self.folder is None) == (self.policy is None):
             raise ConfigError(f"either policy or a folder must be given, got {self.policy!r} and {self.folder}")
@@ -67,9 +63,6 @@ class Selection:
             config = replace(config, environment=config.environment.for_evaluation(self.particles))
             config.check()
         return config, policies
-
-
-Chosen = TypeVar("Chosen", bound=Selection)
 
 
 @dataclass(frozen=True)
@@ -87,11 +80,7 @@ class Command(Selection):
 def open_run(
     program: Program, folder: Path, device: str, seed: int | None = None
 ) -> tuple[RunConfig, dict[str, Policy]]:
-    """Options of the run in a folder, for evaluation, and its policies by stage, the newest last.
-
-    Raises:
-        CFPError: There is no run, it has no policy yet, a file is damaged or not of this run, or the seed is negative.
-    """
+    """Options of the run in a folder, for evaluation, and its policies by stage, the newest last."""
     config = replace(read_config(folder, program.configure), device=device)
     if seed is not None:
         config = replace(config, seed=seed)
@@ -134,11 +123,7 @@ def _stages(about: dict[str, Any]) -> dict[str, Any]:
 
 
 def run(program: Program, command: Command) -> str:
-    """Do what a command says and return what it prints.
-
-    Raises:
-        CFPError: There is no run, it has no policy yet, or a file is damaged.
-    """
+    """Evaluate, film if asked to, and return the table."""
     config, policies = command.open(program)
     results = compare(config, policies, command.episodes, command.noise)
     if command.video is not None:
@@ -148,19 +133,8 @@ def run(program: Program, command: Command) -> str:
 
 def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:
     """Command line entry; returns the exit code."""
-    return evaluation_main("evaluate", Command, run, arguments, program)
-
-
-def evaluation_main(
-    name: str,
-    kind: type[Chosen],
-    run: Callable[[Program, Chosen], str],
-    arguments: Sequence[str] | None,
-    program: Program,
-) -> int:
-    """Command line entry of a program that evaluates policies and prints what it finds; returns the exit code."""
-    started = program_name(f"{program.package}.{name}", arguments)
-    return run_command(lambda: print(run(program, tyro.cli(kind, prog=started, args=arguments))))
+    started = program_name(f"{program.package}.evaluate", arguments)
+    return run_command(lambda: print(run(program, tyro.cli(Command, prog=started, args=arguments))))
 
 
 if __name__ == "__main__":

@@ -9,21 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-LARGEST_JSON = 2**20
-"""Bytes of a JSON file that is read."""
+LARGEST_JSON = 2**20  # bytes
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], Any]) -> None:
-    """Write a file aside, flush it to disk, and move it into place.
-
-    Args:
-        path: Where it ends up; the folder is created.
-        write: Called with the open binary file.
-
-    Raises:
-        OSError: The disk is full or the folder cannot be written; it names the file, and the old one, if any, is
-            untouched.
-    """
+    """Write a file aside, flush it to disk, and move it into place; an `OSError` leaves the old file untouched."""
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(path.name + ".part")
     aside.unlink(missing_ok=True)  # where it is a link, its target must not be written to
@@ -71,7 +61,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
     Raises:
         OSError: It is missing, or not a file that can be read.
-        ValueError: It is not JSON in UTF-8, not an object, or larger than `LARGEST_JSON`.
+        ValueError: It is not a JSON object in UTF-8, or larger than `LARGEST_JSON`.
     """
     if path.exists() and not path.is_file():
         raise OSError("it is not a file")  # a pipe or a device might never end
@@ -86,11 +76,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def parse_json(text: str) -> Any:
-    """Parse JSON of any depth.
-
-    Raises:
-        ValueError: It is not JSON.
-    """
+    """Parse JSON; a ``ValueError`` where it is none."""
     try:
         return json.loads(text)
     except RecursionError as error:

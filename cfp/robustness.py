@@ -10,15 +10,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import tyro
 from matplotlib.figure import Figure
 
 from cfp import train
 from cfp.config import RunConfig
 from cfp.envs.disturbances import Case, disturbed_env, make_cases, reason_without_effect
 from cfp.errors import ConfigError
-from cfp.evaluate import Selection, evaluation_main
+from cfp.evaluate import Selection
 from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
 from cfp.evaluation.plots import write_figure
+from cfp.evaluation.tables import numbers
+from cfp.experiment.cli import program_name, run_command
 from cfp.experiment.training import Program
 from cfp.files import write_json, write_text
 from cfp.policy import DisturbablePolicy, Policy
@@ -56,11 +59,7 @@ class Command(Selection):
     given."""
 
     def check(self) -> None:
-        """Check what the types cannot.
-
-        Raises:
-            ConfigError: Naming the option, what was given and what is allowed.
-        """
+        """Refuse values that are out of range."""
         check_at_least(1, latency=self.latency)
         if self.out is None and self.folder is None:
             raise ConfigError("out must be given with a single policy: the folder to write into")
@@ -74,11 +73,7 @@ class Command(Selection):
 
 
 def choose(cases: Sequence[Case], words: Sequence[str]) -> list[Case]:
-    """The first case, and those whose names hold one of the words; all cases without words.
-
-    Raises:
-        ConfigError: No name holds one of them.
-    """
+    """The first case, and those whose names hold one of the words; all cases without words."""
     for word in words:
         if not any(word in case.name for case in cases[1:]):
             raise ConfigError(f"cases must be words of {', '.join(case.name for case in cases[1:])}, got {word!r}")
@@ -86,11 +81,7 @@ def choose(cases: Sequence[Case], words: Sequence[str]) -> list[Case]:
 
 
 def check_words(cases: Sequence[Case], words: Sequence[str], spec: TaskSpec, policy: Policy) -> None:
-    """Check that each word chooses something.
-
-    Raises:
-        ConfigError: No case with a word in its name changes anything; it says why.
-    """
+    """Check that each word chooses a case that changes something."""
     for word in words:
         reasons = {
             case.name: reason_without_effect(case, spec, policy.uses_image) for case in cases[1:] if word in case.name
@@ -107,10 +98,8 @@ def report(
     if deterministic is None:
         deterministic = policy.deterministic_by_default
     spec, seed = make_spec(config.task, **config.environment.task_options()), evaluation_seed(config)
-    grid, results = (
-        0 if isinstance(policy, DisturbablePolicy) else policy.description.get("resolution", policy.resolution),
-        [],
-    )
+    grid = 0 if isinstance(policy, DisturbablePolicy) else policy.description.get("resolution", policy.resolution)
+    results = []
     for case in cases:
         if reason_without_effect(case, spec, policy.uses_image):
             continue
@@ -124,23 +113,9 @@ def to_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
     """Results as JSON values, ``ratio`` to the first one's mean; None where that is not positive."""
     base = results[0].mean
     return [
-        {
-            "case": result.name,
-            "episodes": len(result.returns),
-            "mean": round(result.mean, 3),
-            "std": round(result.std, 3),
-            "interval": None if result.interval is None else round(result.interval, 3),
-            "ratio": round(result.mean / base, 4) if base > 0 else None,
-            "success": result.success,
-            "returns": [round(value, 3) for value in result.returns],
-        }
+        {"case": result.name, "ratio": round(result.mean / base, 4) if base > 0 else None, **numbers(result)}
         for result in results
     ]
-
-
-def to_csv(rows: Sequence[dict[str, Any]]) -> str:
-    """The table as CSV."""
-    return csv_text(rows, COLUMNS)
 
 
 def to_markdown(config: RunConfig, rows: Sequence[dict[str, Any]]) -> str:
@@ -180,11 +155,7 @@ def draw(config: RunConfig, results: Sequence[Result]) -> Figure:
 
 
 def run(program: Program, command: Command) -> str:
-    """Do what a command says and return what it prints.
-
-    Raises:
-        CFPError: An option is wrong, there is no run, it has no policy yet, or a file is damaged.
-    """
+    """Evaluate all cases, write the files, and return the table."""
     command.check()
     cases = make_cases(command.dropout, command.noise, command.latency, command.shift, command.friction)
     cases = choose(cases, command.cases)
@@ -197,7 +168,7 @@ def run(program: Program, command: Command) -> str:
     rows, path = to_rows(results), folder / "robustness"
     table = to_markdown(config, rows)
     write_json(path.with_suffix(".json"), rows)
-    write_text(path.with_suffix(".csv"), to_csv(rows))
+    write_text(path.with_suffix(".csv"), csv_text(rows, COLUMNS))
     write_text(path.with_suffix(".md"), table)
     write_figure(path.with_suffix(".png"), draw(config, results))
     return f"{table}\nbar plot: {path.with_suffix('.png')}"
@@ -205,7 +176,8 @@ def run(program: Program, command: Command) -> str:
 
 def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:
     """Command line entry; returns the exit code."""
-    return evaluation_main("robustness", Command, run, arguments, program)
+    started = program_name(f"{program.package}.robustness", arguments)
+    return run_command(lambda: print(run(program, tyro.cli(Command, prog=started, args=arguments))))
 
 
 if __name__ == "__main__":

@@ -22,14 +22,9 @@ def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> str:
 
 
 class Table:
-    """A CSV file that grows row by row, also over several sessions, and can take new columns on the way.
-
-    Raises:
-        CheckpointError: The file is damaged.
-    """
+    """A CSV file that grows row by row, also over several sessions, and can take new columns on the way."""
 
     def __init__(self, path: Path, last_step: int | None = None, numbers: Sequence[str] = ("step",)) -> None:
-        """Read the file if it is there."""
         self.path = path
         self.rows = read_table(path, numbers)
         if last_step is not None:
@@ -71,12 +66,8 @@ def read_table(path: Path, numbers: Sequence[str] = ("step",)) -> list[dict[str,
         raise CheckpointError(f"{path}: cannot be read ({error})") from error
     for row in rows:
         for name in numbers:
-            _check_number(path, name, row.get(name))
+            try:
+                float(row.get(name) or "")
+            except ValueError as error:
+                raise CheckpointError(f"{path}: column {name} must hold numbers, got {row.get(name)!r}") from error
     return rows
-
-
-def _check_number(path: Path, column: str, text: str | None) -> None:
-    try:
-        float(text or "")
-    except ValueError as error:
-        raise CheckpointError(f"{path}: column {column} must hold numbers, got {text!r}") from error

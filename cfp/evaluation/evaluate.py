@@ -33,13 +33,7 @@ def attached(policy: PolicyPredictor, env: VecEnv) -> PolicyPredictor:
 
 @dataclass(frozen=True)
 class SingleThreaded:
-    """A policy that acts with one thread, so that its actions do not depend on how many torch uses.
-
-    With several threads torch adds up convolutions in another order, and long episodes amplify the last bit.
-
-    Attributes:
-        policy: Acts.
-    """
+    """A policy that acts with one thread: with several, torch adds up convolutions in another order."""
 
     policy: PolicyPredictor
 
@@ -61,19 +55,12 @@ class SingleThreaded:
 
 @dataclass(frozen=True)
 class Result:
-    """Undiscounted returns of some episodes.
-
-    Attributes:
-        name: Of the policy.
-        resolution: Its action grid R.
-        returns: One sum of raw rewards per episode; those of element 0 first, so that equal places are equal layouts.
-        success: Share of successful episodes, None where the task does not define success.
-    """
+    """Undiscounted returns of some episodes of a policy."""
 
     name: str
-    resolution: int
-    returns: tuple[float, ...]
-    success: float | None = None
+    resolution: int  # of its action grid
+    returns: tuple[float, ...]  # those of element 0 first, so that equal places are equal layouts
+    success: float | None = None  # share of episodes, None where the task does not define success
 
     @property
     def mean(self) -> float:
@@ -112,7 +99,7 @@ class ZeroPolicy:
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Actions (B, 2, R, R) for a batch of observations, as stable-baselines3's ``predict``."""
+        """Actions (B, 2, R, R) for a batch of observations."""
         return self._actions(len(observation)), state
 
     def _actions(self, count: int) -> np.ndarray:
@@ -134,65 +121,40 @@ class RandomPolicy(ZeroPolicy):
 def evaluate(
     name: str, policy: PolicyPredictor, env: VecEnv, episodes: int, *, deterministic: bool, seed: int
 ) -> Result:
-    """Run episodes without learning.
+    """Run episodes without learning, in environments used for nothing else; torch's generator is not touched.
 
-    Neither the environments of a training run nor torch's generator are touched. The same seed gives the same episodes
-    with any number of threads; element i of the batch starts from layout ``seed + i``. With reference parity, whose
-    resets show what was before, this holds only in environments that have just been made.
-
-    Args:
-        name: Of the policy, for the result.
-        policy: Anything with stable-baselines3's ``predict``; shown the state if it asks for it, see `SeesState`.
-        env: Environments used for evaluation only.
-        episodes: How many.
-        deterministic: Act without noise.
-        seed: Of the first element's layout and of the noise.
+    The same seed gives the same episodes with any number of threads; element i of the batch starts from layout
+    ``seed + i``. With reference parity, whose resets show what was before, this holds only in new environments.
     """
     elements: list[int] = []
     successes: list[bool] = []
 
     def note(local: dict[str, Any], _: dict[str, Any]) -> None:
-        if not local["done"]:
-            return
-        elements.append(local["i"])
-        if "is_success" in local["info"]:
-            successes.append(bool(local["info"]["is_success"]))
+        if local["done"]:
+            elements.append(local["i"])
+            if "is_success" in local["info"]:
+                successes.append(bool(local["info"]["is_success"]))
 
     acting = SingleThreaded(attached(policy, env))
     env.seed(seed)
-    cuda = list(range(torch.cuda.device_count()))
-    with torch.random.fork_rng(devices=cuda):
+    with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
         torch.manual_seed(seed)
         returns, _ = evaluate_policy(
-            acting,
-            env,
-            episodes,
-            deterministic=deterministic,
-            callback=note,
-            return_episode_rewards=True,
+            acting, env, episodes, deterministic=deterministic, callback=note, return_episode_rewards=True
         )
     assert isinstance(returns, list)
-    # They come in the order in which episodes end.
-    ordered = [value for _, value in sorted(zip(elements, returns, strict=True), key=lambda pair: pair[0])]
+    ordered = np.asarray(returns)[np.argsort(elements, kind="stable")]  # they come as the episodes end
     success = float(np.mean(successes)) if successes else None
-    action_space = env.action_space
-    assert action_space.shape is not None
-    return Result(name, action_space.shape[-1], tuple(map(float, ordered)), success)
+    assert env.action_space.shape is not None
+    return Result(name, env.action_space.shape[-1], tuple(ordered.tolist()), success)
 
 
 def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, noise: Noise = "default") -> list[Result]:
     """Evaluate trained policies beside zero and random action, all on the same particle layouts.
 
     A policy made for a single layout is evaluated there too, in a row of its own.
-
-    Args:
-        config: The run's options.
-        policies: By name, each with its own resolution. Zero and random action use the first stage's.
-        episodes: Episodes of each.
-        noise: Whether trained policies act with their noise; ``"both"`` gives each a row with and one without.
     """
-    coarsest = config.resolution(1)
-    seed = evaluation_seed(config)
+    coarsest, seed = config.resolution(1), evaluation_seed(config)
     untrained = {"zero action": ZeroPolicy(coarsest), "random action": RandomPolicy(coarsest, config.seed)}
 
     def evaluated(name: str, policy: Policy | ZeroPolicy | RandomPolicy, deterministic: bool) -> Result:

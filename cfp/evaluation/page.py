@@ -22,11 +22,7 @@ HEADER = ("policy", "action", "episodes", "mean return", "95 % interval", "std",
 
 
 def write_page(folder: Path, config: RunConfig, results: Sequence[Result]) -> Path:
-    """Write ``index.html`` beside the other files of a finished run, which it shows by their relative names.
-
-    Returns:
-        The path of the page.
-    """
+    """Write ``index.html`` beside the files of a finished run that it shows; returns its path."""
     title = escape(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed}")
     video = (folder / "video.mp4").exists()
     parts = [

@@ -16,8 +16,7 @@ PICTURES: dict[str, str] = {
 }
 """Pictures of every evaluation (TensorBoard only), and what they show."""
 
-SIZE = 192
-"""Rows of a picture, pixels."""
+SIZE = 192  # rows of a picture, pixels
 
 
 @torch.no_grad()

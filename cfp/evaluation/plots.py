@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -15,11 +16,7 @@ from cfp.tables import read_table
 
 
 def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Path:
-    """Draw ``curve.png``: training and evaluation returns over environment steps, all stages after one another.
-
-    Returns:
-        The path of the picture.
-    """
+    """Draw training and evaluation returns over environment steps into ``curve.png``; returns its path."""
     figure = Figure(figsize=(8, 4.5), dpi=150, layout="constrained")
     axes = figure.add_subplot()
     training = read_table(run / "progress.csv", ("step", "stage"))
@@ -31,8 +28,7 @@ def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Pat
     _, stds = _column(evaluations, "std")
     how = "without noise" if config.report.eval_deterministic else "with noise"
     axes.plot(steps, means, "o-", color="tab:blue", markersize=3, label=f"evaluation ({how}), mean ± std")
-    low = [mean - std for mean, std in zip(means, stds, strict=True)]
-    high = [mean + std for mean, std in zip(means, stds, strict=True)]
+    low, high = np.subtract(means, stds), np.add(means, stds)
     axes.fill_between(steps, low, high, color="tab:blue", alpha=0.2, linewidth=0)
     for (name, value), style in zip(baselines.items(), ("--", ":", "-."), strict=False):
         axes.axhline(value, color="black", linestyle=style, linewidth=1, label=name)

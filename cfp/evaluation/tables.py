@@ -11,18 +11,21 @@ from cfp.evaluation.evaluate import Result
 def to_rows(results: list[Result]) -> list[dict[str, Any]]:
     """Results as JSON values."""
     return [
-        {
-            "policy": result.name,
-            "action": f"{result.resolution}x{result.resolution}",
-            "episodes": len(result.returns),
-            "mean": round(result.mean, 3),
-            "std": round(result.std, 3),
-            "interval": None if result.interval is None else round(result.interval, 3),
-            "returns": [round(value, 3) for value in result.returns],
-            "success": result.success,
-        }
+        {"policy": result.name, "action": f"{result.resolution}x{result.resolution}", **numbers(result)}
         for result in results
     ]
+
+
+def numbers(result: Result) -> dict[str, Any]:
+    """Numbers of a result as JSON values."""
+    return {
+        "episodes": len(result.returns),
+        "mean": round(result.mean, 3),
+        "std": round(result.std, 3),
+        "interval": None if result.interval is None else round(result.interval, 3),
+        "returns": [round(value, 3) for value in result.returns],
+        "success": result.success,
+    }
 
 
 def format_table(config: RunConfig, results: list[Result]) -> str:

@@ -21,7 +21,6 @@ from cfp.evaluation.evaluate import SingleThreaded, attached
 from cfp.policy import Policy
 
 FRAMES_PER_SECOND = 10
-MISSING = "no video: it needs imageio with ffmpeg; install them with: pip install 'torchmpm[video]'"
 
 
 class VideoUnavailable(RuntimeError):
@@ -34,12 +33,7 @@ def available() -> bool:
 
 
 def film(config: RunConfig, policy: Policy) -> Iterator[np.ndarray]:
-    """Pictures of one episode of a policy as it is evaluated, see `film_episode`.
-
-    Args:
-        config: The run's options.
-        policy: One made for a single layout is filmed there.
-    """
+    """Pictures of one episode of a policy as it is evaluated; one made for a single layout is filmed there."""
     seed = policy.description.get("layout", config.seed + EVALUATION_SEED)
     return film_episode(config, policy, policy.resolution, policy.deterministic_by_default, seed)
 
@@ -82,18 +76,13 @@ def _numpy(value: object) -> np.ndarray:
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], hold: int = FRAMES_PER_SECOND) -> None:
-    """Write an MP4 file, picture by picture: no more than one is held.
-
-    Args:
-        path: Where; replaced in one move once it is whole.
-        frames: uint8 (H, W, 3), even H and W, one or more.
-        hold: How often the last picture is repeated at the end.
+    """Write an MP4 file from pictures, uint8 (H, W, 3), and repeat the last one ``hold`` times.
 
     Raises:
         VideoUnavailable: imageio or its ffmpeg is not installed; the message says how to install them.
     """
     if not available():
-        raise VideoUnavailable(MISSING)
+        raise VideoUnavailable("no video: it needs imageio with ffmpeg; pip install 'torchmpm[video]'")
     import imageio.v2 as imageio
 
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -10,7 +10,6 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 from tqdm import tqdm
@@ -40,14 +39,7 @@ class StageFinished(Exception):
 
 @dataclass
 class Stage:
-    """A stage in training.
-
-    Attributes:
-        config: Options of the run.
-        folder: Of the run.
-        position: Number of the stage, and environment steps that the stages before it took.
-        algorithm: Is trained.
-    """
+    """A stage in training."""
 
     config: RunConfig
     folder: Path
@@ -83,11 +75,10 @@ class StageCallback(BaseCallback):
         self.stage, self.every = stage, every
         self._last = stage.step
 
-    def act(self) -> None:
-        """Do what has come due."""
+    def _act(self) -> None:
         raise NotImplementedError
 
-    def is_due(self) -> bool:
+    def _is_due(self) -> bool:
         """Whether the steps since the last call have passed a multiple of `every`."""
         last, self._last = self._last, self.stage.step
         return self.every > 0 and self._last // self.every > last // self.every
@@ -96,8 +87,8 @@ class StageCallback(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
-        if self.is_due():
-            self.act()
+        if self._is_due():
+            self._act()
 
     def _on_training_end(self) -> None:
         self._on_rollout_start()
@@ -129,13 +120,9 @@ class ProgressBarCallback(BaseCallback):
         self.values |= {name: f"{value:.1f}" for name, value in values.items()}
         self.bar.set_postfix(self.values)
 
-    def close(self) -> None:
-        """End the line of the bar, so that what is printed next begins a new one."""
-        self.bar.close()
-
 
 class LogCallback(StageCallback):
-    """Writes rows to the logger of the algorithm: ``progress.csv``, TensorBoard, and Weights & Biases if asked for."""
+    """Writes rows to the logger of the algorithm: ``progress.csv``, TensorBoard, Weights & Biases if asked for."""
 
     def __init__(self, stage: Stage, bar: ProgressBarCallback) -> None:
         super().__init__(stage, stage.config.report.log_every)
@@ -145,8 +132,7 @@ class LogCallback(StageCallback):
     def _on_training_start(self) -> None:
         self._clock = time.perf_counter()
 
-    def act(self) -> None:
-        """Write a row."""
+    def _act(self) -> None:
         now, step, logger = time.perf_counter(), self.stage.step, self.stage.algorithm.logger
         speed = (step - self._logged) / max(now - self._clock, 1e-9)
         self._logged, self._clock = step, now
@@ -161,26 +147,22 @@ class LogCallback(StageCallback):
 
     def _on_training_end(self) -> None:
         if self._logged < self.stage.step:
-            self.act()
+            self._act()
 
 
 class EvaluationCallback(StageCallback):
     """Evaluates the policy and keeps the best one of the stage as ``policy.safetensors``.
 
     A stage that begins with a trained policy is evaluated before its first step: it must do better than that.
-
-    Attributes:
-        means: Mean returns of the stage's evaluations so far, those of earlier sessions included.
-        evaluated: Step of the run at which the last of them was made, 0 for none.
-        seconds: Wall time that evaluations have taken in this session.
     """
 
     def __init__(self, stage: Stage, table: Table, tracker: Tracker, bar: ProgressBarCallback) -> None:
         super().__init__(stage, stage.config.report.eval_every)
         self.table, self.tracker, self.bar = table, tracker, bar
         rows = [row for row in table.rows if int(row["stage"]) == stage.number]
-        self.means = [float(row["mean"]) for row in rows]
-        self.evaluated, self.seconds = int(rows[-1]["step"]) if rows else 0, 0.0
+        self.means = [float(row["mean"]) for row in rows]  # earlier sessions included
+        self.evaluated = int(rows[-1]["step"]) if rows else 0  # step of the last evaluation
+        self.seconds = 0.0  # wall time of evaluations in this session
 
     @property
     def is_missing(self) -> bool:
@@ -193,21 +175,21 @@ class EvaluationCallback(StageCallback):
         patience, means = self.stage.config.report.patience, self.means
         return bool(patience and means) and len(means) - 1 - means.index(max(means)) >= patience
 
-    def act(self) -> None:
-        """Evaluate the policy on layouts that are not trained on."""
+    def _act(self) -> None:
         start, stage, config = time.perf_counter(), self.stage, self.stage.config
         seed, episodes = config.evaluation(stage.number)
         deterministic = config.report.eval_deterministic
         env = make_env(config, config.action_size(stage.number), episodes)
         result = evaluate("", stage.algorithm, env, episodes, deterministic=deterministic, seed=seed)
-        row: dict[str, Any] = {"step": stage.step, "stage": stage.number, "episodes": episodes}
-        row |= {"mean": result.mean, "std": result.std}
-        row |= {"lowest": min(result.returns), "highest": max(result.returns), "success": result.success}
         if result.mean > max(self.means, default=-float("inf")):
             stage.save_policy()  # before the row: a crash between the two repeats the evaluation
         self.means.append(result.mean)
         self.evaluated = stage.step
-        self.table.add(row)
+        self.table.add(
+            {"step": stage.step, "stage": stage.number, "episodes": episodes}
+            | {"mean": result.mean, "std": result.std}
+            | {"lowest": min(result.returns), "highest": max(result.returns), "success": result.success}
+        )
         self.seconds += time.perf_counter() - start
         scalars = {"eval/return": result.mean, "eval/std": result.std, "eval/success": result.success}
         self.tracker.show(stage.step, {**scalars, **stage.algorithm.images()})
@@ -215,11 +197,11 @@ class EvaluationCallback(StageCallback):
 
     def _on_training_start(self) -> None:
         if self.stage.algorithm.starts_trained and self.every and not self.means:
-            self.act()
+            self._act()
 
     def _on_training_end(self) -> None:
         if self.is_missing:
-            self.act()
+            self._act()
 
 
 class FilmCallback(StageCallback):
@@ -229,8 +211,7 @@ class FilmCallback(StageCallback):
         super().__init__(stage, stage.config.report.video_every)
         self.tracker = tracker
 
-    def act(self) -> None:
-        """Film the present policy."""
+    def _act(self) -> None:
         stage, config = self.stage, self.stage.config
         path = stage.folder / "videos" / f"step{stage.step:09d}.mp4"
         size, (seed, _) = config.action_size(stage.number), config.evaluation(stage.number)
@@ -239,33 +220,27 @@ class FilmCallback(StageCallback):
 
 
 class CheckpointCallback(StageCallback):
-    """Writes a checkpoint: at intervals, after each evaluation, and before the run is stopped.
+    """Writes a checkpoint: at intervals, after each evaluation, before the run is stopped, and at the end."""
 
-    Without evaluations the newest policy is written along with it.
-    """
-
-    def __init__(
-        self, stage: Stage, checkpoint: Checkpoint, evaluation: EvaluationCallback, signals: StopSignals
-    ) -> None:
+    def __init__(self, stage: Stage, checkpoint: Checkpoint, evaluation: EvaluationCallback, signals: StopSignals):
         super().__init__(stage, stage.config.report.checkpoint_every)
         self.checkpoint, self.evaluation, self.signals = checkpoint, evaluation, signals
         self._saved = stage.step
 
-    def act(self) -> None:
-        """Write a checkpoint."""
-        if not self.evaluation.means:
+    def _act(self) -> None:
+        if not self.evaluation.means:  # without evaluations there is no best policy but the newest
             self.stage.save_policy()
         self.checkpoint.save(self.stage.algorithm, self.stage.config, self.stage.position)
         self._saved = self.stage.step
 
     def _on_rollout_start(self) -> None:
         just_evaluated = self.evaluation.evaluated == self.stage.step > self._last
-        if self.is_due() or just_evaluated or self.signals.number:
-            self.act()
+        if self._is_due() or just_evaluated or self.signals.number:
+            self._act()
 
     def _on_training_end(self) -> None:
         if self._saved < self.stage.step:
-            self.act()
+            self._act()
 
 
 class StopCallback(StageCallback):
@@ -276,12 +251,6 @@ class StopCallback(StageCallback):
         self.evaluation, self.signals = evaluation, signals
 
     def _on_rollout_start(self) -> None:
-        """Stop if need be; the checkpoint is written.
-
-        Raises:
-            Stopped: The user wants to stop.
-            StageFinished: The evaluations no longer improve.
-        """
         self._on_training_end()
         if self.evaluation.has_plateaued:
             raise StageFinished

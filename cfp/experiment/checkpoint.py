@@ -56,20 +56,11 @@ class Checkpoint:
         self.archive.prune()
 
     def read(self) -> dict[str, Any]:
-        """Read the state.
-
-        Raises:
-            CheckpointError: It is missing, damaged, or of another version.
-        """
+        """Read the state; `CheckpointError` where it is missing, damaged, or of another version."""
         try:
             state = torch.load(self.path, map_location="cpu", weights_only=True)
-        except FileNotFoundError as error:
-            raise CheckpointError(f"{self.path}: there is no checkpoint") from error
         except (OSError, RuntimeError, ValueError, KeyError, EOFError, pickle.UnpicklingError) as error:
-            raise CheckpointError(
-                f"{self.path}: the checkpoint is damaged ({type(error).__name__}) and cannot be resumed; "
-                "the policy.safetensors of the run may still be whole"
-            ) from error
+            raise CheckpointError(f"{self.path}: the checkpoint is damaged ({type(error).__name__})") from error
         if not isinstance(state, dict) or state.get("version") != VERSION:
             found = state.get("version") if isinstance(state, dict) else type(state).__name__
             raise CheckpointError(f"{self.path}: checkpoint version must be {VERSION}, got {found}")
@@ -82,11 +73,7 @@ class Checkpoint:
         return state
 
     def restore(self, algorithm: Algorithm, state: dict[str, Any]) -> None:
-        """Put a state into an algorithm that has just been created with the same options.
-
-        Raises:
-            CheckpointError: The state does not fit the algorithm, or a replay chunk is missing or damaged.
-        """
+        """Put a state into an algorithm that has just been created with the same options."""
         try:
             if algorithm.replay_buffer is not None:
                 self.archive = ReplayArchive(self.archive.folder, state["stage"])
@@ -98,16 +85,13 @@ class Checkpoint:
 
     def does_not_fit(self, error: Exception) -> CheckpointError:
         """The error for a state that cannot be put into an algorithm."""
-        reason = f"{type(error).__name__}: {error}"
-        return CheckpointError(f"{self.path}: the checkpoint does not fit this program ({reason})")
+        return CheckpointError(
+            f"{self.path}: the checkpoint does not fit this program ({type(error).__name__}: {error})"
+        )
 
 
 def check_same(stored: dict[str, Any], given: RunConfig) -> None:
-    """Compare the options of a checkpoint with those of the command that wants to resume it.
-
-    Raises:
-        ConfigError: Naming the first option that differs and may not, with both values.
-    """
+    """Refuse to resume a checkpoint with other options than its own, but for those that may change."""
     old, new = flatten(stored), flatten(json.loads(json.dumps(to_json(given))))
     for name in {**old, **new}:
         if name.startswith(given.changeable) or old.get(name) == new.get(name):

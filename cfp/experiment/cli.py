@@ -13,11 +13,8 @@ from cfp.experiment.process import Stopped, keep_memory
 def run_command(command: Callable[[], int | None]) -> int:
     """Run a program; turn an expected error into one line on the standard error, and any outcome into an exit code.
 
-    Args:
-        command: Does what the command line says and returns the exit code; None means 0.
-
     Returns:
-        The exit code: what ``command`` returned; 2 for bad input (a `CFPError`); 1 for a failure (`NonFiniteError`,
+        What ``command`` returned, None means 0; 2 for bad input (a `CFPError`); 1 for a failure (`NonFiniteError`,
         `OSError`, not enough memory); 128 plus the number of the signal that stopped the program.
     """
     keep_memory()

@@ -62,15 +62,9 @@ class SACAlgorithm(Algorithm):
         hyperparameters: Hyperparameters,
     ) -> CFP:
         """Create the model of a stage."""
-        model = CFP(
-            policy,
-            env,
-            hyperparameters,
-            policy_kwargs=networks,
-            seed=config.seed,
-            device=choose_device(config.device),
-            stats_window_size=max(10, env.num_envs),
-        )
+        window, device = max(10, env.num_envs), choose_device(config.device)
+        options: dict[str, Any] = {"policy_kwargs": networks, "seed": config.seed, "stats_window_size": window}
+        model = CFP(policy, env, hyperparameters, device=device, **options)
         model.set_logger(Logger(None, []))
         return model
 
@@ -143,12 +137,7 @@ class CoarseToFine(SACAlgorithm):
 
     @classmethod
     def initialize(cls, config: Config, folder: Path) -> Position:
-        """Take the first stages from a policy if the options say so; its steps count as those before its handover.
-
-        Raises:
-            ConfigError: It does not fit these stages.
-            CheckpointError: It is missing, damaged, or of another kind.
-        """
+        """Take the first stages from a policy if the options say so; its steps count as those before its handover."""
         if config.start_from is None:
             return Position()
         policy, refine = policy_for(config, config.start_from), config.refine

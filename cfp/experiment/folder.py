@@ -23,21 +23,15 @@ EVALUATION_COLUMNS: dict[str, str] = {
 }
 """Columns of ``evaluations.csv``."""
 
-MARKS = ("config.json", "checkpoint", "progress.csv", "evaluations.csv", "policy.safetensors")
-"""Any of these in a folder means that it holds a run."""
-
 
 def holds_run(folder: Path) -> bool:
     """Whether a folder holds a run, finished or not."""
-    return any((folder / name).exists() for name in MARKS)
+    marks = ("config.json", "checkpoint", "progress.csv", "evaluations.csv", "policy.safetensors")
+    return any((folder / name).exists() for name in marks)
 
 
 def read_config(folder: Path, configure: Callable[[dict[str, Any]], RunConfig]) -> RunConfig:
-    """Options of the run in a folder.
-
-    Raises:
-        CheckpointError: There is no run, or its ``config.json`` cannot be read.
-    """
+    """Options of the run in a folder; `CheckpointError` where there is none or they cannot be read."""
     path = folder / "config.json"
     try:
         config = configure(read_json(path))

@@ -6,11 +6,10 @@ import importlib
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.logger import Image, KVWriter, TensorBoardOutputFormat, filter_excluded_keys
+from stable_baselines3.common.logger import Image, KVWriter, Logger, TensorBoardOutputFormat, filter_excluded_keys
 from torch.utils.tensorboard import SummaryWriter
 
 from cfp.config import RunConfig, to_json
@@ -34,7 +33,6 @@ class ProgressTable(KVWriter):
     """
 
     def __init__(self, table: Table) -> None:
-        """Write into a table."""
         self.table = table
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
@@ -50,52 +48,31 @@ class EventFile(TensorBoardOutputFormat):
     """TensorBoard events that, on a resumed run, replace what was logged past the checkpoint."""
 
     def __init__(self, folder: Path, step: int) -> None:
-        """Open a new event file."""
         self.writer = SummaryWriter(log_dir=str(folder), purge_step=step + 1 if step else None)
         self._is_closed = False
 
 
 def check_trackers(config: RunConfig) -> None:
-    """Refuse what needs a package that is not installed, before anything is written.
-
-    Raises:
-        ConfigError: Naming the option and the extra to install.
-    """
-    report = config.report
-    if report.wandb != "off":
-        import_wandb(report.wandb)
+    """Refuse options that need a package that is not installed, before anything is written."""
+    report, install = config.report, "install it with: pip install 'torchmpm"
     if report.video_every and not available():
         raise ConfigError(
-            f"video_every must be 0 without imageio and its ffmpeg, got {report.video_every}; install them with: "
-            "pip install 'torchmpm[video]'"
+            f"video_every must be 0 without imageio and its ffmpeg, got {report.video_every}; {install}[video]'"
         )
-
-
-def import_wandb(mode: str) -> ModuleType:
-    """The package of Weights & Biases, which nothing else imports.
-
-    Raises:
-        ConfigError: It is not installed.
-    """
-    try:
-        return importlib.import_module("wandb")
-    except ImportError as error:
-        raise ConfigError(
-            f"wandb must be 'off' without the package wandb, got {mode!r}; install it with: "
-            "pip install 'torchmpm[wandb]'"
-        ) from error
+    if report.wandb != "off":
+        try:
+            importlib.import_module("wandb")
+        except ImportError as error:
+            raise ConfigError(
+                f"wandb must be 'off' without the package wandb, got {report.wandb!r}; {install}[wandb]'"
+            ) from error
 
 
 class WandbWriter(KVWriter):
-    """A logger output to Weights & Biases; a resumed run continues the same curve.
-
-    Raises:
-        ConfigError: The package is not installed.
-    """
+    """A logger output to Weights & Biases; a resumed run continues the same curve."""
 
     def __init__(self, config: RunConfig, folder: Path) -> None:
-        report = config.report
-        self.wandb = import_wandb(report.wandb)
+        report, self.wandb = config.report, importlib.import_module("wandb")
         identity = folder / "wandb-id.txt"
         if not identity.exists():
             write_text(identity, uuid.uuid4().hex[:8])
@@ -114,11 +91,9 @@ class WandbWriter(KVWriter):
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
         """Send one point; what does not exist yet (None) is left out."""
-        values = {name: self._convert(value) for name, value in key_values.items() if value is not None}
-        self.run.log({**values, "step": step})
-
-    def _convert(self, value: Any) -> Any:
-        return self.wandb.Image(value.image) if isinstance(value, Image) else value
+        given = {name: value for name, value in key_values.items() if value is not None}
+        images = {name: self.wandb.Image(value.image) for name, value in given.items() if isinstance(value, Image)}
+        self.run.log({**given, **images, "step": step})
 
     def film(self, path: Path, step: int) -> None:
         """Send a video."""
@@ -130,25 +105,19 @@ class WandbWriter(KVWriter):
 
 
 class Tracker:
-    """The places to which a run's rows go besides its tables, and pictures and films that only they take.
-
-    Attributes:
-        writers: For stable-baselines3's logger.
-    """
+    """The places to which a run's rows go besides its tables, and pictures and films that only they take."""
 
     def __init__(self, config: RunConfig, folder: Path, step: int) -> None:
         self.wandb = WandbWriter(config, folder) if config.report.wandb != "off" else None
         events = EventFile(folder / "tensorboard", step)
         self.writers: list[KVWriter] = [events, self.wandb] if self.wandb else [events]
+        self._logger = Logger(None, self.writers)
 
     def show(self, step: int, values: Mapping[str, float | np.ndarray | None]) -> None:
         """Write scalars and pictures, uint8 (H, W, 3), at once and without a row in a table."""
-        given = {name: value for name, value in values.items() if value is not None}
-        wrapped = {
-            name: Image(value, "HWC") if isinstance(value, np.ndarray) else value for name, value in given.items()
-        }
-        for writer in self.writers:
-            writer.write(dict(wrapped), dict.fromkeys(wrapped, ()), step)
+        for name, value in values.items():
+            self._logger.record(name, Image(value, "HWC") if isinstance(value, np.ndarray) else value)
+        self._logger.dump(step)
 
     def film(self, step: int, path: Path) -> None:
         """Show a video to those who take files; TensorBoard does not."""

@@ -13,11 +13,7 @@ _M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -3, -1
 
 
 def keep_memory() -> None:
-    """Let the C library keep freed memory instead of returning it to the system.
-
-    Tensors of a megabyte are otherwise fetched from the system, page by page, at every operation: an update is a
-    third slower. Only glibc has this setting; elsewhere nothing happens.
-    """
+    """Let glibc keep freed memory; fetching large tensors from the system anew makes an update a third slower."""
     if sys.platform != "linux":
         return
     library = ctypes.CDLL(None)
@@ -44,15 +40,8 @@ class Stopped(Exception):
         self.number = number
 
 
-class Plateau(Exception):
-    """A stage is over because its evaluations no longer improve; its checkpoint is written."""
-
-
 class StopSignals:
-    """Turn Ctrl-C and SIGTERM into a request that training grants between two steps.
-
-    A second signal is not held back: it raises ``KeyboardInterrupt`` at once.
-    """
+    """Lets training end its step after Ctrl-C or SIGTERM; the second one raises ``KeyboardInterrupt`` at once."""
 
     def __init__(self) -> None:
         self.number = 0

@@ -35,8 +35,7 @@ class ReplayArchive:
     """
 
     def __init__(self, folder: Path, stage: int) -> None:
-        self.folder = folder
-        self.stage = stage
+        self.folder, self.stage = folder, stage
         self.chunks: list[Chunk] = []
 
     def save(self, buffer: ReplayBuffer, rows: int) -> list[dict[str, Any]]:
@@ -55,10 +54,9 @@ class ReplayArchive:
     def prune(self) -> None:
         """Delete every chunk that the list does not name; call it once the checkpoint is in place."""
         wanted = {chunk.file for chunk in self.chunks}
-        if self.folder.is_dir():
-            for path in self.folder.iterdir():
-                if path.name.startswith("stage") and path.name not in wanted:
-                    path.unlink()
+        for path in self.folder.glob("stage*"):
+            if path.name not in wanted:
+                path.unlink()
 
     def load(self, buffer: ReplayBuffer, rows: int, chunks: list[dict[str, Any]]) -> None:
         """Fill a fresh ring from the chunks that a checkpoint names.

@@ -9,6 +9,7 @@ from typing import Any
 
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
+from tqdm import tqdm
 
 from cfp.config import RunConfig, to_json
 from cfp.envs.make import choose_device, make_env
@@ -40,11 +41,7 @@ from cfp.weights import is_of_another_task, read_policy
 
 
 def check_options(config: RunConfig) -> None:
-    """Check all that can be checked before anything is written.
-
-    Raises:
-        ConfigError: An option is wrong, or needs a package that is not installed.
-    """
+    """Check all that can be checked before anything is written."""
     config.check()
     check_trackers(config)
     for stage in range(1, len(config.ends()) + 1):
@@ -56,17 +53,6 @@ class Run:
 
     ``policy.safetensors`` is the policy with the best evaluation of its stage so far (without evaluations: the newest);
     the next stage starts from it, and the final table evaluates it on layouts of its own.
-
-    Args:
-        algorithm: Class of the algorithm.
-        config: The run's options.
-        folder: Its folder.
-        resume: Continue from the folder's checkpoint; without one, start from the beginning.
-        signals: Whether the user wants to stop.
-
-    Attributes:
-        step: Environment steps of the run so far.
-        evaluation_seconds: Wall time that evaluations have taken in this session.
 
     Raises:
         ConfigError: The folder already holds a run and ``resume`` is not set (nothing in it is touched), or the options
@@ -81,7 +67,8 @@ class Run:
         if holds_run(folder) and not resume:
             raise ConfigError(f"out: {folder} already holds a run; continue it with --resume, or name another folder")
         self.algorithm, self.config, self.folder, self.signals = algorithm, config, folder, signals
-        self.stages, self.evaluation_seconds = len(config.ends()), 0.0
+        self.stages = len(config.ends())
+        self.evaluation_seconds = 0.0  # in this session
         self.checkpoint = Checkpoint(folder / "checkpoint")
         self.state: dict[str, Any] | None = None
         if resume and self.checkpoint.exists():
@@ -121,8 +108,9 @@ class Run:
                 self.position = Position(number, self.position.offset)
                 algorithm = self._create(previous)
                 self._train_stage(Stage(self.config, self.folder, self.position, algorithm))
-                if number < self.stages and self._newest_stage() == number:  # else a crash in the next stage repeats it
-                    copy_policy(policy_path(self.folder), policy_path(self.folder, number))
+                newest = policy_path(self.folder)  # of the next stage already, if this repeats the end after a crash
+                if number < self.stages and read_policy(newest)[1]["stage"] == number:
+                    copy_policy(newest, policy_path(self.folder, number))
                 self.position = Position(number, self.position.offset + algorithm.num_timesteps)
                 previous = algorithm
         finally:
@@ -163,33 +151,20 @@ class Run:
                 StopCallback(stage, evaluation, self.signals),
             ]
         )
-        finished_early = False
         try:
             stage.algorithm.learn(stage.steps_left, callbacks)
         except StageFinished:
-            finished_early = True
+            patience = self.config.report.patience
+            tqdm.write(f"stage {stage.number} ends early: {patience} evaluations without a new best")
         finally:
             self.step = stage.step
             self.evaluation_seconds += evaluation.seconds
-            bar.close()
-        if finished_early:
-            patience = self.config.report.patience
-            print(f"stage {stage.number} ends early: {patience} evaluations without a new best")
-
-    def _newest_stage(self) -> int:
-        """Stage of the policy in ``policy.safetensors``."""
-        stage: int = read_policy(policy_path(self.folder))[1]["stage"]
-        return stage
-
-    def policies(self) -> dict[str, Policy]:
-        """Policies of the run so far by name, see `policy_files`."""
-        device = choose_device(self.config.device)
-        files = policy_files(self.folder, self.stages)
-        return {name: self.algorithm.load(path, device) for name, path in files.items()}
+            bar.bar.close()
 
     def finish(self) -> list[Result]:
         """After training: the final table, ``results.json``, curve, video and page. Returns the table's rows."""
-        policies = self.policies()
+        device, files = choose_device(self.config.device), policy_files(self.folder, self.stages)
+        policies = {name: self.algorithm.load(path, device) for name, path in files.items()}
         results = compare(self.config, policies, self.config.report.eval_episodes)
         write_json(self.folder / "results.json", to_rows(results))
         untrained = {result.name: result.mean for result in results[:2]}

@@ -12,8 +12,6 @@ from filelock import FileLock, Timeout
 
 from cfp.errors import CFPError
 
-NAME = ".lock"
-
 
 class FolderInUse(CFPError):
     """Another process holds the folder."""
@@ -21,18 +19,15 @@ class FolderInUse(CFPError):
 
 @contextmanager
 def run_lock(folder: Path, timeout: float = 0.0) -> Iterator[None]:
-    """Hold the folder of a run, which is created if need be.
-
-    The system releases the lock when the process ends, however it ends. On a shared file system this holds between
-    machines too if that knows ``flock`` (NFS 4, Lustre with ``-o flock``).
+    """Hold the folder of a run, which is created if need be; the system releases it however the process ends.
 
     Raises:
-        FolderInUse: It is still held by another process.
+        FolderInUse: It is still held by another process after ``timeout`` seconds.
         OSError: The folder cannot be written.
     """
     is_new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / NAME
+    path = folder / ".lock"
     try:
         lock = FileLock(path).acquire(timeout=timeout)
     except Timeout:

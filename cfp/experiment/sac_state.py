@@ -29,8 +29,8 @@ def model_state_dict(model: CFP) -> dict[str, Any]:
         "recent": [{key: float(value) for key, value in info.items()} for info in model.ep_info_buffer or ()],
         "successes": [bool(success) for success in model.ep_success_buffer or ()],
         "means": {name: (values[name], count) for name, count in model.logger.name_to_count.items()},
-        "environment": environment_state(model),
-        "random": random_state(model),
+        "environment": _environment_state(model),
+        "random": _random_state(model),
     }
 
 
@@ -49,11 +49,11 @@ def load_model_state_dict(model: CFP, state: dict[str, Any]) -> None:
     for name, (mean, count) in state["means"].items():
         model.logger.record_mean(name, mean)
         model.logger.name_to_count[name] = count
-    restore_environment(model, state["environment"])
-    restore_random(model, state["random"])
+    _restore_environment(model, state["environment"])
+    _restore_random(model, state["random"])
 
 
-def environment_state(model: CFP) -> dict[str, Any]:
+def _environment_state(model: CFP) -> dict[str, Any]:
     """The episodes in progress: the matter, the sums of their rewards, and what the policy sees next."""
     monitor, env = _environments(model)
     return {
@@ -65,10 +65,9 @@ def environment_state(model: CFP) -> dict[str, Any]:
     }
 
 
-def restore_environment(model: CFP, state: dict[str, Any]) -> None:
-    """Undo `environment_state`; the environment is reset first, so that later episodes start as they would have."""
+def _restore_environment(model: CFP, state: dict[str, Any]) -> None:
     monitor, env = _environments(model)
-    monitor.reset()
+    monitor.reset()  # so that later episodes start as they would have
     env.load_state_dict(state["episodes"])
     env.torch_env.generators = state["generators"]
     monitor.episode_returns = state["returns"].numpy().copy()
@@ -83,7 +82,7 @@ def _environments(model: CFP) -> tuple[VecMonitor, TorchVecEnv]:
     return monitor, monitor.venv
 
 
-def random_state(model: CFP) -> dict[str, Any]:
+def _random_state(model: CFP) -> dict[str, Any]:
     """States of every generator that training draws from: torch's, the replay memory's, the action space's."""
     assert isinstance(model.replay_buffer, ReplayRing)
     state: dict[str, Any] = {
@@ -96,8 +95,7 @@ def random_state(model: CFP) -> dict[str, Any]:
     return state
 
 
-def restore_random(model: CFP, state: dict[str, Any]) -> None:
-    """Undo `random_state`."""
+def _restore_random(model: CFP, state: dict[str, Any]) -> None:
     assert isinstance(model.replay_buffer, ReplayRing)
     torch.set_rng_state(state["torch"])
     model.replay_buffer.generator.bit_generator.state = json.loads(state["replay"])

@@ -27,21 +27,13 @@ from cfp.policy import Policy
 
 @dataclass(frozen=True)
 class Program:
-    """What the command lines of a package are made of.
+    """What the command lines of a package are made of."""
 
-    Attributes:
-        package: ``python -m PACKAGE.train``.
-        about: First words of the help.
-        configure: From JSON values to options; what the values leave out comes from the preset they name.
-        find: The algorithm of a name.
-        load: Loads a policy file onto a device.
-    """
-
-    package: str
-    about: str
-    configure: Callable[[dict[str, Any]], RunConfig]
-    find: Callable[[str], type[Algorithm]]
-    load: Callable[[Path, str], Policy]
+    package: str  # python -m PACKAGE.train
+    about: str  # first words of the help
+    configure: Callable[[dict[str, Any]], RunConfig]  # options from JSON values; the others come from the preset
+    find: Callable[[str], type[Algorithm]]  # the algorithm of a name
+    load: Callable[[Path, str], Policy]  # loads a policy file onto a device
 
 
 @dataclass(frozen=True)
@@ -75,12 +67,7 @@ class _Choice:
 
 
 def parse(program: Program, arguments: Sequence[str], started: str | None = None) -> Command:
-    """Read a command line.
-
-    Raises:
-        ConfigError: An option is wrong.
-        SystemExit: ``--help``, or an option that does not exist or cannot be read (exit code 2).
-    """
+    """Read a command line; ``SystemExit`` after ``--help``, or for an option that does not exist or cannot be read."""
     choice, _ = tyro.cli(_Choice, args=list(arguments), return_unknown_args=True, add_help=False, console_outputs=False)
     values = _values(choice)
     preset = program.configure({name: values[name] for name in ("algo", "task", "preset") if name in values})
@@ -95,31 +82,27 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
             default=Command(defaults),
             config=(tyro.conf.OmitArgPrefixes,),
         )
-        # The word may be another spelling of the name.
+        # the command line may spell the name of the algorithm in another way
         return command if choice.algo is None else replace(command, run=replace(command.run, algo=base.algo))
 
     if choice.resume:
-        folder = choice.out or _default_folder(read(base).run)  # all that names a folder comes from these words
+        folder = choice.out or _default_folder(read(base).run)
         if (folder / "config.json").exists():
             past = read_config(folder, program.configure)
-            # What a file says otherwise than the run is refused, not left out.
+            # a value of the file that differs from the run's is refused later
             command = read(past if choice.config is None else update_from_dict(past, values))
             command.run.check()
             return replace(command, out=folder)
     command = read(base)
-    run = command.run.with_derived(preset, values.keys() | _named(arguments))
+    named = {word[2:].partition("=")[0].replace("-", "_") for word in arguments if word.startswith("--")}
+    run = command.run.with_derived(preset, values.keys() | named)
     run.check()
     run.check_effect(preset)
     return replace(command, run=run, out=command.out or _default_folder(run))
 
 
-def _named(arguments: Sequence[str]) -> set[str]:
-    """Options that words of a command line name."""
-    return {word[2:].partition("=")[0].replace("-", "_") for word in arguments if word.startswith("--")}
-
-
 def _values(choice: _Choice) -> dict[str, Any]:
-    """What a file and the choice on the command line say about the defaults."""
+    """Options that decide about the defaults, from the --config file and the command line."""
     values: dict[str, Any] = {}
     if choice.config is not None:
         try:
@@ -135,13 +118,12 @@ def _default_folder(config: RunConfig) -> Path:
 
 
 def main(program: Program, arguments: Sequence[str] | None = None, started: str | None = None) -> int:
-    """Do what a command line says; returns the exit code, see `parse`."""
+    """Train as a command line says; returns the exit code."""
     words = sys.argv[1:] if arguments is None else arguments
     return run_command(lambda: _train(program, words, started or program_name(f"{program.package}.train", arguments)))
 
 
 def _train(program: Program, arguments: Sequence[str], started: str) -> None:
-    """Train, evaluate, draw and film."""
     command = parse(program, arguments, started)
     folder, config = command.out, command.run
     assert folder is not None
