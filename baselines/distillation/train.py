@@ -85,14 +85,8 @@ class Distill(Stateful, Algorithm):
         self.adam = torch.optim.Adam(trained, config.student_learning_rate)
         seed = config.seed + (stage - 1) * config.num_layouts
         episodes = Episodes(self.env, seed, config.max_episode_steps, config.num_layouts)
-        self.collector = Collector(
-            self.env,
-            self._make_teacher(training, teacher),
-            episodes,
-            config.switch_every,
-            config.dropout,
-            self.spec.resolutions[-1],
-        )
+        guide, grid = self._make_teacher(training, teacher), self.spec.resolutions[-1]
+        self.collector = Collector(self.env, guide, episodes, config.switch_every, config.dropout, grid)
         self.dataset, self.rounds = Dataset(config.capacity), 0
 
     def _make_teacher(self, training: RunConfig, path: Path | None) -> Teacher:
