@@ -11,7 +11,7 @@ from cfp.config import RunConfig
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm, Sees
 from cfp.from_dict import update_from_dict
-from cfp.policy import Policy
+from cfp.policy_protocols import Policy
 from cfp.weights import read_policy
 
 ALGORITHMS: dict[str, str] = {

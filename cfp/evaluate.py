@@ -23,7 +23,7 @@ from cfp.experiment.folder import policy_files, read_config
 from cfp.experiment.run import make_video
 from cfp.experiment.training import Program
 from cfp.from_dict import update_from_dict
-from cfp.policy import Policy
+from cfp.policy_protocols import Policy
 from cfp.presets import from_json
 from cfp.sections import Particles
 from cfp.validation import check_at_least

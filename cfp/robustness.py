@@ -24,7 +24,7 @@ from cfp.evaluation.tables import numbers
 from cfp.experiment.cli import program_name, run_command
 from cfp.experiment.training import Program
 from cfp.files import write_json, write_text
-from cfp.policy import DisturbablePolicy, Policy
+from cfp.policy_protocols import DisturbablePolicy, Policy
 from cfp.presets import from_json
 from cfp.tables import csv_text
 from cfp.validation import check_at_least

@@ -1,4 +1,7 @@
-"""Velocity rules on grid nodes: floors, ceilings, walls and boxes, from data."""
+"""Velocity rules on grid nodes: floors, ceilings, walls and boxes, from data.
+
+The native kernels have the same formulas in ``native/cpu/grid.hpp`` and ``native/cuda/grid.py``.
+"""
 
 from __future__ import annotations
 

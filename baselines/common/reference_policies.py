@@ -13,7 +13,7 @@ from torch import Tensor
 import cfp
 from baselines.common.grid import GridConfig
 from baselines.common.open_loop import OpenLoop
-from cfp.policy import Policy
+from cfp.policy_protocols import Policy
 from cfp.sections import ReportConfig
 from dittogym import make_spec
 from dittogym.action import ActionIndexing, from_grid_indexing

@@ -12,8 +12,8 @@ from typing import Literal
 import tyro
 
 from baselines.common.reference_policies import REFERENCE_POLICIES
-from baselines.compare.evaluations import Noise, Protocol, Robustness
 from baselines.compare.executor import Executor, InProcessExecutor, LocalExecutor, Resources, execute
+from baselines.compare.final_evaluation import Noise, Protocol, Robustness
 from baselines.compare.jobs import Job, check_folder, make_jobs
 from baselines.compare.plan import Plan
 from baselines.compare.ray import RayExecutor

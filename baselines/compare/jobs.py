@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from baselines.common.reference_policies import REFERENCE_POLICIES
-from baselines.compare.evaluations import RECORD, Protocol, read_record
+from baselines.compare.final_evaluation import RECORD, Protocol, read_record
 from baselines.compare.plan import Plan
 from baselines.registry import ALGORITHMS, ALIASES, configure, sees
 from cfp.config import EVALUATION_SEED, RunConfig, to_json

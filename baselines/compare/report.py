@@ -10,7 +10,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from baselines.compare import paper, plots, tables
-from baselines.compare.evaluations import Protocol
+from baselines.compare.final_evaluation import Protocol
 from baselines.compare.results import Group, RunResult, group_results
 from baselines.compare.table import Table
 from cfp.evaluation.page import STYLE

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from baselines.compare.evaluations import FinalEvaluation, read_evaluation, read_record
+from baselines.compare.final_evaluation import FinalEvaluation, read_evaluation, read_record
 from baselines.compare.jobs import Job, read_sessions
 from baselines.compare.stats import Curve, interquartile_mean, score_interval
 from cfp.sections import Particles

@@ -17,7 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
-from baselines.compare.evaluations import Protocol, evaluate_run
+from baselines.compare.final_evaluation import Protocol, evaluate_run
 from baselines.compare.jobs import Job, check_folder, read_sessions
 from baselines.registry import configure, find
 from cfp.config import to_json

@@ -25,7 +25,7 @@ from cfp.config import RunConfig, check_training_layouts
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.algorithm import Algorithm, Scalars, Sees
-from cfp.policy import Policy
+from cfp.policy_protocols import Policy
 from cfp.sections import Particles, ReportConfig
 from cfp.validation import check_at_least, check_fraction, check_positive
 from cfp.weights import KIND, load, policy_for, read_policy, save_policy

@@ -31,7 +31,7 @@ class Case:
     Attributes:
         name: Name in tables and plots.
         action_dropout: Fraction of the policy's decisions that are set to 0, drawn anew in each step; decisions are the
-            2 R R entries of its action grid, or those of `cfp.policy.DisturbablePolicy`.
+            2 R R entries of its action grid, or those of `cfp.policy_protocols.DisturbablePolicy`.
         observation_dropout: Fraction of the 3 x 64 x 64 pixels that are set to 0, drawn anew in each step. A velocity
             pixel of 0 means fast motion, a pixel of 132 rest.
         action_noise: Standard deviation of Gaussian noise on each decision; 1 is the full actuation.
@@ -100,7 +100,7 @@ class Disturbed(VecEnvWrapper):
         case: The disturbance; its constants are not applied here.
         seed: Seed of the generator, which restarts at each ``reset``.
         grid: Rows and columns R of the grid on which the policy decides; None: A; 0: none, and the policy calls
-            `disturb` itself, see `cfp.policy.DisturbablePolicy`.
+            `disturb` itself, see `cfp.policy_protocols.DisturbablePolicy`.
     """
 
     def __init__(self, venv: VecEnv, case: Case, seed: int, grid: int | None = None) -> None:

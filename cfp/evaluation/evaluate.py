@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.envs.make import make_env
 from cfp.envs.vec_env import TorchVecEnv
-from cfp.policy import Policy, SeesState
+from cfp.policy_protocols import Policy, SeesState
 
 Noise = Literal["default", "with", "without", "both"]
 """With action noise or without; default: as the run that trained a policy evaluates it."""

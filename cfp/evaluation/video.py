@@ -18,7 +18,7 @@ from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.envs.make import make_env
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.evaluation.evaluate import SingleThreaded, attached
-from cfp.policy import Policy
+from cfp.policy_protocols import Policy
 
 FRAMES_PER_SECOND = 10
 

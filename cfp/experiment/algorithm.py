@@ -19,7 +19,7 @@ from cfp.config import RunConfig
 from cfp.envs.make import choose_device
 from cfp.experiment.folder import policy_path
 from cfp.experiment.process import StopSignals
-from cfp.policy import Policy
+from cfp.policy_protocols import Policy
 
 Sees = Literal["image", "state", "simulator", "nothing"]
 """What a policy may look at: the observation; the full state; the simulator, to plan with; nothing."""

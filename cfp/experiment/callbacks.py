@@ -27,6 +27,17 @@ LOG_METRICS: dict[str, str] = {
     "time/steps_per_second": "environment steps per second of wall time since the last point (TensorBoard only)",
 }
 """Scalars that every algorithm logs beside its own."""
+EVALUATION_COLUMNS: dict[str, str] = {
+    "step": "environment steps of the run so far",
+    "stage": "stage in training, 1 is the first",
+    "episodes": "episodes of the evaluation, each on a layout of its own that is not trained on",
+    "mean": "mean of their undiscounted returns; a stage keeps the policy with the highest",
+    "std": "standard deviation of the returns",
+    "lowest": "lowest return",
+    "highest": "highest return",
+    "success": "share of successes, where the task defines success",
+}
+"""Columns of ``evaluations.csv``."""
 
 
 class StageFinished(Exception):

@@ -11,18 +11,6 @@ from cfp.errors import CheckpointError
 from cfp.files import copy_atomically, read_json
 from cfp.weights import read_policy
 
-EVALUATION_COLUMNS: dict[str, str] = {
-    "step": "environment steps of the run so far",
-    "stage": "stage in training, 1 is the first",
-    "episodes": "episodes of the evaluation, each on a layout of its own that is not trained on",
-    "mean": "mean of their undiscounted returns; a stage keeps the policy with the highest",
-    "std": "standard deviation of the returns",
-    "lowest": "lowest return",
-    "highest": "highest return",
-    "success": "share of successes, where the task defines success",
-}
-"""Columns of ``evaluations.csv``."""
-
 
 def holds_run(folder: Path) -> bool:
     """Whether a folder holds a run, finished or not."""

@@ -35,7 +35,7 @@ from cfp.experiment.folder import copy_policy, holds_run, policy_files, policy_p
 from cfp.experiment.loggers import ProgressTable, Tracker, check_trackers
 from cfp.experiment.process import StopSignals
 from cfp.files import write_json
-from cfp.policy import Policy
+from cfp.policy_protocols import Policy
 from cfp.tables import Table
 from cfp.weights import is_of_another_task, read_policy
 

@@ -22,7 +22,7 @@ from cfp.experiment.run import Run, check_options
 from cfp.experiment.run_lock import run_lock
 from cfp.files import read_json
 from cfp.from_dict import update_from_dict
-from cfp.policy import Policy
+from cfp.policy_protocols import Policy
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,9 @@ HANGING_BLOCK = Obstacle(
 
 @dataclass(frozen=True)
 class Forward:
-    """Displacement from the start and present speed to the right, both saturating; shared with OBSTACLE.
+    """Displacement from the start and present speed to the right, both saturating.
+
+    OBSTACLE uses it too: a term added here needs a weight in both tasks.
 
     Attributes:
         goal: Displacement that counts as success, m.

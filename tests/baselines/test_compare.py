@@ -9,7 +9,7 @@ import pytest
 
 from baselines.compare import evaluations
 from baselines.compare.__main__ import main
-from baselines.compare.evaluations import Protocol, Record, evaluation_config
+from baselines.compare.final_evaluation import Protocol, Record, evaluation_config
 from baselines.compare.jobs import Job
 from baselines.compare.worker import carry_out
 from baselines.registry import configure, load
@@ -101,7 +101,7 @@ def test_variant_that_sees_the_image_is_labelled_so(finished):
 def test_more_episodes_are_added_to_those_that_are_there(finished, monkeypatch):
     record = finished / "runs" / "mpc-shapematch-quick-0" / "final_evaluation.json"
     before = json.loads(record.read_text())
-    monkeypatch.setattr("baselines.compare.evaluations.BATCH", 2)
+    monkeypatch.setattr("baselines.compare.final_evaluation.BATCH", 2)
     assert compare(finished, "--algos", "mpc", "--seeds", "0", "--episodes", "3") == 0
     after = json.loads(record.read_text())
     assert after["policy"] == before["policy"]

@@ -15,8 +15,8 @@ import pytest
 from test_compare import COMMON, MPC, PLAN, compare, sessions
 
 from baselines.compare.__main__ import main
-from baselines.compare.evaluations import Protocol
 from baselines.compare.executor import LocalExecutor, Resources, execute, run_process
+from baselines.compare.final_evaluation import Protocol
 from baselines.compare.jobs import Job
 from baselines.compare.ray import RayExecutor
 from baselines.registry import configure

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from test_compare import PLAN, compare
 
-from baselines.compare.evaluations import Protocol
+from baselines.compare.final_evaluation import Protocol
 from baselines.compare.jobs import Job, make_jobs, resolve
 from baselines.compare.plan import Plan
 from baselines.compare.worker import decode, encode

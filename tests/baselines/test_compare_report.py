@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from baselines.compare.__main__ import main
-from baselines.compare.evaluations import Protocol
+from baselines.compare.final_evaluation import Protocol
 from baselines.compare.jobs import make_jobs
 from baselines.compare.plan import Plan
 from baselines.compare.plots import learning_curves

@@ -12,7 +12,7 @@ import cfp
 import cfp.train
 from baselines import Distill, GradientPlannerConfig, OpenLoop, Shac, distill
 from baselines.common.episodes import Episodes
-from baselines.compare.evaluations import Protocol
+from baselines.compare.final_evaluation import Protocol
 from baselines.compare.jobs import Job
 from baselines.compare.results import read_result
 from baselines.compare.worker import train

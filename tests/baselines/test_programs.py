@@ -16,7 +16,7 @@ from cfp.agent.actor import build_actor
 from cfp.errors import ConfigError
 from cfp.experiment.callbacks import EvaluationCallback
 from cfp.experiment.training import parse
-from cfp.policy import SeesState
+from cfp.policy_protocols import SeesState
 from cfp.tables import read_table
 from cfp.weights import describe, save_policy
 

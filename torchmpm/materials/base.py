@@ -19,6 +19,8 @@ class Material(Protocol):
     """Interface of a constitutive law.
 
     All methods take ``F``, the planes (B, N) of a deformation gradient, and ``Jp``, the plastic volume ratio (B, N).
+    The backends ``"eager"`` and ``"compile"`` run any material; the native kernels know those named in
+    ``torchmpm/native/tables.py``.
     """
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:

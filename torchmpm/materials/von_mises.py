@@ -1,4 +1,7 @@
-"""Von Mises plasticity in principal logarithmic strains, the robot material of DittoGym (Huang et al., 2024)."""
+"""Von Mises plasticity in principal logarithmic strains, the robot material of DittoGym (Huang et al., 2024).
+
+The native kernels have the same formulas in ``native/cpu/material.hpp`` and ``native/cuda/material.py``.
+"""
 
 from __future__ import annotations
 
