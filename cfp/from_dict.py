@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Literal, TypeVar
 
@@ -56,7 +57,8 @@ def _convert(value: Any, kind: Any, where: str) -> Any:
             except ConfigError:
                 continue
     elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
+        with suppress(OverflowError):  # an integer beyond the largest float
+            return float(value)
     elif isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
         return value
     raise ConfigError(f"{where} must be {type_name(kind)}, got {value!r}")

@@ -231,6 +231,7 @@ CONFIGS = [
     file_of_options("with a group of nothing", '{"learning": null}', "learning must be an object, got None"),
     file_of_options("with steps as text", '{"steps": "x"}', "steps must be an integer, got 'x'"),
     file_of_options("with a rate of NaN", '{"learning": {"learning_rate": NaN}}', "learning_rate must be finite,"),
+    file_of_options("with a rate of 400 digits", f'{{"learning": {{"tau": 1{"0" * 400}}}}}', "tau must be a number"),
     file_of_options("with half particles", '{"environment": {"particles": [1.5, 2]}}', "a list of 2, each an integer"),
     Case(
         "config file missing",

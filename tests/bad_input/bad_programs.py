@@ -13,6 +13,7 @@ import cfp.evaluate
 import cfp.train
 
 NEW = " --out {folder}/new "
+ROBUSTNESS = baselines.robustness.main
 
 
 def training(name, options, *words, main=cfp.train.main):
@@ -30,7 +31,7 @@ def distilling(name, options, *words):
 
 
 def evaluating(name, options, *words, main=cfp.evaluate.main):
-    return Case(f"evaluate {name}", command(main, options + " --device cpu"), words, Refused)
+    return Case(f"evaluate {name}", command(main, "--device cpu " + options), words, Refused)
 
 
 def comparing(name, options, *words):
@@ -120,14 +121,22 @@ OTHERS = [
     evaluating("a folder that is not there", "{folder}/none", "none: there is no run (no config.json)"),
     evaluating("an unknown policy", "--policy alchemy", "no shipped one has that name (catch, grow, run, "),
     evaluating("no episodes", "--policy run --episodes 0", "episodes must be at least 1, got 0"),
+    evaluating("a policy and a folder", "{folder} --policy run", "either policy or a folder must be given"),
+    evaluating(
+        "a policy on an abacus", "--policy run --device abacus", "device must be auto, cpu or cuda, got 'abacus'"
+    ),
     evaluating("an empty folder", "{folder}", "there is no run", main=baselines.evaluate.main),
-    evaluating("a disturbed nothing", "{folder}", "there is no run", main=baselines.robustness.main),
+    evaluating("a disturbed nothing", "{folder}", "there is no run", main=ROBUSTNESS),
     evaluating(
         "under an earthquake",
         "{folder} --cases earthquake",
         "cases must be words of action dropout 20%",
-        main=baselines.robustness.main,
+        main=ROBUSTNESS,
     ),
+    evaluating("without most actions", "{folder} --dropout 1.5", "dropout must be between 0 and 1", main=ROBUSTNESS),
+    evaluating("under noise of NaN", "{folder} --noise nan", "noise must be positive", main=ROBUSTNESS),
+    evaluating("on ice that pushes", "{folder} --friction -1", "friction must be at least 0", main=ROBUSTNESS),
+    evaluating("disturbed, nowhere", "--policy run", "out must be given with a single policy", main=ROBUSTNESS),
     comparing("unknown tasks", "--tasks swim", "task must be catch"),
     comparing("unknown algorithms", "--algos alchemy", "algo must be one of cfp"),
     comparing("a seed twice", "--seeds 1 1", "seeds must be one or more different values, got 1 1"),
