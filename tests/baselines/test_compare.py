@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from baselines.compare import evaluations
+from baselines.compare import final_evaluation as evaluations
 from baselines.compare.__main__ import main
 from baselines.compare.final_evaluation import Protocol, Record, evaluation_config
 from baselines.compare.jobs import Job

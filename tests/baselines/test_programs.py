@@ -162,14 +162,14 @@ def test_stop_in_the_last_step_leaves_a_whole_stage(tmp_path, stop_at):
 
 
 def test_last_evaluation_that_a_crash_prevented_is_made_up_for(tmp_path, monkeypatch):
-    act = EvaluationCallback.act
+    act = EvaluationCallback._act
 
     def crash(callback):
         if callback.stage.step == 30:
             raise RuntimeError("killed")
         act(callback)
 
-    monkeypatch.setattr(EvaluationCallback, "act", crash)
+    monkeypatch.setattr(EvaluationCallback, "_act", crash)
     with pytest.raises(RuntimeError, match="killed"):
         run("mpc", tmp_path)
     monkeypatch.undo()

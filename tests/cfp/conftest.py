@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from tiny import run
+from tiny_runs import run
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 import torch
-from tiny import assert_same_run, at_step, run
+from tiny_runs import assert_same_run, at_step, run
 
 import cfp
 from cfp import evaluate

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny import run
+from tiny_runs import run
 
 from cfp import train
 from cfp.evaluation.evaluate import evaluate

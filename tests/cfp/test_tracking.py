@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tiny import assert_same_run, run
+from tiny_runs import assert_same_run, run
 
 from cfp import train
 from cfp.agent.actor import build_actor

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny import TINY, assert_same_run, at_step, run
+from tiny_runs import TINY, assert_same_run, at_step, run
 
 import cfp
 import dittogym
