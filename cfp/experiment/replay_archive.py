@@ -53,9 +53,9 @@ class ReplayArchive:
 
     def prune(self) -> None:
         """Delete every chunk that the list does not name; call it once the checkpoint is in place."""
-        wanted = {chunk.file for chunk in self.chunks}
+        listed = {chunk.file for chunk in self.chunks}
         for path in self.folder.glob("stage*"):
-            if path.name not in wanted:
+            if path.name not in listed:
                 path.unlink()
 
     def load(self, buffer: ReplayBuffer, rows: int, chunks: list[dict[str, Any]]) -> None:
