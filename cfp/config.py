@@ -97,7 +97,10 @@ class RunConfig:
             ConfigError: An option is wrong.
         """
         check_task(self.task)
-        _check_finite(self)
+        for name, value in flatten(to_json(self)).items():  # JSON files and command lines can contain NaN and infinity
+            for number in value if isinstance(value, tuple) else (value,):
+                if isinstance(number, float) and not math.isfinite(number):
+                    raise ConfigError(f"{name.split('.')[-1]} must be finite, got {value}")
         if not 0 <= self.seed <= LARGEST_SEED:
             raise ConfigError(f"seed must be between 0 and {LARGEST_SEED}, got {self.seed}")
         for option in dataclasses.fields(self):
@@ -136,7 +139,7 @@ class StagedConfig(RunConfig):
         return self.resolutions[stage - 1]
 
     def action_size(self, stage: int) -> int:
-        """Rows and columns of the actions that the environment of a stage takes, see `ActorSpec.patch`."""
+        """Rows and columns of the actions that the environment of a stage takes, see `ActorSpec.action_size`."""
         return self.actor_spec(stage).action_size
 
     def actor_spec(self, stage: int) -> ActorSpec:
@@ -231,8 +234,7 @@ class Config(StagedConfig):
         """Check what the types do not express."""
         super().check()
         for name in ("random_steps", "alpha", "gate_penalty"):
-            for value in getattr(self, name):
-                check_at_least(0, **{name: value})
+            check_at_least(0, **{name: min(getattr(self, name), default=0)})
         if self.learning.warm_critic and self.start_from is not None:
             raise ConfigError("warm_critic must be False with start_from, got True (a policy file has no critics)")
         if self.refine and self.start_from is None:
@@ -258,14 +260,3 @@ def check_task(task: object) -> None:
 def to_json(config: RunConfig) -> dict[str, Any]:
     """A configuration as plain JSON values."""
     return dataclasses.asdict(config)
-
-
-def _check_finite(options: Any) -> None:
-    """Refuse NaN and infinity, which JSON files and command lines can contain, in all sections."""
-    for option in dataclasses.fields(options):
-        value = getattr(options, option.name)
-        if dataclasses.is_dataclass(value):
-            _check_finite(value)
-        for number in value if isinstance(value, tuple) else (value,):
-            if isinstance(number, float) and not math.isfinite(number):
-                raise ConfigError(f"{option.name} must be finite, got {value}")

@@ -84,13 +84,12 @@ def preset(task: str, name: str = "quick") -> Config:
     allowed = typing.get_args(Preset) if task in TASKS else ("quick",)
     if name not in allowed:
         raise ConfigError(f"preset must be {' or '.join(allowed)} for {task}, got {name!r}")
-    numbers = TASKS[task] if task in TASKS else _custom_numbers(task)
+    if task in TASKS:
+        numbers = TASKS[task]
+    else:
+        spec = dittogym.make_spec(task)
+        numbers = replace(CUSTOM_TASK, resolutions=(spec.coarse, spec.fine))
     return _paper(task, numbers) if name == "paper" else _quick(task, numbers)
-
-
-def _custom_numbers(task: str) -> TaskNumbers:
-    spec = dittogym.make_spec(task)
-    return replace(CUSTOM_TASK, resolutions=(spec.coarse, spec.fine))
 
 
 def _paper(task: str, numbers: TaskNumbers) -> Config:
@@ -113,8 +112,9 @@ def _paper(task: str, numbers: TaskNumbers) -> Config:
 
 def _quick(task: str, numbers: TaskNumbers) -> Config:
     """Minutes instead of days: many small robots, small batches, a shorter horizon of credit."""
+    paper = _paper(task, numbers)
     return replace(
-        _paper(task, numbers),
+        paper,
         preset="quick",
         seed=0,
         steps=4_800,
@@ -122,7 +122,7 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
         random_steps=(480, 100),
         alpha=(0.5 * numbers.alpha[0], numbers.alpha[1]),
         environment=EnvironmentConfig(),
-        network=NetworkConfig("half_pixel", numbers.split, 0.25 if numbers.split else 1.0),
+        network=replace(paper.network, interpolation="half_pixel"),
         learning=LearningConfig(
             batch_size=64, learning_rate=1e-3, gamma=0.9, tau=0.01, buffer_size=20_000, gradient_steps=4
         ),
@@ -130,12 +130,10 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
     )
 
 
-def from_json(values: dict[str, Any], program: str = "train") -> Config:
-    """A configuration from JSON values; those that are left out come from the preset that the values name.
-
-    An error names the ``program`` of `baselines` that takes other algorithms.
-    """
+def from_json(values: dict[str, Any]) -> Config:
+    """A configuration from JSON values; those that are left out come from the preset that the values name."""
     if (algo := values.get("algo", "cfp")) != "cfp":
-        raise ConfigError(f"algo must be 'cfp', got {algo!r}; python -m baselines.{program} runs other algorithms")
+        programs = "python -m baselines.train, baselines.evaluate and baselines.robustness run other algorithms"
+        raise ConfigError(f"algo must be 'cfp', got {algo!r}; {programs}")
     base = preset(values.get("task", DEFAULT_TASK), values.get("preset", "quick"))
     return update_from_dict(base, values)

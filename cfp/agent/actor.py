@@ -11,15 +11,7 @@ from torch.nn import functional as F
 
 from cfp.agent import fused
 from cfp.agent.composition import blend
-from cfp.agent.networks import (
-    IMAGE_SIZE,
-    Encoder,
-    PairEncoder,
-    initialise,
-    make_head,
-    normalise_image,
-    upsample,
-)
+from cfp.agent.networks import IMAGE_SIZE, Encoder, PairEncoder, initialise, make_head, normalise_image, upsample
 from cfp.agent.spec import ActorSpec
 
 STD_BOUNDS = (0.1, 6.0)

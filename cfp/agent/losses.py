@@ -11,13 +11,7 @@ from cfp.agent.networks import TwinCritic
 
 
 def critic_target(
-    actor: Actor,
-    target: TwinCritic,
-    next_obs: Tensor,
-    rewards: Tensor,
-    not_done: Tensor,
-    alpha: Tensor,
-    gamma: float,
+    actor: Actor, target: TwinCritic, next_obs: Tensor, rewards: Tensor, not_done: Tensor, alpha: Tensor, gamma: float
 ) -> Tensor:
     """Regression target ``y = r + c gamma (min Q'(s', a') - alpha log pi(a'|s'))``, (B, 1), without gradient.
 

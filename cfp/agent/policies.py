@@ -6,7 +6,6 @@ from abc import ABC, abstractmethod
 from typing import Any, cast
 
 import numpy as np
-import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
@@ -26,25 +25,11 @@ class NetworkPolicy(sac_policies.SACPolicy, ABC):
     ``optimizer_kwargs`` the optimiser is a fused Adam.
     """
 
-    def __init__(
-        self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        use_sde: bool = False,
-        optimizer_class: type[torch.optim.Optimizer] = torch.optim.Adam,
-        optimizer_kwargs: dict[str, Any] | None = None,
-    ) -> None:
+    def __init__(self, *spaces_and_schedule: Any, use_sde: bool = False, **options: Any) -> None:
         if use_sde:
             raise ValueError("use_sde must be False, got True: the actor has its own exploration noise")
-        super().__init__(
-            observation_space,
-            action_space,
-            lr_schedule,
-            normalize_images=False,
-            optimizer_class=optimizer_class,
-            optimizer_kwargs={"fused": True} if optimizer_kwargs is None else optimizer_kwargs,
-        )
+        options.setdefault("optimizer_kwargs", {"fused": True})
+        super().__init__(*spaces_and_schedule, normalize_images=False, **options)
 
     @abstractmethod
     def new_actor(self) -> SquashedActor:
@@ -101,11 +86,9 @@ class CFPPolicy(NetworkPolicy):
     ) -> None:
         self.spec = spec or ActorSpec((action_space.shape[-1],))
         size = self.spec.action_size
-        if action_space.shape != (2, size, size):
-            raise ValueError(
-                f"action_space must have shape {(2, size, size)} for resolutions {self.spec.resolutions}, "
-                f"got {action_space.shape}"
-            )
+        if (found := action_space.shape) != (2, size, size):
+            grids = self.spec.resolutions
+            raise ValueError(f"action_space must have shape {(2, size, size)} for resolutions {grids}, got {found}")
         super().__init__(observation_space, action_space, lr_schedule, **options)
 
     def new_actor(self) -> Actor:

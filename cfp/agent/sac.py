@@ -59,7 +59,7 @@ class RewardStatistics(nn.Module):
     mean: Tensor
     variance: Tensor
 
-    def __init__(self, momentum: float = 0.99) -> None:
+    def __init__(self, momentum: float) -> None:
         super().__init__()
         self.momentum = momentum
         self.register_buffer("mean", torch.zeros(()))
@@ -239,16 +239,10 @@ class CFP(SAC):
         return sample.action.cpu().numpy(), composition.join(sample.parts).cpu().numpy()
 
     def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
+        self, replay_buffer: ReplayBuffer, buffer_action: np.ndarray, new_obs: Any, reward: np.ndarray, *rest: Any
     ) -> None:
         self._check_finite("reward", reward)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, *rest)
 
     def _check_finite(self, name: str, values: np.ndarray) -> None:
         finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)

@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
+from cfp.agent.actor_policy import Memory
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
 from cfp.experiment.folder import policy_path
@@ -84,11 +85,10 @@ class Algorithm(ABC):
     @classmethod
     def create(cls, config: Any, stage: int, folder: Path, resumed: bool = False) -> Algorithm:
         """The algorithm at the beginning of a stage, also if it is ``resumed`` from a checkpoint loaded later."""
-        start: Policy | None = None
         if stage > 1:
-            start = cls.load(policy_path(folder, stage - 1), choose_device(config.device))
-        elif not resumed:
-            start = cls.initial_policy(config)
+            start: Policy | None = cls.load(policy_path(folder, stage - 1), choose_device(config.device))
+        else:
+            start = None if resumed else cls.initial_policy(config)
         algorithm = cls(config, stage, start)
         algorithm.starts_trained = start is not None
         return algorithm
@@ -153,25 +153,9 @@ class Algorithm(ABC):
     def policy(self) -> PolicyPredictor:
         """What has been learned so far."""
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Choose actions as stable-baselines3's ``predict`` does.
-
-        Args:
-            observation: (B, 3, 64, 64) uint8.
-            state: What the last call returned, None at the beginning; arrays with a leading B.
-            episode_start: (B,) bool, which elements begin a new episode.
-            deterministic: Without noise.
-
-        Returns:
-            Actions (B, 2, R, R), and the policy's memory for the next step.
-        """
-        return self.policy.predict(observation, state, episode_start, deterministic)
+    def predict(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, Memory]:
+        """Actions of the policy, see `cfp.ActorPolicy.predict`, and its memory for the next step."""
+        return self.policy.predict(*args, **kwargs)
 
     @abstractmethod
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:

@@ -31,10 +31,6 @@ class Checkpoint:
         self.path = folder / "state.pt"
         self.archive = ReplayArchive(folder / "replay", 1)
 
-    def exists(self) -> bool:
-        """Whether a whole checkpoint is there."""
-        return self.path.exists()
-
     def save(self, algorithm: Algorithm, config: RunConfig, position: Position) -> None:
         """Replace the checkpoint."""
         state = {
@@ -85,9 +81,8 @@ class Checkpoint:
 
     def does_not_fit(self, error: Exception) -> CheckpointError:
         """The error for a state that cannot be put into an algorithm."""
-        return CheckpointError(
-            f"{self.path}: the checkpoint does not fit this program ({type(error).__name__}: {error})"
-        )
+        reason = f"{type(error).__name__}: {error}"
+        return CheckpointError(f"{self.path}: the checkpoint does not fit this program ({reason})")
 
 
 def check_same(stored: dict[str, Any], given: RunConfig) -> None:

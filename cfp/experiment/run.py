@@ -66,7 +66,7 @@ class Run:
         self.evaluation_seconds = 0.0  # in this session
         self.checkpoint = Checkpoint(folder / "checkpoint")
         self.state: dict[str, Any] | None = None
-        if resume and self.checkpoint.exists():
+        if resume and self.checkpoint.path.exists():
             self._read_checkpoint()
         else:
             if resume:
