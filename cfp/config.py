@@ -27,10 +27,7 @@ EVALUATION_SEED = 10_000
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Options of a training run that every algorithm has.
-
-    A run consists of one or more stages, which are counted from 1.
-    """
+    """Options of a training run that every algorithm has; its stages are counted from 1."""
 
     task: str
     """Task; MODULE:NAME for a custom task that the module registers."""
@@ -154,10 +151,7 @@ class StagedConfig(RunConfig):
         )
 
     def with_derived(self, base: RunConfig, given: Collection[str]) -> RunConfig:
-        """Scale the handovers with the steps; for another number of stages, adjust the options with one value each.
-
-        Stages are then equally long, and additional ones take the last value of the preset.
-        """
+        """Scale the handovers with the steps; other numbers of stages are equally long, and repeat the last values."""
         assert isinstance(base, StagedConfig)
         stages, scale, changes = len(self.resolutions), self.steps / base.steps, dict[str, Any]()
         for name, count in self._counts().items():
@@ -242,10 +236,7 @@ class Config(StagedConfig):
 
 
 def check_training_layouts(name: str, count: int, before: int = 0) -> None:
-    """Check that training uses no initial positions of evaluations; both are numbered from the run's seed.
-
-    The option ``name`` determines their number, ``count``; ``before`` others are used before them.
-    """
+    """Check that ``count`` initial positions, an option's value, after ``before`` others are none of evaluations."""
     if before + count > EVALUATION_SEED:
         largest = EVALUATION_SEED - before
         raise ConfigError(f"{name} must be at most {largest}, got {count}: later seeds belong to evaluations")

@@ -20,33 +20,19 @@ from cfp.sections import EnvironmentConfig, NetworkConfig, ReportConfig
 
 @dataclass(frozen=True)
 class TaskNumbers:
-    """Published hyperparameters of one task.
+    """Published hyperparameters of one task; pairs are those of stages 1 and 2."""
 
-    Attributes:
-        alpha: Temperature of stages 1 and 2.
-        gate_bias: Bias of the gate logit.
-        gate_penalty: Weight rho of the gate penalty.
-        steps: Environment steps plotted in the paper.
-        handover: Step at which the paper's curves change from stage 1 to stage 2.
-        seed: Seed of the published weights.
-        resolutions: Action grids of stages 1 and 2.
-        random_steps: Uniformly random steps of stages 1 and 2.
-        split: Separate encoders for observation and action, with a gate of at most 0.25.
-        variant: Material, where the published run changed it.
-        deterministic: Evaluation without action noise.
-    """
-
-    alpha: tuple[float, float]
+    alpha: tuple[float, float]  # temperature
     gate_bias: float
     gate_penalty: float
-    steps: int
-    handover: int
-    seed: int = 0
+    steps: int  # environment steps plotted in the paper
+    handover: int  # step at which the paper's curves change from stage 1 to stage 2
+    seed: int = 0  # of the published weights
     resolutions: tuple[int, int] = (8, 16)
     random_steps: tuple[int, int] = (6000, 100)
-    split: bool = False
-    variant: Literal["published"] | None = None
-    deterministic: bool = False
+    split: bool = False  # separate encoders for observation and action, with a gate of at most 0.25
+    variant: Literal["published"] | None = None  # material, where the published run changed it
+    deterministic: bool = False  # evaluation without action noise
 
 
 # For GROW and CATCH no stage-2 configuration was published; stage 1's values are used.

@@ -39,8 +39,7 @@ def actor_loss(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Mean of ``alpha log pi - min Q`` plus penalties, and scalars to log (see `cfp.agent.sac.METRICS`).
 
-    ``gate_penalty`` weighs the gate of a residual actor, ``anchor`` the mean squared difference between the actions and
-    the mean actions of ``origin``, an actor to stay close to.
+    ``gate_penalty`` weighs a residual actor's gate, ``anchor`` the mean squared distance to ``origin``'s mean actions.
     """
     action, log_prob, gate, _ = actor.sample(obs)
     q_values = torch.minimum(*critic(obs, action))

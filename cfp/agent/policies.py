@@ -21,15 +21,15 @@ from cfp.agent.spec import ActorSpec
 class NetworkPolicy(sac_policies.SACPolicy, ABC):
     """Base class of the policies that `cfp.agent.sac.CFP` trains; subclasses create actor and critics.
 
-    Networks read observations as they are (``normalize_images`` is off). ``use_sde`` must be False; without
-    ``optimizer_kwargs`` the optimiser is a fused Adam.
+    Networks read observations as they are. ``use_sde`` must be False; the optimiser is a fused Adam by default.
     """
 
     def __init__(self, *spaces_and_schedule: Any, use_sde: bool = False, **options: Any) -> None:
         if use_sde:
             raise ValueError("use_sde must be False, got True: the actor has its own exploration noise")
         options.setdefault("optimizer_kwargs", {"fused": True})
-        super().__init__(*spaces_and_schedule, normalize_images=False, **options)
+        options["normalize_images"] = False
+        super().__init__(*spaces_and_schedule, **options)
 
     @abstractmethod
     def new_actor(self) -> SquashedActor:
@@ -62,8 +62,7 @@ class CFPPolicy(NetworkPolicy):
     """Actor, twin critics and target critics of the coarse-to-fine policy.
 
     The actors of coarser stages are frozen submodules of the actor, so ``state_dict`` and ``predict`` cover all stages.
-    ``predict`` does not clip: a composed action may exceed [-1, 1] by the overshoot of the cubic interpolation, as in
-    the reference implementation.
+    ``predict`` does not clip: a composed action may exceed [-1, 1] by the overshoot of the cubic interpolation.
 
     Args:
         observation_space: uint8 (3, 64, 64).

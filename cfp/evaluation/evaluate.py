@@ -87,22 +87,22 @@ class UntrainedPolicy:
     """Draws actions (B, 2, R, R) by their shape, whatever it sees."""
 
     resolution: int
-    draw: Callable[[tuple[int, ...]], np.ndarray]
+    draw: Callable[[tuple[int, ...]], Any]
 
     def predict(
         self, observation: Observation, state: Memory = None, episode_start: Start = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Memory]:
         """Actions for a batch of observations."""
-        return self.draw((len(observation), 2, self.resolution, self.resolution)).astype(np.float32), state
+        actions: np.ndarray = self.draw((len(observation), 2, self.resolution, self.resolution))
+        return actions.astype(np.float32), state
 
 
 def evaluate(
     name: str, policy: PolicyPredictor, env: VecEnv, episodes: int, *, deterministic: bool, seed: int
 ) -> Result:
-    """Run episodes without learning, in environments used for nothing else; torch's generator is not touched.
+    """Run episodes without learning, element i of the batch from layout ``seed + i``; torch's generator is not touched.
 
-    The same seed gives the same episodes with any number of threads; element i of the batch starts from layout
-    ``seed + i``. With reference parity, whose resets show what was before, this holds only in new environments.
+    The same seed gives the same episodes; with reference parity, whose resets show what was before, in a new ``env``.
     """
     elements: list[int] = []
     successes: list[bool] = []
@@ -128,10 +128,7 @@ def evaluate(
 
 
 def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, noise: Noise = "default") -> list[Result]:
-    """Evaluate trained policies beside zero and random action, all on the same particle layouts.
-
-    A policy made for a single layout is evaluated there too, in a row of its own.
-    """
+    """Evaluate policies beside zero and random action on the same layouts; one made for a single layout also there."""
     coarsest, seed = config.resolution(1), evaluation_seed(config)
     uniform = partial(np.random.default_rng(config.seed).uniform, -1, 1)
 

@@ -40,10 +40,7 @@ def film(config: RunConfig, policy: Policy) -> Iterator[np.ndarray]:
 def film_episode(
     config: RunConfig, policy: PolicyPredictor, size: int, deterministic: bool, seed: int
 ) -> Iterator[np.ndarray]:
-    """Pictures of one episode, uint8 (512, 512, 3): the start, then one per environment step.
-
-    They are made as they are asked for; torch's generators are as before when all have been taken.
-    """
+    """Pictures of one episode, uint8 (512, 512, 3), to be taken all at once: the start, then one per step."""
     venv = make_env(config, size, 1).venv
     assert isinstance(venv, TorchVecEnv)
     acting = SingleThreaded(attached(policy, venv))

@@ -47,22 +47,14 @@ class Algorithm(ABC):
         config: Options of the run.
         stage: Which stage, 1 is the first.
         start: Policy of the stage before; in the first stage `initial_policy`.
-
-    Attributes:
-        sees: What its policies look at; their training may use more.
-        num_timesteps: Environment steps taken in this stage.
-        starts_trained: Whether the stage begins with a trained policy, which is then evaluated before the first step.
-        replay_buffer: Transitions to keep in checkpoints.
-        logger: Receives scalars.
-        scalars: Those of the last update.
     """
 
-    sees: ClassVar[Sees] = "image"
-    num_timesteps: int = 0
-    starts_trained: bool = False
-    replay_buffer: ReplayBuffer | None = None
+    sees: ClassVar[Sees] = "image"  # what its policies look at; their training may use more
+    num_timesteps: int = 0  # environment steps taken in this stage
+    starts_trained: bool = False  # with a policy that is then evaluated before the first step
+    replay_buffer: ReplayBuffer | None = None  # transitions to keep in checkpoints
     logger: Logger
-    scalars: Scalars = {}
+    scalars: Scalars = {}  # of the last update
 
     @abstractmethod
     def __init__(self, config: Any, stage: int = 1, start: Any = None) -> None: ...
@@ -163,7 +155,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """All that learning needs to continue, as tensors and plain values; without the replay memory."""
+        """All that learning needs to continue besides `num_timesteps` and `replay_buffer`: tensors and plain values."""
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:

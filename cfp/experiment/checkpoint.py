@@ -21,10 +21,9 @@ VERSION = 2
 
 
 class Checkpoint:
-    """The ``checkpoint`` folder of a run.
+    """The ``checkpoint`` folder of a run; a crash at any moment leaves the previous checkpoint whole.
 
-    The state file is replaced in one move, and names its replay chunks, which are immutable: a crash at any moment
-    leaves the previous checkpoint whole. Reading runs no code from the file.
+    The state file is replaced in one move, and names its replay chunks, which are immutable.
     """
 
     def __init__(self, folder: Path) -> None:

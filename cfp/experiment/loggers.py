@@ -27,10 +27,7 @@ EVALUATION_METRICS: dict[str, str] = {
 
 
 class ProgressTable(KVWriter):
-    """A logger output that appends to ``progress.csv`` (stable-baselines3's own starts the file anew).
-
-    Wall-clock values are left out, so that two runs with one seed write the same file.
-    """
+    """A logger output that appends to ``progress.csv``; stable-baselines3's own starts the file anew."""
 
     def __init__(self, table: Table) -> None:
         self.table = table
