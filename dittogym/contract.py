@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from dittogym.rewards import RewardOps
+from dittogym.reward_ops import RewardOps
 from torchmpm import ParticleState
 
 #: Terms that the engine adds to those of a task.
@@ -59,7 +59,7 @@ class Moment(NamedTuple):
         observation: (B, 3, 64, 64) uint8; the floating point image of
             :func:`dittogym.core.soft_observation` where a smooth reward is wanted.
         memory: What the task remembers, tensors with a leading B.
-        ops: Operations that have a smooth form, see :class:`dittogym.rewards.RewardOps`.
+        ops: Operations that have a smooth form, see :class:`dittogym.reward_ops.RewardOps`.
     """
 
     particles: ParticleState

@@ -13,9 +13,9 @@ from torch import Tensor
 from dittogym import core
 from dittogym.action import ActionIndexing, to_grid_indexing
 from dittogym.arguments import DTYPES, check_action, choice, find_device, find_mask, find_resolution, reset_options
-from dittogym.bodies.positions import InitialPositions, Particles, Seed, particle_counts
+from dittogym.bodies.positions import InitialPositions, Particles, Seed, get_state, particle_counts, set_state
 from dittogym.contract import ENGINE_INFO, measure
-from dittogym.model import PARITIES, EnvState, ParityName, Snapshot, check_stability, make_model
+from dittogym.model import EnvState, Parity, Snapshot, check_stability, make_model
 from dittogym.observation.image import SHAPE
 from dittogym.physics import Physics, merged, physics_values
 from dittogym.render.frame import frame
@@ -28,10 +28,10 @@ from torchmpm.rollout import Segment, check_repetition
 class TorchEnv:
     """``num_envs`` independent simulations of one task, advanced together.
 
-    Rewards and states keep their autograd graph as long as gradients are enabled: differentiate through
-    :meth:`step`, cut the graph with :meth:`detach`, or run under ``torch.no_grad()``. The observation is an integer
-    image and has no gradient. Elements are not reset automatically: one that has ended continues until :meth:`reset`
-    is called with a mask. Element i of a batch reset with seed s is the single environment reset with seed s + i.
+    Rewards and states keep their autograd graph as long as gradients are enabled; :meth:`detach` cuts it. The
+    observation is an integer image and has no gradient. Elements are not reset automatically: one that has ended
+    continues until :meth:`reset` is called with a mask. Element i of a batch reset with seed s is the single
+    environment reset with seed s + i.
 
     Args:
         task: A task name or a :class:`dittogym.spec.TaskSpec`.
@@ -45,8 +45,9 @@ class TorchEnv:
         action_layout: ``"image"``: action pixel (row, column) acts where observation pixel (row, column) looks;
             ``"grid"``: (x, y), as in the reference implementation. ``None``: ``"grid"`` with reference parity, else
             ``"image"``.
-        parity: ``"clean"``, or ``"reference"`` to bring back the reference's stale observation and action centre
-            after a reset, its random positions, unit particle volume and pixel raster at every particle count.
+        parity: ``"clean"``, or ``"reference"`` to bring back the reference's stale observation, action centre and
+            ``TaskSpec.stale_memory`` after a reset, and at every particle count its random positions, unit particle
+            volume and pixel raster.
         resample: Draw new particles at every reset, not only at a seeded one.
         deterministic: Accept only what repeats a trajectory bit by bit for one seed and number of threads: the CPU, and
             not the backend ``"compile"``.
@@ -56,9 +57,7 @@ class TorchEnv:
 
     Attributes:
         spec: The task.
-        num_envs: Number B of simulations.
         action_shape: (2, R, R).
-        action_layout: ``"image"`` or ``"grid"``.
         state: The :class:`torchmpm.ParticleState` of all simulations.
 
     Raises:
@@ -80,7 +79,7 @@ class TorchEnv:
         device: str | torch.device = "cpu",
         backend: str = "auto",
         action_layout: ActionIndexing | None = None,
-        parity: ParityName = "clean",
+        parity: Parity = "clean",
         resample: bool = False,
         deterministic: bool = False,
         segment: Segment = "auto",
@@ -99,14 +98,12 @@ class TorchEnv:
             )
         self.action_resolution = find_resolution(self.spec, resolution)
         self.action_shape = (2, self.action_resolution, self.action_resolution)
-        self._parity = choice("parity", parity, PARITIES)
-        indexing = {"image": "image", "grid": "grid", None: self._parity.action_indexing}
-        self.action_layout: ActionIndexing = choice("action_layout", action_layout, indexing)
+        self._as_reference = choice("parity", parity, {"clean": False, "reference": True})
+        own: ActionIndexing = "grid" if self._as_reference else "image"
+        self.action_layout = choice("action_layout", action_layout, {"image": "image", "grid": "grid", None: own})
         counts = particle_counts(self.spec, particles)
-        self.model = make_model(
-            self.spec, counts, substeps=substeps, backend=backend, parity=self._parity, segment=segment
-        )
-        random = self._parity.random_positions or counts == tuple(body.count for body in self.spec.bodies)
+        self.model = make_model(self.spec, counts, substeps=substeps, backend=backend, parity=parity, segment=segment)
+        random = self._as_reference or counts == tuple(body.count for body in self.spec.bodies)
         self._initial_positions = InitialPositions(self.spec, counts, self.num_envs, random=random, resample=resample)
         self._like = torch.empty(self.num_envs, dtype=self.dtype, device=self.device)
         self.device = self._like.device  # with the number of what is the current device now
@@ -123,7 +120,7 @@ class TorchEnv:
 
     @property
     def env_state(self) -> EnvState:
-        """Everything that moves, for :mod:`dittogym.core`; see also :meth:`save`. Assign a state to continue from it.
+        """Everything that moves, for :mod:`dittogym.core`. Assign a state to continue from it.
 
         Raises:
             RuntimeError: It was neither reset nor assigned.
@@ -150,15 +147,15 @@ class TorchEnv:
 
         By element: tensors ``key`` (624,) and ``pos`` () of the Mersenne Twister.
         """
-        return {element: sampler.generator for element, sampler in self._initial_positions.samplers.items()}
+        return {element: get_state(each) for element, each in self._initial_positions.generators.items()}
 
     @generators.setter
     def generators(self, states: Mapping[int, Mapping[str, Tensor]]) -> None:
-        samplers = self._initial_positions.samplers
-        if missing := [element for element in states if element not in samplers]:
+        generators = self._initial_positions.generators
+        if missing := [element for element in states if element not in generators]:
             raise RuntimeError(f"call reset() first: elements {missing} have no random generator yet")
         for element, state in states.items():
-            samplers[element].generator = state
+            set_state(generators[element], state)
 
     @property
     def state(self) -> ParticleState:
@@ -178,8 +175,7 @@ class TorchEnv:
         """Cut the autograd graph: gradients do not reach back beyond this moment.
 
         Args:
-            physics: Also those in the constants that the last reset was given; without, a constant can be learned from
-                one stretch of an episode after the other.
+            physics: Also gradients in the constants that the last reset was given.
         """
         state = tree.detach(self.env_state)
         self._env_state = state if physics else replace(state, physics=self.env_state.physics)
@@ -256,7 +252,7 @@ class TorchEnv:
         fresh, observation = core.reset(self.model, drawn.positions[index], tree.map(lambda t: t[index], physics))
         info = tree.detach(core.measured_info(self.model, fresh, fresh.start))
         if self._env_state is not None:
-            if self._parity.stale_reset:
+            if self._as_reference:
                 fresh, observation = self._stale(fresh, observation, index)
             if len(index) < self.num_envs:
                 fresh, observation, info = self._insert(index, fresh, observation, info)
@@ -323,13 +319,7 @@ class TorchEnv:
         return observation, result.reward, result.terminated, result.state.steps >= self.spec.horizon, info
 
     def soft_observation(self) -> Tensor:
-        """The present image as a smooth function of the state.
-
-        See :func:`dittogym.core.soft_observation`.
-
-        Returns:
-            (B, 3, 64, 64) in the units of the uint8 observation, with the autograd graph of the state.
-        """
+        """The present image (B, 3, 64, 64) as a smooth function; see :func:`dittogym.core.soft_observation`."""
         return core.soft_observation(self.model, self.env_state)
 
     def render(self, index: int = 0, *, muscles: bool = False, size: int = 512) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dittogym.bodies.shapes import Lattice
 from dittogym.contract import Memory, Moment, Outcome
 from dittogym.geometry import Obstacle, ceiling, floor, nodes, side_walls
-from dittogym.rewards import count_of, distance, drop_widest, pick
+from dittogym.reward_ops import count_of, distance, drop_widest, pick
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.window import Window
 from torchmpm import VelocityRule

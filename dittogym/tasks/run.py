@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from dittogym.bodies.shapes import Disc
 from dittogym.contract import Moment, Outcome
 from dittogym.geometry import Obstacle, ceiling, floor, nodes
-from dittogym.rewards import signed_quadratic
+from dittogym.reward_ops import signed_quadratic
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.window import Window
 from torchmpm import VelocityRule
