@@ -56,8 +56,7 @@ class Moment(NamedTuple):
         num_robot_particles: The robot's particles come first.
         now: Averages after the step.
         start: Averages right after the reset.
-        observation: (B, 3, 64, 64) uint8; the floating point image of
-            :func:`dittogym.core.soft_observation` where a smooth reward is wanted.
+        observation: (B, 3, 64, 64) uint8, or for a smooth reward that of :func:`dittogym.core.soft_observation`.
         memory: What the task remembers, tensors with a leading B.
         ops: Operations that have a smooth form, see :class:`dittogym.reward_ops.RewardOps`.
     """
@@ -77,13 +76,8 @@ class Moment(NamedTuple):
 
     @property
     def object_com(self) -> Tensor:
-        """Mean position (B, 2) of the object's particles, m.
-
-        Raises:
-            ValueError: The task has no object.
-        """
-        if self.now.object_com is None:
-            raise ValueError("object_com needs a task with an object, got one without")
+        """Mean position (B, 2) of the object's particles, m, in tasks with an object."""
+        assert self.now.object_com is not None
         return self.now.object_com
 
 
@@ -122,10 +116,7 @@ def check_memory(task: str, memory: object, stale: tuple[str, ...], batch: int) 
 def check_outcome(
     task: str, outcome: object, memory: Memory, weights: Mapping[str, float], batch: int, checked: set[tuple[Any, ...]]
 ) -> None:
-    """Refuse what a task must not return as the outcome of a step.
-
-    Types and shapes are checked when names appear for the first time, not in every step.
-    """
+    """Refuse what a task must not return from a step; shapes are checked when names appear for the first time."""
     who = f"reward_fn of task {task!r}"
     if not isinstance(outcome, Outcome):
         raise TypeError(f"{who} must return an Outcome, got {type(outcome).__name__}")

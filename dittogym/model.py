@@ -63,12 +63,6 @@ class Snapshot:
     state: EnvState
     observation: Tensor
 
-    @property
-    def kind(self) -> tuple[object, ...]:
-        """What an environment must have in common with it."""
-        x = self.state.particles.x
-        return self.task, self.counts, self.particle_weight, x.dtype, x.device
-
 
 torch.serialization.add_safe_globals([Snapshot, EnvState, Measurement])  # tensors, numbers and a name
 

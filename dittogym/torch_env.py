@@ -204,15 +204,16 @@ class TorchEnv:
         if not isinstance(snapshot, Snapshot):
             raise TypeError(f"snapshot must be what save() returned, got {type(snapshot).__name__}")
         chosen = find_mask("mask", mask, self.num_envs, self.device)
-        theirs, size, counts = snapshot.state, len(snapshot.state.steps), self.model.camera.counts
-        kind, own = snapshot.kind, (self.spec.name, counts, self.model.particle_weight, self.dtype, self.device)
+        x, size = snapshot.state.particles.x, len(snapshot.state.steps)
+        own = self.spec.name, self.model.camera.counts, self.model.particle_weight, self.dtype, self.device
+        kind = snapshot.task, snapshot.counts, snapshot.particle_weight, x.dtype, x.device
         if kind != own or size not in (1, self.num_envs):
             raise ValueError(
                 f"snapshot must hold 1 or {self.num_envs} simulations of {own}, got {size} of {kind} "
                 "(task, particles, what each stands for, dtype, device)"
             )
         index = torch.arange(self.num_envs, device=self.device) % size
-        state, observation = tree.map(lambda t: t[index], (theirs, snapshot.observation))
+        state, observation = tree.map(lambda t: t[index], (snapshot.state, snapshot.observation))
         if not bool(chosen.all()):
             mine = self.env_state
             physics = merged(self.spec, mine.physics, state.physics, chosen, self._like)

@@ -14,15 +14,11 @@ from torchmpm.sampling import Points
 
 @runtime_checkable
 class Shape(Protocol):
-    """Where the particles of a body start.
-
-    ``draws`` is the number of uniform random numbers a particle takes in the reference implementation: 4 where each
-    coordinate is a magnitude and a sign, 2 where it is one number, 0 for a lattice.
-    """
+    """Where the particles of a body start."""
 
     @property
     def draws(self) -> int:
-        """Uniform numbers per particle in the reference."""
+        """Uniform numbers per particle in the reference: 4 (a magnitude and a sign a coordinate), 2, or 0 (lattice)."""
 
     @property
     def corner(self) -> tuple[float, float]:

@@ -56,7 +56,7 @@ def initial_memory(moment: Moment, spec: TaskSpec) -> Memory:
 def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
     """Mean distance of the tip from the goal, under a square root."""
     tip = pick(moment.particles.x, moment.memory["tip"])
-    gap = distance(tip, spec.goal_like(tip)[None]).mean(1)
+    gap = distance(tip, tip.new_tensor([spec.goal])).mean(1)
     reached = gap < REACHED
     return Outcome(
         terms={"distance": -gap.sqrt(), "success": moment.ops.heaviside(REACHED - gap, BONUS_WIDTH)},

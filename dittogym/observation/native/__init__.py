@@ -6,8 +6,9 @@ With the pixel raster it yields the same bytes as ``dittogym.observation.raster`
 from __future__ import annotations
 
 import ctypes
+import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -41,8 +42,9 @@ class Picture(ctypes.Structure):
     ]
 
 
+@functools.lru_cache(maxsize=64)
 def drawing(
-    view: Centre, boxes: Sequence[Box], bodies: Sequence[tuple[int, float, bool]], pixels: bool, dtype: torch.dtype
+    view: Centre, boxes: tuple[Box, ...], bodies: tuple[tuple[int, float, bool], ...], pixels: bool, dtype: torch.dtype
 ) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
     """A function that draws what a :class:`dittogym.observation.camera.Camera` sees, for tensors on the CPU."""
     function = getattr(build(_SOURCE, *_OPTIONS), _FUNCTIONS[dtype])
