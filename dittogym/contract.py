@@ -76,8 +76,13 @@ class Moment(NamedTuple):
 
     @property
     def object_com(self) -> Tensor:
-        """Mean position (B, 2) of the object's particles, m, in tasks with an object."""
-        assert self.now.object_com is not None
+        """Mean position (B, 2) of the object's particles, m.
+
+        Raises:
+            ValueError: The task has no object.
+        """
+        if self.now.object_com is None:
+            raise ValueError("object_com needs a task with an object, got one without")
         return self.now.object_com
 
 

@@ -22,7 +22,7 @@ FAILURE_REWARD = -16.0
 
 
 class StepResult(NamedTuple):
-    """What a control step comes to; leading B throughout.
+    """What a control step comes to.
 
     Attributes:
         state: The next state.
@@ -31,7 +31,7 @@ class StepResult(NamedTuple):
         terms: Weighted reward terms by name, (B,) each.
         terminated: (B,) bool.
         success: (B,) bool; ``None`` where the task does not define it.
-        info: ``com``, ``split``, ``finite``, ``object_com`` where there is an object, and the task's own quantities.
+        info: ``com``, ``split``, ``finite``, ``object_com`` where there is an object, and the task's own; leading B.
         true_reward: (B,) the task's reward; ``reward`` unless that is smooth.
         actuation: (B, 2, P, P) on the patch, Pa.
         soft_observation: (B, 3, 64, 64) of :func:`soft_observation`; ``None`` unless the reward is smooth.
@@ -59,10 +59,6 @@ def reset(model: Model, positions: Tensor, physics: Physics | None = None) -> tu
 
     Returns:
         State and observation (B, 3, 64, 64) uint8.
-
-    Raises:
-        ValueError: What the task remembers cannot be kept.
-        TypeError: The same.
     """
     spec, particles = model.spec, ParticleState.at_rest(positions)
     start = measure(particles, model.num_robot_particles)
@@ -84,8 +80,8 @@ def step(model: Model, state: EnvState, action: Tensor, *, soft: bool = False) -
         soft: Whether the reward is the smooth one, for gradients; all else is as without.
 
     Raises:
-        ValueError: As in :func:`evaluate`.
-        TypeError: As in :func:`evaluate`.
+        ValueError: The task returns what it must not, or a term that is not finite although the simulation is.
+        TypeError: The task returns something else than an :class:`dittogym.Outcome`.
     """
     return evaluate(model, *transition(model, state, action), soft=soft)
 
@@ -149,10 +145,6 @@ def evaluate(model: Model, state: EnvState, actuation: Tensor, *, soft: bool = F
         state: After the transition.
         actuation: (B, 2, P, P) on the patch, Pa.
         soft: Whether the reward is the smooth one.
-
-    Raises:
-        ValueError: The task returns what it must not, or a term that is not finite although the simulation is.
-        TypeError: The task returns something else than an :class:`dittogym.Outcome`.
     """
     spec, observation = model.spec, observe(model, state)
     now = measure(state.particles, model.num_robot_particles)
@@ -169,24 +161,15 @@ def evaluate(model: Model, state: EnvState, actuation: Tensor, *, soft: bool = F
         terminated = terminated | (now.split > spec.split_limit)
     if outcome.memory is not None:  # a copy: it may hold what info does
         state = replace(state, memory=tree.map(Tensor.clone, dict(outcome.memory)))
-    return StepResult(
-        state=state,
-        observation=observation,
-        reward=reward,
-        terms=terms,
-        terminated=terminated,
-        success=None if outcome.success is None else outcome.success & valid,
-        info=info | dict(outcome.info or {}),
-        true_reward=true_reward,
-        actuation=actuation,
-        soft_observation=image,
-    )
+    success = None if outcome.success is None else outcome.success & valid
+    info |= outcome.info or {}
+    return StepResult(state, observation, reward, terms, terminated, success, info, true_reward, actuation, image)
 
 
 def measured_info(model: Model, state: EnvState, now: Measurement) -> dict[str, Tensor]:
     """What ``info`` holds in every task, by name, of a state and its averages ``now``."""
-    info = {"com": now.com, "split": now.split, "finite": is_valid(model, state)}
-    return info if now.object_com is None else {**info, "object_com": now.object_com}
+    info = {"com": now.com, "split": now.split, "finite": is_valid(model, state), "object_com": now.object_com}
+    return {name: value for name, value in info.items() if value is not None}
 
 
 def is_valid(model: Model, state: EnvState) -> Tensor:

@@ -12,7 +12,7 @@ from dittogym.bodies.shapes import Shape, check_pair
 from dittogym.contract import Memory, Moment, Outcome
 from dittogym.geometry import NODES, Box, Obstacle, mark
 from dittogym.observation.image import SIZE
-from dittogym.window import FIXED, Centre, Window
+from dittogym.window import Centre, Window
 from torchmpm import Material, checks
 
 
@@ -102,7 +102,7 @@ class TaskSpec:
     lam: float = 50.0
     gravity: tuple[float, float] = (0.0, 0.0)
     damping: float = 1.0
-    window: Window = FIXED
+    window: Window = Window()  # noqa: RUF009
     view: Centre = (None, None)
     reach: Centre = (None, None)
     patch: int = 64
@@ -118,8 +118,8 @@ class TaskSpec:
     def __post_init__(self) -> None:
         for name, kind in (("name", str), ("robot", BodySpec), ("window", Window), ("weights", Mapping)):
             checks.instance(name, getattr(self, name), kind)
-        for name, kind in (("objects", BodySpec), ("obstacles", Obstacle), ("stale_memory", str)):
-            checks.instances(name, getattr(self, name), kind)
+        for name, each in (("objects", BodySpec), ("obstacles", Obstacle), ("stale_memory", str)):
+            checks.instances(name, getattr(self, name), each)
         self._check_numbers()
         object.__setattr__(self, "weights", dict(self.weights))  # later changes of the caller's do not reach it
         if len(self.objects) > 1:

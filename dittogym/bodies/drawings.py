@@ -33,9 +33,8 @@ PROBE = 4096
 def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
     """The task with another robot.
 
-    Pictures and outlines keep the area of the task's own robot, and so its number of particles, its weight and the look
-    of its matter; they stand where it stood: same centre in x, same lowest point. A shape lies where it says, and is
-    filled as densely as the task's own robot. A body is taken as it is.
+    Pictures and outlines keep the area, particles and mass of the task's own robot, and stand where it stood: same
+    centre in x, same lowest point. A shape lies where it says, and is filled as densely. A body is taken as it is.
 
     Args:
         spec: The task.
@@ -48,13 +47,11 @@ def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
             long that the task would end at once.
     """
     own = spec.robot
-    if isinstance(body, BodySpec):
-        robot = body
-    elif isinstance(body, Shape):
-        robot = replace(own, shape=body, count=max(1, round(own.count * body.area / own.shape.area)))
-    else:
-        robot = replace(own, shape=_figure(body, own.shape))
-    spec = replace(spec, robot=robot)
+    if isinstance(body, Shape):
+        body = replace(own, shape=body, count=max(1, round(own.count * body.area / own.shape.area)))
+    elif not isinstance(body, BodySpec):
+        body = replace(own, shape=_figure(body, own.shape))
+    spec = replace(spec, robot=body)
     _check_place(spec)
     return spec
 

@@ -48,9 +48,9 @@ def load_target(target: TargetLike) -> np.ndarray:
     """A target as a (64, 64) bool array, row 0 at the top.
 
     Args:
-        target: The name of a drawn target (``"star"``, ``"I"``, ``"M"``, ``"T"``), the path of an image that OpenCV
-            reads, or an array (H, W), (H, W, 3) or (H, W, 4): bool, uint8 0..255, or floating point 0..1. Pictures of
-            another size are resized to 64 x 64 by area; grey values from 125 of 255 belong to the shape.
+        target: ``"star"``, ``"I"``, ``"M"``, ``"T"``, the path of an image, or an array (H, W), (H, W, 3) or (H, W, 4):
+            bool, uint8 0..255, or floating point 0..1. Pictures of another size are resized to 64 x 64 by area; grey
+            values from 125 of 255 belong to the shape.
 
     Raises:
         ValueError: Neither a name nor a readable image, an array of another kind, or a picture without any pixel set or
@@ -62,7 +62,6 @@ def load_target(target: TargetLike) -> np.ndarray:
             cv2.fillPoly(grey, [np.array(outline)], 255)
     else:
         grey = read_grey(target, "target", others="".join(f"{name!r}, " for name in _OUTLINES))
-    if grey.shape != (SIZE, SIZE):
         grey = cv2.resize(grey, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
     mask = grey >= THRESHOLD
     if not mask.any() or mask.all():
