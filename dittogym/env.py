@@ -140,8 +140,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def load(self, snapshot: Snapshot) -> np.ndarray:
         """Continue from a saved moment, see :meth:`dittogym.TorchEnv.load`; returns its image (3, 64, 64) uint8."""
-        image: np.ndarray = first(as_numpy(self.torch_env.load(snapshot)))
-        return image
+        return first(as_numpy(self.torch_env.load(snapshot)))
 
     def render(self) -> np.ndarray | None:
         """The picture (512, 512, 3) uint8 in mode ``"rgb_array"``, else nothing."""

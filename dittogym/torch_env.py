@@ -14,7 +14,7 @@ from dittogym import core
 from dittogym.action import ActionIndexing, to_grid_indexing
 from dittogym.arguments import DTYPES, check_action, choice, find_device, find_mask, find_resolution, reset_options
 from dittogym.bodies.positions import InitialPositions, Particles, Seed, get_state, particle_counts, set_state
-from dittogym.contract import ENGINE_INFO, measure
+from dittogym.contract import measure
 from dittogym.model import EnvState, Parity, Snapshot, check_stability, make_model
 from dittogym.observation.image import SHAPE
 from dittogym.physics import Physics, merged, physics_values
@@ -110,7 +110,6 @@ class TorchEnv:
         self._physics: Physics = {}
         self._env_state: EnvState | None = None
         self._observation: Tensor | None = None
-        self._info: dict[str, Tensor] | None = None
         self._actuation: Tensor | None = None
 
     @property
@@ -139,7 +138,7 @@ class TorchEnv:
         own = self.num_envs, self.num_particles, self.dtype, self.device
         if kind != own:
             raise ValueError(f"env_state must be of {own} (simulations, particles, dtype, device), got {kind}")
-        self._env_state, self._actuation, self._observation, self._info = value, None, None, None
+        self._env_state, self._actuation, self._observation = value, None, None
 
     @property
     def generators(self) -> dict[int, dict[str, Tensor]]:
@@ -162,14 +161,11 @@ class TorchEnv:
         """The particles of all simulations."""
         return self.env_state.particles
 
-    def _present(self) -> tuple[Tensor, dict[str, Tensor]]:
-        """Observation and measured info of the present state, computed again if the state was assigned."""
+    def _present_observation(self) -> Tensor:
+        """The last observation, computed again if the state was assigned."""
         if self._observation is None:
             self._observation = core.observe(self.model, self.env_state)
-        if self._info is None:
-            now = measure(self.state, self.model.num_robot_particles)
-            self._info = tree.detach(core.measured_info(self.model, self.env_state, now))
-        return self._observation, self._info
+        return self._observation
 
     def detach(self, *, physics: bool = True) -> None:
         """Cut the autograd graph: gradients do not reach back beyond this moment.
@@ -182,7 +178,7 @@ class TorchEnv:
 
     def save(self) -> Snapshot:
         """A copy of the present moment, to which :meth:`load` returns; keeps the autograd graph."""
-        state, observation = tree.map(Tensor.clone, (self.env_state, self._present()[0]))
+        state, observation = tree.map(Tensor.clone, (self.env_state, self._present_observation()))
         return Snapshot(self.spec.name, self.model.camera.counts, self.model.particle_weight, state, observation)
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
@@ -218,7 +214,7 @@ class TorchEnv:
             mine = self.env_state
             physics = merged(self.spec, mine.physics, state.physics, chosen, self._like)
             state, mine = (replace(each, physics=physics) for each in (state, mine))
-            state, observation = tree.where(chosen, (state, observation), (mine, self._present()[0]))
+            state, observation = tree.where(chosen, (state, observation), (mine, self._present_observation()))
         self.env_state = state
         self._observation = observation.clone()
         return observation
@@ -251,7 +247,7 @@ class TorchEnv:
         assert drawn.positions is not None
         index = mask.nonzero()[:, 0]
         fresh, observation = core.reset(self.model, drawn.positions[index], tree.map(lambda t: t[index], physics))
-        info = tree.detach(core.measured_info(self.model, fresh, fresh.start))
+        info = core.measured_info(self.model, fresh, fresh.start)
         if self._env_state is not None:
             if self._as_reference:
                 fresh, observation = self._stale(fresh, observation, index)
@@ -261,8 +257,8 @@ class TorchEnv:
         # Gradients in positions and constants reach back to this reset only, not to the next that uses them.
         self._initial_positions = replace(drawn, positions=drawn.positions.detach().clone())
         self._physics = tree.map(lambda t: t.detach().clone(), physics)
-        self._env_state, self._actuation, self._observation, self._info = fresh, None, observation, info
-        return tree.map(Tensor.clone, (observation, info))
+        self._env_state, self._actuation, self._observation = fresh, None, observation
+        return observation.clone(), tree.map(lambda t: t.detach().clone(), info)
 
     def _next_physics(self, given: Any, mask: Tensor) -> Physics:
         """The constants of the next episodes, where elements outside ``mask`` keep those that wait for them."""
@@ -278,12 +274,13 @@ class TorchEnv:
         old = self.env_state
         memory = {name: old.memory[name][index].detach() for name in self.spec.stale_memory}
         fresh = replace(fresh, centre=old.centre[index].detach(), memory={**fresh.memory, **memory})
-        return fresh, self._present()[0][index]
+        return fresh, self._present_observation()[index]
 
     def _insert(self, index: Tensor, state: EnvState, *seen: Any) -> tuple[Any, ...]:
         """The present state, observation and info of all elements, with others in place of the elements ``index``."""
-        present = (replace(self.env_state, physics={}), *self._present())
-        others = (replace(state, physics={}), *seen)
+        old = replace(self.env_state, physics={})
+        info = core.measured_info(self.model, old, measure(old.particles, self.model.num_robot_particles))
+        present, others = (old, self._present_observation(), info), (replace(state, physics={}), *seen)
         inserted: tuple[Any, ...] = tree.map(lambda whole, part: whole.index_copy(0, index, part), present, others)
         return inserted
 
@@ -312,9 +309,7 @@ class TorchEnv:
             info["is_success"] = result.success
         if soft:
             info["true_reward"] = result.true_reward
-        # Copies: what is returned belongs to the caller.
-        self._observation = result.observation.clone()
-        self._info = {name: value.detach().clone() for name, value in result.info.items() if name in ENGINE_INFO}
+        self._observation = result.observation.clone()  # what is returned belongs to the caller
         self._env_state, self._actuation = result.state, result.actuation.detach()
         observation = result.observation if result.soft_observation is None else result.soft_observation
         return observation, result.reward, result.terminated, result.state.steps >= self.spec.horizon, info

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from dittogym.geometry import Box
 from dittogym.observation import native, raster
-from dittogym.observation.image import CLIP, encode, quantise
-from dittogym.observation.raster import Background, RasterInput
+from dittogym.observation.image import CLIP, encode
+from dittogym.observation.raster import RasterInput
 from dittogym.window import GRID, Centre, Window, centre_in_window
 from torchmpm.backends import transforming, warn_eager
 
@@ -50,8 +50,10 @@ class Camera:
         """:meth:`observe` in torch operations."""
         row, column = raster.crop_corner(centre_in_window(self.view, centre, origin))
         shown = self.raster_input(x, v, origin, row, column)
-        shown = shown._replace(background=self._background(origin, row, column))
-        return quantise(raster.pixel_means(shown) if self.pixels else raster.splat_means(shown))
+        alike = not self.window.moves and None not in self.view  # for all elements
+        corners = (corner[:1] if alike else corner for corner in (origin, row, column))
+        shown = shown._replace(background=raster.draw_boxes(self.boxes, *corners))
+        return encode(raster.pixel_means(shown) if self.pixels else raster.splat_means(shown)).to(torch.uint8)
 
     def observe_smoothly(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
         """The image in the units of the uint8 one as a smooth function of its arguments.
@@ -84,12 +86,6 @@ class Camera:
             row=row,
             column=column,
         )
-
-    def _background(self, origin: Tensor, row: Tensor, column: Tensor) -> Background | None:
-        if not self.boxes or self.window.moves or None in self.view:
-            return raster.draw_boxes(self.boxes, origin, row, column)
-        corner = int(row[0, 0]), int(column[0, 0])
-        return raster.draw_fixed_boxes(self.boxes, (self.window.left, 0.0), *corner, origin.dtype, origin.device)
 
 
 @functools.lru_cache(maxsize=64)

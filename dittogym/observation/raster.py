@@ -5,7 +5,6 @@ Crop and background also as smooth functions, see ``docs/concepts/gradients.md``
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -81,16 +80,6 @@ def draw_boxes(boxes: Sequence[Box], origin: Tensor, row: Tensor, column: Tensor
     mask = along.float() @ across.float() > 0
     fraction = mask.view(-1, SIZE, BLOCK, SIZE, BLOCK).to(origin.dtype).mean((2, 4))
     return Background(mask, fraction)
-
-
-@functools.lru_cache(maxsize=64)
-@torch.inference_mode(False)  # what is kept must serve gradients later
-def draw_fixed_boxes(
-    boxes: tuple[Box, ...], origin: tuple[float, float], row: int, column: int, dtype: torch.dtype, device: torch.device
-) -> Background | None:
-    """What :func:`draw_boxes` returns where neither window nor crop moves; cached."""
-    place = torch.tensor([origin], dtype=dtype, device=device)
-    return draw_boxes(boxes, place, *(torch.tensor([[first]], device=device) for first in (row, column)))
 
 
 def _between(value: Tensor, low: float, high: float, closed: bool) -> Tensor:
