@@ -53,7 +53,7 @@ class Snapshot:
         task: Name of the task.
         counts: Particles of each body.
         particle_weight: By body, the full-size particles that one particle stands for.
-        state: Everything that moves, leading B.
+        state: Everything that moves.
         observation: (B, 3, 64, 64) uint8.
     """
 
@@ -154,7 +154,7 @@ def make_model(
 
 
 def check_stability(model: Model, physics: Physics) -> None:
-    """Refuse matter, with the muscles of the task or of ``physics``, that needs shorter substeps."""
+    """Refuse matter that with its muscles needs shorter substeps."""
     solver = model.solver_for(physics)
     limit = solver.stable_dt(physics.get("max_actuation", model.spec.max_actuation))
     if solver.dt > limit:

@@ -34,8 +34,8 @@ class RewardOps:
     ) -> Tensor:
         """Bring ``z`` into [low, high].
 
-        The smooth form subtracts ``w ln(1 + exp((z - high) / w))``, and adds the like at ``low``. It differs from the
-        exact one by at most w ln 2, at the limit, where its slope is 1/2.
+        The smooth form subtracts ``w ln(1 + exp((z - high) / w))``, at most w ln 2 at the limit, and adds the like at
+        ``low``.
 
         Args:
             z: Of any shape.
@@ -76,8 +76,8 @@ class RewardOps:
     def mean_over_nearest(self, values: Tensor, x: Tensor, point: Tensor, fraction: float) -> Tensor:
         """Mean of ``values`` over the particles nearest to a point, those that :func:`nearest` chooses.
 
-        In the smooth form the weights of particles fall off around the distance within which there are as many, over
-        :data:`SELECTION_WIDTH`, and no particle is left out.
+        In the smooth form all particles count, with weights that fall off around the distance within which there are
+        as many, over :data:`SELECTION_WIDTH`.
 
         Args:
             values: (B, N, K).

@@ -26,12 +26,7 @@ class BodySpec:
         mass: Mass of a particle at full size, kg.
         material: ``None``: with the constants of the task, von Mises matter for the robot, elastic for an object.
         lite: Particles in the lite tier; ``None``: 2,000 for the robot, in proportion to it for an object.
-        hidden_velocity: Whether the velocity channels of the observation leave it out; the occupancy channel always
-            shows it.
-
-    Raises:
-        ValueError: A number is out of range.
-        TypeError: The shape is not a :class:`dittogym.bodies.shapes.Shape`.
+        hidden_velocity: Whether the velocity channels of the observation leave it out.
     """
 
     shape: Shape
@@ -82,7 +77,7 @@ class TaskSpec:
         coarse, fine: Action resolutions.
         split_limit: Spread at which the episode ends, m; ``None`` for never.
         initial_memory: What to remember from the start of an episode, tensors with a leading B.
-        stale_memory: Entries of the memory that a reset leaves as they are under ``parity="reference"``.
+        stale_memory: Entries of the memory that a reset leaves as they are with ``parity="reference"``.
         target: (64, 64) bool picture to match, centred on the robot, row 0 at the top; for pictures of the task.
 
     Raises:

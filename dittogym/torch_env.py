@@ -42,15 +42,13 @@ class TorchEnv:
         dtype: ``"float32"`` or ``"float64"``, by name or as torch's.
         device: Where it runs.
         backend: Of the solver, see :class:`torchmpm.Solver`.
-        action_layout: ``"image"``: action pixel (row, column) acts where observation pixel (row, column) looks;
-            ``"grid"``: (x, y), as in the reference implementation. ``None``: ``"grid"`` with reference parity, else
-            ``"image"``.
+        action_layout: ``"image"``: action pixel (row, column) acts where that pixel of the observation looks;
+            ``"grid"``: (x, y), as in the reference implementation. ``None``: as ``parity`` has it.
         parity: ``"clean"``, or ``"reference"`` to bring back the reference's stale observation, action centre and
             ``TaskSpec.stale_memory`` after a reset, and at every particle count its random positions, unit particle
             volume and pixel raster.
         resample: Draw new particles at every reset, not only at a seeded one.
-        deterministic: Accept only what repeats a trajectory bit by bit for one seed and number of threads: the CPU, and
-            not the backend ``"compile"``.
+        deterministic: Refuse what does not repeat bit by bit: CUDA, and the backend ``"compile"``.
         segment: Substeps between checkpoints where gradients are enabled, see :func:`torchmpm.segment_for`.
         task_options: ``body``, ``obstacles``, and options of the task such as ``target`` of SHAPE MATCH; see
             :func:`dittogym.make_spec`.
@@ -92,10 +90,8 @@ class TorchEnv:
             checks.flag(name, flag)
         self.dtype, self.device = choice("dtype", str(dtype).removeprefix("torch."), DTYPES), find_device(device)
         if deterministic and (self.device.type != "cpu" or backend == "compile"):
-            raise ValueError(
-                "deterministic=True needs device 'cpu' and a backend other than 'compile', "
-                f"got {device!r} and {backend!r}"
-            )
+            needs = "deterministic=True needs device 'cpu' and a backend other than 'compile'"
+            raise ValueError(f"{needs}, got {device!r} and {backend!r}")
         self.action_resolution = find_resolution(self.spec, resolution)
         self.action_shape = (2, self.action_resolution, self.action_resolution)
         self._as_reference = choice("parity", parity, {"clean": False, "reference": True})
@@ -197,8 +193,7 @@ class TorchEnv:
             TypeError: Not a snapshot.
             ValueError: The snapshot is of another task, other numbers of particles, another type, device or batch size.
         """
-        if not isinstance(snapshot, Snapshot):
-            raise TypeError(f"snapshot must be what save() returned, got {type(snapshot).__name__}")
+        checks.instance("snapshot", snapshot, Snapshot)
         chosen = find_mask("mask", mask, self.num_envs, self.device)
         x, size = snapshot.state.particles.x, len(snapshot.state.steps)
         own = self.spec.name, self.model.camera.counts, self.model.particle_weight, self.dtype, self.device
@@ -225,10 +220,9 @@ class TorchEnv:
         Args:
             seed: Seeds element i with ``seed + i``, or with ``seed[i]``, and draws new positions. Without it, or
                 where ``seed[i]`` is ``None``, the last positions are used again, unless ``resample`` was asked for.
-            options: ``"positions"``: (N, 2) or (B, N, 2) world positions in m, robot first, used until the next seed,
-                with ``resample`` until the next reset;
-                ``"physics"``: constants of the matter, one value for all, one per element or one per particle, see
-                :func:`dittogym.physics.physics_values`; used until given again, ``{}`` goes back to the task's own;
+            options: ``"positions"``: (N, 2) or (B, N, 2) in the world, m, robot first, used until the next seed, with
+                ``resample`` until the next reset; ``"physics"``: constants of the matter, see
+                :func:`dittogym.physics.physics_values`, used until given again, ``{}`` goes back to the task's own;
                 ``"reset_mask"``: (B,) bool, reset only these elements.
 
         Returns:
@@ -290,8 +284,8 @@ class TorchEnv:
         Args:
             action: (B, 2, R, R), muscle actuation in units of the task's maximum; ``[:, 0]`` along material x. Values
                 beyond [-1, 1] saturate after the interpolation.
-            soft: For gradients: the observation is :meth:`soft_observation`, reward and its terms are the task's smooth
-                ones, and ``info["true_reward"]`` is the reward. All else is as without.
+            soft: For gradients: observation, reward and its terms are the smooth ones, and ``info["true_reward"]`` is
+                the reward. All else is as without.
 
         Returns:
             observation (B, 3, 64, 64) uint8; reward (B,); terminated (B,) bool; truncated (B,) bool, at the horizon;
@@ -305,10 +299,8 @@ class TorchEnv:
         action = to_grid_indexing(action, self.action_layout)
         result = core.step(self.model, self.env_state, action, soft=soft)
         info: dict[str, Any] = {"reward_terms": dict(result.terms), **result.info}
-        if result.success is not None:
-            info["is_success"] = result.success
-        if soft:
-            info["true_reward"] = result.true_reward
+        info |= {} if result.success is None else {"is_success": result.success}
+        info |= {"true_reward": result.true_reward} if soft else {}
         self._observation = result.observation.clone()  # what is returned belongs to the caller
         self._env_state, self._actuation = result.state, result.actuation.detach()
         observation = result.observation if result.soft_observation is None else result.soft_observation
@@ -319,14 +311,11 @@ class TorchEnv:
         return core.soft_observation(self.model, self.env_state)
 
     def render(self, index: int = 0, *, muscles: bool = False, size: int = 512) -> np.ndarray:
-        """Picture of one simulation in RGB.
+        """Picture (S, S, 3) uint8 of one simulation in RGB.
 
         Args:
             index: Which element of the batch.
             muscles: Colour the robot by the actuation of the last step: contraction red, expansion blue.
-            size: Pixels per side.
-
-        Returns:
-            (S, S, 3) uint8 for S = ``size``.
+            size: S, pixels per side.
         """
         return frame(self.model, self.env_state, index, self._actuation if muscles else None, size)

@@ -52,9 +52,9 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     Args:
         task: Task name or specification.
         num_envs: Number of simulations.
-        autoreset_mode: ``SAME_STEP`` (an ended episode is reset in the same call; the last observation and info are
-            in ``info["final_obs"]`` and ``info["final_info"]``), ``NEXT_STEP`` (in the next call, whose action it
-            ignores), or ``DISABLED`` (``reset(options={"reset_mask": ...})``).
+        autoreset_mode: ``SAME_STEP`` (an ended episode is reset in the same call; ``info["final_obs"]`` and
+            ``info["final_info"]`` are the last ones), ``NEXT_STEP`` (in the next call, whose action it ignores), or
+            ``DISABLED``.
         render_mode: ``None`` or ``"rgb_array"``.
         render_muscles: Colour the robots by their muscles in pictures.
         max_episode_steps: Horizon instead of the task's; -1 for none.
@@ -145,7 +145,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return images, rewards, ends, limits, _restarted(info, as_numpy(step.reset_info), done) | last
 
     def _reset_then_step(self, action: torch.Tensor) -> tuple[Any, ...]:
-        """A step in which, in the mode ``NEXT_STEP``, elements that have ended before are reset instead."""
+        """A step in which elements that have ended before are reset instead in the mode ``NEXT_STEP``."""
         fresh = self._ended.copy()
         ended = torch.as_tensor(fresh, device=action.device)
         action = action.masked_fill(ended[:, None, None, None], 0.0)  # ignored, and may hold NaN
@@ -154,9 +154,9 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         rewards, ends, info = _array(reward.double()) * ~fresh, _array(terminated) & ~fresh, as_numpy(raw)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             self._ended = ends | limits
-        if not fresh.any():
-            return as_numpy(observation), rewards, ends, limits, _with_masks(info, ~fresh)
-        observation, start = self.torch_env.reset(options={"reset_mask": ended})
+        start: dict[str, Tensor] = {}
+        if fresh.any():
+            observation, start = self.torch_env.reset(options={"reset_mask": ended})
         return as_numpy(observation), rewards, ends, limits, _restarted(info, as_numpy(start), fresh)
 
     def save(self) -> Snapshot:

@@ -103,21 +103,17 @@ def _check_place(spec: TaskSpec) -> None:
     shape = spec.robot.shape
     (left, bottom), (width, height) = shape.corner, shape.size
     points = shape.positions(sampling.sobol(PROBE, seed=0))
-    window = spec.window.left if spec.window.follow is None else float(points[:, 0].mean()) - spec.window.follow
-    corners = torch.tensor([[(left, bottom), (left + width, bottom + height)]], dtype=torch.float64, device="cpu")
-    if not bool(contains(corners, corners.new_tensor([[window, 0.0]])).all()):
-        raise ValueError(
-            f"body must lie inside the window ({window:.3f} < x < {window + 1:.3f}, 0 < y < 1), got "
-            f"{left:.3f} < x < {left + width:.3f}, {bottom:.3f} < y < {bottom + height:.3f}"
-        )
+    origin = spec.window.origin(torch.from_numpy(points.mean(0, keepdims=True)))
+    corners = origin.new_tensor([[(left, bottom), (left + width, bottom + height)]])
+    if not bool(contains(corners, origin).all()):
+        window = f"{origin[0, 0]:.3f} < x < {origin[0, 0] + 1:.3f}, 0 < y < 1"
+        place = f"{left:.3f} < x < {left + width:.3f}, {bottom:.3f} < y < {bottom + height:.3f}"
+        raise ValueError(f"body must lie inside the window ({window}), got {place}")
     for other in spec.objects:
         low, high = np.array(other.shape.corner), np.array(other.shape.corner) + other.shape.size
         if ((points > low) & (points < high)).all(1).any():
-            raise ValueError(
-                f"body must leave the place of the object free, {low.round(4).tolist()} to {high.round(4).tolist()}"
-            )
-    split = float(np.sqrt(points.var(0).sum()))
-    if spec.split_limit is not None and split >= spec.split_limit:
-        raise ValueError(
-            f"body must be more compact: its spread is {split:.3f} m, and {spec.name} ends at {spec.split_limit} m"
-        )
+            place = f"{low.round(4).tolist()} to {high.round(4).tolist()}"
+            raise ValueError(f"body must leave the place of the object free, {place}")
+    split, limit = float(np.sqrt(points.var(0).sum())), spec.split_limit
+    if limit is not None and split >= limit:
+        raise ValueError(f"body must be more compact: its spread is {split:.3f} m, and {spec.name} ends at {limit} m")

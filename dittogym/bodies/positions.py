@@ -133,9 +133,8 @@ class InitialPositions:
         positions = real_tensor("positions", given).to(like, copy=True)
         shape = (sum(self.counts), 2)
         if tuple(positions.shape) not in (shape, (self.num_envs, *shape)):
-            raise ValueError(
-                f"positions must have shape {shape} or {(self.num_envs, *shape)}, got {tuple(positions.shape)}"
-            )
+            allowed = f"{shape} or {(self.num_envs, *shape)}"
+            raise ValueError(f"positions must have shape {allowed}, got {tuple(positions.shape)}")
         return positions.expand(self.num_envs, *shape).contiguous()
 
     def _check_inside(self, positions: Tensor) -> None:

@@ -38,14 +38,11 @@ class Shape(Protocol):
 
 @dataclass(frozen=True)
 class Disc:
-    """Disc with the chord density of the reference, given like there by its bounding square.
+    """Disc with the chord density of the reference.
 
     Attributes:
         corner: Lower left corner of the bounding square in the world, m.
         diameter: m.
-
-    Raises:
-        ValueError: Not two numbers, or the diameter is not positive.
     """
 
     corner: tuple[float, float]
@@ -79,9 +76,6 @@ class Rectangle:
     Attributes:
         corner: Lower left corner in the world, m.
         size: Width and height, m.
-
-    Raises:
-        ValueError: Not two numbers, or a size that is not positive.
     """
 
     corner: tuple[float, float]

@@ -44,10 +44,7 @@ LEFT_BEAM = Obstacle(
 
 
 def initial_memory(moment: Moment, spec: TaskSpec) -> Memory:
-    """The tip: the highest particles at the start; of equally high ones the first.
-
-    Which ones the reference takes there is not defined; these reproduce its published rewards to 1e-3.
-    """
+    """The tip: the highest particles at the start; of equally high ones the first (undefined in the reference)."""
     x = moment.robot_x.detach()
     highest = x[..., 1].argsort(dim=1, descending=True, stable=True)[:, : count_of(TIP, x)]
     return {"tip": drop_widest(highest, x)}
