@@ -22,9 +22,9 @@ class Measurement(NamedTuple):
 
     Attributes:
         com: (B, 2) mean position of the robot's particles in the world, m.
-        velocity: (B, 2) mean velocity of the robot's particles, m/s.
+        velocity: (B, 2) their mean velocity, m/s.
         split: (B,) spread of the robot, sqrt(Var x + Var y), m.
-        object_com: (B, 2) mean position of the object's particles; ``None`` in tasks without an object.
+        object_com: (B, 2) mean position of the object's particles, m; ``None`` in tasks without an object.
         object_velocity: (B, 2) their mean velocity, m/s.
     """
 

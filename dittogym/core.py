@@ -144,7 +144,7 @@ def evaluate(model: Model, state: EnvState, actuation: Tensor, *, soft: bool = F
         model: The task.
         state: After the transition.
         actuation: (B, 2, P, P) on the patch, Pa.
-        soft: Whether the reward is the smooth one.
+        soft: As in :func:`step`.
     """
     spec, observation = model.spec, observe(model, state)
     now = measure(state.particles, model.num_robot_particles)
@@ -206,7 +206,5 @@ def _check_finite(task: str, names: list[str], values: Tensor, valid: Tensor) ->
     wrong = ~torch.isfinite(values.detach()) & valid
     if bool(wrong.any()):
         term, element = wrong.nonzero()[0].tolist()
-        raise ValueError(
-            f"reward_fn of task {task!r} must return finite terms where the simulation is finite, "
-            f"got {values[term, element].item()} for {names[term]!r} in simulation {element}"
-        )
+        found = f"{values[term, element].item()} for {names[term]!r} in simulation {element}"
+        raise ValueError(f"reward_fn of task {task!r} must return finite terms in finite simulations, got {found}")

@@ -81,10 +81,8 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be None or one of {RENDER_MODES}, got {render_mode!r}")
         if "num_envs" in options:
-            raise TypeError(
-                f"num_envs must not be given for a single environment, got {options['num_envs']!r}; for a batch use "
-                "gymnasium.make_vec(..., vectorization_mode='vector_entry_point') or dittogym.TorchEnv"
-            )
+            batch = "gymnasium.make_vec(..., vectorization_mode='vector_entry_point') or dittogym.TorchEnv"
+            raise TypeError(f"num_envs must not be given, got {options['num_envs']!r}; for a batch use {batch}")
         self.torch_env = TorchEnv(task, 1, **options)
         self._own_limit = self.torch_env.spec.horizon != make_spec(task).horizon
         self.observation_space, self.action_space = spaces(self.torch_env)
@@ -103,7 +101,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start a new episode; see :meth:`dittogym.TorchEnv.reset`.
+        """Start a new episode, with the arguments of :meth:`dittogym.TorchEnv.reset`.
 
         Args:
             seed: Draws new positions.

@@ -103,13 +103,7 @@ class Model:
 
 
 def make_model(
-    spec: TaskSpec,
-    counts: tuple[int, ...],
-    *,
-    substeps: int,
-    backend: str,
-    parity: Parity = "clean",
-    segment: Segment = "auto",
+    spec: TaskSpec, counts: tuple[int, ...], substeps: int, backend: str, parity: Parity, segment: Segment = "auto"
 ) -> Model:
     """Build the physics of a task.
 
@@ -138,16 +132,10 @@ def make_model(
         backend=backend,
         allow_unstable=True,  # checked with the muscles, here and when a reset changes the matter
     )
-    camera = Camera(
-        view=spec.view,
-        window=spec.window,
-        boxes=spec.observed_boxes,
-        counts=counts,
-        particle_weight=weight,
-        hidden_velocity=tuple(body.hidden_velocity for body in spec.bodies),
-        pixels=parity == "reference" or counts == full,
-        native=backend in ("auto", "native") and solver.kernels.unsupported(torch.device("cpu")) is None,
-    )
+    pixels = parity == "reference" or counts == full
+    native = backend in ("auto", "native") and solver.kernels.unsupported(torch.device("cpu")) is None
+    hidden = tuple(body.hidden_velocity for body in spec.bodies)
+    camera = Camera(spec.view, spec.window, spec.observed_boxes, counts, weight, hidden, pixels, native)
     model = Model(spec, solver, substeps, weight, camera, segment)
     check_stability(model, {})
     return model
@@ -158,10 +146,8 @@ def check_stability(model: Model, physics: Physics) -> None:
     solver = model.solver_for(physics)
     limit = solver.stable_dt(physics.get("max_actuation", model.spec.max_actuation))
     if solver.dt > limit:
-        raise ValueError(
-            f"mu, lam, max_actuation and mass must allow substeps of {solver.dt} s, got matter so stiff and light that "
-            f"substeps would have to be at most {limit} s"
-        )
+        matter = f"got matter so stiff and light that substeps would have to be at most {limit} s"
+        raise ValueError(f"mu, lam, max_actuation and mass must allow substeps of {solver.dt} s, {matter}")
 
 
 def _bodies(spec: TaskSpec, counts: tuple[int, ...], weight: tuple[float, ...], physics: Physics) -> tuple[Body, ...]:

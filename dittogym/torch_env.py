@@ -53,11 +53,6 @@ class TorchEnv:
         task_options: ``body``, ``obstacles``, and options of the task such as ``target`` of SHAPE MATCH; see
             :func:`dittogym.make_spec`.
 
-    Attributes:
-        spec: The task.
-        action_shape: (2, R, R).
-        state: The :class:`torchmpm.ParticleState` of all simulations.
-
     Raises:
         ValueError: An argument is out of range.
         TypeError: The task has no such option.
@@ -119,7 +114,7 @@ class TorchEnv:
 
         Raises:
             RuntimeError: It was neither reset nor assigned.
-            TypeError: The assigned value is not an EnvState.
+            TypeError: What is assigned is not an EnvState.
             ValueError: It has another number of simulations or particles, another dtype or device.
         """
         if self._env_state is None:
@@ -138,10 +133,7 @@ class TorchEnv:
 
     @property
     def generators(self) -> dict[int, dict[str, Tensor]]:
-        """States of the elements' random generators, which ``resample`` draws from; assign them to restore them.
-
-        By element: tensors ``key`` (624,) and ``pos`` () of the Mersenne Twister.
-        """
+        """States of the random generators that ``resample`` draws from, ``key`` (624,) and ``pos`` (); can be set."""
         return {element: get_state(each) for element, each in self._initial_positions.generators.items()}
 
     @generators.setter
@@ -164,11 +156,7 @@ class TorchEnv:
         return self._observation
 
     def detach(self, *, physics: bool = True) -> None:
-        """Cut the autograd graph: gradients do not reach back beyond this moment.
-
-        Args:
-            physics: Also gradients in the constants that the last reset was given.
-        """
+        """Cut the autograd graph; that of constants given to the last reset only with ``physics``."""
         state = tree.detach(self.env_state)
         self._env_state = state if physics else replace(state, physics=self.env_state.physics)
 
@@ -284,8 +272,7 @@ class TorchEnv:
         Args:
             action: (B, 2, R, R), muscle actuation in units of the task's maximum; ``[:, 0]`` along material x. Values
                 beyond [-1, 1] saturate after the interpolation.
-            soft: For gradients: observation, reward and its terms are the smooth ones, and ``info["true_reward"]`` is
-                the reward. All else is as without.
+            soft: Observation and reward are the smooth ones, for gradients; ``info["true_reward"]`` is the reward.
 
         Returns:
             observation (B, 3, 64, 64) uint8; reward (B,); terminated (B,) bool; truncated (B,) bool, at the horizon;

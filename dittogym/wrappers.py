@@ -61,8 +61,7 @@ class _VectorObservation(VectorWrapper):
         self, env: VectorEnv[Any, Any, Any], function: Callable[[np.ndarray], np.ndarray], space: gymnasium.spaces.Box
     ) -> None:
         super().__init__(env)
-        self._function = function
-        self.single_observation_space = space
+        self._function, self.single_observation_space = function, space
         self.observation_space = batch_space(space, env.num_envs)
 
     def reset(self, **arguments: Any) -> tuple[np.ndarray, dict[str, Any]]:

@@ -42,9 +42,8 @@ def particle_counts(spec: TaskSpec, particles: Particles) -> tuple[int, ...]:
     elif isinstance(particles, (tuple, list)) and len(particles) == len(full):
         counts = tuple(checks.whole(f"particles[{i}]", n, 1) for i, n in enumerate(particles))
     else:
-        raise ValueError(
-            f"particles must be 'full', 'lite', a number, or {len(full)} number(s), one a body, got {particles!r}"
-        )
+        allowed = f"'full', 'lite', a number, or {len(full)} number(s), one a body"
+        raise ValueError(f"particles must be {allowed}, got {particles!r}")
     if min(counts) < 1:
         raise ValueError(f"particles must be at least 1 for every body, got {particles!r}")
     return counts
@@ -142,8 +141,6 @@ class InitialPositions:
         inside = contains(positions, origin)
         if not bool(inside.all()):
             element, particle = (~inside).nonzero()[0].tolist()
-            where = positions[element, particle].tolist()
-            raise ValueError(
-                f"positions must lie inside the window ({origin[element, 0]:.3f} < x < {origin[element, 0] + 1:.3f}, "
-                f"0 < y < 1), got {where} for particle {particle} of element {element}"
-            )
+            window = f"{origin[element, 0]:.3f} < x < {origin[element, 0] + 1:.3f}, 0 < y < 1"
+            where = f"{positions[element, particle].tolist()} for particle {particle} of element {element}"
+            raise ValueError(f"positions must lie inside the window ({window}), got {where}")

@@ -22,13 +22,10 @@ OFF_CENTRE = 3.0
 # Corners (column, row) of filled polygons, several for a shape that is a union.
 # fmt: off
 _OUTLINES: dict[str, list[list[tuple[int, int]]]] = {
-    "star": [
-        [
-            (30, 15), (32, 15), (36, 26), (44, 25), (45, 27),
-            (38, 34), (43, 48), (40, 47), (31, 41), (23, 48),
-            (22, 47), (26, 34), (19, 28), (18, 25), (26, 25),
-        ],
-    ],
+    "star": [[
+        (30, 15), (32, 15), (36, 26), (44, 25), (45, 27), (38, 34), (43, 48), (40, 47),
+        (31, 41), (23, 48), (22, 47), (26, 34), (19, 28), (18, 25), (26, 25),
+    ]],
     "I": [
         [(15, 17), (46, 17), (46, 19), (15, 19)],
         [(26, 20), (34, 20), (34, 39), (26, 39)],
@@ -68,9 +65,6 @@ def load_target(target: TargetLike) -> np.ndarray:
         raise ValueError(f"target must have pixels of the shape and of the ground, got {mask.sum()} of {mask.size}")
     offset = np.argwhere(mask).mean(0) - (SIZE - 1) / 2
     if np.abs(offset).max() > OFF_CENTRE:
-        warnings.warn(
-            f"the target's centroid is {offset[0]:+.1f} rows and {offset[1]:+.1f} columns off the middle; the robot's "
-            "centre stays in the middle of the picture, so it cannot cover this target well",
-            stacklevel=2,
-        )
+        where = f"{offset[0]:+.1f} rows and {offset[1]:+.1f} columns off the middle"
+        warnings.warn(f"the target's centroid is {where}, where the robot's centre always is", stacklevel=2)
     return mask

@@ -1,7 +1,4 @@
-"""The observation as one C++ function, for CPUs with a compiler.
-
-With the pixel raster it yields the same bytes as ``dittogym.observation.raster``; splats may differ by one.
-"""
+"""The observation as one C++ function: the bytes of ``dittogym.observation.raster``, or for splats at most one off."""
 
 from __future__ import annotations
 
