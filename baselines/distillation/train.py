@@ -20,7 +20,7 @@ from baselines.common.grid import grid_size
 from baselines.common.policies import image_policy
 from baselines.common.schedules import linear_decay, stage_progress
 from baselines.common.stateful import Stateful
-from baselines.distillation import teacher_training
+from baselines.distillation import teachers
 from baselines.distillation.config import DistillConfig
 from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entries
 from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
@@ -219,19 +219,19 @@ class Distill(Stateful, Algorithm):
     @classmethod
     def initialize(cls, config: DistillConfig, folder: Path) -> Position:
         """Copy the teacher into the folder, if it is a policy."""
-        teacher_training.copy_teacher(config, folder)
+        teachers.copy_teacher(config, folder)
         return Position()
 
     @classmethod
     def prepare(cls, config: DistillConfig, folder: Path, signals: StopSignals) -> None:
         """Train the teacher, if only its algorithm is named."""
-        teacher_training.train_teacher(config, folder, signals)
+        teachers.train_teacher(config, folder, signals)
 
     @classmethod
     def create(cls, config: DistillConfig, stage: int, folder: Path, resumed: bool = False) -> Distill:
         """The student at the beginning of a stage."""
         start = load(policy_path(folder, stage - 1), choose_device(config.device)) if stage > 1 else None
-        teacher = None if config.teacher == "mpc" else teacher_training.teacher_path(folder)
+        teacher = None if config.teacher == "mpc" else teachers.teacher_path(folder)
         algorithm = cls(config, stage, start, teacher)
         algorithm.starts_trained = stage > 1
         return algorithm
@@ -239,7 +239,7 @@ class Distill(Stateful, Algorithm):
     @classmethod
     def warnings(cls, config: DistillConfig, folder: Path, first_stage: int) -> list[str]:
         """A warning if the teacher was planned for one start only."""
-        return teacher_training.warnings(config, folder)
+        return teachers.warnings(config, folder)
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the policy, as one of CFP."""
