@@ -28,12 +28,6 @@ POLL = 0.2  # seconds between two looks at the processes and at the stop signals
 class ProcessKilled(Exception):
     """The process of a run was killed by a signal."""
 
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-
-    def __str__(self) -> str:
-        return f"killed by {signal.Signals(self.args[0]).name}; see log.txt"
-
 
 @dataclass(frozen=True)
 class Resources:
@@ -52,12 +46,10 @@ class Executor(ABC):
     def submit(self, job: Job) -> Future[Outcome]:
         """Begin a run as soon as there is room for it; it may be over when this returns."""
 
-    @abstractmethod
-    def stop(self) -> None:
+    def stop(self) -> None:  # noqa: B027  (nothing where no run is in progress)
         """Ask the runs in progress to stop with a checkpoint, and begin no other."""
 
-    @abstractmethod
-    def shutdown(self, kill: bool) -> None:
+    def shutdown(self, kill: bool) -> None:  # noqa: B027
         """Free all resources; ``kill`` ends the runs in progress at once."""
 
 
@@ -87,7 +79,7 @@ def execute(
 
 
 class InProcessExecutor(Executor):
-    """Carries out each run in this process when it is submitted."""
+    """Carries out each run in this process when it is submitted; it looks at the signals itself."""
 
     def __init__(self, signals: StopSignals, resources: Resources) -> None:
         self.signals, self.lock_timeout = signals, resources.lock_timeout
@@ -98,12 +90,6 @@ class InProcessExecutor(Executor):
         stopped = self.signals.number
         future.set_result("stopped" if stopped else carry_out(job, self.signals, self.lock_timeout, own_process=False))
         return future
-
-    def stop(self) -> None:
-        """Runs look at the signals themselves."""
-
-    def shutdown(self, kill: bool) -> None:
-        """Nothing is in progress."""
 
 
 class LocalExecutor(Executor):
@@ -230,7 +216,7 @@ def run_process(job: Job, threads: int, lock_timeout: float, urgency: Callable[[
         pass  # the process has ended already; its exit code says how
     code = _wait(process, urgency)
     if code < 0 and not urgency():
-        raise ProcessKilled(-code)
+        raise ProcessKilled(f"killed by {signal.Signals(-code).name}; see log.txt")
     outcome: Outcome = "stopped" if code < 0 else {code: name for name, code in EXIT_CODES.items()}.get(code, "failed")
     if outcome == "failed" and not (folder / "error.txt").exists():  # it failed outside of the run itself
         with open(folder / "log.txt", "rb") as log:

@@ -44,11 +44,6 @@ class RunResult:
     cost: Cost | None
     evaluation: FinalEvaluation | None
 
-    @property
-    def score(self) -> float | None:
-        """Mean return on the common layouts."""
-        return None if self.evaluation is None else self.evaluation.mean
-
 
 @dataclass(frozen=True)
 class Group:
@@ -75,11 +70,6 @@ class Group:
         return [each.mean for each in self.evaluations]
 
     @property
-    def own_layouts(self) -> list[float]:
-        """Returns on the only layout that policies were made for."""
-        return [each.own_layout for each in self.evaluations if each.own_layout is not None]
-
-    @property
     def iqm(self) -> float | None:
         """Interquartile mean of the scores."""
         return float(interquartile_mean(self.scores)) if self.scores else None
@@ -93,12 +83,6 @@ class Group:
     def particles(self) -> Particles:
         """Particles of the evaluations during training."""
         return self.job.config.environment.particles
-
-    @property
-    def train_particles(self) -> Particles:
-        """Particles of training itself."""
-        particles: Particles | None = getattr(self.job.config, "train_particles", None)
-        return self.particles if particles is None else particles
 
     @property
     def curves(self) -> list[Curve]:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from baselines.common.policies import StateBasedPolicy, load_network
 from baselines.modular.env import segment
-from baselines.modular.kmeans import update
+from baselines.modular.kmeans import fit, update
 from baselines.modular.networks import ModularActor
 from baselines.modular.nodes import Nodes, visible_positions
 from cfp.weights import read_policy, report_mismatch, write_policy
@@ -64,11 +64,12 @@ class SegmentPolicy(StateBasedPolicy):
         self, env: TorchEnv, state: tuple[np.ndarray, ...] | None, deterministic: bool
     ) -> tuple[Tensor, tuple[np.ndarray, ...] | None]:
         """Actions (B, 2, P, P), and the segment of every particle, (B, N)."""
-        labels, is_new = None, torch.ones_like(env.env_state.steps, dtype=torch.bool)
-        if state is not None:
-            labels = torch.as_tensor(state[0], device=env.device)
-            labels, is_new = update(visible_positions(env), labels, self.nodes.count), env.env_state.steps == 0
-        labels = segment(env, self.nodes, labels, is_new)
+        x, count = visible_positions(env), self.nodes.count
+        if state is None:
+            labels = fit(x, count)
+        else:
+            labels = update(x, torch.as_tensor(state[0], device=env.device), count)
+            labels = segment(x, labels, count, env.env_state.steps == 0)
         device = next(self.actor.parameters()).device
         values = self.actor(self.nodes.observe(env, labels).to(device), deterministic)
         if self.change is not None:

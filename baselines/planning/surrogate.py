@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from cfp.errors import ConfigError
 from dittogym import TorchEnv
 from dittogym.model import EnvState
 from dittogym.physics import PER_PARTICLE
@@ -51,7 +52,7 @@ def _nearest_particles(large: TorchEnv, small: TorchEnv) -> Tensor:
     indices, start, small_start = [], 0, 0
     for many, few in zip(large.model.solver.bodies, small.model.solver.bodies, strict=True):
         if few.count > many.count:
-            raise ValueError(f"a reduced model must have at most {many.count} particles of a body, got {few.count}")
+            raise ConfigError(f"train_particles of a body must be at most {many.count}, got {few.count}")
         x = large.state.x[:, start : start + many.count].detach()
         small_x = small.state.x[:, small_start : small_start + few.count].detach()
         nearest = torch.cdist(small_x, x).topk(min(NEIGHBOURS, many.count), largest=False).indices

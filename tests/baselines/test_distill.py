@@ -188,7 +188,7 @@ def test_teacher_remembers_its_segments_as_long_as_an_episode_lasts(segments, mo
     anew, fit = [], modular_env.fit
     monkeypatch.setattr(modular_env, "fit", lambda x, count: anew.append(len(x)) or fit(x, count))
     Distill(make(teacher=str(segments), max_episode_steps=6)).learn(32)
-    assert sum(anew) == 7, "of 16 steps: the first robot begins anew after 3, 9 and 15, the second after 6 and 12"
+    assert sum(anew) == 5, "of 16 steps: the first robot begins anew after 3, 9 and 15, the second after 6 and 12"
 
 
 class Scripted(Teacher):

@@ -54,7 +54,7 @@ def test_options_that_only_the_model_can_refuse_leave_the_folder_free(tmp_path, 
     options = "--task shapematch --particles 60 --substeps 1 --grid 4 --horizon 2 --commit 2 --iterations 1"
     arguments = ["--algo", "mpc", *options.split(), "--no-video", "--device", "cpu", "--out", str(tmp_path)]
     assert train.main([*arguments, "--train-particles", "61"]) == 2
-    assert "train_particles: a reduced model must have at most 60 particles" in capsys.readouterr().err
+    assert "train_particles of a body must be at most 60, got 61" in capsys.readouterr().err
     assert not holds_run(tmp_path)
     assert train.main([*arguments, "--train-particles", "60"]) == 0
 
