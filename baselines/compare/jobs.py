@@ -147,10 +147,7 @@ def make_jobs(
     steps: int | None = None,
     device: str = "auto",
 ) -> list[Job]:
-    """All runs of a comparison, ordered by seed, so that a comparison that is stopped early has something to compare.
-
-    Reference policies have one run, that of the first seed.
-    """
+    """All runs of a comparison, by seed, so that one that is stopped early has something to compare."""
     for name, values in (("tasks", tasks), ("algos", labels), ("seeds", seeds)):
         if not values or len(set(values)) < len(values):
             given = " ".join(map(str, values)) or "none"
@@ -164,7 +161,7 @@ def make_jobs(
             for label in labels:
                 config = resolve(plan, label, task, preset, seed, steps, device)
                 job = Job(label, config, folder / f"{label}-{task_name(task)}-{preset}-{seed}", protocol(config))
-                if seed == seeds[0] or not job.untrained:
+                if seed == seeds[0] or not job.untrained:  # reference policies have one run
                     jobs.append(job)
     _check_same_task(jobs)
     return jobs

@@ -52,17 +52,10 @@ class Group:
     task: str
     observes: str
     label: str
-    runs: tuple[RunResult, ...]
-
-    @property
-    def job(self) -> Job:
-        """The first run, for what all of them have in common."""
-        return self.runs[0].job
-
-    @property
-    def evaluations(self) -> list[FinalEvaluation]:
-        """Final evaluations of the runs that have one."""
-        return [run.evaluation for run in self.runs if run.evaluation is not None]
+    job: Job  # the first run, for what all of them have in common
+    evaluations: list[FinalEvaluation]  # of the runs that have one
+    curves: list[Curve]  # of the runs that have one
+    costs: list[Cost]  # of the runs of which a session has ended in order
 
     @property
     def scores(self) -> list[float]:
@@ -83,16 +76,6 @@ class Group:
     def particles(self) -> Particles:
         """Particles of the evaluations during training."""
         return self.job.config.environment.particles
-
-    @property
-    def curves(self) -> list[Curve]:
-        """Curves of the runs that have one."""
-        return [run.curve for run in self.runs if len(run.curve[0])]
-
-    @property
-    def costs(self) -> list[Cost]:
-        """Costs of the runs of which a session has ended in order."""
-        return [run.cost for run in self.runs if run.cost is not None]
 
     @property
     def speed(self) -> float | None:
@@ -120,9 +103,13 @@ def group_results(runs: Sequence[RunResult]) -> list[Group]:
     members: dict[tuple[str, str, str], list[RunResult]] = {}
     for run in runs:
         members.setdefault((run.job.config.task, run.job.observes, run.job.label), []).append(run)
-    tasks = list(dict.fromkeys(task for task, _, _ in members))
-    keys = sorted(members, key=lambda key: (tasks.index(key[0]), OBSERVATIONS.index(key[1])))
-    return [Group(*key, tuple(members[key])) for key in keys]
+    tasks, groups = list(dict.fromkeys(task for task, _, _ in members)), []
+    for key in sorted(members, key=lambda key: (tasks.index(key[0]), OBSERVATIONS.index(key[1]))):
+        evaluations = [run.evaluation for run in members[key] if run.evaluation is not None]
+        curves = [run.curve for run in members[key] if len(run.curve[0])]
+        costs = [run.cost for run in members[key] if run.cost is not None]
+        groups.append(Group(*key, members[key][0].job, evaluations, curves, costs))
+    return groups
 
 
 def _read_curve(folder: Path) -> Curve:

@@ -45,11 +45,7 @@ class Teacher(Stateful, ABC):
 
 
 class PolicyTeacher(Teacher):
-    """A trained policy, without noise.
-
-    An open-loop policy plays the action of the step that each episode is at. Other policies get their memory back, and
-    start anew where an episode does.
-    """
+    """A trained policy without noise; an open-loop one plays the action of the step that each episode is at."""
 
     def __init__(self, policy: Policy, policy_layout: ActionIndexing, layout: ActionIndexing) -> None:
         self.policy, self.policy_layout, self.layout = policy, policy_layout, layout
@@ -91,16 +87,14 @@ class PlannerTeacher(Teacher):
     def act(self, env: TorchEnv, observation: Tensor) -> Tensor:
         """The next actions (B, 2, R, R) of the plans."""
         self.env.env_state = env.env_state
-        action = self.planner.act()
-        self.fresh = self.planner.has_replanned
-        return action.float()
+        self.fresh = self.planner.needs_plan
+        return self.planner.act().float()
 
 
 def project(actions: Tensor, resolution: int, patch: int) -> Tensor:
-    """Actions on another grid that drive the muscles as similarly as possible.
+    """Actions on another grid that drive the muscles as similarly as possible, clipped to [-1, 1].
 
-    With the environment's bicubic interpolation to the patch, ``U``, the result has the least squared difference from
-    ``U a U^T`` there, clipped to [-1, 1].
+    With the bicubic interpolation ``U`` to the patch, they have the least squared difference from ``U a U^T`` there.
     """
     matrix = _projection(actions.shape[-1], resolution, patch).to(actions)
     return (matrix @ actions @ matrix.T).clamp(-1.0, 1.0)
@@ -118,12 +112,6 @@ def read_teacher(path: str | Path, task: str, environment: EnvironmentConfig) ->
     """Load a policy that can teach a task."""
     check_trained_for("teacher", read_policy(path)[1], task, environment)
     return load(path)
-
-
-def is_record_of_one_start(teacher: Policy, task: str, environment: EnvironmentConfig) -> bool:
-    """Whether a teacher was planned for a single layout, in a task whose episodes start from different ones."""
-    varies = any(body.shape.draws for body in make_spec(task, **environment.task_options()).bodies)
-    return varies and "layout" in teacher.description
 
 
 def teacher_path(folder: Path) -> Path:
@@ -150,8 +138,8 @@ def warnings(config: DistillConfig, folder: Path) -> list[str]:
     """A warning if the teacher is the record of one episode, in a task whose episodes start differently."""
     if config.teacher in ("mpc", *TRAINED):
         return []
-    teacher = read_teacher(teacher_path(folder), config.task, config.environment)
-    if not is_record_of_one_start(teacher, config.task, config.environment):
+    spec = make_spec(config.task, **config.environment.task_options())
+    if not any(body.shape.draws for body in spec.bodies) or "layout" not in read_policy(teacher_path(folder))[1]:
         return []
     return [
         f"teacher: the record of one planned episode, while every episode of {config.task} starts differently; "
@@ -160,10 +148,7 @@ def warnings(config: DistillConfig, folder: Path) -> list[str]:
 
 
 def train_teacher(config: DistillConfig, folder: Path, signals: StopSignals) -> None:
-    """Train the teacher with the defaults of its algorithm, if only that is named and it is not there yet.
-
-    What this took is added up in ``teacher/cost.json``.
-    """
+    """Train a teacher that is only named and not there yet; what this took is added up in ``teacher/cost.json``."""
     if config.teacher not in TRAINED or teacher_path(folder).exists():
         return
     chosen = configure({"algo": config.teacher, "task": config.task})

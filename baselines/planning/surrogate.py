@@ -27,14 +27,11 @@ class Surrogate:
     def __init__(self, large: TorchEnv, small: TorchEnv) -> None:
         self.env = small
         self.indices = _nearest_particles(large, small)  # (B, n) of the large environment's particles
-        memory = small.env_state.memory
+        memory = small.env_state.memory  # integers in it are numbers of particles, such as the tip in GROW
         self._particle_memory = {name: value for name, value in memory.items() if not value.is_floating_point()}
 
     def sync(self, state: EnvState) -> None:
-        """Bring the small environment to a state of the large one.
-
-        Integers in a task's memory are numbers of particles (the tip in GROW): the small environment keeps its own.
-        """
+        """Bring the small environment to a state of the large one."""
 
         def select(value: Tensor) -> Tensor:
             return value[torch.arange(len(value), device=value.device)[:, None], self.indices]
