@@ -1,7 +1,5 @@
 """All algorithms and reference policies by name; their modules are imported when they are used."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from pathlib import Path
 from typing import Any

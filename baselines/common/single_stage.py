@@ -1,7 +1,5 @@
 """Ablations of the coarse-to-fine policy: a single stage, trained alone for the whole budget."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """``python -m baselines.compare``: several algorithms, tasks and seeds, and one report about them."""
 
-from __future__ import annotations
-
 import inspect
 import sys
 from collections.abc import Sequence

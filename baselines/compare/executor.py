@@ -1,7 +1,5 @@
 """What carries out runs: one interface for this process, processes of this machine, and a cluster."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The final evaluation of a run's policy, recorded in its folder so that no episode is played twice."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The contents of the run folders of a comparison, read for the report."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

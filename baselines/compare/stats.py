@@ -1,7 +1,5 @@
 """Statistics of few runs (Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice")."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

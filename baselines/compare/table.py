@@ -1,7 +1,5 @@
 """A table with declared columns, rendered as CSV, Markdown and HTML."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape

@@ -4,8 +4,6 @@ As a program, the process reads its job as one line of JSON from the standard in
 the standard input ends, the parent is gone, and the run stops with a checkpoint as if a signal had asked it to.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

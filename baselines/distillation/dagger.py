@@ -1,7 +1,5 @@
 """Dataset aggregation (DAgger; Ross et al., AISTATS 2011): the student acts, the teacher labels the visited states."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable
 from typing import Any, NamedTuple

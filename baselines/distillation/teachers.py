@@ -1,7 +1,5 @@
 """Teachers of a distillation: a trained policy of any kind, which may be trained first, or the gradient planner."""
 
-from __future__ import annotations
-
 import functools
 import time
 from abc import ABC, abstractmethod

@@ -1,7 +1,5 @@
 """An environment whose observations and actions are those of the robot's segments."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

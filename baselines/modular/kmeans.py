@@ -3,8 +3,6 @@
 An episode begins with `fit`; every later step starts from the labels of the one before, so segments stay the same.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Features and actions of a robot's segments, the nodes of a modular policy."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -11,9 +11,8 @@ from stable_baselines3.common.vec_env import VecMonitor
 import cfp
 from baselines.common.policies import StateBasedPolicy
 from baselines.modular.env import SegmentedEnv
-from baselines.modular.networks import Kind, ModularActor, ModularCritics
+from baselines.modular.networks import Kind, ModularActor, ModularCritics, SegmentPolicy
 from baselines.modular.nodes import Nodes
-from baselines.modular.policy import SegmentPolicy
 from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
 from cfp.agent.policies import NetworkPolicy
 from cfp.config import RunConfig

@@ -1,7 +1,5 @@
 """Planning without gradients, by the cross-entropy method."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Planning by gradient ascent through the simulator."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

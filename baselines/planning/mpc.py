@@ -1,7 +1,5 @@
 """Model predictive control: planners as algorithms that plan their way through one episode and record it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 

@@ -1,7 +1,5 @@
 """A cheaper model to plan in: the state of one simulation copied into another with fewer particles."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """What the optimisation of a whole trajectory minimises: a smooth loss of every step."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Open-loop actions by gradient descent through the simulation."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple

@@ -20,9 +20,8 @@ from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entri
 from baselines.distillation.teachers import PolicyTeacher, Teacher, project, read_teacher
 from baselines.distillation.train import METRICS
 from baselines.modular import env as modular_env
-from baselines.modular.networks import ModularActor
+from baselines.modular.networks import ModularActor, SegmentPolicy
 from baselines.modular.nodes import Nodes
-from baselines.modular.policy import SegmentPolicy
 from baselines.registry import configure
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.process import StopSignals

@@ -11,9 +11,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 import baselines
 import cfp
 from baselines.modular.kmeans import fit, update
-from baselines.modular.networks import ModularActor, ModularCritics
+from baselines.modular.networks import ModularActor, ModularCritics, SegmentPolicy
 from baselines.modular.nodes import Nodes, pack, visible_positions
-from baselines.modular.policy import SegmentPolicy
 from baselines.modular.train import GNN16, ModularConfig
 from baselines.registry import find
 from cfp.envs.disturbances import Case
