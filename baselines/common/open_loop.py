@@ -71,11 +71,7 @@ class OpenLoop:
 
     @classmethod
     def load(cls, path: Path) -> OpenLoop:
-        """Load what `save` wrote.
-
-        Raises:
-            CheckpointError: No such file, a damaged one, or one that is not such a policy.
-        """
+        """Load what `save` wrote; a `CheckpointError` if it is missing, damaged, or not such a policy."""
         tensors, description = read_policy(path)
         with report_mismatch(path):
             return cls(tensors["actions"], description)

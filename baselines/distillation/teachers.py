@@ -34,7 +34,6 @@ TRAINED = ("shac", "gradient")
 class Teacher(Stateful, ABC):
     """Labels the present states of an environment with actions."""
 
-    resolution: int  # action grid R
     fresh: bool = True  # or the last actions are part of a plan, and right only for robots that have followed it
 
     @abstractmethod
@@ -47,7 +46,6 @@ class PolicyTeacher(Teacher):
 
     def __init__(self, policy: Policy, policy_layout: ActionIndexing, layout: ActionIndexing) -> None:
         self.policy, self.policy_layout, self.layout = policy, policy_layout, layout
-        self.resolution = policy.resolution
         self._memory: tuple[np.ndarray, ...] | None = None
 
     @torch.no_grad()
@@ -70,16 +68,13 @@ class PolicyTeacher(Teacher):
 
 
 class PlannerTeacher(Teacher):
-    """The gradient planner, which plans from the states that the student has reached.
-
-    It plans for all robots at once, every `PlannerConfig.commit` steps, each plan from what is left of the last one.
-    """
+    """The gradient planner, which plans for all robots at once from the states that the student has reached."""
 
     parts = ("planner",)
 
     def __init__(self, env: TorchEnv, config: GradientPlannerConfig, seed: int) -> None:
         env.reset(seed=seed)
-        self.env, self.resolution = env, env.action_resolution
+        self.env = env
         self.planner = GradientPlanner(env, config, seed=seed)
 
     def act(self, env: TorchEnv, observation: Tensor) -> Tensor:

@@ -107,11 +107,7 @@ class Distill(Stateful, Algorithm):
             yield
 
     def update(self) -> Scalars:
-        """Do one round of DAgger: collect labels, and learn from all that are kept.
-
-        Raises:
-            NonFiniteError: The loss is not finite.
-        """
+        """Collect the labels of a round, and learn from all; a `NonFiniteError` if the loss is not finite."""
         config, beta = self.config, self.config.beta_decay**self.rounds
         progress = stage_progress(config, self.stage, self.num_timesteps)
         learning_rate = config.student_learning_rate * linear_decay(progress)
@@ -150,9 +146,7 @@ class Distill(Stateful, Algorithm):
     def loss(self, observations: Tensor, actions: Tensor) -> Tensor:
         """Mean squared difference of the student's mean actions from the teacher's, on the grid that is carried out.
 
-        Args:
-            observations: (B, 3, 64, 64) uint8.
-            actions: (B, 2, R, R) of the teacher, on any grid.
+        ``observations`` are (B, 3, 64, 64) uint8, the teacher's ``actions`` (B, 2, R, R) on any grid.
         """
         target = project(actions.to(self.env.device), self.spec.action_size, self.env.spec.patch)
         return (self.actor(observations.to(self.env.device), deterministic=True) - target).square().mean()

@@ -22,7 +22,7 @@ class SegmentedEnv:
 
     def __init__(self, env: TorchEnv, nodes: Nodes) -> None:
         self.env, self.nodes = env, nodes
-        self.num_envs, self.device, self.action_resolution = env.num_envs, env.device, env.action_resolution
+        self.num_envs, self.device = env.num_envs, env.device
         self.labels = torch.zeros(env.num_envs, env.model.num_robot_particles, dtype=torch.int64, device=env.device)
         self._observation = torch.zeros(env.num_envs, nodes.count, nodes.num_columns(env.spec), device=env.device)
 

@@ -181,11 +181,7 @@ class SegmentPolicy(StateBasedPolicy):
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu") -> SegmentPolicy:
-        """Load what `save` wrote.
-
-        Raises:
-            CheckpointError: The file is missing, damaged, or not such a policy.
-        """
+        """Load what `save` wrote; a `CheckpointError` if it is missing, damaged, or not such a policy."""
         tensors, description = read_policy(path, device)
         with report_mismatch(path):
             actor = load_network(lambda: ModularActor(**description["network"]), tensors, device)

@@ -170,11 +170,7 @@ class Shac(Stateful, Algorithm):
         return value
 
     def update(self) -> Scalars:
-        """Play one window and learn from it.
-
-        Raises:
-            NonFiniteError: Ten updates in a row had no finite gradient, or actions are not finite.
-        """
+        """Learn from one more window; a `NonFiniteError` if actions, or ten gradients in a row, are not finite."""
         config = self.config
         learning_rate = config.learning_rate * linear_decay(stage_progress(config, 1, self.num_timesteps))
         for adam in (self.actor_adam, self.critic_adam):

@@ -145,11 +145,7 @@ class Gradient(Stateful, OpenLoopAlgorithm):
         self.best_loss, self.best_size, self.best, self.phase = math.inf, 0.0, self.theta.detach().clone(), 0
 
     def update(self) -> Scalars:
-        """Do one iteration.
-
-        Raises:
-            NonFiniteError: Ten iterations in a row failed.
-        """
+        """Do one iteration; a `NonFiniteError` after ten failures in a row."""
         progress = stage_progress(self.config, self.stage, self.num_timesteps)
         learning_rate = self.backoff * self.learning_rate * cosine_decay(progress)
         self.adam.param_groups[0]["lr"] = learning_rate

@@ -80,8 +80,6 @@ def test_how_a_policy_is_evaluated_does_not_change_what_it_learns():
 class Mirror(Teacher):
     """Pulls where the image shows matter, by image alone: what a student can copy."""
 
-    resolution = 8
-
     def act(self, env, seen):
         """Actions of +-0.6 by the speed that is seen."""
         there = torch.nn.functional.avg_pool2d(seen[:, :1].float() / 255.0, 8)
@@ -192,8 +190,6 @@ def test_teacher_remembers_its_segments_as_long_as_an_episode_lasts(segments, mo
 
 class Scripted(Teacher):
     """Looks only every third step; answers the number of the call."""
-
-    resolution = 4
 
     def __init__(self):
         self.calls = -1
