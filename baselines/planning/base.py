@@ -1,5 +1,7 @@
 """Receding-horizon planning in the simulator: what planners share, however they search."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Generic, TypeVar
