@@ -1,7 +1,5 @@
 """Dataset aggregation (DAgger; Ross et al., AISTATS 2011): the student acts, the teacher labels the visited states."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -74,10 +72,7 @@ class Dataset:
 
 
 def drop_entries(values: Tensor, probability: float, grid: int | None = None) -> Tensor:
-    """Set entries of values (B, ..., A, A) to 0 in half of the elements, drawn on a coarser ``grid`` if given.
-
-    Draws come from torch's generator.
-    """
+    """Set random entries of values (B, ..., A, A) to 0 in half of the elements, drawn on a coarser ``grid`` if any."""
     if not probability:
         return values
     mask = torch.rand(values.shape if grid is None else (*values.shape[:-2], grid, grid)) < probability

@@ -10,8 +10,7 @@ import torch
 
 from baselines.compare.__main__ import main
 from baselines.compare.final_evaluation import Protocol
-from baselines.compare.jobs import make_jobs
-from baselines.compare.plan import Plan
+from baselines.compare.jobs import Plan, make_jobs
 from baselines.compare.plots import learning_curves
 from baselines.compare.report import make_tables
 from baselines.compare.results import group_results, read_result

@@ -20,9 +20,8 @@ from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entri
 from baselines.distillation.teachers import PolicyTeacher, Teacher, project, read_teacher
 from baselines.distillation.train import METRICS
 from baselines.modular import env as modular_env
-from baselines.modular.networks import ModularActor
+from baselines.modular.networks import ModularActor, SegmentPolicy
 from baselines.modular.nodes import Nodes
-from baselines.modular.policy import SegmentPolicy
 from baselines.registry import configure
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.process import StopSignals
@@ -80,8 +79,6 @@ def test_how_a_policy_is_evaluated_does_not_change_what_it_learns():
 
 class Mirror(Teacher):
     """Pulls where the image shows matter, by image alone: what a student can copy."""
-
-    resolution = 8
 
     def act(self, env, seen):
         """Actions of +-0.6 by the speed that is seen."""
@@ -188,13 +185,11 @@ def test_teacher_remembers_its_segments_as_long_as_an_episode_lasts(segments, mo
     anew, fit = [], modular_env.fit
     monkeypatch.setattr(modular_env, "fit", lambda x, count: anew.append(len(x)) or fit(x, count))
     Distill(make(teacher=str(segments), max_episode_steps=6)).learn(32)
-    assert sum(anew) == 7, "of 16 steps: the first robot begins anew after 3, 9 and 15, the second after 6 and 12"
+    assert sum(anew) == 5, "of 16 steps: the first robot begins anew after 3, 9 and 15, the second after 6 and 12"
 
 
 class Scripted(Teacher):
     """Looks only every third step; answers the number of the call."""
-
-    resolution = 4
 
     def __init__(self):
         self.calls = -1

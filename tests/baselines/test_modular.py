@@ -10,11 +10,9 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 import baselines
 import cfp
-from baselines.modular.env import segment
-from baselines.modular.kmeans import update
-from baselines.modular.networks import ModularActor, ModularCritics
+from baselines.modular.kmeans import fit, update
+from baselines.modular.networks import ModularActor, ModularCritics, SegmentPolicy
 from baselines.modular.nodes import Nodes, pack, visible_positions
-from baselines.modular.policy import SegmentPolicy
 from baselines.modular.train import GNN16, ModularConfig
 from baselines.registry import find
 from cfp.envs.disturbances import Case
@@ -219,7 +217,7 @@ def test_matter_that_flew_off_leaves_finite_what_is_seen(graph):
     env = TorchEnv("shapematch", resolution=64, particles=200, substeps=1)
     env.reset(seed=0)
     nodes = Nodes(16, graph)
-    labels = segment(env, nodes, None, torch.ones(1, dtype=torch.bool))
+    labels = fit(visible_positions(env), 16)
     particles = env.state.clone()
     particles.x[0, 0], particles.v[0, 0] = 1e25, 1e30  # finite, and out of the window: the episode goes on
     env.env_state = replace(env.env_state, particles=particles)
