@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
-from torch import Tensor
 
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
@@ -22,6 +21,7 @@ from dittogym.geometry import floor
 from dittogym.spec import TaskSpec
 
 FLOOR = floor().name
+FRICTION = (0.0, 0.5, math.inf)
 
 
 @dataclass(frozen=True)
@@ -71,15 +71,6 @@ def disturbed_env(
     return Disturbed(monitored(env), case, seed, grid)
 
 
-def drop(values: Tensor, mask: Tensor) -> Tensor:
-    """Set entries of (B, ..., A, A) to 0, selected by a bool mask (B, ..., R, R) whose entries cover whole cells."""
-    if mask.shape != values.shape:
-        size, grid = values.shape[-1], mask.shape[-1]
-        cell = torch.arange(size, device=mask.device) * grid // size
-        mask = mask[..., cell[:, None], cell]
-    return values.masked_fill(mask, 0)
-
-
 class Disturbed(VecEnvWrapper):
     """Disturbs actions and observations of a vectorised environment, in the same way after each ``reset``.
 
@@ -116,23 +107,23 @@ class Disturbed(VecEnvWrapper):
         self._delayed.append(np.array(actions, np.float32))
         actions = self._delayed.popleft()
         if self.grid:
-            actions = self._disturb(actions, (len(actions), 2, self.grid, self.grid))
+            actions = self.disturb(actions, (len(actions), 2, self.grid, self.grid))
         self.venv.step_async(actions)
 
-    def disturb(self, decisions: np.ndarray) -> np.ndarray:
-        """Disturb decisions (B, ...) that are not on a grid."""
-        return self._disturb(decisions, decisions.shape)
-
-    def _disturb(self, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """Apply noise and dropout that are drawn in ``shape``."""
+    def disturb(self, values: np.ndarray, shape: tuple[int, ...] | None = None) -> np.ndarray:
+        """Apply noise and dropout to values (B, ...), drawn in ``shape`` or for each of them."""
+        shape = shape or values.shape
         if self.case.action_noise:
             noise = self.generator.standard_normal(shape, np.float32)
             if shape != values.shape:
                 noise = bicubic(torch.from_numpy(noise), self.size).numpy()
             values = values + np.float32(self.case.action_noise) * noise
         if self.case.action_dropout:
-            mask = torch.from_numpy(self.generator.random(shape) < self.case.action_dropout)
-            values = drop(torch.from_numpy(values), mask).numpy()
+            dropped = self.generator.random(shape) < self.case.action_dropout
+            if shape != values.shape:
+                cell = np.arange(self.size) * self.grid // self.size
+                dropped = dropped[..., cell[:, None], cell]
+            values = np.where(dropped, values.dtype.type(0), values)
         return values
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -151,11 +142,7 @@ class Disturbed(VecEnvWrapper):
 
 
 def make_cases(
-    dropout: float = 0.2,
-    noise: float = 0.2,
-    latency: int = 1,
-    shift: float = 0.2,
-    friction: tuple[float, ...] = (0.0, 0.5, math.inf),
+    dropout: float = 0.2, noise: float = 0.2, latency: int = 1, shift: float = 0.2, friction: Sequence[float] = FRICTION
 ) -> list[Case]:
     """The cases of a robustness report, the unperturbed one first; constants are multiplied by 1 -+ ``shift``."""
     percent = f"{100 * dropout:g}%"
