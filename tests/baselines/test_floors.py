@@ -16,7 +16,7 @@ from cfp.experiment.training import parse
 from cfp.files import write_json
 from cfp.tables import read_table
 from dittogym.action import patch_field, to_grid_indexing
-from dittogym.rewards import action_cost
+from dittogym.reward_ops import action_cost
 
 TINY = "--particles 100 --substeps 2 --eval-episodes 2 --no-video --device cpu".split()
 IMAGES = np.zeros((2, 3, 64, 64), np.uint8)
