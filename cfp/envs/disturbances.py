@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from torch import Tensor
 
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
@@ -71,6 +72,15 @@ def disturbed_env(
     return Disturbed(monitored(env), case, seed, grid)
 
 
+def drop(values: Tensor, mask: Tensor) -> Tensor:
+    """Set entries of (B, ..., A, A) to 0, selected by a bool mask (B, ..., R, R) whose entries cover whole cells."""
+    if mask.shape != values.shape:
+        size, grid = values.shape[-1], mask.shape[-1]
+        cell = torch.arange(size, device=mask.device) * grid // size
+        mask = mask[..., cell[:, None], cell]
+    return values.masked_fill(mask, 0)
+
+
 class Disturbed(VecEnvWrapper):
     """Disturbs actions and observations of a vectorised environment, in the same way after each ``reset``.
 
@@ -119,11 +129,8 @@ class Disturbed(VecEnvWrapper):
                 noise = bicubic(torch.from_numpy(noise), self.size).numpy()
             values = values + np.float32(self.case.action_noise) * noise
         if self.case.action_dropout:
-            dropped = self.generator.random(shape) < self.case.action_dropout
-            if shape != values.shape:
-                cell = np.arange(self.size) * self.grid // self.size
-                dropped = dropped[..., cell[:, None], cell]
-            values = np.where(dropped, values.dtype.type(0), values)
+            mask = torch.from_numpy(self.generator.random(shape) < self.case.action_dropout)
+            values = drop(torch.from_numpy(values), mask).numpy()
         return values
 
     def step_wait(self) -> VecEnvStepReturn:
