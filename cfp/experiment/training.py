@@ -109,8 +109,8 @@ def _values(choice: _Choice) -> dict[str, Any]:
             values = read_json(choice.config)
         except (OSError, ValueError) as error:
             raise ConfigError(f"config: {choice.config} cannot be read as JSON ({error})") from error
-    chosen = {"algo": choice.algo, "task": choice.task, "preset": choice.preset}
-    return values | {name: value for name, value in chosen.items() if value is not None}
+    names = ("algo", "task", "preset")
+    return values | {name: value for name in names if (value := getattr(choice, name)) is not None}
 
 
 def _default_folder(config: RunConfig) -> Path:
