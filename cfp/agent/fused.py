@@ -62,9 +62,7 @@ def decode(heads: Sequence[nn.Sequential], latent: Tensor) -> list[Tensor]:
     if not isinstance(heads[0][0], nn.ConvTranspose2d):
         return [head(latent) for head in heads]
     first, *rest = zip(*heads, strict=True)
-    values = F.conv_transpose2d(
-        channels_last(latent), *_concatenated(first, dim=1), first[0].stride, first[0].padding
-    )
+    values = F.conv_transpose2d(channels_last(latent), *_concatenated(first, dim=1), first[0].stride, first[0].padding)
     for layers in rest:
         if isinstance(layers[0], nn.ELU):
             values = layers[0](values)
