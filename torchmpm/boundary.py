@@ -3,8 +3,6 @@
 The native kernels have the same formulas in ``native/cpu/grid.hpp`` and ``native/cuda/grid.py``.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

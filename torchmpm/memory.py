@@ -1,7 +1,5 @@
 """Memory that gradients need, estimated before they are computed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

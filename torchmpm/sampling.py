@@ -4,8 +4,6 @@ Each shape is a map of the unit square: give it ``uniform(count, generator)`` fo
 evenly spread particles. No function here touches a global generator.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

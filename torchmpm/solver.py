@@ -1,7 +1,5 @@
 """The solver: a frozen description of grid, bodies and boundary, and the step that advances a state."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
@@ -98,7 +96,7 @@ class Solver:
         """The fields alone: cached tables are built anew in a copy."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    def with_constants(self, bodies: tuple[Body, ...], gravity: tuple[float, float] | Tensor) -> Solver:
+    def with_constants(self, bodies: tuple[Body, ...], gravity: tuple[float, float] | Tensor) -> "Solver":
         """The same solver with other constants, for those that change in every step; skips all checks.
 
         Args:

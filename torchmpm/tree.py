@@ -5,8 +5,6 @@ that ``torch.func``, ``torch.utils.checkpoint`` and ``torch.compile`` consult. I
 release of torch offers it under a public name, and a second registry would not be seen by those functions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields
 from typing import Any, TypeVar

@@ -1,7 +1,5 @@
 """What the solver calls: whether the kernels can run, and a step through them."""
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import os

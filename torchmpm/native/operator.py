@@ -6,8 +6,6 @@ substeps, and returns the planes (13, B, N) of the new state. ``native_step_back
 back through them.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

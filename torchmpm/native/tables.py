@@ -1,7 +1,5 @@
 """What the kernels read: a solver as typed tables built once, a table of its constants, and the tensors of a call."""
 
-from __future__ import annotations
-
 import ctypes
 import math
 import threading

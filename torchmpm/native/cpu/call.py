@@ -1,7 +1,5 @@
 """Runs the C++ kernels on tensors."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager

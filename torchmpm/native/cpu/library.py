@@ -1,7 +1,5 @@
 """Compiles the kernels on first use, keeps them on disk, and loads them."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import hashlib

@@ -11,8 +11,6 @@ are atomic, in no fixed order: results differ from call to call in their last bi
 Only this package imports Triton.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

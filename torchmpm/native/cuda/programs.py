@@ -1,7 +1,5 @@
 """The sequences of kernels behind the operators of torch: a step, and its adjoint."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

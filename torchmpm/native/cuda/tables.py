@@ -1,7 +1,5 @@
 """The tables of :mod:`torchmpm.native.tables` on a CUDA device."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass
 
