@@ -106,12 +106,12 @@ def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Fa
             node = window + shift[:, axis : axis + 1] if bounded and rule.frame == "world" else window
             first, last = (-math.inf if low is None else low), (math.inf if high is None else high)
             inside.append((node >= first) & (node <= last))
-        return inside[0][:, :, None] & inside[1][:, None, :]
+        return (inside[0][:, :, None] & inside[1][:, None, :]).flatten(1)
 
     result = []
     for direction in dict.fromkeys(rule.direction for rule in rules):
         same = [rule for rule in rules if rule.direction == direction]
-        active = torch.zeros(1, grid.width, grid.width, dtype=torch.bool, device=origin.device)
+        active = torch.zeros(1, grid.width**2, dtype=torch.bool, device=origin.device)
         stick, friction = active, torch.zeros_like(active, dtype=origin.dtype)
         for rule in same:
             new = covered(rule) & ~active
@@ -120,15 +120,12 @@ def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Fa
                 stick = stick | new
             elif rule.friction:
                 friction = torch.where(new, rule.friction, friction)
-        result.append(
-            Face(
-                axis="xy".index(direction[1]),
-                sign=1 if direction[0] == "+" else -1,
-                active=active.flatten(1),
-                stick=stick.flatten(1) if any(math.isinf(rule.friction) for rule in same) else None,
-                friction=friction.flatten(1) if any(0 < rule.friction < math.inf for rule in same) else None,
-            )
+        sticks, rubs = (
+            any(math.isinf(rule.friction) for rule in same),
+            any(0 < rule.friction < math.inf for rule in same),
         )
+        axis, sign = "xy".index(direction[1]), 1 if direction[0] == "+" else -1
+        result.append(Face(axis, sign, active, stick if sticks else None, friction if rubs else None))
     return tuple(result)
 
 

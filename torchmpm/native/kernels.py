@@ -47,9 +47,7 @@ class Kernels:
             missing = triton_missing(os.environ.get("CC"), os.environ.get("PATH"))
             if missing is not None:
                 return missing
-            if torch.are_deterministic_algorithms_enabled() and not (
-                torch.is_deterministic_algorithms_warn_only_enabled()
-            ):
+            if torch.get_deterministic_debug_mode() == 2:  # not allowed, rather than warned of
                 return "on CUDA it adds in no fixed order, which torch.use_deterministic_algorithms(True) forbids"
         return self._unsupported
 

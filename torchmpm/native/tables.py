@@ -67,6 +67,11 @@ class Tables(ctypes.Structure):
     ]
 
 
+#: Derivatives in planes, field, origin and gravity, in their shapes, and in the values, (8, B, N): one column per
+#: particle. Those that are not wanted are empty.
+Bars = tuple[Tensor, ...]
+
+
 class Inputs(NamedTuple):
     """Tensors of a call, a tree for ``torchmpm.tree``."""
 
@@ -77,6 +82,17 @@ class Inputs(NamedTuple):
     values: Tensor  # (8, 1 or B, columns) from make_values
     shift: Tensor  # (B, 2) int64, nodes between the world's origin and the window's
     result_bar: Tensor | None = None  # (13, B, N) derivative of a loss in the new planes, for the adjoint
+
+    def empty_bars(self, wants_field: bool, wants_values: bool) -> Bars:
+        """Room for the derivatives."""
+        nothing = self.planes.new_empty(0)
+        return (
+            torch.empty_like(self.planes, memory_format=torch.contiguous_format),
+            torch.empty_like(self.field) if wants_field and self.field is not None else nothing,
+            torch.empty_like(self.origin),
+            torch.empty_like(self.gravity),
+            self.planes.new_empty(VALUES, *self.planes.shape[1:]) if wants_values else nothing.clone(),
+        )
 
 
 _lock = threading.Lock()

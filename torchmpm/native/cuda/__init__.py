@@ -48,17 +48,12 @@ def _run(kind: type[Program], inputs: Inputs, handle: int, substeps: int, *wants
         return kind(own, tables, substeps, *wants)
 
     if planes.device.type != "cuda":
-        return _launched(build(inputs))
+        return build(inputs).run()
     with torch.cuda.device(planes.device):
         if torch.cuda.is_current_stream_capturing():
-            return _launched(build(inputs))
+            return build(inputs).run()
         shapes = (planes.shape, inputs.field is None, inputs.values.shape, planes.dtype, planes.device)
         # Two streams may run at once, so each has buffers of its own.
         stream = torch.cuda.current_stream().cuda_stream
         most = KEPT_SHARE * torch.cuda.get_device_properties(planes.device).total_memory
         return cache.run((kind, handle, substeps, wants, shapes, stream), build, inputs, most)
-
-
-def _launched(program: Program) -> tuple[Tensor, ...]:
-    program.run()
-    return program.results

@@ -5,9 +5,9 @@ import triton.language as tl
 
 from torchmpm.native.cuda.grid import ADJOINT
 from torchmpm.native.cuda.linalg import matmul
-from torchmpm.native.cuda.material import DT, INVERSE_H, H, read_values
+from torchmpm.native.cuda.material import DT, INVERSE_H, H, deform, read_values
 from torchmpm.native.cuda.material_adjoint import material_adjoint
-from torchmpm.native.cuda.step import deform, load_matrix, own_particles, store_matrix, values_at
+from torchmpm.native.cuda.step import load_matrix, own_particles, store_matrix, values_at
 from torchmpm.native.cuda.transfer import (
     SIZES,
     actuation_at,
@@ -89,10 +89,7 @@ def begin_adjoint(
     on, i, j, fx, fy = locate(x, y, origin + 2 * element, valid, constants, resolution)
     node = i * width + j
     sums += ADJOINT * element * width * width
-    act_x, act_y = tl.zeros_like(x), tl.zeros_like(x)
-    if MUSCLE:
-        plane = 2 * resolution * resolution * element
-        act_x, act_y = actuation_at(field + plane, i, j, fx, fy, on, resolution)
+    act_x, act_y = actuation_at(field, element, i, j, fx, fy, on, resolution, MUSCLE)
     _, _, _, _, _, xx, xy, yy = deform(
         dt, c0, c1, c2, c3, f0, f1, f2, f3, Jp, factor, mu2, lam, s0, s1, s2, s3, act_x, act_y, constants, bounds,
         KIND,
@@ -166,11 +163,9 @@ def finish_adjoint(
     on, i, j, fx, fy = locate(x, y, origin + 2 * element, valid, constants, resolution)
     node = i * width + j
     answers += ADJOINT * element * width * width
+    act_x, act_y = actuation_at(field, element, i, j, fx, fy, on, resolution, MUSCLE)
     field += 2 * resolution * resolution * element
     field_bar += 2 * resolution * resolution * element
-    act_x, act_y = tl.zeros_like(x), tl.zeros_like(x)
-    if MUSCLE:
-        act_x, act_y = actuation_at(field, i, j, fx, fy, on, resolution)
     # Derivatives in the momentum (m v) and the affine momentum.
     px_bar, py_bar, pxx_bar, pxy_bar, pyx_bar, pyy_bar = gather(answers + 2, node, width, fx, fy, on, ADJOINT)
     pxx_bar, pxy_bar, pyx_bar, pyy_bar = h * pxx_bar, h * pxy_bar, h * pyx_bar, h * pyy_bar
