@@ -89,6 +89,12 @@ class Face:
     friction: Tensor | None  # (1 or B, cells) Coulomb coefficients, if any
 
 
+def limits(ends: Range) -> tuple[float, float]:
+    """A range of nodes whose open ends are infinite."""
+    low, high = ends
+    return -math.inf if low is None else low, math.inf if high is None else high
+
+
 def node_shift(grid: Grid, origin: Tensor) -> Tensor:
     """Whole nodes between the world's origin and the window's, truncated towards zero, (B, 2) int64."""
     return torch.trunc(origin.detach() * (1.0 / grid.h)).to(torch.int64)
@@ -101,10 +107,9 @@ def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Fa
 
     def covered(rule: VelocityRule) -> Tensor:
         inside = []
-        for axis, (low, high) in enumerate((rule.i, rule.j)):
-            bounded = low is not None or high is not None
-            node = window + shift[:, axis : axis + 1] if bounded and rule.frame == "world" else window
-            first, last = (-math.inf if low is None else low), (math.inf if high is None else high)
+        for axis, ends in enumerate((rule.i, rule.j)):
+            node = window + shift[:, axis : axis + 1] if ends != (None, None) and rule.frame == "world" else window
+            first, last = limits(ends)
             inside.append((node >= first) & (node <= last))
         return (inside[0][:, :, None] & inside[1][:, None, :]).flatten(1)
 

@@ -16,7 +16,7 @@ from torchmpm.boundary import VelocityRule, faces
 from torchmpm.grid import PAD, Grid
 from torchmpm.materials.base import Value
 from torchmpm.materials.body import Body, per_particle
-from torchmpm.native.cpu.library import NO_COMPILER
+from torchmpm.native.cpu.library import NO_COMPILER, load
 from torchmpm.native.kernels import Kernels
 from torchmpm.rollout import Segment, check_repetition, repeated
 from torchmpm.state import ParticleState
@@ -211,7 +211,7 @@ class Solver:
             reason = "on CUDA the native backend runs only if backend='native' asks for it"
         if reason is None:
             try:
-                self.kernels.load(state.dtype)
+                load(state.dtype)
             except ValueError as error:
                 reason = str(error)
         if reason is not None:

@@ -1,10 +1,4 @@
-"""The kernels as operators of torch with an adjoint, for tensors on the CPU and on CUDA.
-
-``native_step`` advances all simulations by some substeps: it takes the tensors of
-:class:`torchmpm.native.tables.Inputs`, a handle of :func:`torchmpm.native.tables.make_tables` and the number of
-substeps, and returns the planes (13, B, N) of the new state. ``native_step_backward`` replays the substeps, then goes
-back through them.
-"""
+"""The kernels as operators of torch with an adjoint, for tensors on the CPU and on CUDA."""
 
 from typing import Any
 
@@ -21,7 +15,7 @@ _NUMBERS = "int handle, int substeps"
 
 @torch.library.custom_op("torchmpm::native_step", mutates_args=(), schema=f"({_INPUTS}, {_NUMBERS}) -> Tensor")
 def native_step(*arguments: Any) -> Tensor:
-    """Advance all simulations: tensors, handle and substeps -> planes (13, B, N)."""
+    """Planes (13, B, N) after some substeps, from the tensors of Inputs, a handle of make_tables, and their number."""
     *tensors, handle, substeps = arguments
     inputs = tree.map(Tensor.contiguous, Inputs(*tensors))
     result = torch.empty_like(inputs.planes)
@@ -38,7 +32,7 @@ def native_step(*arguments: Any) -> Tensor:
     ),
 )
 def native_step_backward(*arguments: Any) -> Bars:
-    """Adjoint of :func:`native_step`: tensors, derivative in the result, handle, substeps, wishes -> derivatives."""
+    """Replay the substeps, then go back: tensors, handle, substeps, whether field and values count -> derivatives."""
     *tensors, handle, substeps, wants_field, wants_values = arguments
     inputs = tree.map(Tensor.contiguous, Inputs(*tensors))
     bars = inputs.empty_bars(wants_field, wants_values)

@@ -1,7 +1,6 @@
 """What the kernels read: a solver as typed tables built once, a table of its constants, and the tensors of a call."""
 
 import ctypes
-import math
 import threading
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -9,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchmpm.boundary import VelocityRule
+from torchmpm.boundary import VelocityRule, limits
 from torchmpm.grid import Grid
 from torchmpm.materials.base import Value, broadcast_plane
 from torchmpm.materials.body import Body, slices
@@ -145,12 +144,8 @@ def _varying(body: Body) -> bool:
 
 
 def _rule_table(rule: VelocityRule, slot: int) -> RuleTable:
-    (i_low, j_low), (i_high, j_high) = (
-        [absent if end is None else end for end in ends]
-        for ends, absent in zip(zip(rule.i, rule.j, strict=True), (-math.inf, math.inf), strict=True)
-    )
     axis, sign = "xy".index(rule.direction[1]), 1.0 if rule.direction[0] == "+" else -1.0
-    return RuleTable(axis, rule.frame == "world", slot, sign, i_low, i_high, j_low, j_high, rule.friction)
+    return RuleTable(axis, rule.frame == "world", slot, sign, *limits(rule.i), *limits(rule.j), rule.friction)
 
 
 def upload(numbers: Sequence[float], like: Tensor) -> Tensor:

@@ -7,8 +7,6 @@ adjoint ``material_adjoint``, ``adjoint``. They compute the formulas of the C++ 
 A substep takes two launches: one over the particles, which reads velocities from the nodes, moves and deforms the
 particles, and adds mass and momentum to the nodes for the next substep; one over the nodes that are in use. Additions
 are atomic, in no fixed order: results differ from call to call in their last bits.
-
-Only this package imports Triton.
 """
 
 from typing import Any

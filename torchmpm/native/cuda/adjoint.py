@@ -131,18 +131,6 @@ def add_values(to, stride, mass, factor, mu2, lam, s0, s1, s2, s3, mask):
     add(to + 7 * stride, s3, mask)
 
 
-@triton.jit
-def store_bars(bars, stride, x, y, vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, Jp, mask):
-    """Store derivatives in the state of particles."""
-    tl.store(bars, x, mask)
-    tl.store(bars + stride, y, mask)
-    tl.store(bars + 2 * stride, vx, mask)
-    tl.store(bars + 3 * stride, vy, mask)
-    store_matrix(bars + 4 * stride, stride, c0, c1, c2, c3, mask)
-    store_matrix(bars + 8 * stride, stride, f0, f1, f2, f3, mask)
-    tl.store(bars + 12 * stride, Jp, mask)
-
-
 @triton.jit(do_not_specialize=SIZES)
 def finish_adjoint(
     state, bars, values_bar, field_bar, origin_bar, answers, field, origin, values, constants, bounds,
@@ -192,10 +180,11 @@ def finish_adjoint(
     fx_bar, fy_bar = tl.where(on, fx_bar * inverse_h, 0.0), tl.where(on, fy_bar * inverse_h, 0.0)
     tl.atomic_add(origin_bar + 2 * element, -tl.sum(fx_bar, axis=0), sem="relaxed")
     tl.atomic_add(origin_bar + 2 * element + 1, -tl.sum(fy_bar, axis=0), sem="relaxed")
-    store_bars(
-        bars + at, stride, x_bar + fx_bar, y_bar + fy_bar, mass * px_bar, mass * py_bar,
-        d0, d1, d2, d3, e0_bar, e1_bar, e2_bar, e3_bar, new_Jp_bar, on,
-    )  # fmt: skip
+    bars += at
+    store_matrix(bars, stride, x_bar + fx_bar, y_bar + fy_bar, mass * px_bar, mass * py_bar, on)
+    store_matrix(bars + 4 * stride, stride, d0, d1, d2, d3, on)
+    store_matrix(bars + 8 * stride, stride, e0_bar, e1_bar, e2_bar, e3_bar, on)
+    tl.store(bars + 12 * stride, new_Jp_bar, on)
     if MUSCLE and WANT_FIELD:
         scatter_actuation(field_bar, i, j, fx, fy, act_x_bar, act_y_bar, on, resolution)
     if WANT_VALUES:

@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchmpm.grid import PAD
 from torchmpm.native.cuda.adjoint import begin_adjoint, finish_adjoint
 from torchmpm.native.cuda.grid import ADJOINT, SUMS, node_adjoint, node_velocities, rule_codes
 from torchmpm.native.cuda.step import particles_pass
@@ -34,7 +35,7 @@ class Program:
     results: tuple[Tensor, ...]  # buffers with what the last run has found
 
     def __init__(self, inputs: Inputs, tables: DeviceTables, substeps: int, numbers: int) -> None:
-        planes, self.width = inputs.planes, tables.width
+        planes, self.width = inputs.planes, tables.tables.resolution + 2 * PAD
         self.inputs, self.device_tables, self.tables, self.substeps = inputs, tables, tables.tables, substeps
         self.batch, self.particles, self.cells = *planes.shape[1:], self.width**2
         self.sums = planes.new_zeros(self.batch * self.cells * numbers)
