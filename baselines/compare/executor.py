@@ -56,7 +56,7 @@ def execute(
 ) -> None:
     """Carry out runs until all are over or have stopped, and shut down the executor."""
     pending: dict[Future[Outcome], Job] = {}
-    stopping, complete = False, False
+    stopping = False
 
     def collect(timeout: float) -> None:
         for future in wait(pending, timeout, FIRST_COMPLETED).done:
@@ -71,9 +71,8 @@ def execute(
             if signals.number and not stopping:
                 stopping = True
                 executor.stop()
-        complete = True
     finally:
-        executor.shutdown(kill=not complete)
+        executor.shutdown(kill=bool(pending))
 
 
 class InProcessExecutor(Executor):

@@ -86,7 +86,7 @@ class Distill(Stateful, Algorithm):
         seed = config.seed + (stage - 1) * config.num_layouts
         episodes = Episodes(self.env, seed, config.max_episode_steps, config.num_layouts)
         guide, grid = self._make_teacher(training, teacher), self.spec.resolutions[-1]
-        self.collector = Collector(self.env, guide, episodes, config.switch_every, config.dropout, grid)
+        self.collector = Collector(guide, episodes, config.switch_every, config.dropout, grid)
         self.dataset, self.rounds = Dataset(config.capacity), 0
 
     def _make_teacher(self, training: RunConfig, path: Path | None) -> Teacher:

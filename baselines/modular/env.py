@@ -70,10 +70,6 @@ class SegmentedEnv:
         self._observation = tree.where(mask, self.nodes.observe(self.env, self.labels), self._observation)
         return self._observation
 
-    def render(self, index: int = 0) -> np.ndarray:
-        """Picture of one element."""
-        return self.env.render(index)
-
 
 def segment(x: Tensor, labels: Tensor, count: int, mask: Tensor) -> Tensor:
     """Labels (B, N) in which the elements of a mask (B,), with particles at x (B, N, 2), are segmented anew."""

@@ -216,11 +216,6 @@ def test_paper_s_returns_stand_beside_ours(report):
     assert (row["ours"], row["paper"], row["band"], row["paper_steps"]) == (4050, 8650, 420, 550_000)
 
 
-def test_curves_over_time_end_with_the_training(report):
-    axes = learning_curves(groups_of(report, labels=LABELS[1:]), minutes=True).axes[0]
-    assert [line.get_xdata().tolist() for line in axes.lines] == [pytest.approx([50 / 60, 100 / 60])] * 3
-
-
 def test_failures_are_named(report):
     row = find(rows(report, "runs"), run="shac-image-slot-quick-1")
     assert (row["state"], row["error"]) == ("failed", "NonFiniteError: a loss | is not finite")

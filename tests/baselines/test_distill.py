@@ -113,7 +113,7 @@ def test_faults_hit_half_of_what_they_may() -> None:
 
 def test_actions_are_lost_on_the_grid_on_which_the_student_decides() -> None:
     env, taken = TorchEnv("run", 2, 64, particles=100, substeps=1), []
-    collector, step = Collector(env, Mirror(), Episodes(env, 0, 20, 3), 2, dropout=0.5, grid=16), env.step
+    collector, step = Collector(Mirror(), Episodes(env, 0, 20, 3), 2, dropout=0.5, grid=16), env.step
     env.step = lambda action: taken.append(action) or step(action)
     collector.collect(8, 0.0, lambda seen: torch.ones(2, 2, 64, 64))
     cells = torch.cat(taken).unflatten(3, (16, 4)).unflatten(2, (16, 4)).transpose(3, 4).flatten(4)
@@ -205,7 +205,7 @@ class Scripted(Teacher):
 @pytest.mark.parametrize(("share", "expected"), [(1.0, [0, 0, 1, 3, 3, 4]), (0.0, [0, 0, 3, 3])])
 def test_labels_count_only_where_the_teacher_looked_or_led(share, expected):
     env = TorchEnv("run", 2, 64, particles=100, substeps=1)
-    collector = Collector(env, Scripted(), Episodes(env, 0, 2, 3), 3)  # the first robot begins anew after one step
+    collector = Collector(Scripted(), Episodes(env, 0, 2, 3), 3)  # the first robot begins anew after one step
     labels = collector.collect(6, share, lambda seen: torch.zeros(2, 2, 8, 8))
     given = (10 * labels.actions[:, 0, 0, 0]).round().int().tolist()
     assert sorted(given) == expected

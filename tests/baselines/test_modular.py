@@ -9,7 +9,6 @@ import torch
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 import baselines
-import cfp
 from baselines.modular.kmeans import fit, update
 from baselines.modular.networks import ModularActor, ModularCritics, SegmentPolicy
 from baselines.modular.nodes import Nodes, pack, visible_positions
@@ -185,18 +184,6 @@ def test_policy_must_be_shown_its_own_kind_of_task(tmp_path):
     policy.save(tmp_path / "a.safetensors")
     with pytest.raises(CheckpointError, match="description"):
         SegmentPolicy.load(tmp_path / "a.safetensors")
-
-
-@pytest.mark.parametrize("algo", ["gnn-16", "gnn-64", "transformer-16", "transformer-64"])
-def test_presets_learn_as_the_first_stage_does(algo):
-    assert find(algo).sees == "state"
-    for task in cfp.presets.TASKS:
-        for name in ("quick", "paper"):
-            mine, ladder = find(algo).preset(task, name), cfp.preset(task, name)
-            mine.check()
-            assert (mine.learning, mine.environment, mine.steps) == (ladder.learning, ladder.environment, ladder.steps)
-            assert (mine.alpha, mine.random_steps) == (ladder.alpha[0], ladder.random_steps[0])
-            assert mine.segments == int(algo[-2:])
 
 
 @pytest.mark.parametrize("algo", ["gnn", "gnn-x", "mlp-16", "gnn-1"])
