@@ -89,7 +89,7 @@ class Face:
     friction: Tensor | None  # (1 or B, cells) Coulomb coefficients, if any
 
 
-def limits(ends: Range) -> tuple[float, float]:
+def limits(ends: Range) -> tuple[int | float, int | float]:
     """A range of nodes whose open ends are infinite."""
     low, high = ends
     return -math.inf if low is None else low, math.inf if high is None else high
