@@ -1,7 +1,5 @@
 """The solver: a frozen description of grid, bodies and boundary, and the step that advances a state."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
@@ -10,15 +8,16 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 from torch.nn.functional import pad
 
 from torchmpm import checks, stability
-from torchmpm.backends import BACKENDS, compiled, compiler_found, has_tangents, transforming, warn_eager
+from torchmpm.backends import BACKENDS, compiled, compiler_found, transforming, warn_eager
 from torchmpm.boundary import VelocityRule, faces
 from torchmpm.grid import PAD, Grid
 from torchmpm.materials.base import Value
 from torchmpm.materials.body import Body, per_particle
-from torchmpm.native.cpu.library import NO_COMPILER
+from torchmpm.native.cpu.library import NO_COMPILER, load
 from torchmpm.native.kernels import Kernels
 from torchmpm.rollout import Segment, check_repetition, repeated
 from torchmpm.state import ParticleState
@@ -98,7 +97,7 @@ class Solver:
         """The fields alone: cached tables are built anew in a copy."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    def with_constants(self, bodies: tuple[Body, ...], gravity: tuple[float, float] | Tensor) -> Solver:
+    def with_constants(self, bodies: tuple[Body, ...], gravity: tuple[float, float] | Tensor) -> "Solver":
         """The same solver with other constants, for those that change in every step; skips all checks.
 
         Args:
@@ -199,7 +198,7 @@ class Solver:
         if self.backend == "eager":
             return False
         tensors = (state.x, state.v, state.C, state.F, state.Jp, *fields, *self.constants.values())
-        tangents = not transforming() and has_tangents(tensor for tensor in tensors if tensor is not None)
+        tangents = not transforming() and any(unpack_dual(t).tangent is not None for t in tensors if t is not None)
         if self.backend == "compile":
             if tangents:
                 raise ValueError("backend 'compile' loses the tangents of forward_ad; use 'eager', or torch.func.jvp")
@@ -213,7 +212,7 @@ class Solver:
             reason = "on CUDA the native backend runs only if backend='native' asks for it"
         if reason is None:
             try:
-                self.kernels.load(state.dtype)
+                load(state.dtype)
             except ValueError as error:
                 reason = str(error)
         if reason is not None:

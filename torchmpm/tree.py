@@ -5,8 +5,6 @@ that ``torch.func``, ``torch.utils.checkpoint`` and ``torch.compile`` consult. I
 release of torch offers it under a public name, and a second registry would not be seen by those functions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields
 from typing import Any, TypeVar
@@ -26,17 +24,11 @@ def register(cls: type[Tree]) -> type[Tree]:
 
     Args:
         cls: A dataclass all of whose fields are containers of tensors.
-
-    Returns:
-        The same class.
     """
     names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
 
     def flatten(instance: Tree) -> tuple[list[Any], None]:
         return [getattr(instance, name) for name in names], None
-
-    def flatten_with_keys(instance: Tree) -> tuple[list[tuple[Any, Any]], None]:
-        return [(pytree.GetAttrKey(name), getattr(instance, name)) for name in names], None
 
     def unflatten(children: Any, _: None) -> Tree:
         instance = object.__new__(cls)
@@ -44,20 +36,17 @@ def register(cls: type[Tree]) -> type[Tree]:
             object.__setattr__(instance, name, child)
         return instance
 
-    pytree.register_pytree_node(cls, flatten, unflatten, flatten_with_keys_fn=flatten_with_keys)
+    pytree.register_pytree_node(cls, flatten, unflatten)
     return cls
 
 
 def map(function: Callable[..., Any], tree: Tree, *others: Tree) -> Tree:
-    """Apply a function to every tensor of a tree, together with the tensors in the same place of other trees.
+    """Apply a function to every tensor of a tree, with the tensors in the same place of other trees, for a new tree.
 
     Args:
         function: Called as ``function(tensor, *other_tensors)``.
         tree: The tree; leaves that are not tensors are kept.
         others: Trees of the same structure.
-
-    Returns:
-        A tree of the same structure.
 
     Raises:
         ValueError: The structures differ.
@@ -86,9 +75,6 @@ def where(mask: Tensor, tree: Tree, other: Tree) -> Tree:
         mask: (B,) bool.
         tree: A tensor (B, ...) or a tree of them.
         other: A tree of the same structure and shapes.
-
-    Returns:
-        A tree of the same structure and shapes.
     """
 
     def select(chosen: Tensor, otherwise: Tensor) -> Tensor:
