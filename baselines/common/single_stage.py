@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
-import cfp
 from cfp.config import Config
 from cfp.errors import ConfigError
 from cfp.experiment.coarse_to_fine import CoarseToFine
+from cfp.presets import sac_preset
 from dittogym.tasks import task_name
 
 
@@ -31,7 +31,7 @@ class SingleStageConfig(Config):
 
 def single_stage_preset(algo: Literal["coarse", "fine"], task: str, name: str) -> SingleStageConfig:
     """The first stage of `cfp.preset`, for all its steps, on the task's coarse or fine action grid."""
-    base = cfp.preset(task, name)
+    base = sac_preset(task, name)
     single = replace(
         base,
         algo=algo,

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from baselines.common.open_loop import OpenLoop
-from baselines.common.stateful import Stateful
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.registry import load
+from cfp.analytic.stateful import Stateful
 from cfp.policy_protocols import Policy, SeesState
 from cfp.sections import EnvironmentConfig
 from cfp.weights import check_trained_for, read_policy

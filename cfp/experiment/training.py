@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import tyro
 
@@ -32,7 +32,7 @@ class Program:
     package: str  # python -m PACKAGE.train
     about: str  # first words of the help
     configure: Callable[[dict[str, Any]], RunConfig]  # options from JSON values; the others come from the preset
-    find: Callable[[str], type[Algorithm]]  # the algorithm of a name
+    find: Callable[[RunConfig], type[Algorithm]]  # the algorithm that the options name
     load: Callable[[Path, str], Policy]  # loads a policy file onto a device
 
 
@@ -58,9 +58,13 @@ class Command:
 class _Choice:
     """What must be known before the defaults are: the same options, read first."""
 
+    decisive: ClassVar[tuple[str, ...]] = ("algo", "task", "preset", "learner")
+    """Those that choose the defaults."""
+
     algo: str | None = None
     task: str | None = None
     preset: str | None = None
+    learner: str | None = None
     out: Path | None = None
     resume: bool = False
     config: Path | None = None
@@ -70,7 +74,7 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
     """Read a command line; ``SystemExit`` after ``--help``, or for an option that does not exist or cannot be read."""
     choice, _ = tyro.cli(_Choice, args=list(arguments), return_unknown_args=True, add_help=False, console_outputs=False)
     values = _values(choice)
-    preset = program.configure({name: values[name] for name in ("algo", "task", "preset") if name in values})
+    preset = program.configure({name: values[name] for name in _Choice.decisive if name in values})
     base = program.configure(values)
 
     def read(defaults: RunConfig) -> Command:
@@ -109,7 +113,7 @@ def _values(choice: _Choice) -> dict[str, Any]:
             values = read_json(choice.config)
         except (OSError, ValueError) as error:
             raise ConfigError(f"config: {choice.config} cannot be read as JSON ({error})") from error
-    chosen = {"algo": choice.algo, "task": choice.task, "preset": choice.preset}
+    chosen = {name: getattr(choice, name) for name in _Choice.decisive}
     return values | {name: value for name, value in chosen.items() if value is not None}
 
 
@@ -138,7 +142,7 @@ def _train(program: Program, arguments: Sequence[str], started: str) -> None:
     print(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed} -> {folder}")
     with run_lock(folder):
         with StopSignals() as signals:
-            run = Run(program.find(config.algo), config, folder, command.resume, signals)
+            run = Run(program.find(config), config, folder, command.resume, signals)
             if config.environment.backend == "compile":
                 print("compiling the physics; the first time on a machine this takes half a minute ...")
             try:

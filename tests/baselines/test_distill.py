@@ -11,7 +11,6 @@ import baselines
 import cfp
 import cfp.train
 from baselines import Distill, GradientPlannerConfig, OpenLoop, Shac, distill
-from baselines.common.episodes import Episodes
 from baselines.compare.final_evaluation import Protocol
 from baselines.compare.jobs import Job
 from baselines.compare.results import read_result
@@ -24,6 +23,7 @@ from baselines.modular.networks import ModularActor
 from baselines.modular.nodes import Nodes
 from baselines.modular.policy import SegmentPolicy
 from baselines.registry import configure
+from cfp.analytic.episodes import Episodes
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.process import StopSignals
 from cfp.sections import EnvironmentConfig, ReportConfig
