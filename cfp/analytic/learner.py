@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -168,3 +168,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         """What has been learned so far."""
         deterministic = self.config.report.eval_deterministic
         return image_policy(self.config.actor_spec(self.stage), self.trained_actor, deterministic)
+
+    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
+        """Write the actor with averaged weights."""
+        super().save_policy(path, description | {"trained_by": self.config.learner})
