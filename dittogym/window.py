@@ -48,10 +48,6 @@ class Window:
         return torch.stack((left, torch.zeros_like(left)), dim=1)
 
 
-#: The window between 0 and 1 m.
-FIXED = Window()
-
-
 def contains(x: Tensor, origin: Tensor) -> Tensor:
     """Which of the points ``x`` (B, N, 2) lie in the windows at ``origin`` (B, 2): (B, N) bool; false for NaN."""
     height = x[..., 1] - origin[:, 1:2]

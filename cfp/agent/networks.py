@@ -6,6 +6,7 @@ channel 1 the y-muscles. Sizes follow the reference implementation of DittoGym (
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import cast
 
 import torch
@@ -34,8 +35,8 @@ _DECODERS: dict[int, tuple[tuple[tuple[int, int, int], ...], tuple[int, ...]]] =
 def upsample(action: Tensor, size: int, interpolation: Interpolation) -> Tensor:
     """Bicubic interpolation (kernel parameter -0.75) of an action image (B, 2, R, R) to (B, 2, size, size).
 
-    The reference implementation aligns corners here but uses half-pixel centres in the environment, so a closed gate
-    does not reproduce the coarse force field; ``"half_pixel"`` uses the rule of the environment everywhere.
+    ``"half_pixel"`` is the environment's rule, with which a closed gate reproduces the coarse force field; the
+    reference implementation aligns corners here.
     """
     if action.shape[-1] == size:
         return action
@@ -90,8 +91,7 @@ class Encoder(nn.Module):
 class PairEncoder(nn.Module):
     """Encode observation and action together, to a latent of (B, 32, 4, 4).
 
-    One encoder of width 32 takes the action stacked after the observation's channels. With ``split``, two encoders of
-    width 16 are used and their latents concatenated, for tasks in which the two images show different places.
+    With ``split``, two encoders of half the width are used, for tasks in which the images show different places.
     """
 
     def __init__(self, split: bool) -> None:
@@ -110,19 +110,19 @@ class PairEncoder(nn.Module):
 def make_head(resolution: int) -> nn.Sequential:
     """Decoder from the latent (B, 32, 4, 4) to an image (B, 2, R, R), without a final activation."""
     if resolution == 4:
-        return nn.Sequential(
-            nn.Flatten(),
-            nn.Linear(LATENT, 128),
-            nn.ELU(),
-            nn.Linear(128, 128),
-            nn.ELU(),
-            nn.Linear(128, 2 * 4 * 4),
-            nn.Unflatten(1, (2, 4, 4)),
-        )
+        return nn.Sequential(*_perceptron(LATENT, 128, 128, 2 * 4 * 4), nn.Unflatten(1, (2, 4, 4)))
     shapes, channels = _DECODERS[resolution]
     layers: list[nn.Module] = []
-    for (kernel, stride, padding), before, after in zip(shapes, channels[:-1], channels[1:], strict=True):
+    for (kernel, stride, padding), (before, after) in zip(shapes, pairwise(channels), strict=True):
         layers += [nn.ConvTranspose2d(before, after, kernel, stride, padding), nn.ELU()]
+    return nn.Sequential(*layers[:-1])
+
+
+def _perceptron(*sizes: int) -> nn.Sequential:
+    """Linear layers of these sizes on a flattened input, with ELUs between them."""
+    layers: list[nn.Module] = [nn.Flatten()]
+    for before, after in pairwise(sizes):
+        layers += [nn.Linear(before, after), nn.ELU()]
     return nn.Sequential(*layers[:-1])
 
 
@@ -132,14 +132,7 @@ class Critic(nn.Module):
     def __init__(self, split: bool) -> None:
         super().__init__()
         self.encoder = PairEncoder(split)
-        self.value = nn.Sequential(
-            nn.Flatten(),
-            nn.Linear(LATENT, 256),
-            nn.ELU(),
-            nn.Linear(256, 256),
-            nn.ELU(),
-            nn.Linear(256, 1),
-        )
+        self.value = _perceptron(LATENT, 256, 256, 1)
         initialise(self)
 
     def forward(self, image: Tensor, patch: Tensor) -> Tensor:

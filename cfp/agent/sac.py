@@ -59,7 +59,7 @@ class RewardStatistics(nn.Module):
     mean: Tensor
     variance: Tensor
 
-    def __init__(self, momentum: float = 0.99) -> None:
+    def __init__(self, momentum: float) -> None:
         super().__init__()
         self.momentum = momentum
         self.register_buffer("mean", torch.zeros(()))
@@ -84,8 +84,8 @@ def clip_each(parameters: Iterable[nn.Parameter], max_norm: float) -> None:
 class CFP(SAC):
     """Soft actor-critic as the coarse-to-fine policy uses it, on stable-baselines3's loop.
 
-    Stage 1 is a `CFPPolicy` with a plain actor, later stages have a residual actor whose coarser stage is frozen. The
-    coarse action is sampled anew in every update, and the entropy covers the residual part only, as in the reference.
+    In stages after the first, the coarse action is sampled anew in every update and the entropy covers the residual
+    part only, as in the reference implementation.
 
     Args:
         policy: `CFPPolicy` or its name, or another `cfp.agent.policies.NetworkPolicy`.
@@ -114,19 +114,10 @@ class CFP(SAC):
         composition = Composition.of(spec) if spec and not noisy else None
         sac_options.setdefault("replay_buffer_class", ReplayRing)
         sac_options.setdefault("replay_buffer_kwargs", {"seed": sac_options.get("seed"), "composition": composition})
-        super().__init__(
-            policy,
-            env,
-            hyperparameters.learning_rate,
-            hyperparameters.buffer_size,
-            learning_starts=hyperparameters.update_start,
-            batch_size=hyperparameters.batch_size,
-            tau=hyperparameters.tau,
-            gamma=hyperparameters.gamma,
-            gradient_steps=hyperparameters.gradient_steps,
-            ent_coef=hyperparameters.alpha,
-            **sac_options,
-        )
+        names = ("learning_rate", "buffer_size", "batch_size", "tau", "gamma", "gradient_steps")
+        sac_options |= {name: getattr(hyperparameters, name) for name in names}
+        starts, alpha = hyperparameters.update_start, hyperparameters.alpha
+        super().__init__(policy, env, learning_starts=starts, ent_coef=alpha, **sac_options)
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -239,16 +230,10 @@ class CFP(SAC):
         return sample.action.cpu().numpy(), composition.join(sample.parts).cpu().numpy()
 
     def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
+        self, replay_buffer: ReplayBuffer, buffer_action: np.ndarray, new_obs: Any, reward: np.ndarray, *rest: Any
     ) -> None:
         self._check_finite("reward", reward)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, *rest)
 
     def _check_finite(self, name: str, values: np.ndarray) -> None:
         finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)

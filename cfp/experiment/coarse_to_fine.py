@@ -39,7 +39,6 @@ class SACAlgorithm(Algorithm):
 
     def __init__(self, config: Any, stage: int, model: CFP) -> None:
         self.config, self.stage, self.model = config, stage, model
-        assert model.replay_buffer is not None
         self.replay_buffer = model.replay_buffer
 
     @property

@@ -113,8 +113,8 @@ def _values(choice: _Choice) -> dict[str, Any]:
             values = read_json(choice.config)
         except (OSError, ValueError) as error:
             raise ConfigError(f"config: {choice.config} cannot be read as JSON ({error})") from error
-    chosen = {name: getattr(choice, name) for name in _Choice.decisive}
-    return values | {name: value for name, value in chosen.items() if value is not None}
+    names = _Choice.decisive
+    return values | {name: value for name in names if (value := getattr(choice, name)) is not None}
 
 
 def _default_folder(config: RunConfig) -> Path:

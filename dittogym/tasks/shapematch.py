@@ -28,8 +28,7 @@ def shapematch(target: TargetLike = "star") -> TaskSpec:
     """The task SHAPE MATCH.
 
     Args:
-        target: ``"star"``, ``"I"``, ``"M"``, ``"T"``, the path of an image, or an array; see
-            :func:`dittogym.tasks.targets.load_target`.
+        target: See :func:`dittogym.tasks.targets.load_target`.
     """
     return TaskSpec(
         name="shapematch",

@@ -10,7 +10,7 @@ from torch import Tensor
 from dittogym.bodies.shapes import Disc, Rectangle
 from dittogym.contract import Memory, Moment, Outcome
 from dittogym.geometry import Obstacle, ceiling, floor, nodes
-from dittogym.rewards import distance, signed_quadratic
+from dittogym.reward_ops import distance, signed_quadratic
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.window import Window
 from torchmpm import VelocityRule, fixed

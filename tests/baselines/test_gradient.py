@@ -6,12 +6,11 @@ import pytest
 import torch
 from updates import EachUpdate
 
+import dittogym
 from baselines import Gradient, OpenLoop
 from baselines.trajectory.optimise import Episode
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.sections import EnvironmentConfig
-
-TASKS = ("shapematch", "run", "grow", "kick", "dig", "obstacle", "catch", "slot")
 
 
 def make(task="shapematch", **changes):
@@ -197,7 +196,7 @@ def test_only_polish_takes_place_where_the_result_is_evaluated():
     assert first.env.action_layout == polish.env.action_layout == "grid"
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", dittogym.TASKS)
 def test_every_task_has_a_gradient(task):
     algorithm = shorten(Gradient(make(task, substeps=20, particles=100, train_particles=100)), 3)
     loss, _, _, gradient = algorithm.play(0.0)

@@ -12,7 +12,7 @@ from torch import Tensor
 from dittogym import Outcome, TorchEnv, make_spec
 from dittogym.core import evaluate
 from dittogym.model import EnvState
-from dittogym.rewards import EXACT, SELECTION_WIDTH, SMOOTH, nearest
+from dittogym.reward_ops import EXACT, SELECTION_WIDTH, SMOOTH, nearest
 from dittogym.tasks.grow import GOAL
 from dittogym.tasks.slot import FALLEN, FAR_SIDE
 from torchmpm import ParticleState
