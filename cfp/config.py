@@ -137,7 +137,7 @@ class StagedConfig(RunConfig):
         return self.resolutions[stage - 1]
 
     def action_size(self, stage: int) -> int:
-        """Rows and columns of the actions that the environment of a stage takes, see `ActorSpec.action_size`."""
+        """Rows and columns of the actions that the environment of a stage takes."""
         return self.actor_spec(stage).action_size
 
     def actor_spec(self, stage: int) -> ActorSpec:
@@ -180,9 +180,8 @@ class StagedConfig(RunConfig):
             if (found := len(getattr(self, name))) != count:
                 raise ConfigError(f"{name} must have {count} values for resolutions {self.resolutions}, got {found}")
         if any(end <= start for start, end in pairwise((0, *self.ends()))):
-            raise ConfigError(
-                f"handover must increase between 0 and the number of steps, {self.steps}, got {self.handover}"
-            )
+            allowed = f"increase between 0 and the number of steps, {self.steps}"
+            raise ConfigError(f"handover must {allowed}, got {self.handover}")
 
     def _counts(self) -> dict[str, int]:
         """Number of values of each option that has one for each stage or residual stage."""

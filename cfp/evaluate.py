@@ -85,9 +85,9 @@ def open_run(
     loaded = choose_device(device)
     policies = {name: program.load(path, loaded) for name, path in files.items()}
     for name, path in files.items():
-        about = policies[name].description
-        if about["stage"] > len(config.ends()):
-            raise CheckpointError(f"{path}: stage must be between 1 and {len(config.ends())}, got {about['stage']}")
+        about, stages = policies[name].description, len(config.ends())
+        if about["stage"] > stages:
+            raise CheckpointError(f"{path}: stage must be between 1 and {stages}, got {about['stage']}")
         given = f"{about['task']} on a grid of {about['resolution']}"
         allowed = f"{config.task} on a grid of {config.resolution(about['stage'])}"
         if given != allowed:

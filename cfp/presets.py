@@ -1,7 +1,6 @@
 """The presets of the eight tasks.
 
-The numbers of the ``paper`` presets are those of the reference implementation's configuration files and of the
-paper's figures (Section 5 and Appendix B of DittoGym, ICLR 2024).
+Those of ``paper`` are from the reference's configuration files and the paper (DittoGym, ICLR 2024, 5 and Appendix B).
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ import tyro
 from matplotlib.figure import Figure
 
 from cfp.config import RunConfig
-from cfp.envs.disturbances import Case, disturbed_env, make_cases, reason_without_effect
+from cfp.envs.disturbances import FRICTION, Case, disturbed_env, make_cases, reason_without_effect
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection
 from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
@@ -49,7 +49,7 @@ class Command(Selection):
     """Control steps by which actions come late."""
     shift: float = 0.2
     """mu, yield stress and gravity are tried at 1 - shift and 1 + shift times their value."""
-    friction: tuple[float, ...] = (0.0, 0.5, math.inf)
+    friction: tuple[float, ...] = FRICTION
     """Coulomb coefficients of the floor; inf sticks. That of the task is left out."""
     cases: tuple[str, ...] = ()
     """Try only cases whose names hold one of these words, such as "dropout", beside the unperturbed one; all if not

@@ -1,7 +1,6 @@
-"""The convolutional networks of the coarse-to-fine policy: encoder, heads, critics.
+"""The convolutional networks of the coarse-to-fine policy: encoder, heads, critics (paper, Section 4.2, Appendix B).
 
-Observations are images (3, 64, 64) and actions are images (2, R, R), in which channel 0 drives the x-muscles and
-channel 1 the y-muscles. Sizes follow the reference implementation of DittoGym (ICLR 2024), Section 4.2 and Appendix B.
+Observations are images (3, 64, 64), actions are images (2, R, R) whose channels drive the x- and the y-muscles.
 """
 
 from __future__ import annotations
@@ -127,18 +126,13 @@ def _perceptron(*sizes: int) -> nn.Sequential:
 
 
 class Critic(nn.Module):
-    """An action-value network: an encoder of its own and a 512-256-256-1 perceptron."""
+    """Parameters of an action-value network: an encoder of its own and a 512-256-256-1 perceptron."""
 
     def __init__(self, split: bool) -> None:
         super().__init__()
         self.encoder = PairEncoder(split)
         self.value = _perceptron(LATENT, 256, 256, 1)
         initialise(self)
-
-    def forward(self, image: Tensor, patch: Tensor) -> Tensor:
-        """Q-value (B, 1) of a normalised observation (B, 3, 64, 64) and an upsampled action (B, 2, 64, 64)."""
-        value: Tensor = self.value(self.encoder(image, patch))
-        return value
 
 
 class TwinCritic(nn.Module):
@@ -156,10 +150,6 @@ class TwinCritic(nn.Module):
         image = normalise_image(observation)
         action = action.reshape(-1, 2, self.resolution, self.resolution)
         patch = upsample(action, IMAGE_SIZE, self.interpolation)
-        return tuple(self._q_values(image, patch))
-
-    def _q_values(self, image: Tensor, patch: Tensor) -> Tensor:
-        """The results (2, B, 1) of `Critic.forward`, computed for both critics at once."""
         critics = cast(list[Critic], list(self.critics))
         encoders = list(zip(*(critic.encoder.encoders for critic in critics), strict=True))
         inputs = [(image, patch)] if len(encoders) == 1 else [(image,), (patch,)]
@@ -168,7 +158,7 @@ class TwinCritic(nn.Module):
             for pair, images in zip(encoders, inputs, strict=True)
         ]
         latents = torch.cat(parts, dim=2).transpose(0, 1)  # (2, B, 32, 4, 4)
-        return fused.multilayer_perceptrons([critic.value for critic in critics], latents)
+        return tuple(fused.multilayer_perceptrons([critic.value for critic in critics], latents))
 
     def set_training_mode(self, mode: bool) -> None:
         """Switch between training and evaluation mode; required by stable-baselines3."""

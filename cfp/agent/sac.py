@@ -1,8 +1,7 @@
 """CFP: soft actor-critic with the update rule of the DittoGym reference implementation (paper, Appendix B).
 
-Differences from stable-baselines3's SAC: rewards are normalised by running statistics, the gradient of each parameter
-tensor is clipped separately, the gate of a residual actor is penalised, the temperature is constant, the random phase
-and the start of the updates are independent, and non-finite rewards, actions and losses are errors.
+Differences from stable-baselines3's SAC: rewards are normalised by running statistics, the gradient of each tensor is
+clipped separately, the gate is penalised, and the random phase is independent of the start of the updates.
 """
 
 from __future__ import annotations
@@ -41,12 +40,9 @@ METRICS: dict[str, str] = {
     "train/gate_penalty": "gate penalty inside the actor loss",
     "train/n_updates": "gradient updates so far in this stage",
     "train/learning_rate": "learning rate of the critics, and of the actor unless it has its own",
+    "train/drift": "where a policy is refined: mean square by which sampled actions differ from its mean ones",
 }
 """Scalars that `CFP.train` logs."""
-REFINING_METRICS: dict[str, str] = {
-    "train/drift": "mean square by which sampled actions differ from the mean ones of the policy that is refined",
-}
-"""Additional scalars where a policy is refined."""
 
 
 class RewardStatistics(nn.Module):

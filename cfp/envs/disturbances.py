@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,6 +22,7 @@ from dittogym.geometry import floor
 from dittogym.spec import TaskSpec
 
 FLOOR = floor().name
+FRICTION = (0.0, 0.5, math.inf)
 
 
 @dataclass(frozen=True)
@@ -116,15 +117,12 @@ class Disturbed(VecEnvWrapper):
         self._delayed.append(np.array(actions, np.float32))
         actions = self._delayed.popleft()
         if self.grid:
-            actions = self._disturb(actions, (len(actions), 2, self.grid, self.grid))
+            actions = self.disturb(actions, (len(actions), 2, self.grid, self.grid))
         self.venv.step_async(actions)
 
-    def disturb(self, decisions: np.ndarray) -> np.ndarray:
-        """Disturb decisions (B, ...) that are not on a grid."""
-        return self._disturb(decisions, decisions.shape)
-
-    def _disturb(self, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """Apply noise and dropout that are drawn in ``shape``."""
+    def disturb(self, values: np.ndarray, shape: tuple[int, ...] | None = None) -> np.ndarray:
+        """Apply noise and dropout to values (B, ...), drawn in ``shape`` or for each of them."""
+        shape = shape or values.shape
         if self.case.action_noise:
             noise = self.generator.standard_normal(shape, np.float32)
             if shape != values.shape:
@@ -151,11 +149,7 @@ class Disturbed(VecEnvWrapper):
 
 
 def make_cases(
-    dropout: float = 0.2,
-    noise: float = 0.2,
-    latency: int = 1,
-    shift: float = 0.2,
-    friction: tuple[float, ...] = (0.0, 0.5, math.inf),
+    dropout: float = 0.2, noise: float = 0.2, latency: int = 1, shift: float = 0.2, friction: Sequence[float] = FRICTION
 ) -> list[Case]:
     """The cases of a robustness report, the unperturbed one first; constants are multiplied by 1 -+ ``shift``."""
     percent = f"{100 * dropout:g}%"

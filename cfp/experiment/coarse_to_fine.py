@@ -74,15 +74,15 @@ class SACAlgorithm(Algorithm):
     @classmethod
     def warnings(cls, config: Any, folder: Path, first_stage: int) -> list[str]:
         """Stages that end before they act by their policy, or before they learn."""
-        lines, (starts, waits) = [], (config.learning.update_start, config.learning.actor_start)
+        lines = []
         for stage in range(first_stage, len(config.ends()) + 1):
-            steps, random = config.stage_steps(stage), cls.hyperparameters(config, stage, folder).random_steps
-            if steps <= random:
-                lines.append(f"stage {stage}: all its {steps:,} steps are random (--random-steps {random})")
-            elif steps <= starts:
-                lines.append(f"stage {stage}: no update in its {steps:,} steps (--update-start {starts})")
-            elif steps < waits:
-                lines.append(f"stage {stage}: no actor update in its {steps:,} steps (--actor-start {waits})")
+            steps, own = config.stage_steps(stage), cls.hyperparameters(config, stage, folder)
+            if steps <= own.random_steps:
+                lines.append(f"stage {stage}: all its {steps:,} steps are random (--random-steps {own.random_steps})")
+            elif steps <= own.update_start:
+                lines.append(f"stage {stage}: no update in its {steps:,} steps (--update-start {own.update_start})")
+            elif steps < own.actor_start:
+                lines.append(f"stage {stage}: no actor update in its {steps:,} steps (--actor-start {own.actor_start})")
         return lines
 
     def set_logger(self, logger: Logger) -> None:

@@ -28,10 +28,9 @@ class Chunk:
 
 
 class ReplayArchive:
-    """Copies of a replay buffer's rows in a folder.
+    """Copies of a replay buffer's rows in a folder; a crash at any moment leaves those that the last checkpoint needs.
 
-    A checkpoint names its chunks; a chunk is written before the checkpoint that names it and deleted after the first
-    one that does not, so that a crash at any moment leaves every chunk that the last checkpoint needs.
+    A chunk is written before the checkpoint that names it and deleted after the first one that does not.
     """
 
     def __init__(self, folder: Path, stage: int) -> None:

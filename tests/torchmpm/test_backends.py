@@ -45,10 +45,10 @@ def test_compiled_equals_eager() -> None:
 
 
 @pytest.fixture
-def fresh_process(monkeypatch: pytest.MonkeyPatch) -> None:
+def fresh_process() -> None:
     """As in a process that has not said or loaded anything yet."""
     backends.warn_eager.cache_clear()
-    monkeypatch.setattr(library, "_loaded", {})
+    library.build.cache_clear()
 
 
 @pytest.fixture

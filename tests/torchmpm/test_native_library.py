@@ -27,7 +27,7 @@ def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
 def forget() -> None:
     """As in the next process."""
     library._load.cache_clear()
-    library._loaded.clear()
+    library.build.cache_clear()
 
 
 def script(tmp_path: Path, body: str) -> str:

@@ -20,7 +20,7 @@ _INPUTS = "Tensor planes, Tensor? field, Tensor origin, Tensor gravity, Tensor v
 _NUMBERS = "int handle, int substeps"
 #: Derivatives in planes, field, origin and gravity, in their shapes, and in the values, (8, B, N): one column per
 #: particle. Those that are not wanted are empty.
-Bars = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+Bars = tuple[Tensor, ...]
 
 
 @torch.library.custom_op("torchmpm::native_step", mutates_args=(), schema=f"({_INPUTS}, {_NUMBERS}) -> Tensor")
@@ -99,21 +99,11 @@ def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 
 
 def _backward(ctx: Any, result_bar: Tensor) -> tuple[Tensor | None, ...]:
-    saved = ctx.saved_tensors
-    _, wants_field, wants_origin, wants_gravity, wants_values, *_ = ctx.needs_input_grad
-    planes_bar, field_bar, origin_bar, gravity_bar, values_bar = native_step_backward(
-        *saved, result_bar, ctx.handle, ctx.substeps, wants_field, wants_values
-    )
-    return (
-        planes_bar,
-        field_bar if wants_field else None,
-        origin_bar if wants_origin else None,
-        gravity_bar if wants_gravity else None,
-        _sum_shared(values_bar, saved[4], ctx.handle) if wants_values else None,
-        None,
-        None,
-        None,
-    )
+    saved, wanted = ctx.saved_tensors, ctx.needs_input_grad[:5]
+    wants_field, wants_values = wanted[1], wanted[4]
+    *bars, values_bar = native_step_backward(*saved, result_bar, ctx.handle, ctx.substeps, wants_field, wants_values)
+    bars.append(_sum_shared(values_bar, saved[4], ctx.handle) if wants_values else None)
+    return (*(bar if wants else None for bar, wants in zip(bars, wanted, strict=True)), None, None, None)
 
 
 def _sum_shared(bar: Tensor, values: Tensor, handle: int) -> Tensor:

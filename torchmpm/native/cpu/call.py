@@ -13,8 +13,8 @@ from torchmpm.native.cpu.library import POOL, load, thread_pool
 from torchmpm.native.tables import Inputs, Tables, tables_of
 
 _REAL = {torch.float32: "float", torch.float64: "double"}
-#: Scratch memory up to this size, bytes, is kept for the next call: fresh pages cost a third of a backward pass. It is
-#: enough for 190 substeps of 22,000 particles in single precision; longer steps are cut.
+#: Scratch memory up to this size, bytes, is kept for the next call, as fresh pages cost a third of a backward pass.
+#: It is enough for 190 substeps of 22,000 particles in single precision; longer steps are cut.
 KEPT_BYTES = 2**28
 _kept: list[Tensor] = []
 #: Derivatives that the adjoint writes.
@@ -35,7 +35,7 @@ class _Call(ctypes.Structure):
 
 
 def library_for(dtype: torch.dtype) -> ctypes.CDLL:
-    """The kernels for a dtype, see :func:`torchmpm.native.cpu.library.load`."""
+    """The kernels for a dtype."""
     return load(_REAL[dtype])
 
 

@@ -1,4 +1,4 @@
-// The C interface that torchmpm/native/library.py loads.
+// The C interface that torchmpm/native/cpu/library.py loads.
 #include <exception>
 #include <memory>
 
@@ -31,15 +31,15 @@ template <class Pass> bool run_batch(const Scene& scene, Shape shape, char* scra
     std::atomic<int64_t> next{0};
     return run_together(scene.call.pool, shape.team * shape.teams, [&](int index) {
         Work& own = *work[index / shape.team];
-        Member member{index % shape.team, shape.team, own.team};
+        Member member{index % shape.team, shape.team, own.barrier};
         Pass pass(scene, own, member);
         while (true) {
             if (member.rank == 0) own.element = next.fetch_add(1);
-            member.wait(false);
+            member.wait();
             const int64_t element = own.element;
             if (element >= scene.call.batch) return;
             pass.run(element);
-            member.wait(false);
+            member.wait();
         }
     });
 }

@@ -34,13 +34,10 @@ def forward(*arguments: Any) -> Tensor:
     return result
 
 
-def backward(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def backward(*arguments: Any) -> tuple[Tensor, ...]:
     """Adjoint of :func:`forward`; see :func:`torchmpm.native.operator.native_step_backward`."""
     *tensors, handle, substeps, wants_field, wants_values = arguments
-    planes_bar, field_bar, origin_bar, gravity_bar, values_bar = _run(
-        Backward, Inputs(*tensors), handle, substeps, wants_field, wants_values
-    )
-    return planes_bar, field_bar, origin_bar, gravity_bar, values_bar
+    return _run(Backward, Inputs(*tensors), handle, substeps, wants_field, wants_values)
 
 
 def _run(kind: type[Program], inputs: Inputs, handle: int, substeps: int, *wants: bool) -> tuple[Tensor, ...]:
@@ -66,4 +63,4 @@ def _run(kind: type[Program], inputs: Inputs, handle: int, substeps: int, *wants
 
 def _launched(program: Program) -> tuple[Tensor, ...]:
     program.run()
-    return program.results()
+    return program.results

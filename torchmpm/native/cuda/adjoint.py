@@ -122,13 +122,6 @@ def scatter_actuation(field_bar, i, j, fx, fy, act_x_bar, act_y_bar, on, resolut
 
 
 @triton.jit
-def subtract_sums(to, x, y):
-    """Subtract the sums over particles from two numbers."""
-    tl.atomic_add(to, -tl.sum(x, axis=0), sem="relaxed")
-    tl.atomic_add(to + 1, -tl.sum(y, axis=0), sem="relaxed")
-
-
-@triton.jit
 def add_values(to, stride, mass, factor, mu2, lam, s0, s1, s2, s3, mask):
     """Add derivatives in the eight values of particles."""
     add(to, mass, mask)
@@ -202,7 +195,8 @@ def finish_adjoint(
         field, i, j, act_x_bar, act_y_bar, resolution, MUSCLE,
     )  # fmt: skip
     fx_bar, fy_bar = tl.where(on, fx_bar * inverse_h, 0.0), tl.where(on, fy_bar * inverse_h, 0.0)
-    subtract_sums(origin_bar + 2 * element, fx_bar, fy_bar)
+    tl.atomic_add(origin_bar + 2 * element, -tl.sum(fx_bar, axis=0), sem="relaxed")
+    tl.atomic_add(origin_bar + 2 * element + 1, -tl.sum(fy_bar, axis=0), sem="relaxed")
     store_bars(
         bars + at, stride, x_bar + fx_bar, y_bar + fy_bar, mass * px_bar, mass * py_bar,
         d0, d1, d2, d3, e0_bar, e1_bar, e2_bar, e3_bar, new_Jp_bar, on,

@@ -157,7 +157,13 @@ def node_adjoint(
         code = tl.zeros([BLOCK], tl.int32)
         if SLOTS > 0:
             code = tl.load(codes + node, exists, other=0)
-        vx, vy, bar_x, bar_y = constrain_both(rules, code, vx, vy, bar_x, bar_y, SLOTS)
+        for slot in tl.static_range(SLOTS - 1, -1, -1):
+            before_x, before_y = vx, vy
+            for earlier in tl.static_range(slot):
+                before_x, before_y = constrain(rules, code, before_x, before_y, earlier)
+            bar_x, bar_y = constrain_adjoint(rules, code, before_x, before_y, bar_x, bar_y, slot)
+        for slot in tl.static_range(SLOTS):
+            vx, vy = constrain(rules, code, vx, vy, slot)
         damping, dt = tl.load(constants + DAMPING), tl.load(constants + DT)
         bar_x *= damping
         bar_y *= damping
@@ -173,28 +179,3 @@ def node_adjoint(
         tl.store(answer + 4, -(raw_x * bar_x + raw_y * bar_y), used)
         for r in tl.static_range(5):
             tl.store(at + r, tl.zeros_like(vx), used)
-
-
-@triton.jit
-def constrain_both(rules, code, vx, vy, bar_x, bar_y, SLOTS: tl.constexpr):
-    """Velocity that all rules leave, and the derivative in the one before them."""
-    ax, ay, bx, by, cx, cy, dx, dy = vx, vy, vx, vy, vx, vy, vx, vy  # before each of four slots
-    if SLOTS > 0:
-        vx, vy = constrain(rules, code, ax, ay, 0)
-    bx, by = vx, vy
-    if SLOTS > 1:
-        vx, vy = constrain(rules, code, bx, by, 1)
-    cx, cy = vx, vy
-    if SLOTS > 2:
-        vx, vy = constrain(rules, code, cx, cy, 2)
-    dx, dy = vx, vy
-    if SLOTS > 3:
-        vx, vy = constrain(rules, code, dx, dy, 3)
-        bar_x, bar_y = constrain_adjoint(rules, code, dx, dy, bar_x, bar_y, 3)
-    if SLOTS > 2:
-        bar_x, bar_y = constrain_adjoint(rules, code, cx, cy, bar_x, bar_y, 2)
-    if SLOTS > 1:
-        bar_x, bar_y = constrain_adjoint(rules, code, bx, by, bar_x, bar_y, 1)
-    if SLOTS > 0:
-        bar_x, bar_y = constrain_adjoint(rules, code, ax, ay, bar_x, bar_y, 0)
-    return vx, vy, bar_x, bar_y

@@ -33,12 +33,12 @@ class Program:
     particles, and tells the passes over the nodes where to read.
     """
 
+    results: tuple[Tensor, ...]  # buffers with what the last run has found
+
     def __init__(self, inputs: Inputs, tables: DeviceTables, substeps: int, numbers: int) -> None:
-        planes = inputs.planes
+        planes, self.width = inputs.planes, tables.width
         self.inputs, self.device_tables, self.tables, self.substeps = inputs, tables, tables.tables, substeps
-        self.batch, self.particles = planes.shape[1:]
-        self.width = tables.width
-        self.cells = self.width**2
+        self.batch, self.particles, self.cells = *planes.shape[1:], self.width**2
         self.sums = planes.new_zeros(self.batch * self.cells * numbers)
         self.boxes = torch.empty(substeps, self.batch, 4, dtype=torch.int32, device=planes.device)
         nodes = self.batch * self.cells if tables.slots else 1
@@ -46,10 +46,6 @@ class Program:
 
     def run(self) -> None:
         """Launch everything; allocates nothing."""
-        raise NotImplementedError
-
-    def results(self) -> tuple[Tensor, ...]:
-        """What the last run has found, in buffers of the program."""
         raise NotImplementedError
 
     def prepare(self) -> None:
@@ -103,16 +99,13 @@ class Forward(Program):
         super().__init__(inputs, tables, substeps, SUMS.value)
         self.state = torch.empty_like(inputs.planes)
         self.velocity = inputs.planes.new_empty(self.batch * self.cells * 2)
+        self.results = (self.state,)
 
     def run(self) -> None:
-        """Launch everything; allocates nothing."""
+        """Take all substeps."""
         self.state.copy_(self.inputs.planes)
         self.prepare()
         self.advance([self.state] * (self.substeps + 1), self.velocity, TAPE=False)
-
-    def results(self) -> tuple[Tensor, ...]:
-        """The planes of the new state."""
-        return (self.state,)
 
 
 class Backward(Program):
@@ -129,21 +122,21 @@ class Backward(Program):
         length = -(-planes.numel() // 4) * 4  # whole fours, see tables
         self.tape = planes.new_empty(substeps, length)[:, : planes.numel()].unflatten(1, planes.shape)
         self.answers = planes.new_empty(self.batch * self.cells * ADJOINT.value)
-        self.bars, self.origin_bar, self.gravity_bar = (
-            torch.empty_like(t) for t in (planes, inputs.origin, inputs.gravity)
-        )
+        self.bars, self.origin_bar = torch.empty_like(planes), torch.empty_like(inputs.origin)
+        self.gravity_bar = torch.empty_like(inputs.gravity)
         self.field_bar = nothing if inputs.field is None or not wants_field else torch.empty_like(inputs.field)
         self.values_bar = planes.new_empty(VALUES, *planes.shape[1:]) if wants_values else nothing.clone()
+        self.results = (self.bars, self.field_bar, self.origin_bar, self.gravity_bar, self.values_bar)
 
     def run(self) -> None:
-        """Launch everything; allocates nothing."""
+        """Take all substeps, then go back."""
         assert self.inputs.result_bar is not None
         self.prepare()
         self.tape[0].copy_(self.inputs.planes)
         self.advance(self.tape.unbind(), self.answers, TAPE=True)
         self.boxes.fill_(NOWHERE.value)
         self.bars.copy_(self.inputs.result_bar)
-        for bar in (self.field_bar, self.values_bar, self.origin_bar, self.gravity_bar):
+        for bar in self.results[1:]:
             bar.zero_()
         for s in range(self.substeps - 1, -1, -1):
             self.go_back(s)
@@ -156,7 +149,3 @@ class Backward(Program):
         buffers = (state, self.bars, self.values_bar, self.field_bar, self.origin_bar, self.answers)
         wants = {"WANT_FIELD": self.field_bar.numel() > 0, "WANT_VALUES": self.values_bar.numel() > 0}
         self.over_particles(finish_adjoint, *buffers, **wants)
-
-    def results(self) -> tuple[Tensor, ...]:
-        """Derivatives in planes, field, origin, gravity and values."""
-        return self.bars, self.field_bar, self.origin_bar, self.gravity_bar, self.values_bar

@@ -14,19 +14,8 @@ PAD = tl.constexpr(_PAD)
 NOWHERE = tl.constexpr(2**29)
 #: Sizes that kernels take; one compiled kernel serves all of them.
 SIZES = (
-    "particles",
-    "stride",
-    "first",
-    "count",
-    "blocks",
-    "column",
-    "columns",
-    "values_batch",
-    "resolution",
-    "width",
-    "programs",
-    "cells",
-    "rule_count",
+    *("particles", "stride", "first", "count", "blocks", "column", "columns", "values_batch"),
+    *("resolution", "width", "programs", "cells", "rule_count"),
 )
 
 
