@@ -103,7 +103,7 @@ def test_closed_gates_leave_the_coarsest_field(task):
         while hasattr(levels[0], "coarse"):
             levels.insert(0, levels[0].coarse)
         drawn = Sample(3 * torch.rand(2, 2, ladder[0], ladder[0]) - 1.5, torch.zeros(2), None)
-        levels[0].sample = lambda observation, deterministic, drawn=drawn: drawn  # some of the field is clipped
+        levels[0].sample = lambda *_, drawn=drawn: drawn  # some of the field is clipped
         with torch.no_grad():
             for stage, actor in enumerate(levels, 1):
                 env = make_torch_env(shut, shut.action_size(stage))
