@@ -60,19 +60,29 @@ class AnalyticNumbers:
         handover: Step at which stage 2 begins.
         action_step: Step on the actions in stages 1 and 2.
         on_speed: Trained on speed to the right instead of the task's reward.
+        num_envs: Robots side by side.
+        windows_kept: Latest windows that the regression draws from.
+        minibatches: Steps of the regression after each window.
+        minibatch_size: Images in each.
+        weight_average: Decay of the average of the actor's weights.
     """
 
     steps: int = 25_600
     handover: int = 19_200
-    action_step: tuple[float, float] = (0.1, 0.05)
+    action_step: tuple[float, float] = (0.1, 0.1)
     on_speed: bool = False
+    num_envs: int = 8
+    windows_kept: int = 40
+    minibatches: int = 48
+    minibatch_size: int = 128
+    weight_average: float = 0.995
 
 
 ANALYTIC: dict[str, AnalyticNumbers] = {
+    "shapematch": AnalyticNumbers(4_800, 3_200, (0.3, 0.3), False, 4, 8, 24, 64, 0.98),
     "run": AnalyticNumbers(on_speed=True),
     "obstacle": AnalyticNumbers(on_speed=True),
-    "kick": AnalyticNumbers(action_step=(0.15, 0.05)),
-    "shapematch": AnalyticNumbers(steps=6_400, handover=4_800),
+    "kick": AnalyticNumbers(action_step=(0.15, 0.15)),
 }
 """Those of the tasks that differ from the defaults of `AnalyticNumbers`."""
 
@@ -126,11 +136,15 @@ def analytic_preset(task: str, name: str = "quick") -> AnalyticConfig:
         resolutions=published.resolutions,
         gate_bias=published.gate_bias,
         action_step=own.action_step,
+        windows_kept=own.windows_kept,
+        minibatches=own.minibatches,
+        minibatch_size=own.minibatch_size,
+        weight_average=own.weight_average,
         displacement=not own.on_speed,
         reward=RewardConfig("speed" if own.on_speed else "task"),
-        environment=EnvironmentConfig(num_envs=8),
+        environment=EnvironmentConfig(num_envs=own.num_envs),
         network=published.network,
-        report=replace(published.report, eval_every=1_600, checkpoint_every=1_600, log_every=320),
+        report=replace(published.report, eval_every=own.steps // 12, checkpoint_every=own.steps // 12, log_every=320),
     )
 
 

@@ -108,24 +108,24 @@ def test_command_line_beats_file_beats_preset(tmp_path):
 
 def test_fewer_steps_shorten_every_level():
     config = sac_preset("run")
-    half = parse(PROGRAM, ["--task", "run", "--steps", str(config.steps // 2)]).run
+    half = parse(PROGRAM, ["--learner", "sac", "--task", "run", "--steps", str(config.steps // 2)]).run
     assert half.handover == (config.handover[0] // 2,)
-    explicit = parse(PROGRAM, ["--task", "run", "--steps", "1000", "--handover", "900"]).run
+    explicit = parse(PROGRAM, ["--learner", "sac", "--task", "run", "--steps", "1000", "--handover", "900"]).run
     assert explicit.handover == (900,)
 
 
 def test_another_number_of_levels_stretches_what_each_has_one_of():
-    five = parse(PROGRAM, "--resolutions 4 8 16 32 64 --steps 5000".split()).run
+    five = parse(PROGRAM, "--learner sac --resolutions 4 8 16 32 64 --steps 5000".split()).run
     assert five.handover == (1000, 2000, 3000, 4000)
     assert five.alpha == (0.005, 0.0, 0.0, 0.0, 0.0)
     assert five.gate_bias == (-2.0,) * 4 and five.gate_penalty == (0.8,) * 4
     assert five.random_steps == (480, 100, 100, 100, 100)
-    three = parse(PROGRAM, "--resolutions 4 8 16 --alpha 1 2 3 --handover 100 200".split()).run
+    three = parse(PROGRAM, "--learner sac --resolutions 4 8 16 --alpha 1 2 3 --handover 100 200".split()).run
     assert (three.alpha, three.handover) == ((1.0, 2.0, 3.0), (100, 200))
-    one = parse(PROGRAM, "--resolutions 16".split()).run
+    one = parse(PROGRAM, "--learner sac --resolutions 16".split()).run
     assert (one.handover, one.gate_bias, one.alpha) == ((), (), (0.005,))
     with pytest.raises(ConfigError, match="alpha must have 3 values"):
-        parse(PROGRAM, "--resolutions 4 8 16 --alpha 1 2 3 4".split())
+        parse(PROGRAM, "--learner sac --resolutions 4 8 16 --alpha 1 2 3 4".split())
 
 
 def test_matter_of_the_published_run_of_slot_can_be_chosen():
