@@ -92,7 +92,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
     @staticmethod
     def preset(task: str, name: str) -> AnalyticConfig:
         """Default options for a task, see `cfp.preset`."""
-        return analytic_preset(task, name)
+        return replace(analytic_preset(task, name), algo="analytic")
 
     @classmethod
     def create(cls, config: AnalyticConfig, stage: int, folder: Path, resumed: bool = False) -> AnalyticLearner:

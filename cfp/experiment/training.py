@@ -75,7 +75,6 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
     choice, _ = tyro.cli(_Choice, args=list(arguments), return_unknown_args=True, add_help=False, console_outputs=False)
     values = _values(choice)
     preset = program.configure({name: values[name] for name in _Choice.decisive if name in values})
-    base = program.configure(values)
 
     def read(defaults: RunConfig) -> Command:
         command = tyro.cli(
@@ -87,17 +86,17 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
             config=(tyro.conf.OmitArgPrefixes,),
         )
         # the command line may spell the name of the algorithm in another way
-        return command if choice.algo is None else replace(command, run=replace(command.run, algo=base.algo))
+        return command if choice.algo is None else replace(command, run=replace(command.run, algo=defaults.algo))
 
     if choice.resume:
-        folder = choice.out or Path("runs") / read(base).run.name
+        folder = choice.out or Path("runs") / read(program.configure(values)).run.name
         if (folder / "config.json").exists():
             past = read_config(folder, program.configure)
             # a value of the file that differs from the run's is refused later
             command = read(past if choice.config is None else update_from_dict(past, values))
             command.run.check()
             return replace(command, out=folder)
-    command = read(base)
+    command = read(program.configure(values))
     named = {word[2:].partition("=")[0].replace("-", "_") for word in arguments if word.startswith("--")}
     run = command.run.with_derived(preset, values.keys() | named)
     run.check()

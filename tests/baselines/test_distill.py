@@ -299,7 +299,7 @@ def test_privileged_policy_becomes_one_of_images_that_cfp_refines(privileged, tm
     std = policy.actor.std(torch.zeros(1, 32, 4, 4))
     assert torch.nn.functional.softplus(3 * std - 1).mean() == pytest.approx(0.105, abs=1e-3)
     options = "--steps 24 --handover 12 --batch-size 4 --update-start 8 --actor-start 6 --eval-every 12".split()
-    refined = [*TINY, *options, "--refine", "--start-from", str(folder)]
+    refined = [*TINY, *options, "--learner", "sac", "--refine", "--start-from", str(folder)]
     assert cfp.train.main([*refined, "--out", str(tmp_path / "refined")]) == 0
     first = read_table(tmp_path / "refined" / "evaluations.csv")[0]
     assert (first["step"], first["stage"]) == ("12", "2")
