@@ -68,10 +68,7 @@ def squashed_log_prob(noise: Tensor, std: Tensor, action: Tensor) -> Tensor:
 def sample_squashed_gaussian(
     mean: Tensor, raw_std: Tensor, deterministic: bool, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Sample tanh(m + s eps) with eps ~ N(0, I), or eps = 0 if ``deterministic``, and its log-density (B,).
-
-    m is the network output ``mean`` (B, ...) and s = clip(softplus(3 raw_std - 1), 0.1, 6).
-    """
+    """Sample tanh(mean + s eps) with s = clip(softplus(3 raw_std - 1), 0.1, 6), and its log-density (B,)."""
     std = F.softplus(3 * raw_std - 1).clamp(*STD_BOUNDS)
     noise = torch.zeros_like(mean)
     if not deterministic:

@@ -9,7 +9,7 @@ from cfp.agent.actor import Sample, build_actor
 from cfp.agent.networks import normalise_image, upsample
 from cfp.agent.spec import ActorSpec
 from cfp.envs.make import make_torch_env
-from cfp.presets import preset
+from cfp.presets import sac_preset
 from dittogym import TASKS, make_spec
 
 
@@ -92,7 +92,7 @@ def test_closed_gates_leave_the_coarsest_action(resolutions):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_closed_gates_leave_the_coarsest_field(task):
-    config = preset(task, "quick")
+    config = sac_preset(task, "quick")
     config = replace(config, environment=replace(config.environment, particles=100, substeps=1, num_envs=2))
     ladders = {config.resolutions, tuple(size for size in (4, 8, 16, 32, 64) if size <= make_spec(task).patch)}
     for ladder in ladders:
