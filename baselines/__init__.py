@@ -21,7 +21,7 @@ _MODULES = {
     "MPCConfig": "baselines.planning.mpc",
     "ModularConfig": "baselines.modular.train",
     "OpenLoop": "baselines.common.open_loop",
-    "SegmentPolicy": "baselines.modular.policy",
+    "SegmentPolicy": "baselines.modular.networks",
     "Shac": "baselines.shac.train",
     "ShacConfig": "baselines.shac.train",
     "StatePolicy": "baselines.shac.networks",

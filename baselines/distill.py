@@ -1,7 +1,5 @@
 """``python -m baselines.distill``: a policy of images learns from one that sees more; ``--algo distill`` by name."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """All algorithms and reference policies by name; their modules are imported when they are used."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -35,11 +33,7 @@ ALIASES = {name.replace("-", ""): name for name in ALGORITHMS if "-" in name}
 
 
 def find(name: str) -> type[Algorithm]:
-    """The class of an algorithm.
-
-    Raises:
-        ConfigError: There is none of that name.
-    """
+    """The class of an algorithm; a `ConfigError` if there is none of that name."""
     name = ALIASES.get(name, name) if isinstance(name, str) else str(name)
     if name in REFERENCE_POLICIES:
         raise ConfigError(
@@ -59,11 +53,7 @@ def sees(name: str) -> Sees:
 
 
 def configure(values: dict[str, Any]) -> RunConfig:
-    """Options from JSON values; what they leave out comes from the preset they name.
-
-    Raises:
-        ConfigError: An unknown name or a value of the wrong type.
-    """
+    """Options from JSON values, else from the preset they name; a `ConfigError` for a wrong name or type."""
     algo, task, preset = (
         values.get(name, default) for name, default in (("algo", "cfp"), ("task", "shapematch"), ("preset", "quick"))
     )

@@ -1,7 +1,5 @@
 """``python -m baselines.train --algo NAME``: train any algorithm, watch it, stop it, resume it."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 

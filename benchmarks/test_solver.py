@@ -1,8 +1,6 @@
 """Cost of a substep in the scene of RUN: a plastic robot with muscles on the floor, float32, 128x128 nodes."""
 
 import math
-import subprocess
-import sys
 from dataclasses import replace
 
 import pytest
@@ -80,31 +78,6 @@ def test_forward(per_substep, backend: str, batch: int, count: int, device: str)
         assert torchmpm.diagnostics.finite(end).all()
 
     per_substep(run, particles=batch * count, substeps=100, rounds=8)
-
-
-#: Processes that compete for the cores.
-BUSY = 3
-
-
-@needs_compiler
-def test_beside_other_programs(per_substep) -> None:
-    """A step of one simulation on all threads while other programs occupy the cores.
-
-    Without the scheduler in ``torchmpm/native/cpu/team.hpp`` the median was four times as long on two cores.
-    """
-    solver, state, actuation, origin = scene("native", 1, 22_000)
-
-    def run() -> None:
-        with torch.no_grad():
-            solver.step(state, actuation, substeps=100, origin=origin)
-
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(BUSY)]
-    try:
-        per_substep(run, particles=22_000, substeps=100, rounds=20)
-    finally:
-        for process in busy:
-            process.kill()
-            process.wait()
 
 
 @needs_compiler

@@ -27,10 +27,7 @@ EVALUATION_SEED = 10_000
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Options of a training run that every algorithm has.
-
-    A run consists of one or more stages, which are counted from 1.
-    """
+    """Options of a training run that every algorithm has; its stages are counted from 1."""
 
     task: str
     """Task; MODULE:NAME for a custom task that the module registers."""
@@ -97,7 +94,10 @@ class RunConfig:
             ConfigError: An option is wrong.
         """
         check_task(self.task)
-        _check_finite(self)
+        for name, value in flatten(to_json(self)).items():  # JSON files and command lines can contain NaN and infinity
+            for number in value if isinstance(value, tuple) else (value,):
+                if isinstance(number, float) and not math.isfinite(number):
+                    raise ConfigError(f"{name.split('.')[-1]} must be finite, got {value}")
         if not 0 <= self.seed <= LARGEST_SEED:
             raise ConfigError(f"seed must be between 0 and {LARGEST_SEED}, got {self.seed}")
         for option in dataclasses.fields(self):
@@ -136,7 +136,7 @@ class StagedConfig(RunConfig):
         return self.resolutions[stage - 1]
 
     def action_size(self, stage: int) -> int:
-        """Rows and columns of the actions that the environment of a stage takes, see `ActorSpec.patch`."""
+        """Rows and columns of the actions that the environment of a stage takes."""
         return self.actor_spec(stage).action_size
 
     def actor_spec(self, stage: int) -> ActorSpec:
@@ -151,10 +151,7 @@ class StagedConfig(RunConfig):
         )
 
     def with_derived(self, base: RunConfig, given: Collection[str]) -> RunConfig:
-        """Scale the handovers with the steps; for another number of stages, adjust the options with one value each.
-
-        Stages are then equally long, and additional ones take the last value of the preset.
-        """
+        """Scale the handovers with the steps; other numbers of stages are equally long, and repeat the last values."""
         assert isinstance(base, StagedConfig)
         stages, scale, changes = len(self.resolutions), self.steps / base.steps, dict[str, Any]()
         for name, count in self._counts().items():
@@ -182,9 +179,8 @@ class StagedConfig(RunConfig):
             if (found := len(getattr(self, name))) != count:
                 raise ConfigError(f"{name} must have {count} values for resolutions {self.resolutions}, got {found}")
         if any(end <= start for start, end in pairwise((0, *self.ends()))):
-            raise ConfigError(
-                f"handover must increase between 0 and the number of steps, {self.steps}, got {self.handover}"
-            )
+            allowed = f"increase between 0 and the number of steps, {self.steps}"
+            raise ConfigError(f"handover must {allowed}, got {self.handover}")
 
     def _counts(self) -> dict[str, int]:
         """Number of values of each option that has one for each stage or residual stage."""
@@ -231,8 +227,7 @@ class Config(StagedConfig):
         """Check what the types do not express."""
         super().check()
         for name in ("random_steps", "alpha", "gate_penalty"):
-            for value in getattr(self, name):
-                check_at_least(0, **{name: value})
+            check_at_least(0, **{name: min(getattr(self, name), default=0)})
         if self.learning.warm_critic and self.start_from is not None:
             raise ConfigError("warm_critic must be False with start_from, got True (a policy file has no critics)")
         if self.refine and self.start_from is None:
@@ -240,10 +235,7 @@ class Config(StagedConfig):
 
 
 def check_training_layouts(name: str, count: int, before: int = 0) -> None:
-    """Check that training uses no initial positions of evaluations; both are numbered from the run's seed.
-
-    The option ``name`` determines their number, ``count``; ``before`` others are used before them.
-    """
+    """Check that ``count`` initial positions, an option's value, after ``before`` others are none of evaluations."""
     if before + count > EVALUATION_SEED:
         largest = EVALUATION_SEED - before
         raise ConfigError(f"{name} must be at most {largest}, got {count}: later seeds belong to evaluations")
@@ -258,14 +250,3 @@ def check_task(task: object) -> None:
 def to_json(config: RunConfig) -> dict[str, Any]:
     """A configuration as plain JSON values."""
     return dataclasses.asdict(config)
-
-
-def _check_finite(options: Any) -> None:
-    """Refuse NaN and infinity, which JSON files and command lines can contain, in all sections."""
-    for option in dataclasses.fields(options):
-        value = getattr(options, option.name)
-        if dataclasses.is_dataclass(value):
-            _check_finite(value)
-        for number in value if isinstance(value, tuple) else (value,):
-            if isinstance(number, float) and not math.isfinite(number):
-                raise ConfigError(f"{option.name} must be finite, got {value}")

@@ -6,13 +6,10 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import tyro
 
-from cfp import train
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
 from cfp.errors import CheckpointError, ConfigError
@@ -24,12 +21,10 @@ from cfp.experiment.run import make_video
 from cfp.experiment.training import Program
 from cfp.from_dict import update_from_dict
 from cfp.policy_protocols import Policy
-from cfp.presets import from_json
 from cfp.sections import Particles
+from cfp.train import PROGRAM
 from cfp.validation import check_at_least
 from cfp.weights import policy_file
-
-PROGRAM = replace(train.PROGRAM, configure=partial(from_json, program="evaluate"))
 
 
 @dataclass(frozen=True)
@@ -52,13 +47,12 @@ class Selection:
     def open(self, program: Program) -> tuple[RunConfig, dict[str, Policy]]:
         """Options to evaluate with, and policies by stage, the newest last."""
         check_at_least(1, episodes=self.episodes)
-        if (self.folder is None) == (self.policy is None):
-            raise ConfigError(f"either policy or a folder must be given, got {self.policy!r} and {self.folder}")
-        if self.folder is not None:
+        if self.folder is not None and self.policy is None:
             config, policies = open_run(program, self.folder, self.device, self.seed)
-        else:
-            assert self.policy is not None
+        elif self.policy is not None and self.folder is None:
             config, policies = open_policy(program, self.policy, self.device, self.seed)
+        else:
+            raise ConfigError(f"either policy or a folder must be given, got {self.policy!r} and {self.folder}")
         if self.particles is not None and self.particles != config.environment.particles:
             config = replace(config, environment=config.environment.for_evaluation(self.particles))
             config.check()
@@ -91,9 +85,9 @@ def open_run(
     loaded = choose_device(device)
     policies = {name: program.load(path, loaded) for name, path in files.items()}
     for name, path in files.items():
-        about = policies[name].description
-        if about["stage"] > len(config.ends()):
-            raise CheckpointError(f"{path}: stage must be between 1 and {len(config.ends())}, got {about['stage']}")
+        about, stages = policies[name].description, len(config.ends())
+        if about["stage"] > stages:
+            raise CheckpointError(f"{path}: stage must be between 1 and {stages}, got {about['stage']}")
         given = f"{about['task']} on a grid of {about['resolution']}"
         allowed = f"{config.task} on a grid of {config.resolution(about['stage'])}"
         if given != allowed:
@@ -106,18 +100,13 @@ def open_policy(program: Program, path: str, device: str, seed: int | None) -> t
     policy = program.load(Path(path), choose_device(device))
     about = policy.description
     base = program.configure({"algo": about["kind"], "task": about["task"]})
-    stages = _stages(about)
+    network = about["network"] if isinstance(about.get("network"), dict) else {}
+    # in a custom task, the stages of the preset may not fit the networks
+    stages = {name: network[name] for name in ("resolutions", "gate_bias") if name in network}
     config = update_from_dict(base, {"environment": about["environment"], **stages}).with_derived(base, stages)
     config = replace(config, device=device, seed=about["seed"] if seed is None else seed)
     config.check()
     return config, {policy_file(path).stem: policy}
-
-
-def _stages(about: dict[str, Any]) -> dict[str, Any]:
-    """Options of the stages of a policy; in a custom task, those of the preset may not fit the networks."""
-    network = about.get("network")
-    known = network if isinstance(network, dict) else {}
-    return {name: known[name] for name in ("resolutions", "gate_bias") if name in known}
 
 
 def run(program: Program, command: Command) -> str:

@@ -1,7 +1,6 @@
 """The presets of the eight tasks.
 
-The numbers of the ``paper`` presets are those of the reference implementation's configuration files and of the
-paper's figures (Section 5 and Appendix B of DittoGym, ICLR 2024).
+Those of ``paper`` are from the reference's configuration files and the paper (DittoGym, ICLR 2024, 5 and Appendix B).
 """
 
 from __future__ import annotations
@@ -20,33 +19,19 @@ from cfp.sections import EnvironmentConfig, NetworkConfig, ReportConfig
 
 @dataclass(frozen=True)
 class TaskNumbers:
-    """Published hyperparameters of one task.
+    """Published hyperparameters of one task; pairs are those of stages 1 and 2."""
 
-    Attributes:
-        alpha: Temperature of stages 1 and 2.
-        gate_bias: Bias of the gate logit.
-        gate_penalty: Weight rho of the gate penalty.
-        steps: Environment steps plotted in the paper.
-        handover: Step at which the paper's curves change from stage 1 to stage 2.
-        seed: Seed of the published weights.
-        resolutions: Action grids of stages 1 and 2.
-        random_steps: Uniformly random steps of stages 1 and 2.
-        split: Separate encoders for observation and action, with a gate of at most 0.25.
-        variant: Material, where the published run changed it.
-        deterministic: Evaluation without action noise.
-    """
-
-    alpha: tuple[float, float]
+    alpha: tuple[float, float]  # temperature
     gate_bias: float
     gate_penalty: float
-    steps: int
-    handover: int
-    seed: int = 0
+    steps: int  # environment steps plotted in the paper
+    handover: int  # step at which the paper's curves change from stage 1 to stage 2
+    seed: int = 0  # of the published weights
     resolutions: tuple[int, int] = (8, 16)
     random_steps: tuple[int, int] = (6000, 100)
-    split: bool = False
-    variant: Literal["published"] | None = None
-    deterministic: bool = False
+    split: bool = False  # separate encoders for observation and action, with a gate of at most 0.25
+    variant: Literal["published"] | None = None  # material, where the published run changed it
+    deterministic: bool = False  # evaluation without action noise
 
 
 # For GROW and CATCH no stage-2 configuration was published; stage 1's values are used.
@@ -84,13 +69,12 @@ def preset(task: str, name: str = "quick") -> Config:
     allowed = typing.get_args(Preset) if task in TASKS else ("quick",)
     if name not in allowed:
         raise ConfigError(f"preset must be {' or '.join(allowed)} for {task}, got {name!r}")
-    numbers = TASKS[task] if task in TASKS else _custom_numbers(task)
+    if task in TASKS:
+        numbers = TASKS[task]
+    else:
+        spec = dittogym.make_spec(task)
+        numbers = replace(CUSTOM_TASK, resolutions=(spec.coarse, spec.fine))
     return _paper(task, numbers) if name == "paper" else _quick(task, numbers)
-
-
-def _custom_numbers(task: str) -> TaskNumbers:
-    spec = dittogym.make_spec(task)
-    return replace(CUSTOM_TASK, resolutions=(spec.coarse, spec.fine))
 
 
 def _paper(task: str, numbers: TaskNumbers) -> Config:
@@ -113,8 +97,9 @@ def _paper(task: str, numbers: TaskNumbers) -> Config:
 
 def _quick(task: str, numbers: TaskNumbers) -> Config:
     """Minutes instead of days: many small robots, small batches, a shorter horizon of credit."""
+    paper = _paper(task, numbers)
     return replace(
-        _paper(task, numbers),
+        paper,
         preset="quick",
         seed=0,
         steps=4_800,
@@ -122,7 +107,7 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
         random_steps=(480, 100),
         alpha=(0.5 * numbers.alpha[0], numbers.alpha[1]),
         environment=EnvironmentConfig(),
-        network=NetworkConfig("half_pixel", numbers.split, 0.25 if numbers.split else 1.0),
+        network=replace(paper.network, interpolation="half_pixel"),
         learning=LearningConfig(
             batch_size=64, learning_rate=1e-3, gamma=0.9, tau=0.01, buffer_size=20_000, gradient_steps=4
         ),
@@ -130,12 +115,10 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
     )
 
 
-def from_json(values: dict[str, Any], program: str = "train") -> Config:
-    """A configuration from JSON values; those that are left out come from the preset that the values name.
-
-    An error names the ``program`` of `baselines` that takes other algorithms.
-    """
+def from_json(values: dict[str, Any]) -> Config:
+    """A configuration from JSON values; those that are left out come from the preset that the values name."""
     if (algo := values.get("algo", "cfp")) != "cfp":
-        raise ConfigError(f"algo must be 'cfp', got {algo!r}; python -m baselines.{program} runs other algorithms")
+        programs = "python -m baselines.train, baselines.evaluate and baselines.robustness run other algorithms"
+        raise ConfigError(f"algo must be 'cfp', got {algo!r}; {programs}")
     base = preset(values.get("task", DEFAULT_TASK), values.get("preset", "quick"))
     return update_from_dict(base, values)

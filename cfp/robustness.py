@@ -5,17 +5,15 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import tyro
 from matplotlib.figure import Figure
 
-from cfp import train
 from cfp.config import RunConfig
-from cfp.envs.disturbances import Case, disturbed_env, make_cases, reason_without_effect
+from cfp.envs.disturbances import FRICTION, Case, disturbed_env, make_cases, reason_without_effect
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection
 from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
@@ -25,13 +23,12 @@ from cfp.experiment.cli import program_name, run_command
 from cfp.experiment.training import Program
 from cfp.files import write_json, write_text
 from cfp.policy_protocols import DisturbablePolicy, Policy
-from cfp.presets import from_json
 from cfp.tables import csv_text
+from cfp.train import PROGRAM
 from cfp.validation import check_at_least
 from dittogym import make_spec
 from dittogym.spec import TaskSpec
 
-PROGRAM = replace(train.PROGRAM, configure=partial(from_json, program="robustness"))
 COLUMNS = ("case", "episodes", "mean", "std", "interval", "ratio", "success")
 
 
@@ -52,7 +49,7 @@ class Command(Selection):
     """Control steps by which actions come late."""
     shift: float = 0.2
     """mu, yield stress and gravity are tried at 1 - shift and 1 + shift times their value."""
-    friction: tuple[float, ...] = (0.0, 0.5, math.inf)
+    friction: tuple[float, ...] = FRICTION
     """Coulomb coefficients of the floor; inf sticks. That of the task is left out."""
     cases: tuple[str, ...] = ()
     """Try only cases whose names hold one of these words, such as "dropout", beside the unperturbed one; all if not
@@ -72,24 +69,17 @@ class Command(Selection):
             raise ConfigError(f"friction must be at least 0 (inf sticks), got {self.friction}")
 
 
-def choose(cases: Sequence[Case], words: Sequence[str]) -> list[Case]:
-    """The first case, and those whose names hold one of the words; all cases without words."""
-    names = [case.name for case in cases[1:]]
+def choose(cases: Sequence[Case], words: Sequence[str], spec: TaskSpec, policy: Policy) -> list[Case]:
+    """The first case, and those whose names hold one of the words, if any; each word must choose one with an effect."""
+    reasons = {case.name: reason_without_effect(case, spec, policy.uses_image) for case in cases[1:]}
     for word in words:
-        if not any(word in name for name in names):
-            raise ConfigError(f"cases must be words of {', '.join(names)}, got {word!r}")
-    return [*cases[:1], *(case for case in cases[1:] if not words or any(word in case.name for word in words))]
-
-
-def check_words(cases: Sequence[Case], words: Sequence[str], spec: TaskSpec, policy: Policy) -> None:
-    """Check that each word chooses a case that changes something."""
-    for word in words:
-        reasons = {
-            case.name: reason_without_effect(case, spec, policy.uses_image) for case in cases[1:] if word in case.name
-        }
-        if all(reasons.values()):
-            explained = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
+        chosen = {name: reason for name, reason in reasons.items() if word in name}
+        if not chosen:
+            raise ConfigError(f"cases must be words of {', '.join(reasons)}, got {word!r}")
+        if all(chosen.values()):
+            explained = "; ".join(f"{name}: {reason}" for name, reason in chosen.items())
             raise ConfigError(f"cases must be words of cases that change something, got {word!r} ({explained})")
+    return [*cases[:1], *(case for case in cases[1:] if not words or any(word in case.name for word in words))]
 
 
 def report(
@@ -159,11 +149,10 @@ def run(program: Program, command: Command) -> str:
     """Evaluate all cases, write the files, and return the table."""
     command.check()
     cases = make_cases(command.dropout, command.noise, command.latency, command.shift, command.friction)
-    cases = choose(cases, command.cases)
     config, policies = command.open(program)
     policy, folder = list(policies.values())[-1], command.out or command.folder
     assert folder is not None
-    check_words(cases, command.cases, make_spec(config.task, **config.environment.task_options()), policy)
+    cases = choose(cases, command.cases, make_spec(config.task, **config.environment.task_options()), policy)
     folder.mkdir(parents=True, exist_ok=True)
     results = report(config, policy, cases, command.episodes)
     rows, path = to_rows(results), folder / "robustness"

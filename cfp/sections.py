@@ -56,10 +56,7 @@ class EnvironmentConfig:
         return replace(self, particles=particles, parity="clean", action_layout=self.action_indexing)
 
     def for_evaluation(self, particles: Particles) -> EnvironmentConfig:
-        """These options with other particles: unchanged otherwise at full size, else as `for_training`.
-
-        With the reference's parity fewer particles would make a lighter, softer and fainter robot.
-        """
+        """These options with other particles; if few, without the reference's faults, which make the robot lighter."""
         return replace(self, particles=particles) if particles == "full" else self.for_training(particles)
 
     def check(self) -> None:

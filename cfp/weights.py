@@ -78,11 +78,7 @@ def describe(config: Config, stage: int, steps: int) -> dict[str, Any]:
 
 
 def write_policy(path: Path, tensors: Mapping[str, Tensor], description: dict[str, Any]) -> None:
-    """Write a policy of any kind, with the description of `describe_run` and further entries that its kind needs.
-
-    The weights file contains the description too, so that the two cannot disagree; the JSON file beside it is for
-    readers.
-    """
+    """Write a policy of any kind: weights with the description, `describe_run`'s and more, and JSON for readers."""
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     content = safetensors.torch.save(plain, {FORMAT: json.dumps(description)})
     write_atomically(path, lambda file: file.write(content))
@@ -166,10 +162,8 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
         device: Device of its tensors.
 
     Returns:
-        A policy with stable-baselines3's ``predict(observation, deterministic=...)``, which takes uint8 (3, 64, 64) or
-        (B, 3, 64, 64) and returns float32 (2, A, A) or (B, 2, A, A). ``policy.resolution`` is A, for
-        ``gymnasium.make(..., resolution=...)``, see `ActorSpec.action_size`. ``policy.description`` holds the task and
-        the options of its training.
+        A policy with stable-baselines3's ``predict``. ``policy.resolution`` is for ``gymnasium.make(...,
+        resolution=...)``; ``policy.description`` holds the task and the options of its training.
 
     Raises:
         CheckpointError: The file is missing, damaged, or not such a policy.

@@ -6,12 +6,13 @@ task.
 
 from dittogym.contract import Outcome
 from dittogym.env import Env
-from dittogym.registration import register, register_all
+from dittogym.registration import register
 from dittogym.spec import TaskSpec
 from dittogym.tasks import TASKS, make_spec
 from dittogym.torch_env import TorchEnv
 from dittogym.vector import BatchEnv
 
-register_all()
+for _task, _make in list(TASKS.items()):
+    register(_task, _make)
 
 __all__ = ["TASKS", "BatchEnv", "Env", "Outcome", "TaskSpec", "TorchEnv", "make_spec", "register"]

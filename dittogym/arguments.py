@@ -49,9 +49,9 @@ def find_device(device: str | torch.device) -> torch.device:
     """The device that the option ``device`` names."""
     try:
         found = torch.device(device)
-    except (TypeError, RuntimeError) as error:
-        raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}") from error
-    if found.type not in ("cpu", "cuda"):
+    except (TypeError, RuntimeError):
+        found = None
+    if found is None or found.type not in ("cpu", "cuda"):
         raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
     count = torch.cuda.device_count() if found.type == "cuda" else 1
     if (found.index or 0) >= count:

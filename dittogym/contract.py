@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from dittogym.rewards import RewardOps
+from dittogym.reward_ops import RewardOps
 from torchmpm import ParticleState
 
 #: Terms that the engine adds to those of a task.
@@ -22,9 +22,9 @@ class Measurement(NamedTuple):
 
     Attributes:
         com: (B, 2) mean position of the robot's particles in the world, m.
-        velocity: (B, 2) mean velocity of the robot's particles, m/s.
+        velocity: (B, 2) their mean velocity, m/s.
         split: (B,) spread of the robot, sqrt(Var x + Var y), m.
-        object_com: (B, 2) mean position of the object's particles; ``None`` in tasks without an object.
+        object_com: (B, 2) mean position of the object's particles, m; ``None`` in tasks without an object.
         object_velocity: (B, 2) their mean velocity, m/s.
     """
 
@@ -56,10 +56,9 @@ class Moment(NamedTuple):
         num_robot_particles: The robot's particles come first.
         now: Averages after the step.
         start: Averages right after the reset.
-        observation: (B, 3, 64, 64) uint8; the floating point image of
-            :func:`dittogym.core.soft_observation` where a smooth reward is wanted.
+        observation: (B, 3, 64, 64) uint8, or for a smooth reward that of :func:`dittogym.core.soft_observation`.
         memory: What the task remembers, tensors with a leading B.
-        ops: Operations that have a smooth form, see :class:`dittogym.rewards.RewardOps`.
+        ops: Operations that have a smooth form, see :class:`dittogym.reward_ops.RewardOps`.
     """
 
     particles: ParticleState
@@ -122,10 +121,7 @@ def check_memory(task: str, memory: object, stale: tuple[str, ...], batch: int) 
 def check_outcome(
     task: str, outcome: object, memory: Memory, weights: Mapping[str, float], batch: int, checked: set[tuple[Any, ...]]
 ) -> None:
-    """Refuse what a task must not return as the outcome of a step.
-
-    Types and shapes are checked when names appear for the first time, not in every step.
-    """
+    """Refuse what a task must not return from a step; shapes are checked when names appear for the first time."""
     who = f"reward_fn of task {task!r}"
     if not isinstance(outcome, Outcome):
         raise TypeError(f"{who} must return an Outcome, got {type(outcome).__name__}")

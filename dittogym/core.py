@@ -13,7 +13,7 @@ from dittogym.action import patch_field, place
 from dittogym.contract import Measurement, Moment, Outcome, check_memory, check_outcome, measure
 from dittogym.model import EnvState, Model
 from dittogym.physics import Physics
-from dittogym.rewards import EXACT, SMOOTH, RewardOps, action_cost
+from dittogym.reward_ops import EXACT, SMOOTH, RewardOps, action_cost
 from dittogym.window import centre_in_window, contains
 from torchmpm import ParticleState, diagnostics, tree
 
@@ -22,7 +22,7 @@ FAILURE_REWARD = -16.0
 
 
 class StepResult(NamedTuple):
-    """What a control step comes to; leading B throughout.
+    """What a control step comes to.
 
     Attributes:
         state: The next state.
@@ -31,7 +31,7 @@ class StepResult(NamedTuple):
         terms: Weighted reward terms by name, (B,) each.
         terminated: (B,) bool.
         success: (B,) bool; ``None`` where the task does not define it.
-        info: ``com``, ``split``, ``finite``, ``object_com`` where there is an object, and the task's own quantities.
+        info: ``com``, ``split``, ``finite``, ``object_com`` where there is an object, and the task's own; leading B.
         true_reward: (B,) the task's reward; ``reward`` unless that is smooth.
         actuation: (B, 2, P, P) on the patch, Pa.
         soft_observation: (B, 3, 64, 64) of :func:`soft_observation`; ``None`` unless the reward is smooth.
@@ -59,10 +59,6 @@ def reset(model: Model, positions: Tensor, physics: Physics | None = None) -> tu
 
     Returns:
         State and observation (B, 3, 64, 64) uint8.
-
-    Raises:
-        ValueError: What the task remembers cannot be kept, see :func:`dittogym.contract.check_memory`.
-        TypeError: The same.
     """
     spec, particles = model.spec, ParticleState.at_rest(positions)
     start = measure(particles, model.num_robot_particles)
@@ -82,10 +78,6 @@ def step(model: Model, state: EnvState, action: Tensor, *, soft: bool = False) -
         state: The present state.
         action: (B, 2, R, R) in grid indexing, see :func:`dittogym.action.to_grid_indexing`.
         soft: Whether the reward is the smooth one, for gradients; all else is as without.
-
-    Raises:
-        ValueError: As in :func:`evaluate`.
-        TypeError: As in :func:`evaluate`.
     """
     return evaluate(model, *transition(model, state, action), soft=soft)
 
@@ -103,42 +95,30 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
     Returns:
         The next state, and the actuation on the patch (B, 2, P, P) in Pa.
     """
-    guard = _GradientGuard()
-    if torch.is_grad_enabled():
-        guarded, action = tree.map(guard, state), guard(action)
-        state = guarded if guard.used else state  # without a copy of its planes
+    finite: list[Tensor] = []  # where gradients may go back, known after the step
+
+    def guard(value: Tensor) -> Tensor:
+        """Stop gradients of what is not finite, as NaN would reach all through what they share."""
+        if value.requires_grad:
+            value = value.view_as(value)
+            value.register_hook(lambda gradient: tree.where(finite[0], gradient, torch.zeros_like(gradient)))
+        return value
+
+    guarded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tree.leaves((state, action)))
+    if guarded:
+        state, action = tree.map(guard, (state, action))
     spec, solver = model.spec, model.solver_for(state.physics)
     actuation = patch_field(action, spec.patch, state.physics.get("max_actuation", spec.max_actuation))
     on_nodes = place(actuation, centre_in_window(spec.reach, state.centre, state.origin), solver.grid.resolution)
     particles = solver.step(
         state.particles, on_nodes, substeps=model.substeps, origin=state.origin, segment=model.segment
     )
-    if guard.used:
-        guard.finite = diagnostics.finite(particles)
+    if guarded:
+        finite.append(diagnostics.finite(particles))
     com = particles.x[:, : model.num_robot_particles].mean(1)
     com = torch.where(torch.isfinite(com).all(-1, keepdim=True), com, state.centre)  # the last that was finite
     origin = spec.window.origin(com) if spec.window.moves else state.origin
     return replace(state, particles=particles, origin=origin, centre=com, steps=state.steps + 1), actuation
-
-
-class _GradientGuard:
-    """Stops gradients of elements that are not finite after a step: NaN would reach all through what they share."""
-
-    def __init__(self) -> None:
-        self.used = False
-        self.finite: Tensor | None = None
-
-    def __call__(self, value: Tensor) -> Tensor:
-        """``value`` (B, ...), through which only gradients of finite elements go back."""
-        if not value.requires_grad:
-            return value
-        self.used = True
-        view = value.view_as(value)
-        view.register_hook(self._stop)
-        return view
-
-    def _stop(self, gradient: Tensor) -> Tensor:
-        return gradient if self.finite is None else tree.where(self.finite, gradient, torch.zeros_like(gradient))
 
 
 def observe(model: Model, state: EnvState) -> Tensor:
@@ -154,19 +134,13 @@ def soft_observation(model: Model, state: EnvState) -> Tensor:
 def evaluate(model: Model, state: EnvState, actuation: Tensor, *, soft: bool = False) -> StepResult:
     """Observation, reward, termination and success after a transition.
 
-    Elements whose state is not valid, see :func:`is_valid`, end with the single term ``failure`` =
-    :data:`FAILURE_REWARD`; their neighbours are not touched.
+    Elements whose state is not valid, see :func:`is_valid`, end with the term ``failure`` = :data:`FAILURE_REWARD`.
 
     Args:
         model: The task.
         state: After the transition.
         actuation: (B, 2, P, P) on the patch, Pa.
-        soft: Whether the reward is the smooth one.
-
-    Raises:
-        ValueError: The task returns what it must not, see :func:`dittogym.contract.check_outcome`, or a term that is
-            not finite although the simulation is.
-        TypeError: The task returns something else.
+        soft: As in :func:`step`.
     """
     spec, observation = model.spec, observe(model, state)
     now = measure(state.particles, model.num_robot_particles)
@@ -182,25 +156,16 @@ def evaluate(model: Model, state: EnvState, actuation: Tensor, *, soft: bool = F
     if spec.split_limit is not None:
         terminated = terminated | (now.split > spec.split_limit)
     if outcome.memory is not None:  # a copy: it may hold what info does
-        state = replace(state, memory={name: value.clone() for name, value in outcome.memory.items()})
-    return StepResult(
-        state=state,
-        observation=observation,
-        reward=reward,
-        terms=terms,
-        terminated=terminated,
-        success=None if outcome.success is None else outcome.success & valid,
-        info=info | dict(outcome.info or {}),
-        true_reward=true_reward,
-        actuation=actuation,
-        soft_observation=image,
-    )
+        state = replace(state, memory=tree.map(Tensor.clone, dict(outcome.memory)))
+    success = None if outcome.success is None else outcome.success & valid
+    info |= outcome.info or {}
+    return StepResult(state, observation, reward, terms, terminated, success, info, true_reward, actuation, image)
 
 
 def measured_info(model: Model, state: EnvState, now: Measurement) -> dict[str, Tensor]:
     """What ``info`` holds in every task, by name, of a state and its averages ``now``."""
-    info = {"com": now.com, "split": now.split, "finite": is_valid(model, state)}
-    return info if now.object_com is None else {**info, "object_com": now.object_com}
+    info = {"com": now.com, "split": now.split, "finite": is_valid(model, state), "object_com": now.object_com}
+    return {name: value for name, value in info.items() if value is not None}
 
 
 def is_valid(model: Model, state: EnvState) -> Tensor:
@@ -237,7 +202,5 @@ def _check_finite(task: str, names: list[str], values: Tensor, valid: Tensor) ->
     wrong = ~torch.isfinite(values.detach()) & valid
     if bool(wrong.any()):
         term, element = wrong.nonzero()[0].tolist()
-        raise ValueError(
-            f"reward_fn of task {task!r} must return finite terms where the simulation is finite, "
-            f"got {values[term, element].item()} for {names[term]!r} in simulation {element}"
-        )
+        found = f"{values[term, element].item()} for {names[term]!r} in simulation {element}"
+        raise ValueError(f"reward_fn of task {task!r} must return finite terms in finite simulations, got {found}")

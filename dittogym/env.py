@@ -21,10 +21,8 @@ RENDER_FPS = 30
 
 def spaces(env: TorchEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     """Observation and action space of one simulation."""
-    return (
-        gymnasium.spaces.Box(0, 255, env.observation_shape, np.uint8),
-        gymnasium.spaces.Box(-1.0, 1.0, env.action_shape, np.float32),
-    )
+    observation = gymnasium.spaces.Box(0, 255, env.observation_shape, np.uint8)
+    return observation, gymnasium.spaces.Box(-1.0, 1.0, env.action_shape, np.float32)
 
 
 def as_tensor(action: Any, env: TorchEnv, single: bool = False) -> torch.Tensor:
@@ -42,33 +40,24 @@ def as_tensor(action: Any, env: TorchEnv, single: bool = False) -> torch.Tensor:
     return torch.from_numpy(array).to(env.device)
 
 
-def as_image(observation: torch.Tensor) -> np.ndarray:
-    """A copy, which the user may write to."""
-    image: np.ndarray = observation.cpu().numpy().copy()
-    return image
+def as_numpy(value: Any) -> Any:
+    """Copies of a tensor, or of all in an ``info``, as arrays, which the user may write to."""
+    if isinstance(value, dict):
+        return {name: as_numpy(entry) for name, entry in value.items()}
+    return value.detach().cpu().numpy().copy()
 
 
-def as_numpy(info: dict[str, Any]) -> dict[str, Any]:
-    """Copies of the tensors of an ``info`` as arrays, nested dictionaries included."""
-    return {k: as_numpy(v) if isinstance(v, dict) else v.detach().cpu().numpy().copy() for k, v in info.items()}
-
-
-def element(info: dict[str, Any], index: int) -> dict[str, Any]:
-    """One element of an ``info`` of arrays; numbers come out as Python numbers."""
-
-    def pick(value: Any) -> Any:
-        if isinstance(value, dict):
-            return element(value, index)
-        return value[index].item() if value[index].ndim == 0 else value[index]
-
-    return {name: pick(value) for name, value in info.items()}
+def first(value: Any) -> Any:
+    """The first element of an array, or of all in an ``info``; numbers come out as Python numbers."""
+    if isinstance(value, dict):
+        return {name: first(entry) for name, entry in value.items()}
+    return value[0].item() if value[0].ndim == 0 else value[0]
 
 
 class Env(gymnasium.Env[np.ndarray, np.ndarray]):
     """One simulation behind the Gymnasium interface.
 
-    Made by :func:`gymnasium.make` it leaves the time limit to Gymnasium's wrapper; made directly it truncates by
-    itself, at the task's horizon.
+    Made by :func:`gymnasium.make` it leaves the time limit to Gymnasium's wrapper; made directly it truncates itself.
 
     Args:
         task: Task name or specification.
@@ -90,10 +79,8 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be None or one of {RENDER_MODES}, got {render_mode!r}")
         if "num_envs" in options:
-            raise TypeError(
-                f"num_envs must not be given for a single environment, got {options['num_envs']!r}; for a batch use "
-                "gymnasium.make_vec(..., vectorization_mode='vector_entry_point') or dittogym.TorchEnv"
-            )
+            batch = "gymnasium.make_vec(..., vectorization_mode='vector_entry_point') or dittogym.TorchEnv"
+            raise TypeError(f"num_envs must not be given, got {options['num_envs']!r}; for a batch use {batch}")
         self.torch_env = TorchEnv(task, 1, **options)
         self._own_limit = self.torch_env.spec.horizon != make_spec(task).horizon
         self.observation_space, self.action_space = spaces(self.torch_env)
@@ -112,7 +99,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start a new episode; see :meth:`dittogym.TorchEnv.reset`.
+        """Start a new episode, with the arguments of :meth:`dittogym.TorchEnv.reset`.
 
         Args:
             seed: Draws new positions.
@@ -125,7 +112,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         with torch.no_grad():
             observation, info = self.torch_env.reset(seed=seed, options=options)
         self._show()
-        return as_image(observation)[0], element(as_numpy(info), 0)
+        return first(as_numpy(observation)), first(as_numpy(info))
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance by one control step; see :meth:`dittogym.TorchEnv.step`.
@@ -141,7 +128,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
             observation, reward, terminated, truncated, info = self.torch_env.step(batch)
         self._show()
         limit = bool(truncated[0]) and (self.spec is None or self._own_limit)  # else Gymnasium's TimeLimit truncates
-        return as_image(observation)[0], float(reward[0]), bool(terminated[0]), limit, element(as_numpy(info), 0)
+        return first(as_numpy(observation)), float(reward[0]), bool(terminated[0]), limit, first(as_numpy(info))
 
     def save(self) -> Snapshot:
         """The present moment, to return to with :meth:`load`; see :meth:`dittogym.TorchEnv.save`."""
@@ -149,7 +136,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def load(self, snapshot: Snapshot) -> np.ndarray:
         """Continue from a saved moment, see :meth:`dittogym.TorchEnv.load`; returns its image (3, 64, 64) uint8."""
-        return as_image(self.torch_env.load(snapshot))[0]
+        return first(as_numpy(self.torch_env.load(snapshot)))
 
     def render(self) -> np.ndarray | None:
         """The picture (512, 512, 3) uint8 in mode ``"rgb_array"``, else nothing."""

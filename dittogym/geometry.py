@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from math import inf, isinf
 
 from dittogym.observation.image import RASTER
 from torchmpm import VelocityRule, checks
@@ -14,53 +14,36 @@ from torchmpm.boundary import Range
 NODES = 128
 #: Top of the floor in nodes; the surface lies between this node and the next.
 FLOOR_NODE = 19
-#: Half the width of the mark of a goal: ten fine pixels of the observation's raster, m.
-MARK = 10 / RASTER
 
 
 @dataclass(frozen=True)
 class Box:
-    """Axis-aligned box in the world, m; an infinite bound leaves a side open.
+    """Axis-aligned box in the world, m; an infinite bound leaves a side open, ``closed`` includes the bounds."""
 
-    Its bounds belong to it if it is ``closed``.
-    """
-
-    left: float = -math.inf
-    right: float = math.inf
-    bottom: float = -math.inf
-    top: float = math.inf
+    left: float = -inf
+    right: float = inf
+    bottom: float = -inf
+    top: float = inf
     closed: bool = False
 
-    @property
-    def ground(self) -> bool:
-        """Whether it holds everything below some height."""
-        return (self.left, self.right, self.bottom) == (-math.inf, math.inf, -math.inf) and self.top < math.inf
 
-
-def nodes(
-    left: float = -math.inf,
-    right: float = math.inf,
-    bottom: float = -math.inf,
-    top: float = math.inf,
-    *,
-    closed: bool = False,
-) -> Box:
+def nodes(left: float = -inf, right: float = inf, bottom: float = -inf, top: float = inf, closed: bool = False) -> Box:
     """A box whose bounds are counted in nodes from the world's origin."""
     return Box(left / NODES, right / NODES, bottom / NODES, top / NODES, closed)
 
 
 def mark(point: tuple[float, float]) -> Box:
     """What the observation shows of a goal: fine pixels less than ten away in both directions."""
-    x, y = point
-    return Box(x - MARK, x + MARK, y - MARK, y + MARK)
+    (x, y), half = point, 10 / RASTER
+    return Box(x - half, x + half, y - half, y + half)
 
 
 @dataclass(frozen=True)
 class Obstacle:
     """Something that does not move.
 
-    One list of boxes says where it is: matter cannot enter them, the robot sees them, and a person sees them in
-    :meth:`dittogym.TorchEnv.render`. Where matter or the robot meet something else, ``rules`` and ``observed`` say so.
+    Matter cannot enter its boxes, the robot sees them, and so does a person in :meth:`dittogym.TorchEnv.render`. Where
+    matter or the robot meet something else, ``rules`` and ``observed`` say so.
 
     Attributes:
         name: For messages and docs.
@@ -68,12 +51,7 @@ class Obstacle:
         friction: Coulomb coefficient of their faces; ``math.inf`` sticks.
         rules: What it does to matter instead of what follows from the boxes; of several rules for one direction on a
             node the first in the task's list counts.
-        observed: The boxes that the robot sees instead: their pixels are set in the occupancy channel. Some obstacles
-            of the reference implementation are invisible to the robot, ``()``.
-
-    Raises:
-        ValueError: A box has edges between nodes, or is so thin that its faces would overlap.
-        TypeError: A field is something else; a single rule or box needs its comma too, ``(rule,)``.
+        observed: The boxes that the robot sees instead, in the occupancy channel; ``()``: it is invisible.
     """
 
     name: str
@@ -109,10 +87,10 @@ class Obstacle:
 
 def _faces(box: Box, friction: float) -> Iterator[VelocityRule]:
     """One-sided faces, two nodes deep, on the sides of a box that are not open."""
-    ends = [None if math.isinf(edge) else edge * NODES for edge in (box.left, box.right, box.bottom, box.top)]
-    if any(end is not None and end != round(end) for end in ends):
+    edges = [edge * NODES for edge in (box.left, box.right, box.bottom, box.top)]
+    if any(edge % 1 for edge in edges if not isinf(edge)):
         raise ValueError(f"boxes must have edges at multiples of 1/{NODES} m unless rules are given, got {box}")
-    left, right, bottom, top = (None if end is None else round(end) for end in ends)
+    left, right, bottom, top = (None if isinf(edge) else round(edge) for edge in edges)
     i, j = (left, right), (bottom, top)
     for low, high in (i, j):
         if low is not None and high is not None and high - low < 3:
@@ -127,25 +105,21 @@ def _faces(box: Box, friction: float) -> Iterator[VelocityRule]:
         yield VelocityRule("-y", i, (top - 1, top), friction=friction)
 
 
-def floor(friction: float = math.inf) -> Obstacle:
+def floor(friction: float = inf) -> Obstacle:
     """Ground up to node 19; sticky by default, as published (the reference's Coulomb branch never acts)."""
     rule = VelocityRule("-y", j=(None, FLOOR_NODE), friction=friction)
     return Obstacle("floor", (nodes(top=FLOOR_NODE + 1),), rules=(rule,), observed=())
 
 
 def ceiling(node: int) -> Obstacle:
-    """Upper end of the world: from this node on, nothing rises.
-
-    Raises:
-        ValueError: The node is not a whole number.
-    """
+    """Upper end of the world: from this node on, nothing rises."""
     checks.whole("node", node, 0)
     return Obstacle("ceiling", (nodes(bottom=node),), rules=(VelocityRule("+y", j=(node, None)),), observed=())
 
 
 def side_walls(top: int | None) -> Obstacle:
     """Invisible walls at both ends of a fixed window that reaches from -0.5 m to 0.5 m, up to this node."""
-    height = math.inf if top is None else top
+    height = inf if top is None else top
     boxes = (nodes(32, 34, top=height), nodes(-34, -32, top=height))
     rules = (VelocityRule("+x", (32, 34), (None, top)), VelocityRule("-x", (-34, -32), (None, top)))
     return Obstacle("side walls", boxes, rules=rules, observed=())
@@ -159,17 +133,15 @@ def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True, fric
         i: Inclusive range of world node indices in x.
         j: Inclusive range of world node indices in y; ``None`` leaves an end open.
         visible: Whether the robot sees it.
-        friction: Coulomb coefficient of its faces. Matter slips on them unless it is given; ``math.inf`` sticks, as the
-            floor does.
+        friction: Coulomb coefficient of its faces; ``math.inf`` sticks, as the floor does.
 
     Raises:
-        ValueError: A range is not two node indices, the friction is negative, or the box is narrower than four nodes,
-            so that its faces would overlap.
+        ValueError: A range is not two node indices, the friction is negative, or the box is narrower than four nodes.
     """
     for axis, given in (("i", i), ("j", j)):
         kinds = {int} if axis == "i" else {int, type(None)}
         if not isinstance(given, tuple) or len(given) != 2 or not {type(end) for end in given} <= kinds:
             raise ValueError(f"{axis} must be a range (low, high) of node indices, got {given!r}")
     low, high = j
-    box = nodes(*i, -math.inf if low is None else low, math.inf if high is None else high)
+    box = nodes(*i, -inf if low is None else low, inf if high is None else high)
     return Obstacle(name, (box,), friction, observed=None if visible else ())

@@ -9,7 +9,6 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from dittogym.action import ActionIndexing
 from dittogym.contract import Measurement
 from dittogym.observation.camera import Camera
 from dittogym.physics import Physics, part_of
@@ -18,32 +17,8 @@ from dittogym.window import GRID
 from torchmpm import Body, Elastic, ParticleState, Solver, VonMises, tree
 from torchmpm.rollout import Segment
 
-
-@dataclass(frozen=True)
-class Parity:
-    """Which behaviours of the reference implementation are brought back.
-
-    Attributes:
-        action_indexing: How actions are indexed unless the user says.
-        stale_reset: Whether a reset keeps the last observation, action centre and ``TaskSpec.stale_memory``.
-        unit_volume: Whether a particle keeps its full-size mass and volume at every particle count.
-        random_positions: Whether initial positions are random, not evenly spread, at every particle count.
-        pixel_raster: Whether observations use the pixel raster at every particle count.
-    """
-
-    action_indexing: ActionIndexing = "image"
-    stale_reset: bool = False
-    unit_volume: bool = False
-    random_positions: bool = False
-    pixel_raster: bool = False
-
-
-ParityName = Literal["clean", "reference"]
-#: The choices of the option ``parity``.
-PARITIES: Mapping[str, Parity] = {
-    "clean": Parity(),
-    "reference": Parity("grid", stale_reset=True, unit_volume=True, random_positions=True, pixel_raster=True),
-}
+#: The option ``parity``: with ``"reference"`` the behaviours of the reference implementation are brought back.
+Parity = Literal["clean", "reference"]
 
 
 @tree.register
@@ -78,7 +53,7 @@ class Snapshot:
         task: Name of the task.
         counts: Particles of each body.
         particle_weight: By body, the full-size particles that one particle stands for.
-        state: Everything that moves, leading B.
+        state: Everything that moves.
         observation: (B, 3, 64, 64) uint8.
     """
 
@@ -87,12 +62,6 @@ class Snapshot:
     particle_weight: tuple[float, ...]
     state: EnvState
     observation: Tensor
-
-    @property
-    def kind(self) -> tuple[object, ...]:
-        """What an environment must have in common with it."""
-        x = self.state.particles.x
-        return self.task, self.counts, self.particle_weight, x.dtype, x.device
 
 
 torch.serialization.add_safe_globals([Snapshot, EnvState, Measurement])  # tensors, numbers and a name
@@ -106,16 +75,14 @@ class Model:
         spec: The task.
         solver: Its physics.
         substeps: Substeps of a control step.
-        particle_weight: By body, the full-size particles that one particle stands for.
         camera: Draws observations.
         segment: Substeps between checkpoints where gradients are enabled, see :meth:`torchmpm.Solver.step`.
-        checked: Names that the task has returned so far, see :func:`dittogym.contract.check_outcome`.
+        checked: Names that the task has returned so far.
     """
 
     spec: TaskSpec
     solver: Solver
     substeps: int
-    particle_weight: tuple[float, ...]
     camera: Camera
     segment: Segment = "auto"
     checked: set[tuple[object, ...]] = field(default_factory=set, repr=False)
@@ -129,18 +96,12 @@ class Model:
         """The solver with the constants of :func:`dittogym.physics.physics_values` in place of the task's own."""
         if not physics:
             return self.solver
-        bodies = _bodies(self.spec, self.camera.counts, self.particle_weight, physics)
+        bodies = _bodies(self.spec, self.camera.counts, self.camera.particle_weight, physics)
         return self.solver.with_constants(bodies, physics.get("gravity", self.spec.gravity))
 
 
 def make_model(
-    spec: TaskSpec,
-    counts: tuple[int, ...],
-    *,
-    substeps: int,
-    backend: str,
-    parity: Parity = PARITIES["clean"],
-    segment: Segment = "auto",
+    spec: TaskSpec, counts: tuple[int, ...], substeps: int, backend: str, parity: Parity, segment: Segment = "auto"
 ) -> Model:
     """Build the physics of a task.
 
@@ -152,14 +113,11 @@ def make_model(
         counts: Particles of each body.
         substeps: Substeps of a control step.
         backend: Of the solver.
-        parity: Behaviours of the reference.
+        parity: ``"reference"``: particles of unit volume and the pixel raster at every tier.
         segment: See :class:`Model`.
-
-    Raises:
-        ValueError: The matter is too stiff, see :func:`check_stability`.
     """
     full = tuple(body.count for body in spec.bodies)
-    weight = tuple(1.0 if parity.unit_volume else n / m for n, m in zip(full, counts, strict=True))
+    weight = tuple(1.0 if parity == "reference" else n / m for n, m in zip(full, counts, strict=True))
     solver = Solver(
         GRID,
         _bodies(spec, counts, weight, {}),
@@ -169,30 +127,22 @@ def make_model(
         backend=backend,
         allow_unstable=True,  # checked with the muscles, here and when a reset changes the matter
     )
-    camera = Camera(
-        view=spec.view,
-        window=spec.window,
-        boxes=spec.observed_boxes,
-        counts=counts,
-        particle_weight=weight,
-        hidden_velocity=tuple(body.hidden_velocity for body in spec.bodies),
-        pixels=parity.pixel_raster or counts == full,
-        native=backend in ("auto", "native") and solver.kernels.unsupported(torch.device("cpu")) is None,
-    )
-    model = Model(spec, solver, substeps, weight, camera, segment)
+    pixels = parity == "reference" or counts == full
+    native = backend in ("auto", "native") and solver.kernels.unsupported(torch.device("cpu")) is None
+    hidden = tuple(body.hidden_velocity for body in spec.bodies)
+    camera = Camera(spec.view, spec.window, spec.observed_boxes, counts, weight, hidden, pixels, native)
+    model = Model(spec, solver, substeps, camera, segment)
     check_stability(model, {})
     return model
 
 
 def check_stability(model: Model, physics: Physics) -> None:
-    """Refuse matter, with the muscles of the task or of ``physics``, that needs shorter substeps."""
+    """Refuse matter that with its muscles needs shorter substeps."""
     solver = model.solver_for(physics)
     limit = solver.stable_dt(physics.get("max_actuation", model.spec.max_actuation))
     if solver.dt > limit:
-        raise ValueError(
-            f"mu, lam, max_actuation and mass must allow substeps of {solver.dt} s, got matter so stiff and light that "
-            f"substeps would have to be at most {limit} s"
-        )
+        matter = f"got matter so stiff and light that substeps would have to be at most {limit} s"
+        raise ValueError(f"mu, lam, max_actuation and mass must allow substeps of {solver.dt} s, {matter}")
 
 
 def _bodies(spec: TaskSpec, counts: tuple[int, ...], weight: tuple[float, ...], physics: Physics) -> tuple[Body, ...]:

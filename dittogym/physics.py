@@ -25,7 +25,7 @@ PER_PARTICLE = ("mu", "lam", "yield_stress", "mass")
 
 def defaults(spec: TaskSpec, like: Tensor) -> dict[str, Tensor]:
     """The task's own values for B simulations, B the length of ``like``."""
-    own = {name: getattr(spec, name) for name in NAMES if name != "mass"} | {"mass": 1.0}
+    own = {name: getattr(spec, name, 1.0) for name in NAMES}  # a factor of 1 on the mass
     return {name: _expanded(like.new_tensor(value), name, len(like)) for name, value in own.items()}
 
 
@@ -33,9 +33,8 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
     """Check constants and bring them to one value per simulation or particle; gradients flow through.
 
     Args:
-        given: Mapping from ``dittogym.physics.NAMES`` to a number, or a tensor or array of shape () or (B,); for
-            ``gravity`` of shape (2,) or (B, 2); for those of ``PER_PARTICLE`` also (B, N), robot first, of which a body
-            without such a constant ignores its part.
+        given: Mapping from ``dittogym.physics.NAMES`` to numbers or arrays of shape () or (B,); for ``gravity`` (2,) or
+            (B, 2); for those of ``PER_PARTICLE`` also (B, N), robot first.
         batch: Number B of simulations.
         particles: Number N of particles.
         like: Gives dtype and device.
@@ -84,8 +83,8 @@ def merged(spec: TaskSpec, old: Physics, new: Physics, mask: Tensor, like: Tenso
         return dict(new)
     own = defaults(spec, like)
     names = [name for name in NAMES if name in old or name in new]
-    pairs = {name: _alike(new.get(name, own[name]), old.get(name, own[name])) for name in names}
-    return {name: tree.where(mask, *pair) for name, pair in pairs.items()}
+    pairs = {name: (new.get(name, own[name]), old.get(name, own[name])) for name in names}
+    return {name: tree.where(mask, *_alike(*pair)) for name, pair in pairs.items()}
 
 
 def part_of(value: float | Tensor, particles: slice) -> float | Tensor:
@@ -95,10 +94,9 @@ def part_of(value: float | Tensor, particles: slice) -> float | Tensor:
 
 def _alike(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
     """Values of one shape: where one has a value per particle, both have."""
-    if one.ndim != other.ndim:
-        one, other = (value[:, None] if value.ndim == 1 else value for value in (one, other))
-    alike = torch.broadcast_tensors(one, other)
-    return alike[0], alike[1]
+    if one.ndim == other.ndim:
+        return one, other
+    return (one[:, None].expand_as(other), other) if one.ndim == 1 else (one, other[:, None].expand_as(one))
 
 
 def _expanded(value: Tensor, name: str, batch: int) -> Tensor:

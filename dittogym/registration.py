@@ -60,9 +60,3 @@ def _source(make: Callable[..., TaskSpec]) -> object:
     """Where a function was defined, which stays the same if a notebook's cell defines it again."""
     name = getattr(make, "__qualname__", "<")
     return make if "<" in name else (make.__module__, name)
-
-
-def register_all() -> None:
-    """Register the eight tasks; done on ``import dittogym``."""
-    for task, make in list(TASKS.items()):
-        register(task, make)

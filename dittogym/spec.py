@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
-from torch import Tensor
 
 from dittogym.bodies.shapes import Shape, check_pair
 from dittogym.contract import Memory, Moment, Outcome
 from dittogym.geometry import NODES, Box, Obstacle, mark
 from dittogym.observation.image import SIZE
-from dittogym.window import FIXED, Centre, Window
+from dittogym.window import Centre, Window
 from torchmpm import Material, checks
 
 
@@ -27,12 +26,7 @@ class BodySpec:
         mass: Mass of a particle at full size, kg.
         material: ``None``: with the constants of the task, von Mises matter for the robot, elastic for an object.
         lite: Particles in the lite tier; ``None``: 2,000 for the robot, in proportion to it for an object.
-        hidden_velocity: Whether the velocity channels of the observation leave it out; the occupancy channel always
-            shows it.
-
-    Raises:
-        ValueError: A number is out of range.
-        TypeError: The shape is not a :class:`dittogym.bodies.shapes.Shape`.
+        hidden_velocity: Whether the velocity channels of the observation leave it out.
     """
 
     shape: Shape
@@ -68,10 +62,9 @@ class TaskSpec:
         yield_stress: Of the robot, Pa.
         max_actuation: Muscle stress at action 1, Pa.
         reward_fn: The task's own reward terms, termination and success, from a :class:`dittogym.contract.Moment` and
-            this specification. A reward has a smooth form if it uses the operations of ``moment.ops``.
-        weights: Weights of the reward terms by name: one for each term of ``reward_fn``, and any of ``split`` (a torn
-            robot, where there is a ``split_limit``), ``action`` (norm of the actuation field) and ``alive`` (every
-            step).
+            this specification. Operations of ``moment.ops`` give the reward a smooth form.
+        weights: Weights of the reward terms of ``reward_fn`` by name, and any of ``split`` (a torn robot, where there
+            is a ``split_limit``), ``action`` (norm of the actuation field) and ``alive`` (every step).
         objects: Bodies besides the robot, at most one.
         gravity: (x, y), m/s^2.
         damping: Factor on node velocities in every substep.
@@ -84,7 +77,7 @@ class TaskSpec:
         coarse, fine: Action resolutions.
         split_limit: Spread at which the episode ends, m; ``None`` for never.
         initial_memory: What to remember from the start of an episode, tensors with a leading B.
-        stale_memory: Entries of the memory that a reset leaves as they are under ``parity="reference"``.
+        stale_memory: Entries of the memory that a reset leaves as they are with ``parity="reference"``.
         target: (64, 64) bool picture to match, centred on the robot, row 0 at the top; for pictures of the task.
 
     Raises:
@@ -104,7 +97,7 @@ class TaskSpec:
     lam: float = 50.0
     gravity: tuple[float, float] = (0.0, 0.0)
     damping: float = 1.0
-    window: Window = FIXED
+    window: Window = Window()  # noqa: RUF009
     view: Centre = (None, None)
     reach: Centre = (None, None)
     patch: int = 64
@@ -118,16 +111,12 @@ class TaskSpec:
     target: np.ndarray | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
-        checks.instance("name", self.name, str)
+        for name, kind in (("name", str), ("robot", BodySpec), ("window", Window), ("weights", Mapping)):
+            checks.instance(name, getattr(self, name), kind)
+        for name, each in (("objects", BodySpec), ("obstacles", Obstacle), ("stale_memory", str)):
+            checks.instances(name, getattr(self, name), each)
         self._check_numbers()
-        checks.instance("weights", self.weights, Mapping)
-        for name, value in self.weights.items():
-            checks.number(f"weights[{name!r}]", value)
         object.__setattr__(self, "weights", dict(self.weights))  # later changes of the caller's do not reach it
-        checks.instance("window", self.window, Window)
-        checks.instances("obstacles", self.obstacles, Obstacle)
-        checks.instance("robot", self.robot, BodySpec)
-        checks.instances("objects", self.objects, BodySpec)
         if len(self.objects) > 1:
             raise ValueError(f"objects must be at most one body, got {len(self.objects)}")
         if self.target is not None and np.shape(self.target) != (SIZE, SIZE):
@@ -135,9 +124,10 @@ class TaskSpec:
         for name in ("reward_fn", "initial_memory"):
             if not callable(given := getattr(self, name)):
                 raise TypeError(f"{name} must be a function of a Moment and a TaskSpec, got {given!r}")
-        checks.instances("stale_memory", self.stale_memory, str)
 
     def _check_numbers(self) -> None:
+        for name, value in self.weights.items():
+            checks.number(f"weights[{name!r}]", value)
         checks.whole("horizon", self.horizon, 1)
         checks.number("mu", self.mu, above=0.0)
         checks.number("lam", self.lam)
@@ -159,16 +149,6 @@ class TaskSpec:
     def bodies(self) -> tuple[BodySpec, ...]:
         """Robot and objects in particle order."""
         return (self.robot, *self.objects)
-
-    def goal_like(self, x: Tensor) -> Tensor:
-        """The goal (2,) with the type and device of ``x``, m.
-
-        Raises:
-            ValueError: The task has no goal.
-        """
-        if self.goal is None:
-            raise ValueError(f"goal of task {self.name!r} must be a point (x, y), got None")
-        return x.new_tensor(self.goal)
 
     @property
     def observed_boxes(self) -> tuple[Box, ...]:

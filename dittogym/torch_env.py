@@ -13,9 +13,9 @@ from torch import Tensor
 from dittogym import core
 from dittogym.action import ActionIndexing, to_grid_indexing
 from dittogym.arguments import DTYPES, check_action, choice, find_device, find_mask, find_resolution, reset_options
-from dittogym.bodies.positions import InitialPositions, Particles, Seed, particle_counts
-from dittogym.contract import ENGINE_INFO, measure
-from dittogym.model import PARITIES, EnvState, ParityName, Snapshot, check_stability, make_model
+from dittogym.bodies.positions import InitialPositions, Particles, Seed, get_state, particle_counts, set_state
+from dittogym.contract import measure
+from dittogym.model import EnvState, Parity, Snapshot, check_stability, make_model
 from dittogym.observation.image import SHAPE
 from dittogym.physics import Physics, merged, physics_values
 from dittogym.render.frame import frame
@@ -28,10 +28,10 @@ from torchmpm.rollout import Segment, check_repetition
 class TorchEnv:
     """``num_envs`` independent simulations of one task, advanced together.
 
-    Rewards and states keep their autograd graph as long as gradients are enabled: differentiate through
-    :meth:`step`, cut the graph with :meth:`detach`, or run under ``torch.no_grad()``. The observation is an integer
-    image and has no gradient. Elements are not reset automatically: one that has ended continues until :meth:`reset`
-    is called with a mask. Element i of a batch reset with seed s is the single environment reset with seed s + i.
+    Rewards and states keep their autograd graph as long as gradients are enabled; :meth:`detach` cuts it. The
+    observation is an integer image and has no gradient. Elements are not reset automatically: one that has ended
+    continues until :meth:`reset` is called with a mask. Element i of a batch reset with seed s is the single
+    environment reset with seed s + i.
 
     Args:
         task: A task name or a :class:`dittogym.spec.TaskSpec`.
@@ -42,24 +42,16 @@ class TorchEnv:
         dtype: ``"float32"`` or ``"float64"``, by name or as torch's.
         device: Where it runs.
         backend: Of the solver, see :class:`torchmpm.Solver`.
-        action_layout: ``"image"``: action pixel (row, column) acts where observation pixel (row, column) looks;
-            ``"grid"``: (x, y), as in the reference implementation. ``None``: ``"grid"`` with reference parity, else
-            ``"image"``.
-        parity: ``"clean"``, or ``"reference"`` to bring back the reference's stale observation and action centre
-            after a reset, its random positions, unit particle volume and pixel raster at every particle count.
+        action_layout: ``"image"``: action pixel (row, column) acts where that pixel of the observation looks;
+            ``"grid"``: (x, y), as in the reference implementation. ``None``: as ``parity`` has it.
+        parity: ``"clean"``, or ``"reference"`` to bring back the reference's stale observation, action centre and
+            ``TaskSpec.stale_memory`` after a reset, and at every particle count its random positions, unit particle
+            volume and pixel raster.
         resample: Draw new particles at every reset, not only at a seeded one.
-        deterministic: Accept only what repeats a trajectory bit by bit for one seed and number of threads: the CPU, and
-            not the backend ``"compile"``.
+        deterministic: Refuse what does not repeat bit by bit: CUDA, and the backend ``"compile"``.
         segment: Substeps between checkpoints where gradients are enabled, see :func:`torchmpm.segment_for`.
         task_options: ``body``, ``obstacles``, and options of the task such as ``target`` of SHAPE MATCH; see
             :func:`dittogym.make_spec`.
-
-    Attributes:
-        spec: The task.
-        num_envs: Number B of simulations.
-        action_shape: (2, R, R).
-        action_layout: ``"image"`` or ``"grid"``.
-        state: The :class:`torchmpm.ParticleState` of all simulations.
 
     Raises:
         ValueError: An argument is out of range.
@@ -80,7 +72,7 @@ class TorchEnv:
         device: str | torch.device = "cpu",
         backend: str = "auto",
         action_layout: ActionIndexing | None = None,
-        parity: ParityName = "clean",
+        parity: Parity = "clean",
         resample: bool = False,
         deterministic: bool = False,
         segment: Segment = "auto",
@@ -93,27 +85,22 @@ class TorchEnv:
             checks.flag(name, flag)
         self.dtype, self.device = choice("dtype", str(dtype).removeprefix("torch."), DTYPES), find_device(device)
         if deterministic and (self.device.type != "cpu" or backend == "compile"):
-            raise ValueError(
-                "deterministic=True needs device 'cpu' and a backend other than 'compile', "
-                f"got {device!r} and {backend!r}"
-            )
+            needs = "deterministic=True needs device 'cpu' and a backend other than 'compile'"
+            raise ValueError(f"{needs}, got {device!r} and {backend!r}")
         self.action_resolution = find_resolution(self.spec, resolution)
         self.action_shape = (2, self.action_resolution, self.action_resolution)
-        self._parity = choice("parity", parity, PARITIES)
-        indexing = {"image": "image", "grid": "grid", None: self._parity.action_indexing}
-        self.action_layout: ActionIndexing = choice("action_layout", action_layout, indexing)
+        self._as_reference = choice("parity", parity, {"clean": False, "reference": True})
+        own: ActionIndexing = "grid" if self._as_reference else "image"
+        self.action_layout = choice("action_layout", action_layout, {"image": "image", "grid": "grid", None: own})
         counts = particle_counts(self.spec, particles)
-        self.model = make_model(
-            self.spec, counts, substeps=substeps, backend=backend, parity=self._parity, segment=segment
-        )
-        random = self._parity.random_positions or counts == tuple(body.count for body in self.spec.bodies)
+        self.model = make_model(self.spec, counts, substeps=substeps, backend=backend, parity=parity, segment=segment)
+        random = self._as_reference or counts == tuple(body.count for body in self.spec.bodies)
         self._initial_positions = InitialPositions(self.spec, counts, self.num_envs, random=random, resample=resample)
         self._like = torch.empty(self.num_envs, dtype=self.dtype, device=self.device)
         self.device = self._like.device  # with the number of what is the current device now
         self._physics: Physics = {}
         self._env_state: EnvState | None = None
         self._observation: Tensor | None = None
-        self._info: dict[str, Tensor] | None = None
         self._actuation: Tensor | None = None
 
     @property
@@ -123,12 +110,10 @@ class TorchEnv:
 
     @property
     def env_state(self) -> EnvState:
-        """Everything that moves, for :mod:`dittogym.core`; see also :meth:`save`. Assign a state to continue from it.
+        """Everything that moves, for :mod:`dittogym.core`. Assign a state to continue from it.
 
         Raises:
             RuntimeError: It was neither reset nor assigned.
-            TypeError: The assigned value is not an EnvState.
-            ValueError: It has another number of simulations or particles, another dtype or device.
         """
         if self._env_state is None:
             raise RuntimeError("call reset() first: the environment has no state yet")
@@ -142,52 +127,41 @@ class TorchEnv:
         own = self.num_envs, self.num_particles, self.dtype, self.device
         if kind != own:
             raise ValueError(f"env_state must be of {own} (simulations, particles, dtype, device), got {kind}")
-        self._env_state, self._actuation, self._observation, self._info = value, None, None, None
+        self._env_state, self._actuation, self._observation = value, None, None
 
     @property
     def generators(self) -> dict[int, dict[str, Tensor]]:
-        """States of the elements' random generators, which ``resample`` draws from; assign them to restore them.
-
-        By element: tensors ``key`` (624,) and ``pos`` () of the Mersenne Twister.
-        """
-        return {element: sampler.generator for element, sampler in self._initial_positions.samplers.items()}
+        """States of the random generators that ``resample`` draws from, ``key`` (624,) and ``pos`` (); can be set."""
+        return {element: get_state(each) for element, each in self._initial_positions.generators.items()}
 
     @generators.setter
     def generators(self, states: Mapping[int, Mapping[str, Tensor]]) -> None:
-        samplers = self._initial_positions.samplers
-        if missing := [element for element in states if element not in samplers]:
+        generators = self._initial_positions.generators
+        if missing := [element for element in states if element not in generators]:
             raise RuntimeError(f"call reset() first: elements {missing} have no random generator yet")
         for element, state in states.items():
-            samplers[element].generator = state
+            set_state(generators[element], state)
 
     @property
     def state(self) -> ParticleState:
         """The particles of all simulations."""
         return self.env_state.particles
 
-    def _present(self) -> tuple[Tensor, dict[str, Tensor]]:
-        """Observation and measured info of the present state, computed again if the state was assigned."""
+    def _present_observation(self) -> Tensor:
+        """The last observation, computed again if the state was assigned."""
         if self._observation is None:
             self._observation = core.observe(self.model, self.env_state)
-        if self._info is None:
-            now = measure(self.state, self.model.num_robot_particles)
-            self._info = tree.detach(core.measured_info(self.model, self.env_state, now))
-        return self._observation, self._info
+        return self._observation
 
     def detach(self, *, physics: bool = True) -> None:
-        """Cut the autograd graph: gradients do not reach back beyond this moment.
-
-        Args:
-            physics: Also those in the constants that the last reset was given; without, a constant can be learned from
-                one stretch of an episode after the other.
-        """
+        """Cut the autograd graph; that of constants given to the last reset only with ``physics``."""
         state = tree.detach(self.env_state)
         self._env_state = state if physics else replace(state, physics=self.env_state.physics)
 
     def save(self) -> Snapshot:
         """A copy of the present moment, to which :meth:`load` returns; keeps the autograd graph."""
-        state, observation = tree.map(Tensor.clone, (self.env_state, self._present()[0]))
-        return Snapshot(self.spec.name, self.model.camera.counts, self.model.particle_weight, state, observation)
+        state, observation = tree.map(Tensor.clone, (self.env_state, self._present_observation()))
+        return Snapshot(self.spec.name, self.model.camera.counts, self.model.camera.particle_weight, state, observation)
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Continue from a saved moment, to the last bit as if nothing had happened since.
@@ -202,26 +176,25 @@ class TorchEnv:
             The observation (B, 3, 64, 64) uint8.
 
         Raises:
-            TypeError: Not a snapshot.
             ValueError: The snapshot is of another task, other numbers of particles, another type, device or batch size.
         """
-        if not isinstance(snapshot, Snapshot):
-            raise TypeError(f"snapshot must be what save() returned, got {type(snapshot).__name__}")
+        checks.instance("snapshot", snapshot, Snapshot)
         chosen = find_mask("mask", mask, self.num_envs, self.device)
-        theirs, size, counts = snapshot.state, len(snapshot.state.steps), self.model.camera.counts
-        kind, own = snapshot.kind, (self.spec.name, counts, self.model.particle_weight, self.dtype, self.device)
+        x, size = snapshot.state.particles.x, len(snapshot.state.steps)
+        own = self.spec.name, self.model.camera.counts, self.model.camera.particle_weight, self.dtype, self.device
+        kind = snapshot.task, snapshot.counts, snapshot.particle_weight, x.dtype, x.device
         if kind != own or size not in (1, self.num_envs):
             raise ValueError(
                 f"snapshot must hold 1 or {self.num_envs} simulations of {own}, got {size} of {kind} "
                 "(task, particles, what each stands for, dtype, device)"
             )
         index = torch.arange(self.num_envs, device=self.device) % size
-        state, observation = tree.map(lambda t: t[index], (theirs, snapshot.observation))
+        state, observation = tree.map(lambda t: t[index], (snapshot.state, snapshot.observation))
         if not bool(chosen.all()):
             mine = self.env_state
             physics = merged(self.spec, mine.physics, state.physics, chosen, self._like)
             state, mine = (replace(each, physics=physics) for each in (state, mine))
-            state, observation = tree.where(chosen, (state, observation), (mine, self._present()[0]))
+            state, observation = tree.where(chosen, (state, observation), (mine, self._present_observation()))
         self.env_state = state
         self._observation = observation.clone()
         return observation
@@ -232,10 +205,9 @@ class TorchEnv:
         Args:
             seed: Seeds element i with ``seed + i``, or with ``seed[i]``, and draws new positions. Without it, or
                 where ``seed[i]`` is ``None``, the last positions are used again, unless ``resample`` was asked for.
-            options: ``"positions"``: (N, 2) or (B, N, 2) world positions in m, robot first, used until the next seed,
-                with ``resample`` until the next reset;
-                ``"physics"``: constants of the matter, one value for all, one per element or one per particle, see
-                :func:`dittogym.physics.physics_values`; used until given again, ``{}`` goes back to the task's own;
+            options: ``"positions"``: (N, 2) or (B, N, 2) in the world, m, robot first, used until the next seed, with
+                ``resample`` until the next reset; ``"physics"``: constants of the matter, see
+                :func:`dittogym.physics.physics_values`, used until given again, ``{}`` goes back to the task's own;
                 ``"reset_mask"``: (B,) bool, reset only these elements.
 
         Returns:
@@ -254,18 +226,20 @@ class TorchEnv:
         assert drawn.positions is not None
         index = mask.nonzero()[:, 0]
         fresh, observation = core.reset(self.model, drawn.positions[index], tree.map(lambda t: t[index], physics))
-        info = tree.detach(core.measured_info(self.model, fresh, fresh.start))
+        info = core.measured_info(self.model, fresh, fresh.start)
         if self._env_state is not None:
-            if self._parity.stale_reset:
-                fresh, observation = self._stale(fresh, observation, index)
+            if self._as_reference:  # its reset leaves the last episode's centre, memory and observation
+                old, observation = self._env_state, self._present_observation()[index]
+                memory = {name: old.memory[name][index].detach() for name in self.spec.stale_memory}
+                fresh = replace(fresh, centre=old.centre[index].detach(), memory={**fresh.memory, **memory})
             if len(index) < self.num_envs:
                 fresh, observation, info = self._insert(index, fresh, observation, info)
                 fresh = replace(fresh, physics=merged(self.spec, self.env_state.physics, physics, mask, self._like))
         # Gradients in positions and constants reach back to this reset only, not to the next that uses them.
         self._initial_positions = replace(drawn, positions=drawn.positions.detach().clone())
         self._physics = tree.map(lambda t: t.detach().clone(), physics)
-        self._env_state, self._actuation, self._observation, self._info = fresh, None, observation, info
-        return tree.map(Tensor.clone, (observation, info))
+        self._env_state, self._actuation, self._observation = fresh, None, observation
+        return observation.clone(), tree.map(lambda t: t.detach().clone(), info)
 
     def _next_physics(self, given: Any, mask: Tensor) -> Physics:
         """The constants of the next episodes, where elements outside ``mask`` keep those that wait for them."""
@@ -276,17 +250,11 @@ class TorchEnv:
         check_stability(self.model, physics)
         return physics
 
-    def _stale(self, fresh: EnvState, observation: Tensor, index: Tensor) -> tuple[EnvState, Tensor]:
-        """What the reference implementation's reset leaves of the last episodes of the elements ``index``."""
-        old = self.env_state
-        memory = {name: old.memory[name][index].detach() for name in self.spec.stale_memory}
-        fresh = replace(fresh, centre=old.centre[index].detach(), memory={**fresh.memory, **memory})
-        return fresh, self._present()[0][index]
-
     def _insert(self, index: Tensor, state: EnvState, *seen: Any) -> tuple[Any, ...]:
         """The present state, observation and info of all elements, with others in place of the elements ``index``."""
-        present = (replace(self.env_state, physics={}), *self._present())
-        others = (replace(state, physics={}), *seen)
+        old = replace(self.env_state, physics={})
+        info = core.measured_info(self.model, old, measure(old.particles, self.model.num_robot_particles))
+        present, others = (old, self._present_observation(), info), (replace(state, physics={}), *seen)
         inserted: tuple[Any, ...] = tree.map(lambda whole, part: whole.index_copy(0, index, part), present, others)
         return inserted
 
@@ -296,8 +264,7 @@ class TorchEnv:
         Args:
             action: (B, 2, R, R), muscle actuation in units of the task's maximum; ``[:, 0]`` along material x. Values
                 beyond [-1, 1] saturate after the interpolation.
-            soft: For gradients: the observation is :meth:`soft_observation`, reward and its terms are the task's smooth
-                ones, and ``info["true_reward"]`` is the reward. All else is as without.
+            soft: Observation and reward are the smooth ones, for gradients; ``info["true_reward"]`` is the reward.
 
         Returns:
             observation (B, 3, 64, 64) uint8; reward (B,); terminated (B,) bool; truncated (B,) bool, at the horizon;
@@ -311,36 +278,23 @@ class TorchEnv:
         action = to_grid_indexing(action, self.action_layout)
         result = core.step(self.model, self.env_state, action, soft=soft)
         info: dict[str, Any] = {"reward_terms": dict(result.terms), **result.info}
-        if result.success is not None:
-            info["is_success"] = result.success
-        if soft:
-            info["true_reward"] = result.true_reward
-        # Copies: what is returned belongs to the caller.
-        self._observation = result.observation.clone()
-        self._info = {name: value.detach().clone() for name, value in result.info.items() if name in ENGINE_INFO}
+        info |= {} if result.success is None else {"is_success": result.success}
+        info |= {"true_reward": result.true_reward} if soft else {}
+        self._observation = result.observation.clone()  # what is returned belongs to the caller
         self._env_state, self._actuation = result.state, result.actuation.detach()
         observation = result.observation if result.soft_observation is None else result.soft_observation
         return observation, result.reward, result.terminated, result.state.steps >= self.spec.horizon, info
 
     def soft_observation(self) -> Tensor:
-        """The present image as a smooth function of the state.
-
-        See :func:`dittogym.core.soft_observation`.
-
-        Returns:
-            (B, 3, 64, 64) in the units of the uint8 observation, with the autograd graph of the state.
-        """
+        """The present image (B, 3, 64, 64) as a smooth function; see :func:`dittogym.core.soft_observation`."""
         return core.soft_observation(self.model, self.env_state)
 
     def render(self, index: int = 0, *, muscles: bool = False, size: int = 512) -> np.ndarray:
-        """Picture of one simulation in RGB.
+        """Picture (S, S, 3) uint8 of one simulation in RGB.
 
         Args:
             index: Which element of the batch.
             muscles: Colour the robot by the actuation of the last step: contraction red, expansion blue.
-            size: Pixels per side.
-
-        Returns:
-            (S, S, 3) uint8 for S = ``size``.
+            size: S, pixels per side.
         """
         return frame(self.model, self.env_state, index, self._actuation if muscles else None, size)

@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from dittogym.bodies.positions import Seed
-from dittogym.env import RENDER_FPS, RENDER_MODES, as_image, as_numpy, as_tensor, spaces
+from dittogym.env import RENDER_FPS, RENDER_MODES, as_numpy, as_tensor, spaces
 from dittogym.model import Snapshot
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
@@ -52,9 +52,9 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     Args:
         task: Task name or specification.
         num_envs: Number of simulations.
-        autoreset_mode: ``SAME_STEP`` (an ended episode is reset in the same call; the last observation and info are
-            in ``info["final_obs"]`` and ``info["final_info"]``), ``NEXT_STEP`` (in the next call, whose action it
-            ignores), or ``DISABLED`` (``reset(options={"reset_mask": ...})``).
+        autoreset_mode: ``SAME_STEP`` (an ended episode is reset in the same call; ``info["final_obs"]`` and
+            ``info["final_info"]`` are the last ones), ``NEXT_STEP`` (in the next call, whose action it ignores), or
+            ``DISABLED``.
         render_mode: ``None`` or ``"rgb_array"``.
         render_muscles: Colour the robots by their muscles in pictures.
         max_episode_steps: Horizon instead of the task's; -1 for none.
@@ -108,8 +108,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Start new episodes, of all elements or of ``options["reset_mask"]``; see :meth:`dittogym.TorchEnv.reset`.
 
         Args:
-            seed: Seeds element i with ``seed + i``, or with ``seed[i]`` unless that is ``None``, and draws new
-                positions.
+            seed: Draws new positions, of element i with ``seed + i`` or ``seed[i]``.
             options: As there.
 
         Returns:
@@ -119,7 +118,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         super().reset(seed=seed[0] if isinstance(seed, Sequence) else seed)
         mask = (options or {}).get("reset_mask")
         self._ended &= False if mask is None else ~_array(mask)
-        return as_image(observation), _with_masks(as_numpy(info), np.ones(self.num_envs, dtype=bool))
+        return as_numpy(observation), _with_masks(as_numpy(info), np.ones(self.num_envs, dtype=bool))
 
     @torch.no_grad()
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -136,17 +135,17 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             return self._reset_then_step(action)
         step = autoreset_step(self.torch_env, action, self._horizon)
         rewards, ends, limits = _array(step.reward.double()), _array(step.terminated), _array(step.truncated)
-        images, info = as_image(step.observation), as_numpy(step.info)
+        images, info = as_numpy(step.observation), as_numpy(step.info)
         if step.reset_info is None:
             return images, rewards, ends, limits, _with_masks(info, np.ones_like(ends))
-        done, finals, final = _array(step.done), as_image(step.final_observation), np.empty(self.num_envs, dtype=object)
+        done, finals, final = _array(step.done), as_numpy(step.final_observation), np.empty(self.num_envs, dtype=object)
         for i in np.flatnonzero(done):
             final[i] = finals[i]
         last = {"final_obs": final, "_final_obs": done, "final_info": _with_masks(info, done), "_final_info": done}
         return images, rewards, ends, limits, _restarted(info, as_numpy(step.reset_info), done) | last
 
     def _reset_then_step(self, action: torch.Tensor) -> tuple[Any, ...]:
-        """A step in which, in the mode ``NEXT_STEP``, elements that have ended before are reset instead."""
+        """A step in which elements that have ended before are reset instead in the mode ``NEXT_STEP``."""
         fresh = self._ended.copy()
         ended = torch.as_tensor(fresh, device=action.device)
         action = action.masked_fill(ended[:, None, None, None], 0.0)  # ignored, and may hold NaN
@@ -155,22 +154,20 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         rewards, ends, info = _array(reward.double()) * ~fresh, _array(terminated) & ~fresh, as_numpy(raw)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             self._ended = ends | limits
-        if not fresh.any():
-            return as_image(observation), rewards, ends, limits, _with_masks(info, ~fresh)
-        observation, start = self.torch_env.reset(options={"reset_mask": ended})
-        return as_image(observation), rewards, ends, limits, _restarted(info, as_numpy(start), fresh)
+        start: dict[str, Tensor] = {}
+        if fresh.any():
+            observation, start = self.torch_env.reset(options={"reset_mask": ended})
+        return as_numpy(observation), rewards, ends, limits, _restarted(info, as_numpy(start), fresh)
 
     def save(self) -> Snapshot:
         """The present moment of all simulations; see :meth:`dittogym.TorchEnv.save`."""
         return self.torch_env.save()
 
     def load(self, snapshot: Snapshot, mask: np.ndarray | None = None) -> np.ndarray:
-        """Continue from a saved moment; see :meth:`dittogym.TorchEnv.load`.
-
-        An element that had ended and was to be reset continues instead.
+        """Continue from a saved moment; an element that was to be reset continues instead.
 
         Args:
-            snapshot: Of this environment or one like it; one of a single simulation goes into every element.
+            snapshot: As in :meth:`dittogym.TorchEnv.load`.
             mask: (B,) bool, load only these elements.
 
         Returns:
@@ -178,7 +175,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         observation = self.torch_env.load(snapshot, mask)
         self._ended &= False if mask is None else ~_array(mask)
-        return as_image(observation)
+        return as_numpy(observation)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture for each simulation, (512, 512, 3) uint8, in mode ``"rgb_array"``, else nothing."""

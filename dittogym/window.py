@@ -1,7 +1,5 @@
 """The simulated window of 1 m x 1 m: where it lies, what is inside, and where in it the robot looks and acts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -24,9 +22,6 @@ class Window:
     Attributes:
         left: Its left end for a fixed window, m.
         follow: For a moving window the distance of the robot's centre from its left end, m; then ``left`` is unused.
-
-    Raises:
-        ValueError: A number is not finite.
     """
 
     left: float = 0.0
@@ -46,10 +41,6 @@ class Window:
         """Lower left corner (B, 2) of the window for robots centred on ``com`` (B, 2), m."""
         left = torch.full_like(com[:, 0], self.left) if self.follow is None else com[:, 0] - self.follow
         return torch.stack((left, torch.zeros_like(left)), dim=1)
-
-
-#: The window between 0 and 1 m.
-FIXED = Window()
 
 
 def contains(x: Tensor, origin: Tensor) -> Tensor:

@@ -20,18 +20,14 @@ AnyEnv = gymnasium.Env[Any, Any] | VectorEnv[Any, Any, Any]
 def action_resolution(env: AnyEnv, size: int) -> Any:
     """Actions of (2, size, size), enlarged to the resolution of ``env`` by bicubic interpolation.
 
-    To let the physics itself enlarge them, in one step, give ``resolution=size`` to :func:`gymnasium.make` instead.
-
-    Raises:
-        ValueError: ``size`` is no whole number between 1 and the resolution of ``env``.
+    The option ``resolution=size`` of :func:`gymnasium.make` enlarges them in one step with the physics instead.
     """
     box = _box(env, "action_space")
     size = checks.whole("size", size, 1, box.shape[-1])
 
     def enlarge(action: np.ndarray) -> np.ndarray:
-        expected = (size, size)
-        if np.shape(action)[-2:] != expected:
-            raise ValueError(f"action must end in the shape {expected}, got {np.shape(action)}")
+        if np.shape(action)[-2:] != (size, size):
+            raise ValueError(f"action must end in the shape {(size, size)}, got {np.shape(action)}")
         return _resized(np.asarray(action, np.float32), box.shape[-1], cv2.INTER_CUBIC).clip(-1.0, 1.0)
 
     small = gymnasium.spaces.Box(-1.0, 1.0, (2, size, size), np.float32)
@@ -42,14 +38,8 @@ def action_resolution(env: AnyEnv, size: int) -> Any:
 
 
 def observation_resolution(env: AnyEnv, size: int) -> Any:
-    """Observations of (3, size, size), reduced by averaging over areas.
-
-    Raises:
-        ValueError: ``size`` is no whole number between 1 and the resolution of ``env``.
-    """
-    box = _box(env, "observation_space")
-    size = checks.whole("size", size, 1, box.shape[-1])
-
+    """Observations of (3, size, size), reduced by averaging over areas."""
+    size = checks.whole("size", size, 1, _box(env, "observation_space").shape[-1])
     reduce = functools.partial(_resized, size=size, interpolation=cv2.INTER_AREA)
     small = gymnasium.spaces.Box(0, 255, (3, size, size), np.uint8)
     if isinstance(env, VectorEnv):
@@ -64,8 +54,7 @@ class _VectorObservation(VectorWrapper):
         self, env: VectorEnv[Any, Any, Any], function: Callable[[np.ndarray], np.ndarray], space: gymnasium.spaces.Box
     ) -> None:
         super().__init__(env)
-        self._function = function
-        self.single_observation_space = space
+        self._function, self.single_observation_space = function, space
         self.observation_space = batch_space(space, env.num_envs)
 
     def reset(self, **arguments: Any) -> tuple[np.ndarray, dict[str, Any]]:
@@ -73,13 +62,12 @@ class _VectorObservation(VectorWrapper):
         return self._function(observation), info
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, Any, Any, Any, dict[str, Any]]:
-        observation, *rest, info = self.env.step(actions)
+        observation, reward, terminated, truncated, info = self.env.step(actions)
         if "final_obs" in info:
             final = np.empty_like(info["final_obs"])
             for i in np.flatnonzero(info["_final_obs"]):
                 final[i] = self._function(info["final_obs"][i])
             info = {**info, "final_obs": final}
-        reward, terminated, truncated = rest
         return self._function(observation), reward, terminated, truncated, info
 
 

@@ -1,7 +1,5 @@
 """Memory that gradients need, estimated before they are computed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch
@@ -22,6 +20,8 @@ GRIDS = 16
 
 #: Where a step starts, or (B, N, dtype) of a state on the CPU.
 Start = ParticleState | tuple[int, int, torch.dtype]
+#: Bytes as a function of the segment.
+Need = Callable[[Segment], int]
 
 
 def estimate_memory(
@@ -29,10 +29,9 @@ def estimate_memory(
 ) -> int:
     """Bytes that :meth:`torchmpm.Solver.step` and a backward pass through it need beyond their inputs.
 
-    For the eager backend, the graph of a substep is measured on tensors without memory, and the result is extrapolated.
-    A compiled substep keeps less than an eager one, so there this is an upper bound. For the native backend, the
-    size of its tape is known. The estimate is the largest number of bytes alive at once, with gradients in state and
-    actuation; what an allocator rounds up, or keeps for later, is not included.
+    The largest number of bytes alive at once, with gradients in state and actuation, without what an allocator rounds
+    up or keeps for later. For the eager backend it is extrapolated from the graph of a substep on tensors without
+    memory, for the native one from the size of its tape. For a compiled substep it is an upper bound.
 
     Args:
         solver: The solver; its backend is the one that the step would use.
@@ -43,8 +42,7 @@ def estimate_memory(
         env_steps: Steps in a row, through :func:`torchmpm.trajectory` with its checkpoints.
 
     Raises:
-        ValueError: A number is below 1, the solver cannot run such a state, or it would run it natively on CUDA, whose
-            memory is not known beforehand.
+        ValueError: A number is below 1, the solver cannot run such a state, or would run it natively on CUDA.
     """
     substeps, segment = check_repetition(substeps, segment, "substeps")
     return _estimate(solver, state, substeps, env_steps)(segment)
@@ -77,8 +75,7 @@ def segment_for(solver: Solver, state: Start, *, substeps: int, budget: int, env
     )
 
 
-def _estimate(solver: Solver, start: Start, substeps: int, env_steps: int) -> Callable[[Segment], int]:
-    """The bytes as a function of the segment."""
+def _estimate(solver: Solver, start: Start, substeps: int, env_steps: int) -> Need:
     if isinstance(start, ParticleState):
         state = start
     else:  # nothing is written to the memory of this state, so it takes none
@@ -86,9 +83,9 @@ def _estimate(solver: Solver, start: Start, substeps: int, env_steps: int) -> Ca
         state = ParticleState.from_stack(torch.empty(PLANES, batch, count, dtype=dtype))
     if state.num_particles != solver.num_particles:
         raise ValueError(f"state has {state.num_particles} particles, the solver's bodies {solver.num_particles}")
-    sizes = {"substeps": substeps, "env_steps": env_steps, "the state's batch size": state.batch_size}
-    for name, number in sizes.items():
-        checks.whole(name, number, 1)
+    checks.whole("substeps", substeps, 1)
+    checks.whole("env_steps", env_steps, 1)
+    checks.whole("the state's batch size", state.batch_size, 1)
     if not solver.runs_native(state):
         return _eager(solver, state, substeps, env_steps)
     if state.device.type != "cpu":
@@ -102,14 +99,14 @@ def _sizes(solver: Solver, state: ParticleState) -> tuple[int, int]:
     return PLANES * state.num_particles * size, 2 * solver.grid.resolution**2 * size
 
 
-def _eager(solver: Solver, state: ParticleState, substeps: int, env_steps: int) -> Callable[[Segment], int]:
+def _eager(solver: Solver, state: ParticleState, substeps: int, env_steps: int) -> Need:
     (state_bytes, field_bytes), graph = _sizes(solver, state), _graph_bytes(solver, state)
+    # A further step of a trajectory keeps its start, and the derivative in its actuation.
+    others = (env_steps - 1) * (state_bytes + field_bytes)
 
     def need(segment: Segment) -> int:
         length = SEGMENT if segment == "auto" else substeps if segment is None else segment
         starts = 0 if length >= substeps else -(-substeps // length)
-        # A further step of a trajectory keeps its start, and the derivative in its actuation.
-        others = (env_steps - 1) * (state_bytes + field_bytes)
         return int(graph * (min(length, substeps) + TEMPORARY)) + starts * state_bytes + others
 
     return need
@@ -117,11 +114,10 @@ def _eager(solver: Solver, state: ParticleState, substeps: int, env_steps: int) 
 
 def _graph_bytes(solver: Solver, state: ParticleState) -> int:
     """Bytes that one further substep adds to the graph of a step."""
-    batch, count, nodes = state.batch_size, state.num_particles, solver.grid.resolution
-    stacked = torch.empty(PLANES, batch, count, dtype=state.dtype, device="meta")
-    field = torch.empty(batch, 2, nodes, nodes, dtype=state.dtype, device="meta")
-    scene = solver.scene(ParticleState.from_stack(stacked), field.requires_grad_())
-    planes: Planes = tuple(plane.requires_grad_() for plane in stacked.unbind())
+    empty, nodes = state.to("meta"), solver.grid.resolution
+    field = empty.x.new_empty(state.batch_size, 2, nodes, nodes, requires_grad=True)
+    scene = solver.scene(empty, field)
+    planes: Planes = tuple(plane.detach().requires_grad_() for plane in empty.planes())
     kept: dict[int, torch.UntypedStorage] = {}
 
     def keep(tensor: Tensor) -> Tensor:
@@ -146,9 +142,7 @@ def _occupied(solver: Solver, state: ParticleState) -> float:
     return float(nodes.prod(1).max() / solver.grid.width**2)
 
 
-def _native(
-    solver: Solver, state: ParticleState, substeps: int, env_steps: int, share: float
-) -> Callable[[Segment], int]:
+def _native(solver: Solver, state: ParticleState, substeps: int, env_steps: int, share: float) -> Need:
     planes, (state_bytes, field_bytes) = state.stack(), _sizes(solver, state)
     # Each team of threads has two states of its own, some grids, and a tape. Memory of nodes that no particle comes
     # near is never written to and takes none.

@@ -1,11 +1,9 @@
 """Loops over steps, with checkpoints so that memory stays bounded under autograd."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from numbers import Integral
-from typing import Any, Literal, TypeAlias, TypeVar
+from typing import Any, Literal, TypeAlias, TypeVar, cast
 
 import torch
 from torch.utils.checkpoint import checkpoint
@@ -18,7 +16,7 @@ Input = TypeVar("Input")
 Output = TypeVar("Output")
 
 #: Substeps between checkpoints; ``None`` for none, ``"auto"`` to leave it to the backend.
-Segment: TypeAlias = "int | Literal['auto'] | None"
+Segment: TypeAlias = int | Literal["auto"] | None
 #: Segment of ``"auto"`` where only checkpoints bound the memory.
 SEGMENT = 10
 
@@ -59,8 +57,7 @@ def _checkpointed(function: Callable[[State], State], state: State, reads: Mappi
                 )
         return function(state)
 
-    result: State = checkpoint(replayable, state, use_reentrant=False, preserve_rng_state=False)
-    return result
+    return cast(State, checkpoint(replayable, state, use_reentrant=False, preserve_rng_state=False))
 
 
 def repeated(
@@ -79,14 +76,12 @@ def repeated(
         times: Number of repetitions.
         segment: With gradients enabled, keep the state only every ``segment`` steps and replay the steps between in
             the backward pass: memory for ``times / segment`` states and the graph of ``segment`` steps, for one more
-            forward pass. ``None`` keeps the whole graph, ``"auto"`` is 10. The transforms of ``torch.func`` do not
-            support checkpoints and keep the whole graph too.
+            forward pass. ``None``, and any value under ``torch.func``, keeps the whole graph; ``"auto"`` is 10.
         reads: Tensors by name that ``step`` reads besides the state, and that must not change before a replay.
 
     Raises:
         ValueError: ``times`` is negative or ``segment`` is below 1.
-        RuntimeError: In the backward pass: the state, or a tensor among ``reads``, was changed in place before its
-            replay.
+        RuntimeError: In the backward pass: the state or one of ``reads`` was changed in place before its replay.
     """
     times, segment = check_repetition(times, segment)
     segment = SEGMENT if segment == "auto" else segment
@@ -125,14 +120,12 @@ def trajectory(
         RuntimeError: In the backward pass: a state or an input was changed in place before the replay of its step.
     """
 
-    def apply(value: Input, state: State) -> State:
+    def advance(value: Input, state: State) -> State:
         return step(state, value)
 
     outputs = []
     for value in inputs:
-        if checkpointed:
-            state = _checkpointed(partial(apply, value), state, {"input": value})
-        else:
-            state = step(state, value)
+        once = partial(advance, value)
+        state = _checkpointed(once, state, {"input": value}) if checkpointed else once(state)
         outputs.append(observe(state))
     return state, outputs

@@ -1,7 +1,5 @@
 """The solver: a frozen description of grid, bodies and boundary, and the step that advances a state."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
@@ -18,7 +16,7 @@ from torchmpm.boundary import VelocityRule, faces
 from torchmpm.grid import PAD, Grid
 from torchmpm.materials.base import Value
 from torchmpm.materials.body import Body, per_particle
-from torchmpm.native.cpu.library import NO_COMPILER
+from torchmpm.native.cpu.library import NO_COMPILER, load
 from torchmpm.native.kernels import Kernels
 from torchmpm.rollout import Segment, check_repetition, repeated
 from torchmpm.state import ParticleState
@@ -98,10 +96,8 @@ class Solver:
         """The fields alone: cached tables are built anew in a copy."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    def with_constants(self, bodies: tuple[Body, ...], gravity: tuple[float, float] | Tensor) -> Solver:
-        """The same solver with other constants; skips all checks, stability included.
-
-        For simulations whose constants change in every step.
+    def with_constants(self, bodies: tuple[Body, ...], gravity: tuple[float, float] | Tensor) -> "Solver":
+        """The same solver with other constants, for those that change in every step; skips all checks.
 
         Args:
             bodies: Bodies of the same counts.
@@ -131,8 +127,7 @@ class Solver:
     def stable_dt(self, actuation: Value = 0.0) -> float:
         """Largest duration of a substep for which small strains of undeformed material do not grow, s.
 
-        See :func:`torchmpm.stability.stable_dt`. Large strains, and snow that has hardened, are stiffer and may need
-        less.
+        Large strains, and snow that has hardened, are stiffer and may need less. See ``torchmpm.stability``.
 
         Args:
             actuation: Of the muscles, Pa; a number or a tensor of shape (), (B,) or (B, count).
@@ -158,8 +153,7 @@ class Solver:
         Args:
             state: The current state.
             actuation: (B, 2, G, G) muscle actuation in Pa on the nodes of the window, ``[:, 0]`` along material x,
-                indices (i, j) rightwards and upwards; constant during the step, and felt only by bodies with
-                ``muscle=True``. ``None`` for none.
+                indices (i, j) rightwards and upwards; acts on bodies with ``muscle=True``. ``None`` for none.
             substeps: Number of substeps.
             origin: (B, 2) lower left corner of the window in the world, m; ``None`` for (0, 0).
             segment: Substeps between checkpoints when gradients are enabled, see :func:`torchmpm.repeated` and
@@ -182,7 +176,8 @@ class Solver:
             return state
         if self.runs_native(state, actuation, origin):
             return self.kernels.step(state, actuation, origin, self.gravity, substeps, segment)
-        run = partial(self.substep_function(), self, self.scene(state, actuation, origin))
+        function: Any = compiled(type(self).substep) if self.backend == "compile" else type(self).substep
+        run = partial(function, self, self.scene(state, actuation, origin))
         reads = {"origin": origin} | self.constants
         return ParticleState.from_planes(repeated(run, state.planes(), substeps, segment=segment, reads=reads))
 
@@ -190,15 +185,11 @@ class Solver:
         """One substep of a scene, from 13 planes (B, N) to new ones; a subclass may compute it in another way."""
         return substep(scene, planes)
 
-    def substep_function(self) -> Any:
-        """The substep of this class, a function of solver, scene and planes, as the backend runs it."""
-        return compiled(type(self).substep) if self.backend == "compile" else type(self).substep
-
     def runs_native(self, state: ParticleState, *fields: Tensor | None) -> bool:
         """Whether a step from this state, which also depends on the ``fields`` (B, ...), runs in the native kernels.
 
-        ``"auto"`` chooses them on the CPU wherever they work; where they do not, the reason is logged once. On CUDA
-        they run only if ``"native"`` is asked for.
+        ``"auto"`` chooses them on the CPU wherever they work, and logs once why they do not. On CUDA only ``"native"``
+        does.
 
         Raises:
             ValueError: The backend is ``"native"``, or ``"compile"``, and cannot run this.
@@ -206,13 +197,12 @@ class Solver:
         if self.backend == "eager":
             return False
         tensors = (state.x, state.v, state.C, state.F, state.Jp, *fields, *self.constants.values())
-        in_transform = transforming()
-        tangents = not in_transform and has_tangents(tensor for tensor in tensors if tensor is not None)
+        tangents = not transforming() and has_tangents(tensor for tensor in tensors if tensor is not None)
         if self.backend == "compile":
             if tangents:
                 raise ValueError("backend 'compile' loses the tangents of forward_ad; use 'eager', or torch.func.jvp")
             return False
-        reason = self._not_native(state.device, in_transform, tangents)
+        reason = self._not_native(state.device, tangents)
         if self.backend == "native":
             if reason is not None:
                 raise ValueError(f"backend 'native' cannot run this: {reason}; use 'eager'")
@@ -221,21 +211,20 @@ class Solver:
             reason = "on CUDA the native backend runs only if backend='native' asks for it"
         if reason is None:
             try:
-                self.kernels.load(state.dtype)
+                load(state.dtype)
             except ValueError as error:
                 reason = str(error)
         if reason is not None:
             warn_eager(reason)
         return reason is None
 
-    def _not_native(self, device: torch.device, in_transform: bool, tangents: bool) -> str | None:
+    def _not_native(self, device: torch.device, tangents: bool) -> str | None:
         """Why the kernels cannot run a step on a device, or ``None`` if they can."""
         if type(self).substep is not Solver.substep:
             return f"it does not call {type(self).__name__}.substep"
-        reason = self.kernels.unsupported(device)
-        if reason is None and in_transform:
+        if transforming():
             return "the transforms of torch.func do not go through its kernels"
-        return "it has no forward-mode derivatives" if reason is None and tangents else reason
+        return "it has no forward-mode derivatives" if tangents else self.kernels.unsupported(device)
 
     def scene(self, state: ParticleState, actuation: Tensor | None = None, origin: Tensor | None = None) -> Scene:
         """Check the arguments of a step and prepare what its substeps share.

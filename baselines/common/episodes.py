@@ -1,7 +1,5 @@
 """Episodes of simulations that are learned from: when they end, and on which layout the next one starts."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

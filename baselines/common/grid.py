@@ -1,7 +1,5 @@
 """Options of algorithms that act on one grid."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

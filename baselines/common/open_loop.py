@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from torch import Tensor
@@ -72,11 +71,7 @@ class OpenLoop:
 
     @classmethod
     def load(cls, path: Path) -> OpenLoop:
-        """Load what `save` wrote.
-
-        Raises:
-            CheckpointError: No such file, a damaged one, or one that is not such a policy.
-        """
+        """Load what `save` wrote; a `CheckpointError` if it is missing, damaged, or not such a policy."""
         tensors, description = read_policy(path)
         with report_mismatch(path):
             return cls(tensors["actions"], description)
@@ -85,14 +80,9 @@ class OpenLoop:
 class OpenLoopAlgorithm(Algorithm):
     """An algorithm whose policy is a sequence of actions."""
 
-    @property
-    @abstractmethod
-    def policy(self) -> OpenLoop:
-        """The actions so far."""
-
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the actions; those made for one layout name it."""
-        policy = self.policy
+        policy = cast(OpenLoop, self.policy)
         OpenLoop(policy.actions, description | policy.description).save(path)
 
     @classmethod

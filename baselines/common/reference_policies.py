@@ -1,7 +1,5 @@
 """Reference policies: zero actions, random actions and a travelling wave. Nothing is learned."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Schedules of learning rates over a stage of a run."""
 
-from __future__ import annotations
-
 import math
 
 from cfp.config import RunConfig

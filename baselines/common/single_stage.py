@@ -1,9 +1,7 @@
 """Ablations of the coarse-to-fine policy: a single stage, trained alone for the whole budget."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass, fields, replace
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import cfp
 from cfp.config import Config
@@ -29,35 +27,30 @@ class SingleStageConfig(Config):
         super().check()
 
 
-def single_stage_preset(algo: Literal["coarse", "fine"], task: str, name: str) -> SingleStageConfig:
-    """The first stage of `cfp.preset`, for all its steps, on the task's coarse or fine action grid."""
-    base = cfp.preset(task, name)
-    single = replace(
-        base,
-        algo=algo,
-        handover=(),
-        resolutions=base.resolutions[:1] if algo == "coarse" else base.resolutions[-1:],
-        random_steps=base.random_steps[:1],
-        alpha=base.alpha[:1],
-        gate_bias=(),
-        gate_penalty=(),
-    )
-    return SingleStageConfig(**{option.name: getattr(single, option.name) for option in fields(single)})
-
-
 class Coarse(CoarseToFine):
     """The first stage of CFP, for all its steps."""
 
-    @staticmethod
-    def preset(task: str, name: str) -> SingleStageConfig:
-        """Default options for a task, see `single_stage_preset`."""
-        return single_stage_preset("coarse", task, name)
+    algo: ClassVar[str] = "coarse"
+    grid: ClassVar[int] = 0
+
+    @classmethod
+    def preset(cls, task: str, name: str) -> SingleStageConfig:
+        """The first stage of `cfp.preset`, for all its steps, on the task's coarse or fine action grid."""
+        base = cfp.preset(task, name)
+        single = replace(
+            base,
+            algo=cls.algo,
+            handover=(),
+            resolutions=(base.resolutions[cls.grid],),
+            random_steps=base.random_steps[:1],
+            alpha=base.alpha[:1],
+            gate_bias=(),
+            gate_penalty=(),
+        )
+        return SingleStageConfig(**vars(single))
 
 
-class Fine(CoarseToFine):
+class Fine(Coarse):
     """CFP's finest grid from scratch, without a coarse policy."""
 
-    @staticmethod
-    def preset(task: str, name: str) -> SingleStageConfig:
-        """Default options for a task, see `single_stage_preset`."""
-        return single_stage_preset("fine", task, name)
+    algo, grid = "fine", -1

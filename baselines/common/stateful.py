@@ -1,7 +1,5 @@
 """State of objects whose training can be interrupted."""
 
-from __future__ import annotations
-
 import copy
 from typing import Any, ClassVar
 

@@ -1,7 +1,5 @@
 """``python -m baselines.compare``: several algorithms, tasks and seeds, and one report about them."""
 
-from __future__ import annotations
-
 import inspect
 import sys
 from collections.abc import Sequence
@@ -12,11 +10,9 @@ from typing import Literal
 import tyro
 
 from baselines.common.reference_policies import REFERENCE_POLICIES
-from baselines.compare.executor import Executor, InProcessExecutor, LocalExecutor, Resources, execute
+from baselines.compare.executor import Executor, InProcessExecutor, LocalExecutor, RayExecutor, Resources, execute
 from baselines.compare.final_evaluation import Noise, Protocol, Robustness
-from baselines.compare.jobs import Job, check_folder, make_jobs
-from baselines.compare.plan import Plan
-from baselines.compare.ray import RayExecutor
+from baselines.compare.jobs import Job, Plan, check_folder, make_jobs
 from baselines.compare.report import write_report
 from baselines.compare.results import RunResult, read_result
 from baselines.compare.worker import Outcome

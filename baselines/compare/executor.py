@@ -1,6 +1,4 @@
-"""What carries out runs: one interface for this process, processes of this machine, and (in `ray`) a cluster."""
-
-from __future__ import annotations
+"""What carries out runs: one interface for this process, processes of this machine, and a cluster."""
 
 import os
 import signal
@@ -11,9 +9,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 from baselines.compare.jobs import Job
 from baselines.compare.worker import EXIT_CODES, Outcome, carry_out, encode
+from cfp.errors import ConfigError
 from cfp.experiment.process import StopSignals
 from cfp.files import write_text
 
@@ -23,12 +25,6 @@ POLL = 0.2  # seconds between two looks at the processes and at the stop signals
 
 class ProcessKilled(Exception):
     """The process of a run was killed by a signal."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-
-    def __str__(self) -> str:
-        return f"killed by {signal.Signals(self.args[0]).name}; see log.txt"
 
 
 @dataclass(frozen=True)
@@ -48,12 +44,10 @@ class Executor(ABC):
     def submit(self, job: Job) -> Future[Outcome]:
         """Begin a run as soon as there is room for it; it may be over when this returns."""
 
-    @abstractmethod
-    def stop(self) -> None:
+    def stop(self) -> None:  # noqa: B027  (nothing where no run is in progress)
         """Ask the runs in progress to stop with a checkpoint, and begin no other."""
 
-    @abstractmethod
-    def shutdown(self, kill: bool) -> None:
+    def shutdown(self, kill: bool) -> None:  # noqa: B027
         """Free all resources; ``kill`` ends the runs in progress at once."""
 
 
@@ -62,7 +56,7 @@ def execute(
 ) -> None:
     """Carry out runs until all are over or have stopped, and shut down the executor."""
     pending: dict[Future[Outcome], Job] = {}
-    stopping, complete = False, False
+    stopping = False
 
     def collect(timeout: float) -> None:
         for future in wait(pending, timeout, FIRST_COMPLETED).done:
@@ -77,13 +71,12 @@ def execute(
             if signals.number and not stopping:
                 stopping = True
                 executor.stop()
-        complete = True
     finally:
-        executor.shutdown(kill=not complete)
+        executor.shutdown(kill=bool(pending))
 
 
 class InProcessExecutor(Executor):
-    """Carries out each run in this process when it is submitted."""
+    """Carries out each run in this process when it is submitted; it looks at the signals itself."""
 
     def __init__(self, signals: StopSignals, resources: Resources) -> None:
         self.signals, self.lock_timeout = signals, resources.lock_timeout
@@ -94,12 +87,6 @@ class InProcessExecutor(Executor):
         stopped = self.signals.number
         future.set_result("stopped" if stopped else carry_out(job, self.signals, self.lock_timeout, own_process=False))
         return future
-
-    def stop(self) -> None:
-        """Runs look at the signals themselves."""
-
-    def shutdown(self, kill: bool) -> None:
-        """Nothing is in progress."""
 
 
 class LocalExecutor(Executor):
@@ -141,6 +128,67 @@ class LocalExecutor(Executor):
         return self._stop.is_set() + self._kill.is_set()
 
 
+class RayExecutor(Executor):
+    """Carries out runs as tasks of a Ray cluster; Ray is imported only when this is made.
+
+    A run whose node is lost continues on another one from its last checkpoint; the lock on its folder keeps two nodes
+    from working on it at once. Ray counts lost nodes and killed processes together.
+    """
+
+    def __init__(self, address: str | None, resources: Resources) -> None:
+        try:
+            import ray
+        except ImportError as error:
+            raise ConfigError("executor ray requires Ray: pip install 'torchmpm[ray]'") from error
+        self._ray: Any = ray
+        self._owned = not ray.is_initialized()
+        if self._owned:
+            try:
+                ray.init(address=address, log_to_driver=False, configure_logging=False)
+            except ConnectionError as error:
+                raise ConfigError(f"address: no Ray cluster answers at {address!r} ({error})") from error
+        self._threads, self._lock_timeout = resources.cpus or 1, resources.lock_timeout
+        self._task = ray.remote(run_process).options(
+            num_cpus=self._threads,
+            num_gpus=resources.gpus,
+            max_retries=resources.retries,
+            retry_exceptions=[ProcessKilled],
+            scheduling_strategy="SPREAD",
+        )
+        self._references: list[Any] = []
+
+    def submit(self, job: Job) -> Future[Outcome]:
+        """Queue a run, see `Executor.submit`."""
+        reference, future = self._task.remote(job, self._threads, self._lock_timeout), Future[Outcome]()
+        self._references.append(reference)
+        reference.future().add_done_callback(partial(self._finish, future, job.folder))
+        return future
+
+    def stop(self) -> None:
+        """Cancel the tasks, which asks their runs to stop with a checkpoint."""
+        for reference in self._references:
+            self._ray.cancel(reference)
+
+    def shutdown(self, kill: bool) -> None:
+        """Disconnect from the cluster, which ends all tasks of this process."""
+        if self._owned:
+            self._ray.shutdown()
+
+    def _finish(self, future: Future[Outcome], folder: Path, done: Future[Outcome]) -> None:
+        """Pass on the result of a task; an exception that a callback raised would be lost."""
+        error = done.exception()
+        try:
+            if isinstance(error, self._ray.exceptions.TaskCancelledError):
+                future.set_result("stopped")
+            elif isinstance(error, ProcessKilled | self._ray.exceptions.RayError):
+                write_text(folder / "error.txt", f"{type(error).__name__}: {' '.join(str(error).split())}\n")
+                future.set_result("failed")
+            else:
+                future.set_result(done.result())
+        except BaseException as unexpected:
+            future.set_exception(unexpected)
+
+
 def run_process(job: Job, threads: int, lock_timeout: float, urgency: Callable[[], int] = lambda: 0) -> Outcome:
     """Carry out a run in a process of its own, whose output is appended to ``log.txt`` in the run folder.
 
@@ -165,7 +213,7 @@ def run_process(job: Job, threads: int, lock_timeout: float, urgency: Callable[[
         pass  # the process has ended already; its exit code says how
     code = _wait(process, urgency)
     if code < 0 and not urgency():
-        raise ProcessKilled(-code)
+        raise ProcessKilled(f"killed by {signal.Signals(-code).name}; see log.txt")
     outcome: Outcome = "stopped" if code < 0 else {code: name for name, code in EXIT_CODES.items()}.get(code, "failed")
     if outcome == "failed" and not (folder / "error.txt").exists():  # it failed outside of the run itself
         with open(folder / "log.txt", "rb") as log:

@@ -1,7 +1,5 @@
 """The final evaluation of a run's policy, recorded in its folder so that no episode is played twice."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -113,10 +111,7 @@ def read_record(path: Path, **types: type) -> dict[str, Any]:
 
 
 def evaluation_config(config: RunConfig, tier: Particles) -> RunConfig:
-    """Options of the environment of a final evaluation: seed 0 for all runs, so that all play the same layouts.
-
-    The environment depends on ``tier`` and not on the particles of the run, so that it is the same for all runs.
-    """
+    """Options of a final evaluation: seed 0 and the particles of ``tier``, so that all runs play the same episodes."""
     return replace(config, seed=0, environment=config.environment.for_evaluation(tier))
 
 

@@ -1,20 +1,20 @@
-"""The runs of a comparison: which there are, with which options, and which of them are finished."""
+"""The runs of a comparison: which there are, with which options of the plan file, and which of them are finished."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare.final_evaluation import RECORD, Protocol, read_record
-from baselines.compare.plan import Plan
 from baselines.registry import ALGORITHMS, ALIASES, configure, sees
 from cfp.config import EVALUATION_SEED, RunConfig, to_json
 from cfp.errors import ConfigError
 from cfp.experiment.folder import holds_run, read_config
+from cfp.files import read_json
 from cfp.from_dict import flatten
 from cfp.sections import TASK_OPTIONS
 from cfp.weights import is_of_another_task, is_same_task, read_policy
@@ -25,6 +25,72 @@ IRRELEVANT_OPTIONS = ("device", "environment.backend", "report.video", "report.c
 """Options that change neither what a run learns nor which policy it keeps."""
 TASK_DEFINING_OPTIONS = ("substeps", "dtype", "parity", "resample", "target", "variant")
 """Options of the environment on which all algorithms of a task must agree."""
+Options = dict[str, Any]
+"""Options of a run by name, in the form of its ``config.json``."""
+
+COMMAND_LINE_OPTIONS = ("device", "preset", "seed", "task")
+"""Options that the command line gives to all runs, or by which it distinguishes them."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Options of runs beyond their presets."""
+
+    common: Options = field(default_factory=dict)
+    tasks: dict[str, Options] = field(default_factory=dict)
+    algos: dict[str, Options] = field(default_factory=dict)  # also by variant; ``tasks`` in them hold there only
+
+    @classmethod
+    def read(cls, path: Path | None) -> Plan:
+        """Read a JSON file; no file is an empty plan."""
+        if path is None:
+            return cls()
+        try:
+            values = read_json(path)
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"plan: {path} cannot be read as JSON ({error})") from error
+        if not set(values) <= {"common", "tasks", "algos"}:
+            raise ConfigError(f"plan: {path} must hold common, tasks and algos only, got {', '.join(values)}")
+        for part, options in values.items():
+            _check_options(part, options, named=part != "common")
+        return cls(**values)
+
+    def options(self, label: str, task: str) -> Options:
+        """Options of a run; of common, task, algorithm, and algorithm in a task the later ones win."""
+        return _merge(_merge(self.common, self.tasks.get(task, {})), self.own_options(label, task))
+
+    def own_options(self, label: str, task: str) -> Options:
+        """Options of a run that the file gives for its algorithm alone."""
+        own = dict(self.algos.get(label, {}))
+        by_task = own.pop("tasks", {})
+        return _merge(own, by_task.get(task, {}))
+
+    def unused(self, tasks: Sequence[str], labels: Sequence[str]) -> dict[str, list[str]]:
+        """Names in the file that are not part of a comparison, by the part of the file that holds them."""
+        parts = {"tasks": set(self.tasks) - set(tasks), "algos": set(self.algos) - set(labels)}
+        for label in labels:
+            parts[f"algos.{label}.tasks"] = set(self.algos.get(label, {}).get("tasks", {})) - set(tasks)
+        return {part: sorted(names) for part, names in parts.items() if names}
+
+
+def _check_options(name: str, value: Any, named: bool) -> None:
+    """Check options of runs, or if ``named`` such options by the name of a task or an algorithm."""
+    if not isinstance(value, dict):
+        raise ConfigError(f"plan: {name} must be a JSON object, got {value!r}")
+    for key, item in value.items():
+        if named or key == "tasks":
+            _check_options(f"{name}.{key}", item, named=not named)
+        elif key in COMMAND_LINE_OPTIONS:
+            raise ConfigError(f"plan: {name} must not hold {key}, which the command line gives")
+
+
+def _merge(base: Options, values: Options) -> Options:
+    """Options over options, group by group."""
+    merged = {**base, **values}
+    for name, group in base.items():
+        if isinstance(group, dict) and isinstance(values.get(name), dict):
+            merged[name] = _merge(group, values[name])
+    return merged
 
 
 @dataclass(frozen=True)
@@ -81,10 +147,7 @@ def make_jobs(
     steps: int | None = None,
     device: str = "auto",
 ) -> list[Job]:
-    """All runs of a comparison, ordered by seed, so that a comparison that is stopped early has something to compare.
-
-    Reference policies have one run, that of the first seed.
-    """
+    """All runs of a comparison, by seed, so that one that is stopped early has something to compare."""
     for name, values in (("tasks", tasks), ("algos", labels), ("seeds", seeds)):
         if not values or len(set(values)) < len(values):
             given = " ".join(map(str, values)) or "none"
@@ -98,7 +161,7 @@ def make_jobs(
             for label in labels:
                 config = resolve(plan, label, task, preset, seed, steps, device)
                 job = Job(label, config, folder / f"{label}-{task_name(task)}-{preset}-{seed}", protocol(config))
-                if seed == seeds[0] or not job.untrained:
+                if seed == seeds[0] or not job.untrained:  # reference policies have one run
                     jobs.append(job)
     _check_same_task(jobs)
     return jobs

@@ -4,8 +4,6 @@ Values of figures were measured from the drawn curves: mean and half the width o
 the steps, three seeds, training returns. A resting robot was measured in the reference environment at full size.
 """
 
-from __future__ import annotations
-
 from cfp.sections import Particles
 
 TIER: Particles = "full"

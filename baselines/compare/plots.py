@@ -1,7 +1,5 @@
 """The figures of a comparison. Colours tell algorithms apart, lines and markers what they observe."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

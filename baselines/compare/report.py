@@ -1,7 +1,5 @@
 """The report of a comparison: tables as CSV files, all of them in one Markdown file and one page, and figures."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from html import escape

@@ -1,7 +1,5 @@
 """The contents of the run folders of a comparison, read for the report."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,11 +42,6 @@ class RunResult:
     cost: Cost | None
     evaluation: FinalEvaluation | None
 
-    @property
-    def score(self) -> float | None:
-        """Mean return on the common layouts."""
-        return None if self.evaluation is None else self.evaluation.mean
-
 
 @dataclass(frozen=True)
 class Group:
@@ -57,27 +50,15 @@ class Group:
     task: str
     observes: str
     label: str
-    runs: tuple[RunResult, ...]
-
-    @property
-    def job(self) -> Job:
-        """The first run, for what all of them have in common."""
-        return self.runs[0].job
-
-    @property
-    def evaluations(self) -> list[FinalEvaluation]:
-        """Final evaluations of the runs that have one."""
-        return [run.evaluation for run in self.runs if run.evaluation is not None]
+    job: Job  # the first run, for what all of them have in common
+    evaluations: list[FinalEvaluation]  # of the runs that have one
+    curves: list[Curve]  # of the runs that have one
+    costs: list[Cost]  # of the runs of which a session has ended in order
 
     @property
     def scores(self) -> list[float]:
         """Mean returns of the runs that have been evaluated."""
         return [each.mean for each in self.evaluations]
-
-    @property
-    def own_layouts(self) -> list[float]:
-        """Returns on the only layout that policies were made for."""
-        return [each.own_layout for each in self.evaluations if each.own_layout is not None]
 
     @property
     def iqm(self) -> float | None:
@@ -93,22 +74,6 @@ class Group:
     def particles(self) -> Particles:
         """Particles of the evaluations during training."""
         return self.job.config.environment.particles
-
-    @property
-    def train_particles(self) -> Particles:
-        """Particles of training itself."""
-        particles: Particles | None = getattr(self.job.config, "train_particles", None)
-        return self.particles if particles is None else particles
-
-    @property
-    def curves(self) -> list[Curve]:
-        """Curves of the runs that have one."""
-        return [run.curve for run in self.runs if len(run.curve[0])]
-
-    @property
-    def costs(self) -> list[Cost]:
-        """Costs of the runs of which a session has ended in order."""
-        return [run.cost for run in self.runs if run.cost is not None]
 
     @property
     def speed(self) -> float | None:
@@ -136,9 +101,13 @@ def group_results(runs: Sequence[RunResult]) -> list[Group]:
     members: dict[tuple[str, str, str], list[RunResult]] = {}
     for run in runs:
         members.setdefault((run.job.config.task, run.job.observes, run.job.label), []).append(run)
-    tasks = list(dict.fromkeys(task for task, _, _ in members))
-    keys = sorted(members, key=lambda key: (tasks.index(key[0]), OBSERVATIONS.index(key[1])))
-    return [Group(*key, tuple(members[key])) for key in keys]
+    tasks, groups = list(dict.fromkeys(task for task, _, _ in members)), []
+    for key in sorted(members, key=lambda key: (tasks.index(key[0]), OBSERVATIONS.index(key[1]))):
+        evaluations = [run.evaluation for run in members[key] if run.evaluation is not None]
+        curves = [run.curve for run in members[key] if len(run.curve[0])]
+        costs = [run.cost for run in members[key] if run.cost is not None]
+        groups.append(Group(*key, members[key][0].job, evaluations, curves, costs))
+    return groups
 
 
 def _read_curve(folder: Path) -> Curve:

@@ -1,10 +1,4 @@
-"""Statistics of a few runs.
-
-Interquartile mean and stratified bootstrap follow Agarwal et al., "Deep Reinforcement Learning at the Edge of the
-Statistical Precipice", NeurIPS 2021: one score per run, runs resampled within each task.
-"""
-
-from __future__ import annotations
+"""Statistics of few runs (Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice")."""
 
 from collections.abc import Sequence
 
@@ -24,10 +18,10 @@ def interquartile_mean(scores: np.ndarray | Sequence[float], axis: int = 0) -> n
 def bootstrap_interval(
     strata: Sequence[np.ndarray | Sequence[float]], resamples: int = 10_000, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Percentile 95 % interval of the interquartile mean, by stratified bootstrap over runs.
+    """Percentile 95 % interval of the interquartile mean, by stratified bootstrap; None without a task of two runs.
 
     With two or three runs it is hardly wider than their range, and too narrow. The strata hold the scores (N_i,) of the
-    runs of each task; a single stratum may hold curves (N, T), resampled as wholes. None if no stratum has two runs.
+    runs of each task; a single stratum may hold curves (N, T), resampled as wholes.
     """
     resampled = [np.asarray(scores, float) for scores in strata if len(scores) > 1]
     if not resampled:

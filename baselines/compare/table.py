@@ -1,8 +1,6 @@
 """A table with declared columns, rendered as CSV, Markdown and HTML."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -63,10 +61,10 @@ class Table:
         """Heading, description and visible columns."""
         lines = [f"## {self.title}", "", self.description]
         if self.rows:
-            lines += ["", _markdown_line(column.title for column in self.visible)]
-            lines.append(_markdown_line("---:" if column.format else "---" for column in self.visible))
-            for row in self.rows:
-                lines.append(_markdown_line(column.text(row).replace("|", "\\|") for column in self.visible))
+            titles = [column.title for column in self.visible]
+            alignments = ["---:" if column.format else "---" for column in self.visible]
+            rows = [[column.text(row).replace("|", "\\|") for column in self.visible] for row in self.rows]
+            lines += ["", *(f"| {' | '.join(cells)} |" for cells in (titles, alignments, *rows))]
         return "\n".join(lines)
 
     def to_html(self) -> str:
@@ -82,7 +80,3 @@ class Table:
 def _html_cell(tag: str, column: Column, text: str) -> str:
     alignment = "" if column.format else ' class="text"'
     return f"<{tag}{alignment}>{escape(text)}</{tag}>"
-
-
-def _markdown_line(cells: Iterable[str]) -> str:
-    return "| " + " | ".join(cells) + " |"

@@ -1,7 +1,5 @@
 """The tables of a comparison."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -35,6 +33,10 @@ def _mean(values: Sequence[float]) -> float | None:
     return float(np.mean(values)) if values else None
 
 
+def _own_layout(group: Group) -> float | None:
+    return _mean([each.own_layout for each in group.evaluations if each.own_layout is not None])
+
+
 def _labels(groups: Iterable[Group]) -> str:
     return ", ".join(dict.fromkeys(group.label for group in groups))
 
@@ -46,7 +48,7 @@ RUNS = (
     Column("task", value=lambda run: run.job.config.task),
     Column("seed", value=lambda run: run.job.config.seed),
     Column("state", "state", value=lambda run: run.state),
-    Column("score", value=lambda run: run.score),
+    Column("score", value=lambda run: run.evaluation and run.evaluation.mean),
     Column("episodes", value=lambda run: len(run.evaluation.returns) if run.evaluation else 0),
     Column("error", "error", value=lambda run: run.error),
 )
@@ -75,7 +77,7 @@ RETURNS = (
     Column("high", "high", ".1f", lambda group: group.interval[1]),
     Column("mean", "mean", ".1f", lambda group: _mean(group.scores)),
     Column("std", "std", ".1f", lambda group: float(np.std(group.scores, ddof=1)) if len(group.scores) > 1 else None),
-    Column("own", "own layout", ".1f", lambda group: _mean(group.own_layouts)),
+    Column("own", "own layout", ".1f", _own_layout),
 )
 
 
@@ -190,6 +192,10 @@ def _paper_cost(group: Group) -> tuple[float, float] | tuple[None, None]:
     return paper.COST.get(group.label, (None, None)) if group.task == "run" else (None, None)
 
 
+def _train_particles(group: Group) -> str:
+    return str(getattr(group.job.config, "train_particles", None) or group.particles)
+
+
 def _peak_memory(group: Group) -> float | None:
     return max((cost.memory / 2**20 for cost in group.costs if cost.memory), default=None)
 
@@ -197,7 +203,7 @@ def _peak_memory(group: Group) -> float | None:
 COST = (
     *GROUP,
     Column("device", "device", value=lambda group: "/".join(sorted({cost.device for cost in group.costs}))),
-    Column("particles", "particles", value=lambda group: str(group.train_particles)),
+    Column("particles", "particles", value=_train_particles),
     Column("robots", "robots", "d", lambda group: group.job.config.environment.num_envs),
     Column("steps", "steps", ",d", lambda group: max(cost.last_step for cost in group.costs)),
     Column("minutes", "minutes", ".1f", lambda group: group.mean_cost("seconds") / 60),

@@ -4,8 +4,6 @@ As a program, the process reads its job as one line of JSON from the standard in
 the standard input ends, the parent is gone, and the run stops with a checkpoint as if a signal had asked it to.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -15,7 +13,7 @@ import time
 import traceback
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from baselines.compare.final_evaluation import Protocol, evaluate_run
 from baselines.compare.jobs import Job, check_folder, read_sessions
@@ -26,6 +24,7 @@ from cfp.experiment.process import Stopped, StopSignals, keep_memory, peak_memor
 from cfp.experiment.run import Run
 from cfp.experiment.run_lock import FolderInUse, run_lock
 from cfp.files import write_json, write_text
+from cfp.from_dict import update_from_dict
 
 Outcome = Literal["finished", "failed", "busy", "stopped"]
 """How a run ended; busy: another process holds its folder."""
@@ -40,10 +39,9 @@ def encode(job: Job, lock_timeout: float) -> bytes:
 
 def decode(line: str) -> tuple[Job, float]:
     """Inverse of `encode`."""
-    values: dict[str, Any] = json.loads(line)
-    protocol, tier = values["protocol"], values["protocol"]["tier"]
-    protocol["tier"] = tuple(tier) if isinstance(tier, list) else tier
-    job = Job(values["label"], configure(values["config"]), Path(values["folder"]), Protocol(**protocol))
+    values = json.loads(line)
+    protocol = update_from_dict(Protocol(1), values["protocol"])
+    job = Job(values["label"], configure(values["config"]), Path(values["folder"]), protocol)
     return job, values["lock_timeout"]
 
 

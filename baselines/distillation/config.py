@@ -1,7 +1,5 @@
 """Options of a distillation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Dataset aggregation (DAgger; Ross et al., AISTATS 2011): the student acts, the teacher labels the visited states."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -74,10 +72,7 @@ class Dataset:
 
 
 def drop_entries(values: Tensor, probability: float, grid: int | None = None) -> Tensor:
-    """Set entries of values (B, ..., A, A) to 0 in half of the elements, drawn on a coarser ``grid`` if given.
-
-    Draws come from torch's generator.
-    """
+    """Set random entries of values (B, ..., A, A) to 0 in half of the elements, drawn on a coarser ``grid`` if any."""
     if not probability:
         return values
     mask = torch.rand(values.shape if grid is None else (*values.shape[:-2], grid, grid)) < probability
@@ -96,18 +91,12 @@ class Collector(Stateful):
     values = ("steps_since_switch", "teacher_acts", "left_plan")
 
     def __init__(
-        self,
-        env: TorchEnv,
-        teacher: Teacher,
-        episodes: Episodes,
-        switch_every: int,
-        dropout: float = 0.0,
-        grid: int | None = None,
+        self, teacher: Teacher, episodes: Episodes, switch_every: int, dropout: float = 0.0, grid: int | None = None
     ) -> None:
-        self.env, self.teacher, self.episodes, self.switch_every = env, teacher, episodes, switch_every
+        self.env, self.teacher, self.episodes, self.switch_every = episodes.env, teacher, episodes, switch_every
         self.dropout, self.grid = dropout, grid
         self.steps_since_switch = switch_every
-        self.teacher_acts = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
+        self.teacher_acts = torch.zeros(self.env.num_envs, dtype=torch.bool, device=self.env.device)
         self.left_plan = self.teacher_acts.clone()  # the robot is no longer where the teacher's plan takes it
 
     @torch.no_grad()

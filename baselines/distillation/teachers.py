@@ -1,9 +1,9 @@
-"""Teachers of a distillation: a trained policy of any kind, or the gradient planner."""
-
-from __future__ import annotations
+"""Teachers of a distillation: a trained policy of any kind, which may be trained first, or the gradient planner."""
 
 import functools
+import time
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +13,27 @@ from torch import Tensor
 
 from baselines.common.open_loop import OpenLoop
 from baselines.common.stateful import Stateful
+from baselines.distillation.config import DistillConfig
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
-from baselines.registry import load
+from baselines.registry import configure, find, load
+from cfp.errors import CheckpointError, ConfigError
+from cfp.experiment.folder import copy_policy, policy_path
+from cfp.experiment.process import StopSignals
+from cfp.experiment.run import Run
+from cfp.files import read_json, write_json
 from cfp.policy_protocols import Policy, SeesState
-from cfp.sections import EnvironmentConfig
-from cfp.weights import check_trained_for, read_policy
+from cfp.sections import TASK_OPTIONS, EnvironmentConfig
+from cfp.weights import check_trained_for, read_policy, shipped, write_policy
 from dittogym import TorchEnv, make_spec
 from dittogym.action import ActionIndexing, bicubic_matrix, from_grid_indexing, to_grid_indexing
+
+TRAINED = ("shac", "gradient")
+"""Teachers that are trained first if only their algorithm is named."""
 
 
 class Teacher(Stateful, ABC):
     """Labels the present states of an environment with actions."""
 
-    resolution: int  # action grid R
     fresh: bool = True  # or the last actions are part of a plan, and right only for robots that have followed it
 
     @abstractmethod
@@ -34,15 +42,10 @@ class Teacher(Stateful, ABC):
 
 
 class PolicyTeacher(Teacher):
-    """A trained policy, without noise.
-
-    An open-loop policy plays the action of the step that each episode is at. Other policies get their memory back, and
-    start anew where an episode does.
-    """
+    """A trained policy without noise; an open-loop one plays the action of the step that each episode is at."""
 
     def __init__(self, policy: Policy, policy_layout: ActionIndexing, layout: ActionIndexing) -> None:
         self.policy, self.policy_layout, self.layout = policy, policy_layout, layout
-        self.resolution = policy.resolution
         self._memory: tuple[np.ndarray, ...] | None = None
 
     @torch.no_grad()
@@ -65,31 +68,26 @@ class PolicyTeacher(Teacher):
 
 
 class PlannerTeacher(Teacher):
-    """The gradient planner, which plans from the states that the student has reached.
-
-    It plans for all robots at once, every `PlannerConfig.commit` steps, each plan from what is left of the last one.
-    """
+    """The gradient planner, which plans for all robots at once from the states that the student has reached."""
 
     parts = ("planner",)
 
     def __init__(self, env: TorchEnv, config: GradientPlannerConfig, seed: int) -> None:
         env.reset(seed=seed)
-        self.env, self.resolution = env, env.action_resolution
+        self.env = env
         self.planner = GradientPlanner(env, config, seed=seed)
 
     def act(self, env: TorchEnv, observation: Tensor) -> Tensor:
         """The next actions (B, 2, R, R) of the plans."""
         self.env.env_state = env.env_state
-        action = self.planner.act()
-        self.fresh = self.planner.has_replanned
-        return action.float()
+        self.fresh = self.planner.needs_plan
+        return self.planner.act().float()
 
 
 def project(actions: Tensor, resolution: int, patch: int) -> Tensor:
-    """Actions on another grid that drive the muscles as similarly as possible.
+    """Actions on another grid that drive the muscles as similarly as possible, clipped to [-1, 1].
 
-    With the environment's bicubic interpolation to the patch, ``U``, the result has the least squared difference from
-    ``U a U^T`` there, clipped to [-1, 1].
+    With the bicubic interpolation ``U`` to the patch, they have the least squared difference from ``U a U^T`` there.
     """
     matrix = _projection(actions.shape[-1], resolution, patch).to(actions)
     return (matrix @ actions @ matrix.T).clamp(-1.0, 1.0)
@@ -109,7 +107,57 @@ def read_teacher(path: str | Path, task: str, environment: EnvironmentConfig) ->
     return load(path)
 
 
-def is_record_of_one_start(teacher: Policy, task: str, environment: EnvironmentConfig) -> bool:
-    """Whether a teacher was planned for a single layout, in a task whose episodes start from different ones."""
-    varies = any(body.shape.draws for body in make_spec(task, **environment.task_options()).bodies)
-    return varies and "layout" in teacher.description
+def teacher_path(folder: Path) -> Path:
+    """The copy of the teacher in the folder of a run."""
+    return folder / "teacher.safetensors"
+
+
+def copy_teacher(config: DistillConfig, folder: Path) -> None:
+    """Copy the teacher into the folder, if it is a policy."""
+    teacher = config.teacher
+    if teacher in ("mpc", *TRAINED):
+        return
+    try:
+        read_teacher(teacher, config.task, config.environment)
+    except CheckpointError as error:
+        if Path(teacher).exists():
+            raise
+        names = ", ".join(("mpc", *TRAINED, *shipped()))
+        raise ConfigError(f"teacher must be {names}, a run folder or a policy.safetensors, got {teacher!r}") from error
+    write_policy(teacher_path(folder), *read_policy(teacher))
+
+
+def warnings(config: DistillConfig, folder: Path) -> list[str]:
+    """A warning if the teacher is the record of one episode, in a task whose episodes start differently."""
+    if config.teacher in ("mpc", *TRAINED):
+        return []
+    spec = make_spec(config.task, **config.environment.task_options())
+    if not any(body.shape.draws for body in spec.bodies) or "layout" not in read_policy(teacher_path(folder))[1]:
+        return []
+    return [
+        f"teacher: the record of one planned episode, while every episode of {config.task} starts differently; "
+        "evaluate it from other starts (python -m baselines.evaluate --policy), or use mpc, which plans anew"
+    ]
+
+
+def train_teacher(config: DistillConfig, folder: Path, signals: StopSignals) -> None:
+    """Train a teacher that is only named and not there yet; what this took is added up in ``teacher/cost.json``."""
+    if config.teacher not in TRAINED or teacher_path(folder).exists():
+        return
+    chosen = configure({"algo": config.teacher, "task": config.task})
+    same = {name: getattr(config.environment, name) for name in ("substeps", "dtype", "backend", *TASK_OPTIONS)}
+    environment = replace(chosen.environment, **same)
+    chosen = replace(chosen, seed=config.seed, device=config.device, environment=environment)
+    algorithm, own = find(config.teacher), folder / "teacher"
+    run = Run(algorithm, chosen, own, True, signals)
+    print(f"training the teacher first: {config.teacher} -> {own}")
+    start, begin = run.step, time.perf_counter()
+    try:
+        run.train()
+    finally:
+        cost = {"steps": run.step - start, "seconds": time.perf_counter() - begin}
+        cost["evaluation_seconds"] = run.evaluation_seconds
+        path = own / "cost.json"
+        before = read_json(path) if path.exists() else {}
+        write_json(path, {name: value + before.get(name, 0) for name, value in cost.items()})
+    copy_policy(policy_path(own), teacher_path(folder))

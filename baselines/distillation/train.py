@@ -20,7 +20,7 @@ from baselines.common.grid import grid_size
 from baselines.common.policies import image_policy
 from baselines.common.schedules import linear_decay, stage_progress
 from baselines.common.stateful import Stateful
-from baselines.distillation import teacher_training
+from baselines.distillation import teachers
 from baselines.distillation.config import DistillConfig
 from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entries
 from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
@@ -86,7 +86,7 @@ class Distill(Stateful, Algorithm):
         seed = config.seed + (stage - 1) * config.num_layouts
         episodes = Episodes(self.env, seed, config.max_episode_steps, config.num_layouts)
         guide, grid = self._make_teacher(training, teacher), self.spec.resolutions[-1]
-        self.collector = Collector(self.env, guide, episodes, config.switch_every, config.dropout, grid)
+        self.collector = Collector(guide, episodes, config.switch_every, config.dropout, grid)
         self.dataset, self.rounds = Dataset(config.capacity), 0
 
     def _make_teacher(self, training: RunConfig, path: Path | None) -> Teacher:
@@ -107,11 +107,7 @@ class Distill(Stateful, Algorithm):
             yield
 
     def update(self) -> Scalars:
-        """Do one round of DAgger: collect labels, and learn from all that are kept.
-
-        Raises:
-            NonFiniteError: The loss is not finite.
-        """
+        """Collect the labels of a round, and learn from all; a `NonFiniteError` if the loss is not finite."""
         config, beta = self.config, self.config.beta_decay**self.rounds
         progress = stage_progress(config, self.stage, self.num_timesteps)
         learning_rate = config.student_learning_rate * linear_decay(progress)
@@ -150,9 +146,7 @@ class Distill(Stateful, Algorithm):
     def loss(self, observations: Tensor, actions: Tensor) -> Tensor:
         """Mean squared difference of the student's mean actions from the teacher's, on the grid that is carried out.
 
-        Args:
-            observations: (B, 3, 64, 64) uint8.
-            actions: (B, 2, R, R) of the teacher, on any grid.
+        ``observations`` are (B, 3, 64, 64) uint8, the teacher's ``actions`` (B, 2, R, R) on any grid.
         """
         target = project(actions.to(self.env.device), self.spec.action_size, self.env.spec.patch)
         return (self.actor(observations.to(self.env.device), deterministic=True) - target).square().mean()
@@ -219,19 +213,19 @@ class Distill(Stateful, Algorithm):
     @classmethod
     def initialize(cls, config: DistillConfig, folder: Path) -> Position:
         """Copy the teacher into the folder, if it is a policy."""
-        teacher_training.copy_teacher(config, folder)
+        teachers.copy_teacher(config, folder)
         return Position()
 
     @classmethod
     def prepare(cls, config: DistillConfig, folder: Path, signals: StopSignals) -> None:
         """Train the teacher, if only its algorithm is named."""
-        teacher_training.train_teacher(config, folder, signals)
+        teachers.train_teacher(config, folder, signals)
 
     @classmethod
     def create(cls, config: DistillConfig, stage: int, folder: Path, resumed: bool = False) -> Distill:
         """The student at the beginning of a stage."""
         start = load(policy_path(folder, stage - 1), choose_device(config.device)) if stage > 1 else None
-        teacher = None if config.teacher == "mpc" else teacher_training.teacher_path(folder)
+        teacher = None if config.teacher == "mpc" else teachers.teacher_path(folder)
         algorithm = cls(config, stage, start, teacher)
         algorithm.starts_trained = stage > 1
         return algorithm
@@ -239,7 +233,7 @@ class Distill(Stateful, Algorithm):
     @classmethod
     def warnings(cls, config: DistillConfig, folder: Path, first_stage: int) -> list[str]:
         """A warning if the teacher was planned for one start only."""
-        return teacher_training.warnings(config, folder)
+        return teachers.warnings(config, folder)
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the policy, as one of CFP."""

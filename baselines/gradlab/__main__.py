@@ -1,7 +1,5 @@
 """``python -m baselines.gradlab``: up to which horizon does a gradient through the simulation help on a task?"""
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 from collections.abc import Sequence

@@ -78,10 +78,7 @@ class ReturnFunction:
 def finite_difference_errors(
     function: ReturnFunction, actions: Tensor, gradients: Sequence[Tensor], directions: Tensor
 ) -> Tensor:
-    """Errors (horizons, step sizes) of central differences along directions (D, T, 2, R, R) against gradients.
-
-    Root mean square over the directions, relative to the gradient's norm, the expected size of such a derivative.
-    """
+    """Relative errors (horizons, step sizes), in the mean square, of central differences along directions."""
     count = len(directions)
     errors = torch.empty(len(gradients), len(STEP_SIZES), dtype=actions.dtype)
     for column, step in enumerate(STEP_SIZES):

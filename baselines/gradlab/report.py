@@ -1,7 +1,5 @@
 """The report of the gradient laboratory: a conclusion, tables and a figure."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections.abc import Sequence

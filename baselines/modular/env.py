@@ -1,7 +1,5 @@
 """An environment whose observations and actions are those of the robot's segments."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -18,13 +16,14 @@ from torchmpm import tree
 class SegmentedEnv:
     """Observes rows of `Nodes` and takes actions of segments; for `cfp.envs.vec_env.TorchVecEnv`.
 
-    A simulation that is not finite keeps its last observation; its episode ends there.
+    A simulation that is not finite keeps its last observation; its episode ends there. ``labels`` (B, N) are the
+    segments of the robot's particles.
     """
 
     def __init__(self, env: TorchEnv, nodes: Nodes) -> None:
         self.env, self.nodes = env, nodes
-        self.num_envs, self.device, self.action_resolution = env.num_envs, env.device, env.action_resolution
-        self._labels: Tensor | None = None
+        self.num_envs, self.device = env.num_envs, env.device
+        self.labels = torch.zeros(env.num_envs, env.model.num_robot_particles, dtype=torch.int64, device=env.device)
         self._observation = torch.zeros(env.num_envs, nodes.count, nodes.num_columns(env.spec), device=env.device)
 
     @property
@@ -40,7 +39,7 @@ class SegmentedEnv:
 
     @env_state.setter
     def env_state(self, value: tuple[Any, Tensor, Tensor]) -> None:
-        self.env.env_state, self._labels, self._observation = value
+        self.env.env_state, self.labels, self._observation = value
 
     @property
     def generators(self) -> dict[int, dict[str, Tensor]]:
@@ -51,19 +50,12 @@ class SegmentedEnv:
     def generators(self, states: dict[int, dict[str, Tensor]]) -> None:
         self.env.generators = states
 
-    @property
-    def labels(self) -> Tensor:
-        """Segment (B, N) of every particle of the robot."""
-        if self._labels is None:
-            raise RuntimeError("call reset() before segments are used")
-        return self._labels
-
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Start new episodes, see `dittogym.TorchEnv.reset`; returns rows (B, K, columns) and info."""
         _, info = self.env.reset(seed=seed, options=options)
         mask = (options or {}).get("reset_mask")
         mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device) if mask is None else mask
-        self._labels = segment(self.env, self.nodes, self._labels, mask)
+        self.labels = segment(visible_positions(self.env), self.labels, self.nodes.count, mask)
         return self._observe(mask), info
 
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
@@ -71,22 +63,17 @@ class SegmentedEnv:
         field = self.nodes.to_grid(self.env, self.labels, action)
         _, reward, terminated, truncated, info = self.env.step(field)
         labels = update(visible_positions(self.env), self.labels, self.nodes.count)
-        self._labels = tree.where(info["finite"], labels, self.labels)
+        self.labels = tree.where(info["finite"], labels, self.labels)
         return self._observe(info["finite"]), reward, terminated, truncated, info
 
     def _observe(self, mask: Tensor) -> Tensor:
         self._observation = tree.where(mask, self.nodes.observe(self.env, self.labels), self._observation)
         return self._observation
 
-    def render(self, index: int = 0) -> np.ndarray:
-        """Picture of one element."""
-        return self.env.render(index)
 
-
-def segment(env: TorchEnv, nodes: Nodes, labels: Tensor | None, mask: Tensor) -> Tensor:
-    """Labels (B, N) in which the elements of a mask (B,) are segmented anew."""
-    x = visible_positions(env)
-    result = x.new_zeros(x.shape[:2], dtype=torch.int64) if labels is None else labels.clone()
+def segment(x: Tensor, labels: Tensor, count: int, mask: Tensor) -> Tensor:
+    """Labels (B, N) in which the elements of a mask (B,), with particles at x (B, N, 2), are segmented anew."""
+    labels = labels.clone()
     if bool(mask.any()):
-        result[mask] = fit(x[mask], nodes.count)
-    return result
+        labels[mask] = fit(x[mask], count)
+    return labels

@@ -1,10 +1,7 @@
 """Segmentation of the robot's particles by k-means, and which segments are neighbours.
 
-The first segmentation of an episode is scikit-learn's, seeded. Every later one starts from the labels of the previous
-step, so segments keep their identity while the robot moves.
+An episode begins with `fit`; every later step starts from the labels of the one before, so segments stay the same.
 """
-
-from __future__ import annotations
 
 import numpy as np
 import torch
@@ -32,14 +29,11 @@ def fit(x: Tensor, count: int, seed: int = 0) -> Tensor:
 
 
 def update(x: Tensor, labels: Tensor, count: int) -> Tensor:
-    """Segment particles (B, N, 2), m, that have moved by Lloyd's algorithm from the previous labels (B, N).
-
-    A segment that is left without particles gets the one that is farthest from its centre.
-    """
+    """Segment particles (B, N, 2), m, that have moved, by Lloyd's algorithm from the previous labels (B, N)."""
     for _ in range(LLOYD_ITERATIONS):
         distance, labels = squared_distances(x, segment_means(x, labels, count)[0]).min(-1)
         sizes = torch.zeros(len(x), count, device=x.device).scatter_add_(1, labels, torch.ones_like(labels).to(x))
-        for element, empty in (sizes == 0).nonzero().tolist():
+        for element, empty in (sizes == 0).nonzero().tolist():  # gets the particle farthest from its centre
             farthest = int(distance[element].argmax())
             labels[element, farthest], distance[element, farthest] = empty, 0.0
     return labels

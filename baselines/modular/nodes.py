@@ -1,7 +1,5 @@
 """Features and actions of a robot's segments, the nodes of a modular policy."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -92,17 +90,9 @@ class Nodes:
     def to_grid(self, env: TorchEnv, labels: Tensor, values: Tensor) -> Tensor:
         """Actions (B, 2, P, P) in which every node of the patch has the value of the segment with the nearest centre.
 
-        Args:
-            env: Before its step, with its patch as action grid.
-            labels: (B, N).
-            values: (B, K, 2), in [-1, 1].
-
-        Raises:
-            ValueError: The environment has another action grid.
+        Labels are (B, N), values (B, K, 2) in [-1, 1]; the action grid of ``env`` must be its patch.
         """
         size, state = env.spec.patch, env.env_state
-        if env.action_resolution != size:
-            raise ValueError(f"env must have the task's patch, {size}, as action grid, got {env.action_resolution}")
         grid = env.model.solver.grid.resolution
         corner = patch_corner(centre_in_window(env.spec.reach, state.centre, state.origin), size, grid)
         index = torch.arange(size, device=env.device)

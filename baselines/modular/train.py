@@ -6,16 +6,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, cast, get_args
 
-from gymnasium import spaces
-from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecMonitor
 
 import cfp
 from baselines.common.policies import StateBasedPolicy
 from baselines.modular.env import SegmentedEnv
-from baselines.modular.networks import Kind, ModularActor, ModularCritics
+from baselines.modular.networks import Kind, ModularActor, ModularCritics, SegmentPolicy
 from baselines.modular.nodes import Nodes
-from baselines.modular.policy import SegmentPolicy
 from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
 from cfp.agent.policies import NetworkPolicy
 from cfp.config import RunConfig
@@ -95,17 +92,9 @@ class ModularConfig(RunConfig):
 class ModularPolicy(NetworkPolicy):
     """Actor and critics over segments, for `cfp.agent.sac.CFP`; observes rows (K, columns) of `Nodes`."""
 
-    def __init__(
-        self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        kind: Kind,
-        features: int,
-        **options: Any,
-    ) -> None:
+    def __init__(self, *arguments: Any, kind: Kind, features: int, **options: Any) -> None:
         self.kind, self.features = kind, features
-        super().__init__(observation_space, action_space, lr_schedule, **options)
+        super().__init__(*arguments, **options)
 
     def new_actor(self) -> ModularActor:
         """An actor."""
@@ -131,7 +120,6 @@ class Modular(SACAlgorithm):
             algo=cls.algo,
             task=task,
             preset=base.preset,
-            seed=base.seed,
             environment=base.environment,
             report=base.report,
             learning=base.learning,

@@ -97,11 +97,6 @@ class Planner(Stateful, ABC, Generic[Config]):
         """Whether the next call of `act` makes a new plan."""
         return self._step >= min(self.config.commit, len(self._plan))
 
-    @property
-    def has_replanned(self) -> bool:
-        """Whether the last action was the first of its plan."""
-        return self._step == 1
-
     def act(self) -> Tensor:
         """Next action (B, 2, R, R) of every simulation; makes new plans where the last are used up."""
         if self.needs_plan:

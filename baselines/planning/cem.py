@@ -1,7 +1,5 @@
 """Planning without gradients, by the cross-entropy method."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise
@@ -53,9 +51,7 @@ class CEMPlanner(Planner[CEMPlannerConfig]):
 
     A generation of plans is drawn around a mean, all are simulated in one batch, and mean and standard deviation move
     to those of the best. Only true rewards are used. The first candidate of a generation is its mean, so what is kept
-    of the last plan is tried too; the second is zero action, as effort costs.
-
-    Args are those of `Planner`.
+    of the last plan is tried too; the second is zero action, as effort costs. Its arguments are those of `Planner`.
     """
 
     config_type = CEMPlannerConfig

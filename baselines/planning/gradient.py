@@ -1,7 +1,5 @@
 """Planning by gradient ascent through the simulator."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -30,10 +28,7 @@ class GradientPlannerConfig(PlannerConfig):
 
 
 class GradientPlanner(Planner[GradientPlannerConfig]):
-    """Improves the next actions by Adam on the smooth return, differentiated through the simulator.
-
-    Args are those of `Planner`.
-    """
+    """Improves the next actions by Adam on the smooth return; its arguments are those of `Planner`."""
 
     config_type = GradientPlannerConfig
 
@@ -60,12 +55,9 @@ class GradientPlanner(Planner[GradientPlannerConfig]):
 
 
 def clip_steps(gradient: Tensor, limit: float) -> Tensor:
-    """Limit the norm of every control step of a gradient (T, B, 2, R, R) to ``limit`` medians over the steps.
-
-    Steps after the end of an episode have no gradient and do not count.
-    """
+    """Limit the norm of every control step of a gradient (T, B, 2, R, R) to ``limit`` medians over the steps."""
     norm = gradient.flatten(2).norm(dim=2)
-    middle = (norm > 0).sum(0) // 2
+    middle = (norm > 0).sum(0) // 2  # steps after the end of an episode have no gradient and do not count
     largest = limit * norm.sort(0, descending=True).values.gather(0, middle[None])
     scale = torch.where(norm > largest, largest / norm, 1.0)
     return gradient * scale[:, :, None, None, None]

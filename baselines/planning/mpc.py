@@ -1,7 +1,5 @@
 """Model predictive control: planners as algorithms that plan their way through one episode and record it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -106,20 +104,16 @@ class MPC(OpenLoopAlgorithm):
         self.config = config
         self.env = make_torch_env(config, config.resolution(1), 1)
         self.env.reset(seed=config.seed)
-        self.surrogate = None if config.train_particles is None else self._make_surrogate(config.train_particles)
+        self.surrogate = None
+        if config.train_particles is not None:
+            training = replace(config, environment=config.environment.for_training(config.train_particles))
+            small = make_torch_env(training, config.resolution(1), 1)
+            small.reset(seed=config.seed)
+            self.surrogate = Surrogate(self.env, small)
         planning_env = self.surrogate.env if self.surrogate else self.env
         self.planner = self.planner_type(planning_env, config.planner, seed=config.seed)
         self.actions = torch.zeros(0, *self.env.action_shape)
         self.total_reward, self.reward, self.is_done = 0.0, 0.0, False
-
-    def _make_surrogate(self, particles: Particles) -> Surrogate:
-        config = replace(self.config, environment=self.config.environment.for_training(particles))
-        small = make_torch_env(config, config.resolution(1), 1)
-        small.reset(seed=config.seed)
-        try:
-            return Surrogate(self.env, small)
-        except ValueError as error:
-            raise ConfigError(f"train_particles: {error}") from error
 
     @staticmethod
     def preset(task: str, name: str) -> PlannedConfig:

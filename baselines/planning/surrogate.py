@@ -1,12 +1,11 @@
 """A cheaper model to plan in: the state of one simulation copied into another with fewer particles."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from cfp.errors import ConfigError
 from dittogym import TorchEnv
 from dittogym.model import EnvState
 from dittogym.physics import PER_PARTICLE
@@ -26,14 +25,11 @@ class Surrogate:
     def __init__(self, large: TorchEnv, small: TorchEnv) -> None:
         self.env = small
         self.indices = _nearest_particles(large, small)  # (B, n) of the large environment's particles
-        memory = small.env_state.memory
+        memory = small.env_state.memory  # integers in it are numbers of particles, such as the tip in GROW
         self._particle_memory = {name: value for name, value in memory.items() if not value.is_floating_point()}
 
     def sync(self, state: EnvState) -> None:
-        """Bring the small environment to a state of the large one.
-
-        Integers in a task's memory are numbers of particles (the tip in GROW): the small environment keeps its own.
-        """
+        """Bring the small environment to a state of the large one."""
 
         def select(value: Tensor) -> Tensor:
             return value[torch.arange(len(value), device=value.device)[:, None], self.indices]
@@ -51,7 +47,7 @@ def _nearest_particles(large: TorchEnv, small: TorchEnv) -> Tensor:
     indices, start, small_start = [], 0, 0
     for many, few in zip(large.model.solver.bodies, small.model.solver.bodies, strict=True):
         if few.count > many.count:
-            raise ValueError(f"a reduced model must have at most {many.count} particles of a body, got {few.count}")
+            raise ConfigError(f"train_particles of a body must be at most {many.count}, got {few.count}")
         x = large.state.x[:, start : start + many.count].detach()
         small_x = small.state.x[:, small_start : small_start + few.count].detach()
         nearest = torch.cdist(small_x, x).topk(min(NEIGHBOURS, many.count), largest=False).indices

@@ -1,7 +1,5 @@
 """Short-horizon actor-critic: a policy trained by gradients through the simulation (Xu et al., ICLR 2022)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -172,11 +170,7 @@ class Shac(Stateful, Algorithm):
         return value
 
     def update(self) -> Scalars:
-        """Play one window and learn from it.
-
-        Raises:
-            NonFiniteError: Ten updates in a row had no finite gradient, or actions are not finite.
-        """
+        """Learn from one more window; a `NonFiniteError` if actions, or ten gradients in a row, are not finite."""
         config = self.config
         learning_rate = config.learning_rate * linear_decay(stage_progress(config, 1, self.num_timesteps))
         for adam in (self.actor_adam, self.critic_adam):
@@ -238,12 +232,10 @@ class Shac(Stateful, Algorithm):
     @property
     def policy(self) -> StatePolicy | ActorPolicy:
         """What has been learned so far; a policy of the state must be attached to an environment."""
-        return self._policy({"deterministic": self.config.report.eval_deterministic})
-
-    def _policy(self, description: dict[str, Any]) -> StatePolicy | ActorPolicy:
+        deterministic = self.config.report.eval_deterministic
         if isinstance(self.actor, StateActor):
-            return StatePolicy(self.actor, self.features, self.config.noise, description)
-        return image_policy(self.actor.spec, self.actor.actor, self.config.report.eval_deterministic)
+            return StatePolicy(self.actor, self.features, self.config.noise, {"deterministic": deterministic})
+        return image_policy(self.actor.spec, self.actor.actor, deterministic)
 
     def attached(self, env: Any) -> StateBasedPolicy | ActorPolicy:
         """The present policy, acting on the state of the environment ``env`` if it does not see the image."""
@@ -282,14 +274,13 @@ class Shac(Stateful, Algorithm):
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the policy; one of the image becomes a policy of CFP."""
-        description = {**description, "sees": self.config.sees}
-        policy = self._policy(description)
+        policy = self.policy
+        policy.description = {**description, "sees": self.config.sees}
         if isinstance(policy, StatePolicy):
             policy.save(path)
         else:
-            network = {"resolutions": [policy.resolution]}
-            own = {"kind": KIND, "network": network, "trained_by": self.config.algo}
-            save_policy(path, policy.actor, description | own)
+            own = {"kind": KIND, "network": {"resolutions": [policy.resolution]}, "trained_by": self.config.algo}
+            save_policy(path, policy.actor, policy.description | own)
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu") -> StatePolicy | ActorPolicy:

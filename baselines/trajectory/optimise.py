@@ -1,7 +1,5 @@
 """Open-loop actions by gradient descent through the simulation."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
@@ -15,7 +13,7 @@ from baselines.common.grid import Grid, GridConfig, grid_size
 from baselines.common.open_loop import OpenLoop, OpenLoopAlgorithm
 from baselines.common.schedules import cosine_decay, stage_progress
 from baselines.common.stateful import Stateful
-from baselines.trajectory.objective import make_objective
+from baselines.trajectory.objective import Objective
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
@@ -141,17 +139,13 @@ class Gradient(Stateful, OpenLoopAlgorithm):
         self.theta.requires_grad_()
         self.learning_rate = config.polish_learning_rate if polishes else config.learning_rate
         self.adam = torch.optim.Adam([self.theta], self.learning_rate, BETAS)
-        self.objective = make_objective(self.env, config.blur[-1:] if polishes else config.blur)
+        self.objective = Objective(self.env, config.blur[-1:] if polishes else config.blur)
         self.mean_norm = torch.zeros(self.horizon, device=self.env.device)
         self.backoff, self.failed, self.failed_in_a_row = 1.0, 0, 0
         self.best_loss, self.best_size, self.best, self.phase = math.inf, 0.0, self.theta.detach().clone(), 0
 
     def update(self) -> Scalars:
-        """Do one iteration.
-
-        Raises:
-            NonFiniteError: Ten iterations in a row failed.
-        """
+        """Do one iteration; a `NonFiniteError` after ten failures in a row."""
         progress = stage_progress(self.config, self.stage, self.num_timesteps)
         learning_rate = self.backoff * self.learning_rate * cosine_decay(progress)
         self.adam.param_groups[0]["lr"] = learning_rate

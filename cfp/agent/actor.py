@@ -11,15 +11,7 @@ from torch.nn import functional as F
 
 from cfp.agent import fused
 from cfp.agent.composition import blend
-from cfp.agent.networks import (
-    IMAGE_SIZE,
-    Encoder,
-    PairEncoder,
-    initialise,
-    make_head,
-    normalise_image,
-    upsample,
-)
+from cfp.agent.networks import IMAGE_SIZE, Encoder, PairEncoder, initialise, make_head, normalise_image, upsample
 from cfp.agent.spec import ActorSpec
 
 STD_BOUNDS = (0.1, 6.0)
@@ -27,36 +19,22 @@ STD_BOUNDS = (0.1, 6.0)
 
 
 class Sample(NamedTuple):
-    """One sample of an actor.
+    """One sample of an actor."""
 
-    Attributes:
-        action: Action to execute, (B, 2, A, A) with A from `ActorSpec.action_size`. A composed action may exceed
-            [-1, 1] slightly and is not clipped.
-        log_prob: Log-density of the sampled part (for a residual actor the residual action only), (B,).
-        gate: Weight of the residual action, (B, 2, R, R), or None for a plain actor.
-        parts: Parts of the action, see `cfp.agent.composition.Composition`.
-    """
-
-    action: Tensor
-    log_prob: Tensor
-    gate: Tensor | None
-    parts: tuple[Tensor, ...] = ()
+    action: Tensor  # to execute, (B, 2, A, A) with A from `ActorSpec.action_size`; may exceed [-1, 1] slightly
+    log_prob: Tensor  # log-density of the sampled part, for a residual actor the residual action only, (B,)
+    gate: Tensor | None  # weight of the residual action, (B, 2, R, R); None for a plain actor
+    parts: tuple[Tensor, ...] = ()  # of the action, see `cfp.agent.composition.Composition`
 
 
 def squashed_log_prob(noise: Tensor, std: Tensor, action: Tensor) -> Tensor:
-    """Log-density (B,) of ``action = tanh(mean + std * noise)``, summed over all 2 R R entries.
-
-    It is ln N(x; m, s^2) - ln(1 - a^2 + 1e-6), where (x - m)/s is the noise.
-    """
+    """Log-density (B,) of ``a = tanh(m + s eps)``: ln N(x; m, s^2) - ln(1 - a^2 + 1e-6), summed over all entries."""
     normal = -0.5 * noise.square() - std.log() - 0.5 * math.log(2 * math.pi)
     return (normal - torch.log(1 - action.square() + 1e-6)).flatten(1).sum(1)
 
 
 def sample_squashed_gaussian(mean: Tensor, raw_std: Tensor, deterministic: bool) -> tuple[Tensor, Tensor]:
-    """Sample tanh(m + s eps) with eps ~ N(0, I), or eps = 0 if ``deterministic``, and its log-density (B,).
-
-    m is the network output ``mean`` (B, ...) and s = clip(softplus(3 raw_std - 1), 0.1, 6).
-    """
+    """Sample tanh(mean + s eps) with s = clip(softplus(3 raw_std - 1), 0.1, 6), and its log-density (B,)."""
     std = F.softplus(3 * raw_std - 1).clamp(*STD_BOUNDS)
     noise = torch.zeros_like(mean) if deterministic else torch.randn_like(mean)
     action = torch.tanh(mean + std * noise)

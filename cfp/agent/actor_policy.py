@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -14,6 +14,11 @@ from cfp.agent.networks import IMAGE_SIZE
 from cfp.agent.spec import ActorSpec
 
 IMAGE_SHAPE = (3, IMAGE_SIZE, IMAGE_SIZE)
+
+# Arguments of `predict` in stable-baselines3.
+Observation: TypeAlias = np.ndarray | dict[str, np.ndarray]
+Memory: TypeAlias = tuple[np.ndarray, ...] | None
+Start: TypeAlias = np.ndarray | None
 
 
 def check_images(observation: object) -> None:
@@ -58,12 +63,8 @@ class ActorPolicy(nn.Module):
 
     @torch.no_grad()
     def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        self, observation: Observation, state: Memory = None, episode_start: Start = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Memory]:
         """Choose actions, with the signature of stable-baselines3's ``predict``.
 
         Args:

@@ -20,10 +20,9 @@ def blend(coarse: Tensor, residual: Tensor, gate: Tensor, enlarge: Callable[[Ten
 
 @dataclass(frozen=True)
 class Composition:
-    """Structure of a vector that holds the parts of a composed action, from which the action is rebuilt.
+    """Structure of a vector that holds the parts of a composed action, which together are smaller than the action.
 
-    The parts are the action of the first stage, then residual action and gate of each further stage, on the action
-    grids of their stages. Together they are smaller than the composed action on its patch.
+    They are the action of the first stage, then residual action and gate of each further one, on its action grid.
     """
 
     resolutions: tuple[int, ...]  # Action grid R of each stage, coarsest first

@@ -1,7 +1,6 @@
 """Evaluation of several networks of the same shape at once: one operation per layer, with concatenated weights.
 
-A CPU computes one convolution with all their channels faster than several small ones. Each network keeps its own
-parameters; they are concatenated in every evaluation, which costs little, and autograd gives each its own gradient.
+A CPU computes one convolution with all their channels faster than several small ones; concatenation costs little.
 """
 
 from __future__ import annotations

@@ -11,13 +11,7 @@ from cfp.agent.networks import TwinCritic
 
 
 def critic_target(
-    actor: Actor,
-    target: TwinCritic,
-    next_obs: Tensor,
-    rewards: Tensor,
-    not_done: Tensor,
-    alpha: Tensor,
-    gamma: float,
+    actor: Actor, target: TwinCritic, next_obs: Tensor, rewards: Tensor, not_done: Tensor, alpha: Tensor, gamma: float
 ) -> Tensor:
     """Regression target ``y = r + c gamma (min Q'(s', a') - alpha log pi(a'|s'))``, (B, 1), without gradient.
 
@@ -45,8 +39,7 @@ def actor_loss(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Mean of ``alpha log pi - min Q`` plus penalties, and scalars to log (see `cfp.agent.sac.METRICS`).
 
-    ``gate_penalty`` weighs the gate of a residual actor, ``anchor`` the mean squared difference between the actions and
-    the mean actions of ``origin``, an actor to stay close to.
+    ``gate_penalty`` weighs a residual actor's gate, ``anchor`` the mean squared distance to ``origin``'s mean actions.
     """
     action, log_prob, gate, _ = actor.sample(obs)
     q_values = torch.minimum(*critic(obs, action))

@@ -1,11 +1,11 @@
-"""The convolutional networks of the coarse-to-fine policy: encoder, heads, critics.
+"""The convolutional networks of the coarse-to-fine policy: encoder, heads, critics (paper, Section 4.2, Appendix B).
 
-Observations are images (3, 64, 64) and actions are images (2, R, R), in which channel 0 drives the x-muscles and
-channel 1 the y-muscles. Sizes follow the reference implementation of DittoGym (ICLR 2024), Section 4.2 and Appendix B.
+Observations are images (3, 64, 64), actions are images (2, R, R) whose channels drive the x- and the y-muscles.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import cast
 
 import torch
@@ -34,8 +34,8 @@ _DECODERS: dict[int, tuple[tuple[tuple[int, int, int], ...], tuple[int, ...]]] =
 def upsample(action: Tensor, size: int, interpolation: Interpolation) -> Tensor:
     """Bicubic interpolation (kernel parameter -0.75) of an action image (B, 2, R, R) to (B, 2, size, size).
 
-    The reference implementation aligns corners here but uses half-pixel centres in the environment, so a closed gate
-    does not reproduce the coarse force field; ``"half_pixel"`` uses the rule of the environment everywhere.
+    ``"half_pixel"`` is the environment's rule, with which a closed gate reproduces the coarse force field; the
+    reference implementation aligns corners here.
     """
     if action.shape[-1] == size:
         return action
@@ -90,8 +90,7 @@ class Encoder(nn.Module):
 class PairEncoder(nn.Module):
     """Encode observation and action together, to a latent of (B, 32, 4, 4).
 
-    One encoder of width 32 takes the action stacked after the observation's channels. With ``split``, two encoders of
-    width 16 are used and their latents concatenated, for tasks in which the two images show different places.
+    With ``split``, two encoders of half the width are used, for tasks in which the images show different places.
     """
 
     def __init__(self, split: bool) -> None:
@@ -110,42 +109,30 @@ class PairEncoder(nn.Module):
 def make_head(resolution: int) -> nn.Sequential:
     """Decoder from the latent (B, 32, 4, 4) to an image (B, 2, R, R), without a final activation."""
     if resolution == 4:
-        return nn.Sequential(
-            nn.Flatten(),
-            nn.Linear(LATENT, 128),
-            nn.ELU(),
-            nn.Linear(128, 128),
-            nn.ELU(),
-            nn.Linear(128, 2 * 4 * 4),
-            nn.Unflatten(1, (2, 4, 4)),
-        )
+        return nn.Sequential(*_perceptron(LATENT, 128, 128, 2 * 4 * 4), nn.Unflatten(1, (2, 4, 4)))
     shapes, channels = _DECODERS[resolution]
     layers: list[nn.Module] = []
-    for (kernel, stride, padding), before, after in zip(shapes, channels[:-1], channels[1:], strict=True):
+    for (kernel, stride, padding), (before, after) in zip(shapes, pairwise(channels), strict=True):
         layers += [nn.ConvTranspose2d(before, after, kernel, stride, padding), nn.ELU()]
     return nn.Sequential(*layers[:-1])
 
 
+def _perceptron(*sizes: int) -> nn.Sequential:
+    """Linear layers of these sizes on a flattened input, with ELUs between them."""
+    layers: list[nn.Module] = [nn.Flatten()]
+    for before, after in pairwise(sizes):
+        layers += [nn.Linear(before, after), nn.ELU()]
+    return nn.Sequential(*layers[:-1])
+
+
 class Critic(nn.Module):
-    """An action-value network: an encoder of its own and a 512-256-256-1 perceptron."""
+    """Parameters of an action-value network: an encoder of its own and a 512-256-256-1 perceptron."""
 
     def __init__(self, split: bool) -> None:
         super().__init__()
         self.encoder = PairEncoder(split)
-        self.value = nn.Sequential(
-            nn.Flatten(),
-            nn.Linear(LATENT, 256),
-            nn.ELU(),
-            nn.Linear(256, 256),
-            nn.ELU(),
-            nn.Linear(256, 1),
-        )
+        self.value = _perceptron(LATENT, 256, 256, 1)
         initialise(self)
-
-    def forward(self, image: Tensor, patch: Tensor) -> Tensor:
-        """Q-value (B, 1) of a normalised observation (B, 3, 64, 64) and an upsampled action (B, 2, 64, 64)."""
-        value: Tensor = self.value(self.encoder(image, patch))
-        return value
 
 
 class TwinCritic(nn.Module):
@@ -163,10 +150,6 @@ class TwinCritic(nn.Module):
         image = normalise_image(observation)
         action = action.reshape(-1, 2, self.resolution, self.resolution)
         patch = upsample(action, IMAGE_SIZE, self.interpolation)
-        return tuple(self._q_values(image, patch))
-
-    def _q_values(self, image: Tensor, patch: Tensor) -> Tensor:
-        """The results (2, B, 1) of `Critic.forward`, computed for both critics at once."""
         critics = cast(list[Critic], list(self.critics))
         encoders = list(zip(*(critic.encoder.encoders for critic in critics), strict=True))
         inputs = [(image, patch)] if len(encoders) == 1 else [(image,), (patch,)]
@@ -175,7 +158,7 @@ class TwinCritic(nn.Module):
             for pair, images in zip(encoders, inputs, strict=True)
         ]
         latents = torch.cat(parts, dim=2).transpose(0, 1)  # (2, B, 32, 4, 4)
-        return fused.multilayer_perceptrons([critic.value for critic in critics], latents)
+        return tuple(fused.multilayer_perceptrons([critic.value for critic in critics], latents))
 
     def set_training_mode(self, mode: bool) -> None:
         """Switch between training and evaluation mode; required by stable-baselines3."""

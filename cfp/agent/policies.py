@@ -6,7 +6,6 @@ from abc import ABC, abstractmethod
 from typing import Any, cast
 
 import numpy as np
-import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
@@ -22,29 +21,15 @@ from cfp.agent.spec import ActorSpec
 class NetworkPolicy(sac_policies.SACPolicy, ABC):
     """Base class of the policies that `cfp.agent.sac.CFP` trains; subclasses create actor and critics.
 
-    Networks read observations as they are (``normalize_images`` is off). ``use_sde`` must be False; without
-    ``optimizer_kwargs`` the optimiser is a fused Adam.
+    Networks read observations as they are. ``use_sde`` must be False; the optimiser is a fused Adam by default.
     """
 
-    def __init__(
-        self,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        use_sde: bool = False,
-        optimizer_class: type[torch.optim.Optimizer] = torch.optim.Adam,
-        optimizer_kwargs: dict[str, Any] | None = None,
-    ) -> None:
+    def __init__(self, *spaces_and_schedule: Any, use_sde: bool = False, **options: Any) -> None:
         if use_sde:
             raise ValueError("use_sde must be False, got True: the actor has its own exploration noise")
-        super().__init__(
-            observation_space,
-            action_space,
-            lr_schedule,
-            normalize_images=False,
-            optimizer_class=optimizer_class,
-            optimizer_kwargs={"fused": True} if optimizer_kwargs is None else optimizer_kwargs,
-        )
+        options.setdefault("optimizer_kwargs", {"fused": True})
+        options["normalize_images"] = False
+        super().__init__(*spaces_and_schedule, **options)
 
     @abstractmethod
     def new_actor(self) -> SquashedActor:
@@ -77,8 +62,7 @@ class CFPPolicy(NetworkPolicy):
     """Actor, twin critics and target critics of the coarse-to-fine policy.
 
     The actors of coarser stages are frozen submodules of the actor, so ``state_dict`` and ``predict`` cover all stages.
-    ``predict`` does not clip: a composed action may exceed [-1, 1] by the overshoot of the cubic interpolation, as in
-    the reference implementation.
+    ``predict`` does not clip: a composed action may exceed [-1, 1] by the overshoot of the cubic interpolation.
 
     Args:
         observation_space: uint8 (3, 64, 64).
@@ -101,11 +85,9 @@ class CFPPolicy(NetworkPolicy):
     ) -> None:
         self.spec = spec or ActorSpec((action_space.shape[-1],))
         size = self.spec.action_size
-        if action_space.shape != (2, size, size):
-            raise ValueError(
-                f"action_space must have shape {(2, size, size)} for resolutions {self.spec.resolutions}, "
-                f"got {action_space.shape}"
-            )
+        if (found := action_space.shape) != (2, size, size):
+            grids = self.spec.resolutions
+            raise ValueError(f"action_space must have shape {(2, size, size)} for resolutions {grids}, got {found}")
         super().__init__(observation_space, action_space, lr_schedule, **options)
 
     def new_actor(self) -> Actor:

@@ -1,8 +1,7 @@
 """CFP: soft actor-critic with the update rule of the DittoGym reference implementation (paper, Appendix B).
 
-Differences from stable-baselines3's SAC: rewards are normalised by running statistics, the gradient of each parameter
-tensor is clipped separately, the gate of a residual actor is penalised, the temperature is constant, the random phase
-and the start of the updates are independent, and non-finite rewards, actions and losses are errors.
+Differences from stable-baselines3's SAC: rewards are normalised by running statistics, the gradient of each tensor is
+clipped separately, the gate is penalised, and the random phase is independent of the start of the updates.
 """
 
 from __future__ import annotations
@@ -41,12 +40,9 @@ METRICS: dict[str, str] = {
     "train/gate_penalty": "gate penalty inside the actor loss",
     "train/n_updates": "gradient updates so far in this stage",
     "train/learning_rate": "learning rate of the critics, and of the actor unless it has its own",
+    "train/drift": "where a policy is refined: mean square by which sampled actions differ from its mean ones",
 }
 """Scalars that `CFP.train` logs."""
-REFINING_METRICS: dict[str, str] = {
-    "train/drift": "mean square by which sampled actions differ from the mean ones of the policy that is refined",
-}
-"""Additional scalars where a policy is refined."""
 
 
 class RewardStatistics(nn.Module):
@@ -59,7 +55,7 @@ class RewardStatistics(nn.Module):
     mean: Tensor
     variance: Tensor
 
-    def __init__(self, momentum: float = 0.99) -> None:
+    def __init__(self, momentum: float) -> None:
         super().__init__()
         self.momentum = momentum
         self.register_buffer("mean", torch.zeros(()))
@@ -84,8 +80,8 @@ def clip_each(parameters: Iterable[nn.Parameter], max_norm: float) -> None:
 class CFP(SAC):
     """Soft actor-critic as the coarse-to-fine policy uses it, on stable-baselines3's loop.
 
-    Stage 1 is a `CFPPolicy` with a plain actor, later stages have a residual actor whose coarser stage is frozen. The
-    coarse action is sampled anew in every update, and the entropy covers the residual part only, as in the reference.
+    In stages after the first, the coarse action is sampled anew in every update and the entropy covers the residual
+    part only, as in the reference implementation.
 
     Args:
         policy: `CFPPolicy` or its name, or another `cfp.agent.policies.NetworkPolicy`.
@@ -114,19 +110,10 @@ class CFP(SAC):
         composition = Composition.of(spec) if spec and not noisy else None
         sac_options.setdefault("replay_buffer_class", ReplayRing)
         sac_options.setdefault("replay_buffer_kwargs", {"seed": sac_options.get("seed"), "composition": composition})
-        super().__init__(
-            policy,
-            env,
-            hyperparameters.learning_rate,
-            hyperparameters.buffer_size,
-            learning_starts=hyperparameters.update_start,
-            batch_size=hyperparameters.batch_size,
-            tau=hyperparameters.tau,
-            gamma=hyperparameters.gamma,
-            gradient_steps=hyperparameters.gradient_steps,
-            ent_coef=hyperparameters.alpha,
-            **sac_options,
-        )
+        names = ("learning_rate", "buffer_size", "batch_size", "tau", "gamma", "gradient_steps")
+        sac_options |= {name: getattr(hyperparameters, name) for name in names}
+        starts, alpha = hyperparameters.update_start, hyperparameters.alpha
+        super().__init__(policy, env, learning_starts=starts, ent_coef=alpha, **sac_options)
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -239,16 +226,10 @@ class CFP(SAC):
         return sample.action.cpu().numpy(), composition.join(sample.parts).cpu().numpy()
 
     def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
+        self, replay_buffer: ReplayBuffer, buffer_action: np.ndarray, new_obs: Any, reward: np.ndarray, *rest: Any
     ) -> None:
         self._check_finite("reward", reward)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, *rest)
 
     def _check_finite(self, name: str, values: np.ndarray) -> None:
         finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)

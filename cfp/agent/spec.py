@@ -27,9 +27,8 @@ class ActorSpec:
         interpolation: Bicubic upsampling inside the networks: ``"half_pixel"`` as the environment upsamples actions,
             ``"aligned"`` (aligned corners) as the reference implementation does here.
         patch: Size of the images on which a residual actor blends coarse and residual actions; None blends on the
-            grid of the stage, as the reference implementation does. Two cubic upsamplings in a row are not the same
-            as one, so a closed gate reproduces the force field of the coarser stage only if actions are blended at
-            the size of the environment's patch.
+            grid of the stage, as the reference does. Two cubic upsamplings differ from one, so a closed gate leaves
+            the coarser force field only if actions are blended at the size of the environment's patch.
 
     Raises:
         ConfigError: A resolution has no decoder, resolutions do not increase, or ``gate_bias`` or ``patch`` do not
@@ -53,11 +52,8 @@ class ActorSpec:
         increasing = list(self.resolutions) == sorted(set(self.resolutions))
         if not self.resolutions or not increasing or not set(self.resolutions) <= set(RESOLUTIONS):
             raise ConfigError(f"resolutions must be increasing values of {RESOLUTIONS}, got {self.resolutions}")
-        if len(self.gate_bias) != len(self.resolutions) - 1:
-            raise ConfigError(
-                f"gate_bias must have {len(self.resolutions) - 1} values for resolutions {self.resolutions}, "
-                f"got {len(self.gate_bias)}"
-            )
-        finest = self.resolutions[-1]
+        finest, found, count = self.resolutions[-1], len(self.gate_bias), len(self.resolutions) - 1
+        if found != count:
+            raise ConfigError(f"gate_bias must have {count} values for resolutions {self.resolutions}, got {found}")
         if self.patch is not None and not (isinstance(self.patch, int) and finest <= self.patch <= NODES):
             raise ConfigError(f"patch must be between {finest} (the finest action grid) and {NODES}, got {self.patch}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,31 +22,23 @@ from dittogym.geometry import floor
 from dittogym.spec import TaskSpec
 
 FLOOR = floor().name
+FRICTION = (0.0, 0.5, math.inf)
 
 
 @dataclass(frozen=True)
 class Case:
-    """One disturbance.
+    """One disturbance; dropout and noise are drawn anew in each step.
 
-    Attributes:
-        name: Name in tables and plots.
-        action_dropout: Fraction of the policy's decisions that are set to 0, drawn anew in each step; decisions are the
-            2 R R entries of its action grid, or those of `cfp.policy_protocols.DisturbablePolicy`.
-        observation_dropout: Fraction of the 3 x 64 x 64 pixels that are set to 0, drawn anew in each step. A velocity
-            pixel of 0 means fast motion, a pixel of 132 rest.
-        action_noise: Standard deviation of Gaussian noise on each decision; 1 is the full actuation.
-        latency: Delay of the actions in control steps; the first actions of an episode are 0.
-        physics: Factors on ``mu``, ``yield_stress`` and ``gravity`` of the task.
-        friction: Coulomb coefficient of the floor; ``math.inf`` sticks, None keeps that of the task.
+    A policy's decisions are the entries of its action grid, or those of `cfp.policy_protocols.DisturbablePolicy`.
     """
 
-    name: str
-    action_dropout: float = 0.0
-    observation_dropout: float = 0.0
-    action_noise: float = 0.0
-    latency: int = 0
-    physics: Mapping[str, float] = field(default_factory=dict)
-    friction: float | None = None
+    name: str  # in tables and plots
+    action_dropout: float = 0.0  # fraction of the decisions that are set to 0
+    observation_dropout: float = 0.0  # fraction of the 3 x 64 x 64 pixels that are set to 0
+    action_noise: float = 0.0  # standard deviation of Gaussian noise on each decision; 1 is the full actuation
+    latency: int = 0  # delay of the actions in control steps; the first ones of an episode are 0
+    physics: Mapping[str, float] = field(default_factory=dict)  # factors on the task's mu, yield_stress and gravity
+    friction: float | None = None  # Coulomb coefficient of the floor; math.inf sticks, None keeps that of the task
 
 
 def reason_without_effect(case: Case, spec: TaskSpec, uses_image: bool = True) -> str:
@@ -92,15 +84,14 @@ def drop(values: Tensor, mask: Tensor) -> Tensor:
 class Disturbed(VecEnvWrapper):
     """Disturbs actions and observations of a vectorised environment, in the same way after each ``reset``.
 
-    A policy of several stages decides on an action grid and returns an enlarged blend. Its actions are disturbed on
-    that grid: a dropped entry clears its whole cell, noise is enlarged as the environment enlarges actions.
+    A policy of several stages returns an enlarged blend, which is disturbed on the grid on which it decides: a dropped
+    entry clears its whole cell, noise is enlarged as actions are.
 
     Args:
         venv: The environment, with actions (B, 2, A, A) and observations uint8 (B, 3, 64, 64).
         case: The disturbance; its constants are not applied here.
         seed: Seed of the generator, which restarts at each ``reset``.
-        grid: Rows and columns R of the grid on which the policy decides; None: A; 0: none, and the policy calls
-            `disturb` itself, see `cfp.policy_protocols.DisturbablePolicy`.
+        grid: Rows and columns R of the grid on which the policy decides; None: A; 0: none, the policy calls `disturb`.
     """
 
     def __init__(self, venv: VecEnv, case: Case, seed: int, grid: int | None = None) -> None:
@@ -126,15 +117,12 @@ class Disturbed(VecEnvWrapper):
         self._delayed.append(np.array(actions, np.float32))
         actions = self._delayed.popleft()
         if self.grid:
-            actions = self._disturb(actions, (len(actions), 2, self.grid, self.grid))
+            actions = self.disturb(actions, (len(actions), 2, self.grid, self.grid))
         self.venv.step_async(actions)
 
-    def disturb(self, decisions: np.ndarray) -> np.ndarray:
-        """Disturb decisions (B, ...) that are not on a grid."""
-        return self._disturb(decisions, decisions.shape)
-
-    def _disturb(self, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-        """Apply noise and dropout that are drawn in ``shape``."""
+    def disturb(self, values: np.ndarray, shape: tuple[int, ...] | None = None) -> np.ndarray:
+        """Apply noise and dropout to values (B, ...), drawn in ``shape`` or for each of them."""
+        shape = shape or values.shape
         if self.case.action_noise:
             noise = self.generator.standard_normal(shape, np.float32)
             if shape != values.shape:
@@ -161,11 +149,7 @@ class Disturbed(VecEnvWrapper):
 
 
 def make_cases(
-    dropout: float = 0.2,
-    noise: float = 0.2,
-    latency: int = 1,
-    shift: float = 0.2,
-    friction: tuple[float, ...] = (0.0, 0.5, math.inf),
+    dropout: float = 0.2, noise: float = 0.2, latency: int = 1, shift: float = 0.2, friction: Sequence[float] = FRICTION
 ) -> list[Case]:
     """The cases of a robustness report, the unperturbed one first; constants are multiplied by 1 -+ ``shift``."""
     percent = f"{100 * dropout:g}%"

@@ -22,10 +22,9 @@ from torchmpm import tree
 class TorchVecEnv(VecEnv):
     """Batched environment with same-step autoreset, as stable-baselines3 expects it.
 
-    An element whose episode ends is reset within the same step: the returned observation is the first of the new
-    episode, and ``info["terminal_observation"]`` holds the last of the old one. ``info["TimeLimit.truncated"]`` is true
-    whenever the time limit is reached, even if the element terminates in the same step; the reference implementation
-    bootstraps there. An element whose state is not finite (``info["finite"]`` false) terminates and is reset.
+    Of an element whose episode ends, the first observation of the next one is returned, and the last one is
+    ``info["terminal_observation"]``. ``info["TimeLimit.truncated"]`` is true at the time limit even if the element
+    terminates there, as in the reference implementation. A state that is not finite terminates the episode.
 
     Args:
         env: A `dittogym.TorchEnv`, or an environment with its interface; it is stepped without gradients.

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -14,6 +15,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
+from cfp.agent.actor_policy import Memory, Observation, Start
 from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.envs.make import make_env
 from cfp.envs.vec_env import TorchVecEnv
@@ -37,7 +39,7 @@ class SingleThreaded:
 
     policy: PolicyPredictor
 
-    def predict(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+    def predict(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, Memory]:
         """Actions of the policy."""
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
@@ -80,44 +82,27 @@ def evaluation_seed(config: RunConfig) -> int:
     return config.seed + 2 * EVALUATION_SEED
 
 
-class ZeroPolicy:
-    """Leaves every muscle slack."""
+@dataclass(frozen=True)
+class UntrainedPolicy:
+    """Draws actions (B, 2, R, R) by their shape, whatever it sees."""
 
-    def __init__(self, resolution: int) -> None:
-        self.resolution = resolution
+    resolution: int
+    draw: Callable[[tuple[int, ...]], Any]
 
     def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Actions (B, 2, R, R) for a batch of observations."""
-        return self._actions((len(observation), 2, self.resolution, self.resolution)), state
-
-    def _actions(self, shape: tuple[int, ...]) -> np.ndarray:
-        return np.zeros(shape, np.float32)
-
-
-class RandomPolicy(ZeroPolicy):
-    """Uniform actions in [-1, 1], independent in every cell and step."""
-
-    def __init__(self, resolution: int, seed: int) -> None:
-        super().__init__(resolution)
-        self.generator = np.random.default_rng(seed)
-
-    def _actions(self, shape: tuple[int, ...]) -> np.ndarray:
-        return self.generator.uniform(-1, 1, shape).astype(np.float32)
+        self, observation: Observation, state: Memory = None, episode_start: Start = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Memory]:
+        """Actions for a batch of observations."""
+        actions: np.ndarray = self.draw((len(observation), 2, self.resolution, self.resolution))
+        return actions.astype(np.float32), state
 
 
 def evaluate(
     name: str, policy: PolicyPredictor, env: VecEnv, episodes: int, *, deterministic: bool, seed: int
 ) -> Result:
-    """Run episodes without learning, in environments used for nothing else; torch's generator is not touched.
+    """Run episodes without learning, element i of the batch from layout ``seed + i``; torch's generator is not touched.
 
-    The same seed gives the same episodes with any number of threads; element i of the batch starts from layout
-    ``seed + i``. With reference parity, whose resets show what was before, this holds only in new environments.
+    The same seed gives the same episodes; with reference parity, whose resets show what was before, in a new ``env``.
     """
     elements: list[int] = []
     successes: list[bool] = []
@@ -143,18 +128,18 @@ def evaluate(
 
 
 def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, noise: Noise = "default") -> list[Result]:
-    """Evaluate trained policies beside zero and random action, all on the same particle layouts.
-
-    A policy made for a single layout is evaluated there too, in a row of its own.
-    """
+    """Evaluate policies beside zero and random action on the same layouts; one made for a single layout also there."""
     coarsest, seed = config.resolution(1), evaluation_seed(config)
-    untrained = {"zero action": ZeroPolicy(coarsest), "random action": RandomPolicy(coarsest, config.seed)}
+    uniform = partial(np.random.default_rng(config.seed).uniform, -1, 1)
 
-    def evaluated(name: str, policy: Policy | ZeroPolicy | RandomPolicy, deterministic: bool) -> Result:
+    def evaluated(name: str, policy: Policy | UntrainedPolicy, deterministic: bool) -> Result:
         env = make_env(config, policy.resolution, episodes)
         return evaluate(name, policy, env, episodes, deterministic=deterministic, seed=seed)
 
-    results = [evaluated(name, policy, True) for name, policy in untrained.items()]
+    results = [
+        evaluated("zero action", UntrainedPolicy(coarsest, np.zeros), True),
+        evaluated("random action", UntrainedPolicy(coarsest, uniform), True),
+    ]
     for name, trained in policies.items():
         deterministic = trained.deterministic_by_default if noise == "default" else noise == "without"
         grid = trained.description.get("resolution", trained.resolution)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cfp.config import RunConfig
@@ -41,16 +39,13 @@ def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Pat
     axes.set_title(f"{config.algo} on {config.task}, seed {config.seed}")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    path = run / "curve.png"
-    write_figure(path, figure)
-    return path
+    write_figure(run / "curve.png", figure)
+    return run / "curve.png"
 
 
 def write_figure(path: Path, figure: Figure) -> None:
     """Write a figure as PNG, atomically."""
-    content = BytesIO()
-    FigureCanvasAgg(figure).print_png(content)
-    write_atomically(path, lambda file: file.write(content.getvalue()))
+    write_atomically(path, lambda file: figure.savefig(file, format="png"))
 
 
 def _column(rows: Sequence[dict[str, str]], name: str) -> tuple[list[float], list[float]]:

@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import closing
 from importlib.util import find_spec
-from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -41,39 +40,27 @@ def film(config: RunConfig, policy: Policy) -> Iterator[np.ndarray]:
 def film_episode(
     config: RunConfig, policy: PolicyPredictor, size: int, deterministic: bool, seed: int
 ) -> Iterator[np.ndarray]:
-    """Pictures of one episode, uint8 (512, 512, 3): the start, then one per environment step, as they are asked for."""
+    """Pictures of one episode, uint8 (512, 512, 3), to be taken all at once: the start, then one per step."""
     venv = make_env(config, size, 1).venv
     assert isinstance(venv, TorchVecEnv)
     acting = SingleThreaded(attached(policy, venv))
     venv.seed(seed)
     observation = venv.reset()
     yield venv.torch_env.render(0)
-    devices = list(range(torch.cuda.device_count()))
-    with torch.random.fork_rng(devices=devices):
-        torch.manual_seed(seed)
-        states = _generator_states()
     done, memory, start = False, None, np.array([True])
-    while not done:
-        assert isinstance(observation, np.ndarray)
-        with torch.random.fork_rng(devices=devices), torch.no_grad():  # over before the caller goes on with a picture
-            torch.set_rng_state(states[0])
-            torch.cuda.set_rng_state_all(states[1])
-            action, memory = acting.predict(observation, memory, start, deterministic)
-            states = _generator_states()
-            seen, _, terminated, truncated, _ = venv.torch_env.step(
-                torch.as_tensor(action, device=venv.torch_env.device)
-            )
-        observation, done, start = seen.cpu().numpy(), bool(terminated[0] or truncated[0]), np.array([False])
-        yield venv.torch_env.render(0)
+    with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
+        torch.manual_seed(seed)
+        while not done:
+            with torch.no_grad():
+                action, memory = acting.predict(observation, memory, start, deterministic)
+                moves = torch.as_tensor(action, device=venv.torch_env.device)
+                seen, _, terminated, truncated, _ = venv.torch_env.step(moves)
+            observation, done, start = seen.cpu().numpy(), bool(terminated[0] or truncated[0]), np.array([False])
+            yield venv.torch_env.render(0)
 
 
-def _generator_states() -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Where torch's generators are, on the CPU and on every CUDA device."""
-    return torch.get_rng_state(), torch.cuda.get_rng_state_all()
-
-
-def write_video(path: Path, frames: Iterable[np.ndarray], hold: int = FRAMES_PER_SECOND) -> None:
-    """Write an MP4 file from pictures, uint8 (H, W, 3), and repeat the last one ``hold`` times."""
+def write_video(path: Path, frames: Iterable[np.ndarray]) -> None:
+    """Write an MP4 file from one or more pictures, uint8 (H, W, 3), and show the last one a second longer."""
     if not available():
         raise VideoUnavailable("no video: it needs imageio with ffmpeg; pip install 'torchmpm[video]'")
     import imageio.v2 as imageio
@@ -84,18 +71,11 @@ def write_video(path: Path, frames: Iterable[np.ndarray], hold: int = FRAMES_PER
     writer: Any = imageio.get_writer(aside, format="FFMPEG", fps=FRAMES_PER_SECOND, **options)
     try:
         with closing(writer):  # its own `with` leaves ffmpeg running where there is an error
-            for frame in _held(frames, hold):
+            for frame in frames:
+                writer.append_data(frame)
+            for _ in range(FRAMES_PER_SECOND):
                 writer.append_data(frame)
         os.replace(aside, path)
     except BaseException:  # a simulation that fails, a second Ctrl-C
         aside.unlink(missing_ok=True)
         raise
-
-
-def _held(frames: Iterable[np.ndarray], hold: int) -> Iterator[np.ndarray]:
-    """Pictures, the last of them again and again."""
-    last = None
-    for last in frames:
-        yield last
-    if last is not None:
-        yield from repeat(last, hold)

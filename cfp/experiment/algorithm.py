@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
+from cfp.agent.actor_policy import Memory, Observation, Start
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
 from cfp.experiment.folder import policy_path
@@ -46,22 +47,14 @@ class Algorithm(ABC):
         config: Options of the run.
         stage: Which stage, 1 is the first.
         start: Policy of the stage before; in the first stage `initial_policy`.
-
-    Attributes:
-        sees: What its policies look at; their training may use more.
-        num_timesteps: Environment steps taken in this stage.
-        starts_trained: Whether the stage begins with a trained policy, which is then evaluated before the first step.
-        replay_buffer: Transitions to keep in checkpoints.
-        logger: Receives scalars.
-        scalars: Those of the last update.
     """
 
-    sees: ClassVar[Sees] = "image"
-    num_timesteps: int = 0
-    starts_trained: bool = False
-    replay_buffer: ReplayBuffer | None = None
+    sees: ClassVar[Sees] = "image"  # what its policies look at; their training may use more
+    num_timesteps: int = 0  # environment steps taken in this stage
+    starts_trained: bool = False  # with a policy that is then evaluated before the first step
+    replay_buffer: ReplayBuffer | None = None  # transitions to keep in checkpoints
     logger: Logger
-    scalars: Scalars = {}
+    scalars: Scalars = {}  # of the last update
 
     @abstractmethod
     def __init__(self, config: Any, stage: int = 1, start: Any = None) -> None: ...
@@ -84,11 +77,10 @@ class Algorithm(ABC):
     @classmethod
     def create(cls, config: Any, stage: int, folder: Path, resumed: bool = False) -> Algorithm:
         """The algorithm at the beginning of a stage, also if it is ``resumed`` from a checkpoint loaded later."""
-        start: Policy | None = None
         if stage > 1:
-            start = cls.load(policy_path(folder, stage - 1), choose_device(config.device))
-        elif not resumed:
-            start = cls.initial_policy(config)
+            start: Policy | None = cls.load(policy_path(folder, stage - 1), choose_device(config.device))
+        else:
+            start = None if resumed else cls.initial_policy(config)
         algorithm = cls(config, stage, start)
         algorithm.starts_trained = start is not None
         return algorithm
@@ -154,22 +146,11 @@ class Algorithm(ABC):
         """What has been learned so far."""
 
     def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Choose actions as stable-baselines3's ``predict`` does.
+        self, observation: Observation, state: Memory = None, episode_start: Start = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Memory]:
+        """Actions (B, 2, R, R) for a batch, its ``observation`` and memory ``state``, and the memory for the next step.
 
-        Args:
-            observation: (B, 3, 64, 64) uint8.
-            state: What the last call returned, None at the beginning; arrays with a leading B.
-            episode_start: (B,) bool, which elements begin a new episode.
-            deterministic: Without noise.
-
-        Returns:
-            Actions (B, 2, R, R), and the policy's memory for the next step.
+        ``episode_start`` tells which elements begin anew, ``deterministic`` whether to act without noise.
         """
         return self.policy.predict(observation, state, episode_start, deterministic)
 
@@ -179,7 +160,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """All that learning needs to continue, as tensors and plain values; without the replay memory."""
+        """All that learning needs to continue besides `num_timesteps` and `replay_buffer`: tensors and plain values."""
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:

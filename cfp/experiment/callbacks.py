@@ -101,12 +101,12 @@ class StageCallback(BaseCallback):
         self._on_rollout_start()
 
 
-class ProgressBarCallback(BaseCallback):
+class ProgressBarCallback(StageCallback):
     """Shows on the standard error how far the run has come."""
 
     def __init__(self, stage: Stage) -> None:
-        super().__init__()
-        self.stage, self.values = stage, dict[str, str]()
+        super().__init__(stage, 0)
+        self.values = dict[str, str]()
         self.bar = tqdm(disable=True)
 
     def _on_training_start(self) -> None:
@@ -188,11 +188,9 @@ class EvaluationCallback(StageCallback):
             stage.save_policy()  # before the row: a crash between the two repeats the evaluation
         self.means.append(result.mean)
         self.evaluated = stage.step
-        self.table.add(
-            {"step": stage.step, "stage": stage.number, "episodes": episodes}
-            | {"mean": result.mean, "std": result.std}
-            | {"lowest": min(result.returns), "highest": max(result.returns), "success": result.success}
-        )
+        lowest, highest = min(result.returns), max(result.returns)
+        values = stage.step, stage.number, episodes, result.mean, result.std, lowest, highest, result.success
+        self.table.add(dict(zip(EVALUATION_COLUMNS, values, strict=True)))
         self.seconds += time.perf_counter() - start
         scalars = {"eval/return": result.mean, "eval/std": result.std, "eval/success": result.success}
         self.tracker.show(stage.step, {**scalars, **stage.algorithm.images()})

@@ -21,19 +21,14 @@ VERSION = 2
 
 
 class Checkpoint:
-    """The ``checkpoint`` folder of a run.
+    """The ``checkpoint`` folder of a run; a crash at any moment leaves the previous checkpoint whole.
 
-    The state file is replaced in one move, and names its replay chunks, which are immutable: a crash at any moment
-    leaves the previous checkpoint whole. Reading runs no code from the file.
+    The state file is replaced in one move, and names its replay chunks, which are immutable.
     """
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / "state.pt"
         self.archive = ReplayArchive(folder / "replay", 1)
-
-    def exists(self) -> bool:
-        """Whether a whole checkpoint is there."""
-        return self.path.exists()
 
     def save(self, algorithm: Algorithm, config: RunConfig, position: Position) -> None:
         """Replace the checkpoint."""
@@ -85,9 +80,8 @@ class Checkpoint:
 
     def does_not_fit(self, error: Exception) -> CheckpointError:
         """The error for a state that cannot be put into an algorithm."""
-        return CheckpointError(
-            f"{self.path}: the checkpoint does not fit this program ({type(error).__name__}: {error})"
-        )
+        reason = f"{type(error).__name__}: {error}"
+        return CheckpointError(f"{self.path}: the checkpoint does not fit this program ({reason})")
 
 
 def check_same(stored: dict[str, Any], given: RunConfig) -> None:

@@ -32,9 +32,8 @@ def run_command(command: Callable[[], int | None]) -> int:
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and "allocate memory" not in str(error):  # how torch reports it
             raise
-        print(
-            f"error: not enough memory: reduce num_envs, episodes, particles or buffer_size ({error})", file=sys.stderr
-        )
+        advice = "reduce num_envs, episodes, particles or buffer_size"
+        print(f"error: not enough memory: {advice} ({error})", file=sys.stderr)
         return 1
 
 

@@ -26,6 +26,8 @@ from cfp.experiment.sac_state import load_model_state_dict, model_state_dict
 from cfp.presets import preset
 from cfp.weights import KIND, load, policy_for, read_policy, report_mismatch, save_policy, write_policy
 
+START = "start.safetensors"
+"""The run's own copy of the policy that it refines."""
 ROLLOUT_METRICS: dict[str, str] = {
     "rollout/return": "mean undiscounted return of the last training episodes (with action noise)",
     "rollout/length": "their mean length in environment steps",
@@ -40,7 +42,6 @@ class SACAlgorithm(Algorithm):
 
     def __init__(self, config: Any, stage: int, model: CFP) -> None:
         self.config, self.stage, self.model = config, stage, model
-        assert model.replay_buffer is not None
         self.replay_buffer = model.replay_buffer
 
     @property
@@ -76,15 +77,15 @@ class SACAlgorithm(Algorithm):
     @classmethod
     def warnings(cls, config: Any, folder: Path, first_stage: int) -> list[str]:
         """Stages that end before they act by their policy, or before they learn."""
-        lines, (starts, waits) = [], (config.learning.update_start, config.learning.actor_start)
+        lines = []
         for stage in range(first_stage, len(config.ends()) + 1):
-            steps, random = config.stage_steps(stage), cls.hyperparameters(config, stage, folder).random_steps
-            if steps <= random:
-                lines.append(f"stage {stage}: all its {steps:,} steps are random (--random-steps {random})")
-            elif steps <= starts:
-                lines.append(f"stage {stage}: no update in its {steps:,} steps (--update-start {starts})")
-            elif steps < waits:
-                lines.append(f"stage {stage}: no actor update in its {steps:,} steps (--actor-start {waits})")
+            steps, own = config.stage_steps(stage), cls.hyperparameters(config, stage, folder)
+            if steps <= own.random_steps:
+                lines.append(f"stage {stage}: all its {steps:,} steps are random (--random-steps {own.random_steps})")
+            elif steps <= own.update_start:
+                lines.append(f"stage {stage}: no update in its {steps:,} steps (--update-start {own.update_start})")
+            elif steps < own.actor_start:
+                lines.append(f"stage {stage}: no actor update in its {steps:,} steps (--actor-start {own.actor_start})")
         return lines
 
     def set_logger(self, logger: Logger) -> None:
@@ -147,7 +148,7 @@ class CoarseToFine(SACAlgorithm):
         if stages > 1 and policy.spec != (allowed_spec := config.actor_spec(stages)):
             raise ConfigError(f"start_from must have networks {allowed_spec}, got {policy.spec}")
         stage = stages if refine else stages + 1
-        copy = _start_path(folder) if refine else policy_path(folder, stages)
+        copy = folder / START if refine else policy_path(folder, stages)
         write_policy(copy, *read_policy(config.start_from))
         return Position(stage, (0, *config.handover)[stage - 1])
 
@@ -164,7 +165,7 @@ class CoarseToFine(SACAlgorithm):
         model = cls.make_model(config, env, CFPPolicy, {"spec": spec}, cls.hyperparameters(config, stage, folder))
         actor, refines = model.networks()[0], _refines(config, folder, stage)
         if refines:
-            model.origin = load(_start_path(folder), str(model.device)).actor
+            model.origin = load(folder / START, str(model.device)).actor
             actor.load_state_dict(model.origin.state_dict())
         elif stage > 1:
             path = policy_path(folder, stage - 1)
@@ -199,12 +200,7 @@ class CoarseToFine(SACAlgorithm):
         save_policy(path, self.model.networks()[0], description | {"kind": KIND, "network": network})
 
 
-def _start_path(folder: Path) -> Path:
-    """The run's own copy of the policy that it refines."""
-    return folder / "start.safetensors"
-
-
 def _refines(config: Config, folder: Path, stage: int) -> bool:
     """Whether the actor of a stage begins as the one that is refined."""
-    start = _start_path(folder)
+    start = folder / START
     return config.refine and start.exists() and bool(read_policy(start)[1]["stage"] == stage)

@@ -27,10 +27,7 @@ EVALUATION_METRICS: dict[str, str] = {
 
 
 class ProgressTable(KVWriter):
-    """A logger output that appends to ``progress.csv`` (stable-baselines3's own starts the file anew).
-
-    Wall-clock values are left out, so that two runs with one seed write the same file.
-    """
+    """A logger output that appends to ``progress.csv``; stable-baselines3's own starts the file anew."""
 
     def __init__(self, table: Table) -> None:
         self.table = table
@@ -54,18 +51,15 @@ class EventFile(TensorBoardOutputFormat):
 
 def check_trackers(config: RunConfig) -> None:
     """Refuse options that need a package that is not installed, before anything is written."""
-    report, install = config.report, "install it with: pip install 'torchmpm"
-    if report.video_every and not available():
-        raise ConfigError(
-            f"video_every must be 0 without imageio and its ffmpeg, got {report.video_every}; {install}[video]'"
-        )
-    if report.wandb != "off":
+    every, wandb, install = config.report.video_every, config.report.wandb, "install it with: pip install 'torchmpm"
+    if every and not available():
+        raise ConfigError(f"video_every must be 0 without imageio and its ffmpeg, got {every}; {install}[video]'")
+    if wandb != "off":
         try:
             importlib.import_module("wandb")
         except ImportError as error:
-            raise ConfigError(
-                f"wandb must be 'off' without the package wandb, got {report.wandb!r}; {install}[wandb]'"
-            ) from error
+            message = f"wandb must be 'off' without the package wandb, got {wandb!r}; {install}[wandb]'"
+            raise ConfigError(message) from error
 
 
 class WandbWriter(KVWriter):

@@ -28,10 +28,9 @@ class Chunk:
 
 
 class ReplayArchive:
-    """Copies of a replay buffer's rows in a folder.
+    """Copies of a replay buffer's rows in a folder; a crash at any moment leaves those that the last checkpoint needs.
 
-    A checkpoint names its chunks; a chunk is written before the checkpoint that names it and deleted after the first
-    one that does not, so that a crash at any moment leaves every chunk that the last checkpoint needs.
+    A chunk is written before the checkpoint that names it and deleted after the first one that does not.
     """
 
     def __init__(self, folder: Path, stage: int) -> None:
@@ -62,22 +61,19 @@ class ReplayArchive:
         """Fill a fresh ring from the chunks that a checkpoint names."""
         self.chunks = [Chunk(**chunk) for chunk in chunks]
         oldest = max(0, rows - buffer.buffer_size)
-        covered = oldest
-        for chunk in self.chunks:
+        starts = [max(oldest, chunk.start) for chunk in self.chunks]
+        for stop, start in zip([oldest, *(chunk.stop for chunk in self.chunks)], [*starts, rows], strict=True):
+            if stop != start:
+                raise CheckpointError(f"{self.folder}: rows {stop} to {start} of the replay buffer are missing")
+        for chunk, first in zip(self.chunks, starts, strict=True):
             if Path(chunk.file).name != chunk.file:
                 raise CheckpointError(f"{self.folder}: chunks must be files in this folder, got {chunk.file!r}")
-            first = max(oldest, chunk.start)
-            if first != covered:
-                raise CheckpointError(f"{self.folder}: rows {covered} to {first} of the replay buffer are missing")
             index = np.arange(first, chunk.stop) % buffer.buffer_size
             for name, values in _read_arrays(self.folder / chunk.file).items():
                 ring = getattr(buffer, name)
                 if values.shape[1:] != ring.shape[1:]:
                     raise ValueError(f"{chunk.file}: {name} must have shape {ring.shape[1:]}, got {values.shape[1:]}")
                 ring[index] = values[first - chunk.start :]
-            covered = chunk.stop
-        if covered != rows:
-            raise CheckpointError(f"{self.folder}: rows {covered} to {rows} of the replay buffer are missing")
         buffer.pos = rows % buffer.buffer_size
         buffer.full = rows >= buffer.buffer_size
 

@@ -51,8 +51,8 @@ def check_options(config: RunConfig) -> None:
 class Run:
     """Trains all stages of a run in its folder.
 
-    ``policy.safetensors`` is the policy with the best evaluation of its stage so far (without evaluations: the newest);
-    the next stage starts from it, and the final table evaluates it on layouts of its own.
+    ``policy.safetensors`` is the policy with the best evaluation of its stage so far (without evaluations: the newest),
+    from which the next stage starts.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Run:
         self.evaluation_seconds = 0.0  # in this session
         self.checkpoint = Checkpoint(folder / "checkpoint")
         self.state: dict[str, Any] | None = None
-        if resume and self.checkpoint.exists():
+        if resume and self.checkpoint.path.exists():
             self._read_checkpoint()
         else:
             if resume:

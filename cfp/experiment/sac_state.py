@@ -16,14 +16,9 @@ from cfp.envs.vec_env import TorchVecEnv
 
 
 def model_state_dict(model: CFP) -> dict[str, Any]:
-    """All that `CFP` learns and counts, as tensors and plain values."""
-    (actor, critic, _), values = model.networks(), model.logger.name_to_value  # of the row that comes next
-    return {
-        "policy": model.policy.state_dict(),
-        "actor_optimizer": actor.optimizer.state_dict(),
-        "critic_optimizer": critic.optimizer.state_dict(),
-        "reward_statistics": model.reward_statistics.state_dict(),
-        "num_timesteps": model.num_timesteps,
+    """All that `CFP` learns and counts but ``num_timesteps``, as tensors and plain values."""
+    values = model.logger.name_to_value  # of the row that comes next
+    return {name: part.state_dict() for name, part in _parts(model).items()} | {
         "episodes": model._episode_num,
         "updates": model._n_updates,
         "recent": [{key: float(value) for key, value in info.items()} for info in model.ep_info_buffer or ()],
@@ -36,12 +31,8 @@ def model_state_dict(model: CFP) -> dict[str, Any]:
 
 def load_model_state_dict(model: CFP, state: dict[str, Any]) -> None:
     """Undo `model_state_dict`."""
-    actor, critic, _ = model.networks()
-    model.policy.load_state_dict(state["policy"])
-    actor.optimizer.load_state_dict(state["actor_optimizer"])
-    critic.optimizer.load_state_dict(state["critic_optimizer"])
-    model.reward_statistics.load_state_dict(state["reward_statistics"])
-    model.num_timesteps = state["num_timesteps"]
+    for name, part in _parts(model).items():
+        part.load_state_dict(state[name])
     model._episode_num = state["episodes"]
     model._n_updates = state["updates"]
     model.ep_info_buffer = deque(state["recent"], maxlen=model._stats_window_size)
@@ -51,6 +42,13 @@ def load_model_state_dict(model: CFP, state: dict[str, Any]) -> None:
         model.logger.name_to_count[name] = count
     _restore_environment(model, state["environment"])
     _restore_random(model, state["random"])
+
+
+def _parts(model: CFP) -> dict[str, Any]:
+    """What has a state of its own."""
+    actor, critic, _ = model.networks()
+    optimizers = {"actor_optimizer": actor.optimizer, "critic_optimizer": critic.optimizer}
+    return {"policy": model.policy, "reward_statistics": model.reward_statistics, **optimizers}
 
 
 def _environment_state(model: CFP) -> dict[str, Any]:

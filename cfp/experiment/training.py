@@ -86,7 +86,7 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
         return command if choice.algo is None else replace(command, run=replace(command.run, algo=base.algo))
 
     if choice.resume:
-        folder = choice.out or _default_folder(read(base).run)
+        folder = choice.out or Path("runs") / read(base).run.name
         if (folder / "config.json").exists():
             past = read_config(folder, program.configure)
             # a value of the file that differs from the run's is refused later
@@ -98,7 +98,7 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
     run = command.run.with_derived(preset, values.keys() | named)
     run.check()
     run.check_effect(preset)
-    return replace(command, run=run, out=command.out or _default_folder(run))
+    return replace(command, run=run, out=command.out or Path("runs") / run.name)
 
 
 def _values(choice: _Choice) -> dict[str, Any]:
@@ -109,12 +109,8 @@ def _values(choice: _Choice) -> dict[str, Any]:
             values = read_json(choice.config)
         except (OSError, ValueError) as error:
             raise ConfigError(f"config: {choice.config} cannot be read as JSON ({error})") from error
-    chosen = {"algo": choice.algo, "task": choice.task, "preset": choice.preset}
-    return values | {name: value for name, value in chosen.items() if value is not None}
-
-
-def _default_folder(config: RunConfig) -> Path:
-    return Path("runs") / config.name
+    names = ("algo", "task", "preset")
+    return values | {name: value for name in names if (value := getattr(choice, name)) is not None}
 
 
 def main(program: Program, arguments: Sequence[str] | None = None, started: str | None = None) -> int:

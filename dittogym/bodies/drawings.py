@@ -33,9 +33,8 @@ PROBE = 4096
 def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
     """The task with another robot.
 
-    Pictures and outlines keep the area of the task's own robot, and so its number of particles, its weight and the look
-    of its matter; they stand where it stood: same centre in x, same lowest point. A shape lies where it says, and is
-    filled as densely as the task's own robot. A body is taken as it is.
+    Pictures and outlines keep the area, particles and mass of the task's own robot, and stand where it stood: same
+    centre in x, same lowest point. A shape lies where it says, and is filled as densely. A body is taken as it is.
 
     Args:
         spec: The task.
@@ -48,13 +47,11 @@ def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
             long that the task would end at once.
     """
     own = spec.robot
-    if isinstance(body, BodySpec):
-        robot = body
-    elif isinstance(body, Shape):
-        robot = replace(own, shape=body, count=max(1, round(own.count * body.area / own.shape.area)))
-    else:
-        robot = replace(own, shape=_figure(body, own.shape))
-    spec = replace(spec, robot=robot)
+    if isinstance(body, Shape):
+        body = replace(own, shape=body, count=max(1, round(own.count * body.area / own.shape.area)))
+    elif not isinstance(body, BodySpec):
+        body = replace(own, shape=_figure(body, own.shape))
+    spec = replace(spec, robot=body)
     _check_place(spec)
     return spec
 
@@ -106,21 +103,17 @@ def _check_place(spec: TaskSpec) -> None:
     shape = spec.robot.shape
     (left, bottom), (width, height) = shape.corner, shape.size
     points = shape.positions(sampling.sobol(PROBE, seed=0))
-    window = spec.window.left if spec.window.follow is None else float(points[:, 0].mean()) - spec.window.follow
-    corners = torch.tensor([[(left, bottom), (left + width, bottom + height)]], dtype=torch.float64, device="cpu")
-    if not bool(contains(corners, corners.new_tensor([[window, 0.0]])).all()):
-        raise ValueError(
-            f"body must lie inside the window ({window:.3f} < x < {window + 1:.3f}, 0 < y < 1), got "
-            f"{left:.3f} < x < {left + width:.3f}, {bottom:.3f} < y < {bottom + height:.3f}"
-        )
+    origin = spec.window.origin(torch.from_numpy(points.mean(0, keepdims=True)))
+    corners = origin.new_tensor([[(left, bottom), (left + width, bottom + height)]])
+    if not bool(contains(corners, origin).all()):
+        window = f"{origin[0, 0]:.3f} < x < {origin[0, 0] + 1:.3f}, 0 < y < 1"
+        place = f"{left:.3f} < x < {left + width:.3f}, {bottom:.3f} < y < {bottom + height:.3f}"
+        raise ValueError(f"body must lie inside the window ({window}), got {place}")
     for other in spec.objects:
         low, high = np.array(other.shape.corner), np.array(other.shape.corner) + other.shape.size
         if ((points > low) & (points < high)).all(1).any():
-            raise ValueError(
-                f"body must leave the place of the object free, {low.round(4).tolist()} to {high.round(4).tolist()}"
-            )
-    split = float(np.sqrt(points.var(0).sum()))
-    if spec.split_limit is not None and split >= spec.split_limit:
-        raise ValueError(
-            f"body must be more compact: its spread is {split:.3f} m, and {spec.name} ends at {spec.split_limit} m"
-        )
+            place = f"{low.round(4).tolist()} to {high.round(4).tolist()}"
+            raise ValueError(f"body must leave the place of the object free, {place}")
+    split, limit = float(np.sqrt(points.var(0).sum())), spec.split_limit
+    if limit is not None and split >= limit:
+        raise ValueError(f"body must be more compact: its spread is {split:.3f} m, and {spec.name} ends at {limit} m")

@@ -25,29 +25,27 @@ def read_grey(picture: PictureLike, name: str, others: str) -> np.ndarray:
     path = os.fspath(picture)
     if not os.path.isfile(path):
         raise ValueError(f"{name} must be {others}an array or the path of an image; no such file: {path!r}")
-    width, height = _claimed_size(path, name)
-    if width * height > LARGEST:
-        raise ValueError(f"{name} {path!r} must have at most {LARGEST} pixels, got {width} x {height}")
     try:
-        image = cv2.imread(path, cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
+        width, height = _claimed_size(path)
+        small = width * height <= LARGEST
+        image = cv2.imread(path, cv2.IMREAD_UNCHANGED) if small else None
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, cv2.error) as error:
         raise ValueError(f"{name} {path!r} cannot be read as an image ({error})") from error
+    if not small:
+        raise ValueError(f"{name} {path!r} must have at most {LARGEST} pixels, got {width} x {height}")
     if image is None:
         raise ValueError(f"{name} {path!r} cannot be read as an image")
     return _grey(image, name)
 
 
-def _claimed_size(path: str, name: str) -> tuple[int, int]:
+def _claimed_size(path: str) -> tuple[int, int]:
     """Width and height from the head of a file: a few bytes may claim to be what fills the memory."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow's own about large pictures; there is a limit of ours
-            with Image.open(path) as image:
-                size = image.size
-                image.verify()  # OpenCV takes memory for whatever length a chunk of a PNG claims
-                return size
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise ValueError(f"{name} {path!r} cannot be read as an image ({error})") from error
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Pillow's own about large pictures; there is a limit of ours
+        with Image.open(path) as image:
+            size = image.size
+            image.verify()  # OpenCV takes memory for whatever length a chunk of a PNG claims
+            return size
 
 
 def _grey(image: np.ndarray, name: str) -> np.ndarray:

@@ -30,11 +30,7 @@ MAX_SEED = 2**32 - 1
 
 
 def particle_counts(spec: TaskSpec, particles: Particles) -> tuple[int, ...]:
-    """Particles of each body.
-
-    A single number keeps the full-size ratio between the bodies; so does ``"lite"``, unless a body of the task has a
-    number of its own, ``BodySpec.lite``.
-    """
+    """Particles of each body; a single number, or ``"lite"`` without ``BodySpec.lite``, keeps the full-size ratio."""
     full = tuple(body.count for body in spec.bodies)
     if particles == "full":
         return full
@@ -46,54 +42,40 @@ def particle_counts(spec: TaskSpec, particles: Particles) -> tuple[int, ...]:
     elif isinstance(particles, (tuple, list)) and len(particles) == len(full):
         counts = tuple(checks.whole(f"particles[{i}]", n, 1) for i, n in enumerate(particles))
     else:
-        raise ValueError(
-            f"particles must be 'full', 'lite', a number, or {len(full)} number(s), one a body, got {particles!r}"
-        )
+        allowed = f"'full', 'lite', a number, or {len(full)} number(s), one a body"
+        raise ValueError(f"particles must be {allowed}, got {particles!r}")
     if min(counts) < 1:
         raise ValueError(f"particles must be at least 1 for every body, got {particles!r}")
     return counts
 
 
-class PositionSampler:
-    """Draws the initial positions of one batch element; holds its random generator.
+def get_state(generator: np.random.RandomState) -> dict[str, Tensor]:
+    """State of a Mersenne Twister: ``key`` (624,) and ``pos`` ()."""
+    state = generator.get_state(legacy=False)["state"]
+    return {"key": torch.from_numpy(state["key"].astype(np.int64)), "pos": torch.tensor(state["pos"], device="cpu")}
+
+
+def set_state(generator: np.random.RandomState, state: Mapping[str, Tensor]) -> None:
+    """Bring a generator to what :func:`get_state` returned."""
+    key, pos = state["key"].numpy().astype(np.uint32), int(state["pos"])
+    generator.set_state({"bit_generator": "MT19937", "state": {"key": key, "pos": pos}})
+
+
+def body_positions(body: BodySpec, count: int, generator: np.random.RandomState, *, random: bool) -> Points:
+    """Positions (N, 2) of ``count`` particles of a body, m.
 
     ``random`` positions are those that the reference implementation draws after ``numpy.random.seed(seed)``. With few
     particles they would leave holes in the body; a scrambled Sobol sequence does not.
     """
-
-    def __init__(self, spec: TaskSpec, counts: tuple[int, ...], seed: int | None, *, random: bool) -> None:
-        if seed is not None:
-            checks.whole("seed", seed, 0, MAX_SEED)
-        self._spec, self._counts, self._random = spec, counts, random
-        self._generator = np.random.RandomState(seed)
-
-    @property
-    def generator(self) -> dict[str, Tensor]:
-        """State of the generator; assign it to restore it."""
-        state = self._generator.get_state(legacy=False)["state"]
-        return {"key": torch.from_numpy(state["key"].astype(np.int64)), "pos": torch.tensor(state["pos"], device="cpu")}
-
-    @generator.setter
-    def generator(self, state: Mapping[str, Tensor]) -> None:
-        key, pos = state["key"].numpy().astype(np.uint32), int(state["pos"])
-        self._generator.set_state({"bit_generator": "MT19937", "state": {"key": key, "pos": pos}})
-
-    def draw(self) -> Points:
-        """Positions (N, 2) in m, robot first; every call continues the generator's sequence."""
-        return np.concatenate(
-            [b.shape.positions(self._numbers(b, n)) for b, n in zip(self._spec.bodies, self._counts, strict=True)]
-        )
-
-    def _numbers(self, body: BodySpec, count: int) -> Points:
-        if body.shape.draws == 0:
-            return np.empty((count, 2))
-        if not self._random:
-            return sampling.sobol(count, seed=int(self._generator.randint(2**31)))
-        draws = self._generator.random_sample((count, body.shape.draws))
-        if body.shape.draws == 2:
-            return draws
-        magnitude, sign = draws[:, :2], np.where(draws[:, 2:] > 0.5, 1.0, -1.0)
-        return 0.5 * (1.0 + sign * magnitude)
+    if body.shape.draws == 0:
+        numbers = np.empty((count, 2))
+    elif random:
+        numbers = generator.random_sample((count, body.shape.draws))
+    else:
+        numbers = sampling.sobol(count, seed=int(generator.randint(2**31)))
+    if numbers.shape[1] == 4:  # magnitudes and signs
+        numbers = 0.5 * (1.0 + np.where(numbers[:, 2:] > 0.5, 1.0, -1.0) * numbers[:, :2])
+    return body.shape.positions(numbers)
 
 
 @dataclass(frozen=True)
@@ -103,36 +85,38 @@ class InitialPositions:
     spec: TaskSpec  # The task
     counts: tuple[int, ...]  # Particles of each body
     num_envs: int  # Number B of simulations
-    random: bool  # Random positions instead of evenly spread ones, see :class:`PositionSampler`
+    random: bool  # Random positions instead of evenly spread ones, see :func:`body_positions`
     resample: bool  # Draw anew at every reset
-    samplers: Mapping[int, PositionSampler] = field(default_factory=dict)  # By element
+    generators: Mapping[int, np.random.RandomState] = field(default_factory=dict)  # By element
     positions: Tensor | None = None  # (B, N, 2) in the world, m; None before the first draw
 
     def draw(self, seed: Seed, mask: np.ndarray, given: Any, like: Tensor) -> InitialPositions:
         """The initial positions of the next episodes; elements outside ``mask`` (B,) keep theirs."""
-        seeds, samplers = self._seeds(seed), dict(self.samplers)
+        seeds, generators = self._seeds(seed), dict(self.generators)
         # Every element has positions from the first draw on.
         mask = np.ones_like(mask) if self.positions is None else mask.copy()
         for i in np.flatnonzero(mask).tolist():
-            if seeds[i] is not None or i not in samplers:
-                samplers[i] = PositionSampler(self.spec, self.counts, seeds[i], random=self.random)
+            if seeds[i] is not None or i not in generators:
+                generators[i] = np.random.RandomState(seeds[i])
             elif self.resample:
-                samplers[i] = copy.deepcopy(samplers[i])
+                generators[i] = copy.deepcopy(generators[i])
             else:
                 mask[i] = given is not None
         if given is not None:
             positions = self._given(given, like)
         elif mask.any():
             stacked = np.zeros((self.num_envs, sum(self.counts), 2))
+            bodies = tuple(zip(self.spec.bodies, self.counts, strict=True))
             for i in np.flatnonzero(mask).tolist():
-                stacked[i] = samplers[i].draw()
+                drawn = [body_positions(body, n, generators[i], random=self.random) for body, n in bodies]
+                stacked[i] = np.concatenate(drawn)
             positions = torch.from_numpy(stacked).to(like)
         else:
             return self
         if self.positions is not None:
             positions = tree.where(torch.as_tensor(mask, device=like.device), positions, self.positions)
         self._check_inside(positions)
-        return replace(self, samplers=samplers, positions=positions)
+        return replace(self, generators=generators, positions=positions)
 
     def _seeds(self, seed: Seed) -> Sequence[int | None]:
         if seed is None:
@@ -148,9 +132,8 @@ class InitialPositions:
         positions = real_tensor("positions", given).to(like, copy=True)
         shape = (sum(self.counts), 2)
         if tuple(positions.shape) not in (shape, (self.num_envs, *shape)):
-            raise ValueError(
-                f"positions must have shape {shape} or {(self.num_envs, *shape)}, got {tuple(positions.shape)}"
-            )
+            allowed = f"{shape} or {(self.num_envs, *shape)}"
+            raise ValueError(f"positions must have shape {allowed}, got {tuple(positions.shape)}")
         return positions.expand(self.num_envs, *shape).contiguous()
 
     def _check_inside(self, positions: Tensor) -> None:
@@ -158,8 +141,6 @@ class InitialPositions:
         inside = contains(positions, origin)
         if not bool(inside.all()):
             element, particle = (~inside).nonzero()[0].tolist()
-            where = positions[element, particle].tolist()
-            raise ValueError(
-                f"positions must lie inside the window ({origin[element, 0]:.3f} < x < {origin[element, 0] + 1:.3f}, "
-                f"0 < y < 1), got {where} for particle {particle} of element {element}"
-            )
+            window = f"{origin[element, 0]:.3f} < x < {origin[element, 0] + 1:.3f}, 0 < y < 1"
+            where = f"{positions[element, particle].tolist()} for particle {particle} of element {element}"
+            raise ValueError(f"positions must lie inside the window ({window}), got {where}")

@@ -14,15 +14,11 @@ from torchmpm.sampling import Points
 
 @runtime_checkable
 class Shape(Protocol):
-    """Where the particles of a body start.
-
-    ``draws`` is the number of uniform random numbers a particle takes in the reference implementation: 4 where each
-    coordinate is a magnitude and a sign, 2 where it is one number, 0 for a lattice.
-    """
+    """Where the particles of a body start."""
 
     @property
     def draws(self) -> int:
-        """Uniform numbers per particle in the reference."""
+        """Uniform numbers per particle in the reference: 4 (a magnitude and a sign a coordinate), 2, or 0 (lattice)."""
 
     @property
     def corner(self) -> tuple[float, float]:
@@ -42,14 +38,11 @@ class Shape(Protocol):
 
 @dataclass(frozen=True)
 class Disc:
-    """Disc with the chord density of the reference, given like there by its bounding square.
+    """Disc with the chord density of the reference.
 
     Attributes:
         corner: Lower left corner of the bounding square in the world, m.
         diameter: m.
-
-    Raises:
-        ValueError: Not two numbers, or the diameter is not positive.
     """
 
     corner: tuple[float, float]
@@ -83,9 +76,6 @@ class Rectangle:
     Attributes:
         corner: Lower left corner in the world, m.
         size: Width and height, m.
-
-    Raises:
-        ValueError: Not two numbers, or a size that is not positive.
     """
 
     corner: tuple[float, float]

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from dittogym.geometry import Box
 from dittogym.observation import native, raster
-from dittogym.observation.image import CLIP, encode, quantise
-from dittogym.observation.raster import Background, RasterInput
-from dittogym.observation.smooth import box_fraction, smooth_crop_corner
+from dittogym.observation.image import CLIP, encode
+from dittogym.observation.raster import RasterInput
 from dittogym.window import GRID, Centre, Window, centre_in_window
 from torchmpm.backends import transforming, warn_eager
-
-#: Draws images (B, 3, 64, 64) uint8 of x, v, origin and centre.
-Drawing = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,51 +32,41 @@ class Camera:
     hidden_velocity: tuple[bool, ...]  # By body, whether the velocity channels leave it out
     pixels: bool  # Whether to use the reference's pixel raster instead of splats
     native: bool  # Whether to draw in C++ where that is possible
-    _drawings: dict[tuple[torch.dtype, torch.device], Drawing] = field(default_factory=dict, repr=False)
-
-    def __getstate__(self) -> dict[str, object]:
-        """Copies and pickles leave out the functions of the loaded library."""
-        return {**vars(self), "_drawings": {}}
 
     def observe(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
         """The image (B, 3, 64, 64) uint8; particles that are not finite are not drawn."""
         arrays = (x.detach(), v.detach(), origin.detach(), centre.detach())
-        if transforming():  # torch.func does not go through the C++ function
+        if not self.native or x.device.type != "cpu" or transforming():  # torch.func cannot look into the C++ function
             return self.draw(*arrays)
-        kind = x.dtype, x.device
-        if kind not in self._drawings:
-            self._drawings[kind] = self._choose(*kind)
-        return self._drawings[kind](*arrays)
-
-    def _choose(self, dtype: torch.dtype, device: torch.device) -> Drawing:
-        if not self.native or device.type != "cpu":
-            return self.draw
+        bodies = tuple(zip(self.counts, self.particle_weight, self.hidden_velocity, strict=True))
         try:
-            bodies = zip(self.counts, self.particle_weight, self.hidden_velocity, strict=True)
-            return native.drawing(self.view, self.boxes, tuple(bodies), self.pixels, dtype)
+            drawing = native.drawing(self.view, self.boxes, bodies, self.pixels, x.dtype)
         except ValueError as error:  # no compiler, or it failed
             warn_eager(str(error))
-            return self.draw
+            return self.draw(*arrays)
+        return drawing(*arrays)
 
     def draw(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
         """:meth:`observe` in torch operations."""
         row, column = raster.crop_corner(centre_in_window(self.view, centre, origin))
         shown = self.raster_input(x, v, origin, row, column)
-        shown = shown._replace(background=self._background(origin, row, column))
-        return quantise(raster.pixel_means(shown) if self.pixels else raster.splat_means(shown))
+        alike = not self.window.moves and None not in self.view  # for all elements
+        corners = (corner[:1] if alike else corner for corner in (origin, row, column))
+        shown = shown._replace(background=raster.draw_boxes(self.boxes, *corners))
+        return encode(raster.pixel_means(shown) if self.pixels else raster.splat_means(shown)).to(torch.uint8)
 
     def observe_smoothly(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
         """The image in the units of the uint8 one as a smooth function of its arguments.
 
-        Particles are splats at every tier, and crop and background move with the robot without steps. The derivative is
-        continuous except where values saturate at 0 and 255, at the cap on velocities (5 m/s), for particles at the
-        edge of the simulated window, and where edges of boxes meet edges of pixels.
+        Particles are splats at every tier, and crop and background move with the robot without steps. The derivative
+        jumps only where values or velocities (5 m/s) saturate, at the edge of the simulated window, and where edges of
+        boxes meet edges of pixels.
         """
         follows = (self.view[0] is None and not self.window.moves, self.view[1] is None)
-        row, column = smooth_crop_corner(centre_in_window(self.view, centre, origin), follows)
+        row, column = raster.smooth_crop_corner(centre_in_window(self.view, centre, origin), follows)
         means = raster.splat_means(self.raster_input(x, v, origin, row, column))
         if self.boxes:
-            free = 1.0 - box_fraction(self.boxes, origin, row, column)
+            free = 1.0 - raster.box_fraction(self.boxes, origin, row, column)
             means = torch.cat((1.0 - free[:, None] * (1.0 - means[:, :1]), means[:, 1:]), dim=1)
         return encode(means)
 
@@ -101,12 +86,6 @@ class Camera:
             row=row,
             column=column,
         )
-
-    def _background(self, origin: Tensor, row: Tensor, column: Tensor) -> Background | None:
-        if not self.boxes or self.window.moves or None in self.view:
-            return raster.draw_boxes(self.boxes, origin, row, column)
-        corner = int(row[0, 0]), int(column[0, 0])
-        return raster.draw_fixed_boxes(self.boxes, (self.window.left, 0.0), *corner, origin.dtype, origin.device)
 
 
 @functools.lru_cache(maxsize=64)

@@ -28,15 +28,10 @@ OCCUPIED_COUNT, OCCUPIED_WIDTH = 24.8, 3.3
 
 
 def encode(means: Tensor) -> Tensor:
-    """Bring block means (B, 3, 64, 64) to the units of the image: occupancy 0 to 255, zero velocity at 132."""
+    """Block means (B, 3, 64, 64) in the units of the uint8 image: occupancy 0 to 255, zero velocity at 132."""
     occupancy = 255.0 * means[:, :1]
     velocity = 10.0 * (255.0 * (means[:, 1:] + CLIP) / (2 * CLIP) - 127.0) + 127.0
     return torch.cat((occupancy, velocity), dim=1).clamp(0.0, 255.0)
-
-
-def quantise(means: Tensor) -> Tensor:
-    """Block means (B, 3, 64, 64) as the uint8 image: :func:`encode`, truncated."""
-    return encode(means).to(torch.uint8)
 
 
 def silhouette(observation: Tensor) -> Tensor:

@@ -1,8 +1,10 @@
-"""Rasters of a half-window: mean occupancy and velocity of image pixels (3, 64, 64), row 0 at the top."""
+"""Rasters of a half-window: mean occupancy and velocity of image pixels (3, 64, 64), row 0 at the top.
+
+Crop and background also as smooth functions, see ``docs/concepts/gradients.md``.
+"""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -15,6 +17,8 @@ from torchmpm.spline import quadratic_weights
 
 #: Pixels around the image that splats at its edge reach into.
 FRAME = 3
+#: Fine pixels by which truncation shifts a moving crop, and the rule of :func:`draw_boxes` a box, on average.
+HALF = 0.5
 
 
 def crop_corner(centre: Tensor) -> tuple[Tensor, Tensor]:
@@ -27,6 +31,18 @@ def crop_corner(centre: Tensor) -> tuple[Tensor, Tensor]:
     column = (middle[:, 0:1] - half).clamp(0, RASTER - 2 * half)
     below = (middle[:, 1:2] - half).clamp(0, RASTER - 2 * half)
     return RASTER - below - 2 * half, column
+
+
+def smooth_crop_corner(centre: Tensor, follows: tuple[bool, bool]) -> tuple[Tensor, Tensor]:
+    """First fine row and column (B, 1) of a crop, not truncated along axes on which it ``follows`` the robot."""
+    half = SIZE * BLOCK // 2
+    row, column = (corner.to(centre.dtype) for corner in crop_corner(centre))
+    first = (RASTER * centre - HALF - half).clamp(0.0, RASTER - 2.0 * half)
+    if follows[0]:
+        column = first[:, 0:1]
+    if follows[1]:
+        row = RASTER - 2 * half - first[:, 1:2]
+    return row, column
 
 
 class Background(NamedTuple):
@@ -66,18 +82,29 @@ def draw_boxes(boxes: Sequence[Box], origin: Tensor, row: Tensor, column: Tensor
     return Background(mask, fraction)
 
 
-@functools.lru_cache(maxsize=64)
-@torch.inference_mode(False)  # what is kept must serve gradients later
-def draw_fixed_boxes(
-    boxes: tuple[Box, ...], origin: tuple[float, float], row: int, column: int, dtype: torch.dtype, device: torch.device
-) -> Background | None:
-    """What :func:`draw_boxes` returns where neither window nor crop moves; cached."""
-    place = torch.tensor([origin], dtype=dtype, device=device)
-    return draw_boxes(boxes, place, *(torch.tensor([[first]], device=device) for first in (row, column)))
-
-
 def _between(value: Tensor, low: float, high: float, closed: bool) -> Tensor:
     return (value >= low) & (value <= high) if closed else (value > low) & (value < high)
+
+
+def box_fraction(boxes: Sequence[Box], origin: Tensor, row: Tensor, column: Tensor) -> Tensor:
+    """Fraction of each image pixel that boxes cover, (B, 64, 64), for a window at ``origin`` (B, 2), m.
+
+    Boxes may touch; where they overlap within a pixel that they do not fill, the overlap counts twice.
+    """
+    pixel = torch.arange(SIZE, device=origin.device, dtype=origin.dtype)
+    width = BLOCK / RASTER
+    left = (column + BLOCK * pixel - HALF) / RASTER + origin[:, 0:1]
+    bottom = (RASTER - row - BLOCK * (pixel + 1) + HALF) / RASTER + origin[:, 1:2]
+    fraction = torch.zeros_like(bottom[:, :, None])
+    for box in boxes:
+        along, across = _overlap(bottom, width, box.bottom, box.top), _overlap(left, width, box.left, box.right)
+        fraction = fraction + along[:, :, None] * across[:, None]
+    return fraction.clamp_max(1.0)
+
+
+def _overlap(start: Tensor, width: float, low: float, high: float) -> Tensor:
+    """Fraction of the intervals of a ``width`` from ``start`` on that lies between ``low`` and ``high``."""
+    return ((start + width).clamp_max(high) - start.clamp_min(low)).clamp_min(0.0) / width
 
 
 def pixel_means(shown: RasterInput) -> Tensor:

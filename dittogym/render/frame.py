@@ -7,7 +7,7 @@ import numpy as np
 from torch import Tensor
 
 from dittogym.action import place
-from dittogym.geometry import Box
+from dittogym.geometry import NODES, Box
 from dittogym.model import EnvState, Model
 from dittogym.window import centre_in_window
 from torchmpm import Snow, checks
@@ -45,7 +45,8 @@ def frame(model: Model, state: EnvState, index: int, actuation: Tensor | None, s
         canvas.target(spec.target, state.centre[index].detach().cpu().double().numpy())
     for obstacle in spec.obstacles:
         for box in obstacle.boxes:
-            canvas.box(box, filled=bool(obstacle.observed_boxes) or box.ground)
+            ground = box == Box(top=box.top)
+            canvas.box(box, filled=bool(obstacle.observed_boxes) or ground)
     x = particles.x[0].cpu().double().numpy()
     counts = [body.count for body in model.solver.bodies]
     kinds = [ROBOT, *(GROUND_BODY if isinstance(body.material, Snow) else OBJECT for body in spec.objects)]
@@ -53,7 +54,7 @@ def frame(model: Model, state: EnvState, index: int, actuation: Tensor | None, s
     if actuation is not None:
         colours[: model.num_robot_particles] = _muscle_colours(model, state, index, actuation)
     parts = [part for _, part in slices(model.solver.bodies)]
-    for part, weight in reversed(list(zip(parts, model.particle_weight, strict=True))):  # the robot last, on top
+    for part, weight in reversed(list(zip(parts, model.camera.particle_weight, strict=True))):  # the robot last, on top
         radius = max(1, round(FULL_SIZE_RADIUS * np.sqrt(weight) * canvas.pixels))
         canvas.dots(x[part], colours[part], radius)
     return cv2.resize(canvas.image, (size, size), interpolation=cv2.INTER_AREA)
@@ -82,9 +83,8 @@ class Canvas:
     def goal(self, goal: tuple[float, float]) -> None:
         """A disc at a point of the world."""
         middle = (np.array(goal) - self.origin) * self.pixels
-        if not self._near(middle):
-            return
-        cv2.circle(self.image, (round(middle[0]), round(self.pixels - middle[1])), self.pixels // 60, TARGET, -1)
+        if self._near(middle):
+            cv2.circle(self.image, (round(middle[0]), round(self.pixels - middle[1])), self.pixels // 60, TARGET, -1)
 
     def target(self, target: np.ndarray, centre: np.ndarray) -> None:
         """The picture to match, half a window wide, around the robot's centre."""
@@ -119,7 +119,7 @@ class Canvas:
 def _muscle_colours(model: Model, state: EnvState, index: int, actuation: Tensor) -> np.ndarray:
     spec, one = model.spec, slice(index, index + 1)
     centre = centre_in_window(spec.reach, state.centre[one], state.origin[one])
-    nodes = place(actuation[one], centre, model.solver.grid.resolution)[0].sum(0).cpu().double().numpy()
+    nodes = place(actuation[one], centre, NODES)[0].sum(0).cpu().double().numpy()
     robot_x = state.particles.x[index, : model.num_robot_particles] - state.origin[index]
     relative = robot_x.detach().cpu().double().numpy()
     finite = np.isfinite(relative).all(1, keepdims=True)

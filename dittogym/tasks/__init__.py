@@ -8,6 +8,7 @@ import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from dittogym.bodies.drawings import BodyLike, with_body
 from dittogym.geometry import Obstacle
@@ -34,10 +35,7 @@ def task_name(task: str) -> str:
 
 
 def fingerprint(task: str) -> str | None:
-    """SHA-256 of the file that defines a custom task; ``None`` for a task of the library, or if there is no file.
-
-    Files that it imports do not count.
-    """
+    """SHA-256 of the file that defines a custom task; ``None`` for a task of the library, or if there is no file."""
     try:
         file = Path(inspect.getsourcefile(TASKS[task_name(task)]) or "")
     except TypeError:  # no plain function
@@ -67,11 +65,7 @@ def allowed_instead(task: object) -> str | None:
 
 
 def make_spec(
-    task: str | TaskSpec,
-    *,
-    body: BodyLike | None = None,
-    obstacles: Sequence[Obstacle] | None = None,
-    **options: object,
+    task: str | TaskSpec, *, body: BodyLike | None = None, obstacles: Sequence[Obstacle] | None = None, **options: Any
 ) -> TaskSpec:
     """The specification of a task.
 
@@ -96,10 +90,8 @@ def make_spec(
         make = TASKS[task_name(task)]
         known = list(inspect.signature(make).parameters)
         if unknown := [name for name in options if name not in known]:
-            names = ", ".join(("body", "obstacles", *known))
-            raise TypeError(
-                f"task {task!r} has no option {unknown[0]!r}; besides the arguments of TorchEnv it has: {names}"
-            )
+            names = f"besides the arguments of TorchEnv it has: {', '.join(('body', 'obstacles', *known))}"
+            raise TypeError(f"task {task!r} has no option {unknown[0]!r}; {names}")
         spec = make(**options)
     if obstacles is not None:
         checks.instances("obstacles", obstacles, Obstacle)

@@ -1,7 +1,5 @@
 """CATCH: reach into a narrow shaft, take hold of a cube, and put it on a shelf."""
 
-from __future__ import annotations
-
 import math
 
 from dittogym.bodies.shapes import Disc, Rectangle
@@ -57,7 +55,7 @@ def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
     """Distances of the cube from the goal, and of the hand from the cube."""
     x, cube = moment.robot_x, moment.object_com
     hand = moment.ops.mean_over_nearest(x, x, moment.memory["object_com"], HAND)
-    to_goal, to_cube = (offset.abs().sum(-1) for offset in (cube - spec.goal_like(cube), hand - cube))
+    to_goal, to_cube = (offset.abs().sum(-1) for offset in (cube - cube.new_tensor(spec.goal), hand - cube))
     return Outcome(
         terms={
             "object_distance": -moment.ops.clamp(to_goal, high=CAP),

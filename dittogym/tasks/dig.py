@@ -1,11 +1,9 @@
 """DIG: get through loose soil to a point in it."""
 
-from __future__ import annotations
-
 from dittogym.bodies.shapes import Disc, Rectangle
 from dittogym.contract import Moment, Outcome
 from dittogym.geometry import ceiling, floor, side_walls
-from dittogym.rewards import signed_quadratic
+from dittogym.reward_ops import signed_quadratic
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.window import Window
 from torchmpm import Snow, lame
@@ -13,13 +11,15 @@ from torchmpm import Snow, lame
 GOAL = (0.2, 0.17)
 #: Mean distance of the robot's particles (|x| + |y|) from the goal that counts as success (our definition), m.
 REACHED = 0.1
-SOIL = Snow(*lame(5000.0, 0.2))
+SNOW = Snow(*lame(5000.0, 0.2))
+PLACE = Rectangle((-0.25, 0.16), (0.5, 0.33), draws=2)
+SOIL = BodySpec(PLACE, count=8000, lite=3400, material=SNOW, hidden_velocity=True)
 
 
 def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
     """Mean distance of all particles from the goal, under a square root; speed to the right and downwards."""
     x = moment.robot_x
-    distance = (x - spec.goal_like(x)).abs().sum(-1).mean(1)
+    distance = (x - x.new_tensor(spec.goal)).abs().sum(-1).mean(1)
     right, up = moment.now.velocity.unbind(1)
     rightwards, downwards = (moment.ops.clamp(signed_quadratic(v, 5.0), -20.0, 20.0) for v in (right, -up))
     return Outcome(
@@ -35,15 +35,7 @@ def dig() -> TaskSpec:
         name="dig",
         horizon=1000,
         robot=BodySpec(Disc((-0.2, 0.5), 0.14), count=12000),
-        objects=(
-            BodySpec(
-                Rectangle((-0.25, 0.16), (0.5, 0.33), draws=2),
-                count=8000,
-                lite=3400,
-                material=SOIL,
-                hidden_velocity=True,
-            ),
-        ),
+        objects=(SOIL,),
         mu=400.0,
         yield_stress=65.0,
         max_actuation=50.0,

@@ -1,11 +1,9 @@
 """GROW: reach a point above, past two beams."""
 
-from __future__ import annotations
-
 from dittogym.bodies.shapes import Lattice
 from dittogym.contract import Memory, Moment, Outcome
 from dittogym.geometry import Obstacle, ceiling, floor, nodes, side_walls
-from dittogym.rewards import count_of, distance, drop_widest, pick
+from dittogym.reward_ops import count_of, distance, drop_widest, pick
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.window import Window
 from torchmpm import VelocityRule
@@ -44,10 +42,7 @@ LEFT_BEAM = Obstacle(
 
 
 def initial_memory(moment: Moment, spec: TaskSpec) -> Memory:
-    """The tip: the highest particles at the start; of equally high ones the first.
-
-    Which ones the reference takes there is not defined; these reproduce its published rewards to 1e-3.
-    """
+    """The tip: the highest particles at the start; of equally high ones the first (undefined in the reference)."""
     x = moment.robot_x.detach()
     highest = x[..., 1].argsort(dim=1, descending=True, stable=True)[:, : count_of(TIP, x)]
     return {"tip": drop_widest(highest, x)}
@@ -56,7 +51,7 @@ def initial_memory(moment: Moment, spec: TaskSpec) -> Memory:
 def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
     """Mean distance of the tip from the goal, under a square root."""
     tip = pick(moment.particles.x, moment.memory["tip"])
-    gap = distance(tip, spec.goal_like(tip)[None]).mean(1)
+    gap = distance(tip, tip.new_tensor([spec.goal])).mean(1)
     reached = gap < REACHED
     return Outcome(
         terms={"distance": -gap.sqrt(), "success": moment.ops.heaviside(REACHED - gap, BONUS_WIDTH)},

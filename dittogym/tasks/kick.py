@@ -1,11 +1,9 @@
 """KICK: drive a cube to the right and stay behind it."""
 
-from __future__ import annotations
-
 from dittogym.bodies.shapes import Disc, Rectangle
 from dittogym.contract import Moment, Outcome
 from dittogym.geometry import ceiling, floor
-from dittogym.rewards import signed_quadratic
+from dittogym.reward_ops import signed_quadratic
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.window import Window
 

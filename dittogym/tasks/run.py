@@ -1,13 +1,11 @@
 """RUN: run to the right, as far and as fast as possible."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from dittogym.bodies.shapes import Disc
 from dittogym.contract import Moment, Outcome
 from dittogym.geometry import Obstacle, ceiling, floor, nodes
-from dittogym.rewards import signed_quadratic
+from dittogym.reward_ops import signed_quadratic
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.window import Window
 from torchmpm import VelocityRule
@@ -32,15 +30,9 @@ HANGING_BLOCK = Obstacle(
 
 @dataclass(frozen=True)
 class Forward:
-    """Displacement from the start and present speed to the right, both saturating.
+    """Displacement from the start and present speed to the right, both saturating; OBSTACLE uses it too."""
 
-    OBSTACLE uses it too: a term added here needs a weight in both tasks.
-
-    Attributes:
-        goal: Displacement that counts as success, m.
-    """
-
-    goal: float
+    goal: float  # Displacement that counts as success, m
 
     def __call__(self, moment: Moment, spec: TaskSpec) -> Outcome:
         """Displacement, speed and end of the episode."""

@@ -1,7 +1,5 @@
 """SHAPE MATCH: take the shape of a picture, without gravity."""
 
-from __future__ import annotations
-
 import torch
 
 from dittogym.bodies.shapes import Disc
@@ -28,8 +26,7 @@ def shapematch(target: TargetLike = "star") -> TaskSpec:
     """The task SHAPE MATCH.
 
     Args:
-        target: ``"star"``, ``"I"``, ``"M"``, ``"T"``, the path of an image, or an array; see
-            :func:`dittogym.tasks.targets.load_target`.
+        target: See :func:`dittogym.tasks.targets.load_target`.
     """
     return TaskSpec(
         name="shapematch",

@@ -22,13 +22,10 @@ OFF_CENTRE = 3.0
 # Corners (column, row) of filled polygons, several for a shape that is a union.
 # fmt: off
 _OUTLINES: dict[str, list[list[tuple[int, int]]]] = {
-    "star": [
-        [
-            (30, 15), (32, 15), (36, 26), (44, 25), (45, 27),
-            (38, 34), (43, 48), (40, 47), (31, 41), (23, 48),
-            (22, 47), (26, 34), (19, 28), (18, 25), (26, 25),
-        ],
-    ],
+    "star": [[
+        (30, 15), (32, 15), (36, 26), (44, 25), (45, 27), (38, 34), (43, 48), (40, 47),
+        (31, 41), (23, 48), (22, 47), (26, 34), (19, 28), (18, 25), (26, 25),
+    ]],
     "I": [
         [(15, 17), (46, 17), (46, 19), (15, 19)],
         [(26, 20), (34, 20), (34, 39), (26, 39)],
@@ -48,9 +45,9 @@ def load_target(target: TargetLike) -> np.ndarray:
     """A target as a (64, 64) bool array, row 0 at the top.
 
     Args:
-        target: The name of a drawn target (``"star"``, ``"I"``, ``"M"``, ``"T"``), the path of an image that OpenCV
-            reads, or an array (H, W), (H, W, 3) or (H, W, 4): bool, uint8 0..255, or floating point 0..1. Pictures of
-            another size are resized to 64 x 64 by area; grey values from 125 of 255 belong to the shape.
+        target: ``"star"``, ``"I"``, ``"M"``, ``"T"``, the path of an image, or an array (H, W), (H, W, 3) or (H, W, 4):
+            bool, uint8 0..255, or floating point 0..1. Pictures of another size are resized to 64 x 64 by area; grey
+            values from 125 of 255 belong to the shape.
 
     Raises:
         ValueError: Neither a name nor a readable image, an array of another kind, or a picture without any pixel set or
@@ -62,16 +59,12 @@ def load_target(target: TargetLike) -> np.ndarray:
             cv2.fillPoly(grey, [np.array(outline)], 255)
     else:
         grey = read_grey(target, "target", others="".join(f"{name!r}, " for name in _OUTLINES))
-    if grey.shape != (SIZE, SIZE):
         grey = cv2.resize(grey, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
     mask = grey >= THRESHOLD
     if not mask.any() or mask.all():
         raise ValueError(f"target must have pixels of the shape and of the ground, got {mask.sum()} of {mask.size}")
     offset = np.argwhere(mask).mean(0) - (SIZE - 1) / 2
     if np.abs(offset).max() > OFF_CENTRE:
-        warnings.warn(
-            f"the target's centroid is {offset[0]:+.1f} rows and {offset[1]:+.1f} columns off the middle; the robot's "
-            "centre stays in the middle of the picture, so it cannot cover this target well",
-            stacklevel=2,
-        )
+        where = f"{offset[0]:+.1f} rows and {offset[1]:+.1f} columns off the middle"
+        warnings.warn(f"the target's centroid is {where}, where the robot's centre always is", stacklevel=2)
     return mask

@@ -232,6 +232,7 @@ CONFIGS = [
     file_of_options("with steps as text", '{"steps": "x"}', "steps must be an integer, got 'x'"),
     file_of_options("with a rate of NaN", '{"learning": {"learning_rate": NaN}}', "learning_rate must be finite,"),
     file_of_options("with a rate of 400 digits", f'{{"learning": {{"tau": 1{"0" * 400}}}}}', "tau must be a number"),
+    file_of_options("with floats of 16 bits", '{"environment": {"dtype": "float16"}}', "dtype must be 'float32' or"),
     file_of_options("with half particles", '{"environment": {"particles": [1.5, 2]}}', "a list of 2, each an integer"),
     Case(
         "config file missing",

@@ -129,7 +129,7 @@ OTHERS = [
     evaluating("a disturbed nothing", "{folder}", "there is no run", main=ROBUSTNESS),
     evaluating(
         "under an earthquake",
-        "{folder} --cases earthquake",
+        "--policy run --out {folder}/new --cases earthquake",
         "cases must be words of action dropout 20%",
         main=ROBUSTNESS,
     ),

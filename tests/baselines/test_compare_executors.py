@@ -15,10 +15,9 @@ import pytest
 from test_compare import COMMON, MPC, PLAN, compare, sessions
 
 from baselines.compare.__main__ import main
-from baselines.compare.executor import LocalExecutor, Resources, execute, run_process
+from baselines.compare.executor import LocalExecutor, RayExecutor, Resources, execute, run_process
 from baselines.compare.final_evaluation import Protocol
 from baselines.compare.jobs import Job
-from baselines.compare.ray import RayExecutor
 from baselines.registry import configure
 from cfp.experiment.process import StopSignals
 from cfp.tables import read_table
@@ -179,7 +178,7 @@ def test_error_of_an_executor_is_not_lost(job, monkeypatch, use_program):
     """For instance a full disk, on which not even the reason of a failure can be written."""
     use_program(KILLED)
     monkeypatch.setitem(sys.modules, "ray", FakeRay())
-    monkeypatch.setattr("baselines.compare.ray.write_text", lambda *_: open("/dev/full/nothing", "w"))
+    monkeypatch.setattr("baselines.compare.executor.write_text", lambda *_: open("/dev/full/nothing", "w"))
     with pytest.raises(OSError):
         outcomes(RayExecutor(None, Resources(retries=0)), job)
 

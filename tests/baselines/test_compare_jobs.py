@@ -6,8 +6,7 @@ import pytest
 from test_compare import PLAN, compare
 
 from baselines.compare.final_evaluation import Protocol
-from baselines.compare.jobs import Job, make_jobs, resolve
-from baselines.compare.plan import Plan
+from baselines.compare.jobs import Job, Plan, make_jobs, resolve
 from baselines.compare.worker import decode, encode
 from baselines.registry import configure
 

@@ -5,14 +5,7 @@ import pytest
 
 import cfp
 from baselines.compare import paper
-from baselines.compare.stats import (
-    align_curves,
-    bootstrap_interval,
-    first_step_at,
-    interquartile_mean,
-    score_interval,
-    wilson_interval,
-)
+from baselines.compare.stats import align_curves, bootstrap_interval, first_step_at, interquartile_mean, score_interval
 
 
 def test_interquartile_mean_cuts_whole_runs():
@@ -35,24 +28,9 @@ def test_bootstrap_resamples_within_strata():
     assert score_interval([[0.0, 2.0], [10.0, 12.0]]) == pytest.approx((5.0, 7.0))
 
 
-def test_bootstrap_finds_the_interval_of_a_normal_mean():
-    scores = np.random.default_rng(1).normal(size=400)
-    low, high = bootstrap_interval([scores])
-    # For normal samples the variance of the interquartile mean is 1.19 times that of the mean.
-    assert (high - low) / 2 == pytest.approx(1.96 * np.sqrt(1.19 / 400), rel=0.15)
-    assert (low + high) / 2 == pytest.approx(interquartile_mean(scores), abs=0.02)
-
-
 def test_bootstrap_resamples_whole_curves():
     low, high = bootstrap_interval([np.array([[0.0, 10.0], [2.0, 12.0]])], resamples=500)
     assert low == pytest.approx([0, 10]) and high == pytest.approx([2, 12])
-
-
-def test_wilson_interval():
-    # Newcombe (1998), Statistics in Medicine 17, Table I, method 3.
-    assert wilson_interval(81, 263) == pytest.approx((0.2553, 0.3662), abs=5e-5)
-    assert wilson_interval(0, 20) == pytest.approx((0.0, 0.1611), abs=5e-5)
-    assert wilson_interval(20, 20) == pytest.approx((1 - 0.1611, 1.0), abs=5e-5)
 
 
 def test_first_step_at_a_value():

@@ -20,9 +20,8 @@ from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entri
 from baselines.distillation.teachers import PolicyTeacher, Teacher, project, read_teacher
 from baselines.distillation.train import METRICS
 from baselines.modular import env as modular_env
-from baselines.modular.networks import ModularActor
+from baselines.modular.networks import ModularActor, SegmentPolicy
 from baselines.modular.nodes import Nodes
-from baselines.modular.policy import SegmentPolicy
 from baselines.registry import configure
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.process import StopSignals
@@ -81,8 +80,6 @@ def test_how_a_policy_is_evaluated_does_not_change_what_it_learns():
 class Mirror(Teacher):
     """Pulls where the image shows matter, by image alone: what a student can copy."""
 
-    resolution = 8
-
     def act(self, env, seen):
         """Actions of +-0.6 by the speed that is seen."""
         there = torch.nn.functional.avg_pool2d(seen[:, :1].float() / 255.0, 8)
@@ -116,7 +113,7 @@ def test_faults_hit_half_of_what_they_may() -> None:
 
 def test_actions_are_lost_on_the_grid_on_which_the_student_decides() -> None:
     env, taken = TorchEnv("run", 2, 64, particles=100, substeps=1), []
-    collector, step = Collector(env, Mirror(), Episodes(env, 0, 20, 3), 2, dropout=0.5, grid=16), env.step
+    collector, step = Collector(Mirror(), Episodes(env, 0, 20, 3), 2, dropout=0.5, grid=16), env.step
     env.step = lambda action: taken.append(action) or step(action)
     collector.collect(8, 0.0, lambda seen: torch.ones(2, 2, 64, 64))
     cells = torch.cat(taken).unflatten(3, (16, 4)).unflatten(2, (16, 4)).transpose(3, 4).flatten(4)
@@ -188,13 +185,11 @@ def test_teacher_remembers_its_segments_as_long_as_an_episode_lasts(segments, mo
     anew, fit = [], modular_env.fit
     monkeypatch.setattr(modular_env, "fit", lambda x, count: anew.append(len(x)) or fit(x, count))
     Distill(make(teacher=str(segments), max_episode_steps=6)).learn(32)
-    assert sum(anew) == 7, "of 16 steps: the first robot begins anew after 3, 9 and 15, the second after 6 and 12"
+    assert sum(anew) == 5, "of 16 steps: the first robot begins anew after 3, 9 and 15, the second after 6 and 12"
 
 
 class Scripted(Teacher):
     """Looks only every third step; answers the number of the call."""
-
-    resolution = 4
 
     def __init__(self):
         self.calls = -1
@@ -210,7 +205,7 @@ class Scripted(Teacher):
 @pytest.mark.parametrize(("share", "expected"), [(1.0, [0, 0, 1, 3, 3, 4]), (0.0, [0, 0, 3, 3])])
 def test_labels_count_only_where_the_teacher_looked_or_led(share, expected):
     env = TorchEnv("run", 2, 64, particles=100, substeps=1)
-    collector = Collector(env, Scripted(), Episodes(env, 0, 2, 3), 3)  # the first robot begins anew after one step
+    collector = Collector(Scripted(), Episodes(env, 0, 2, 3), 3)  # the first robot begins anew after one step
     labels = collector.collect(6, share, lambda seen: torch.zeros(2, 2, 8, 8))
     given = (10 * labels.actions[:, 0, 0, 0]).round().int().tolist()
     assert sorted(given) == expected

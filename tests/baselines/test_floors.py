@@ -1,4 +1,4 @@
-"""Floors of a comparison, and single levels of the ladder."""
+"""Reference policies, and single stages of the coarse-to-fine policy."""
 
 import json
 
@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-import cfp
 from baselines import train
 from baselines.common.reference_policies import wave
 from baselines.registry import configure, find, reference_policy
@@ -17,7 +16,7 @@ from cfp.experiment.training import parse
 from cfp.files import write_json
 from cfp.tables import read_table
 from dittogym.action import patch_field, to_grid_indexing
-from dittogym.rewards import action_cost
+from dittogym.reward_ops import action_cost
 
 TINY = "--particles 100 --substeps 2 --eval-episodes 2 --no-video --device cpu".split()
 IMAGES = np.zeros((2, 3, 64, 64), np.uint8)
@@ -78,18 +77,6 @@ def test_coarse_is_the_first_stage_and_goes_on(tmp_path):
     curves = [read_table(tmp_path / name / "evaluations.csv") for name in ("coarse", "cfp")]
     first = [row for row in curves[1] if row["stage"] == "1"]
     assert len(first) == 4 and curves[0][:4] == first and [row["step"] for row in curves[0][4:]] == ["50", "60"]
-
-
-@pytest.mark.parametrize("task", cfp.presets.TASKS)
-def test_presets_are_single_levels(task):
-    for name in ("quick", "paper"):
-        ladder = cfp.preset(task, name)
-        for algo, level in (("coarse", 0), ("fine", -1)):
-            config = find(algo).preset(task, name)
-            config.check()
-            assert config.resolutions == (ladder.resolutions[level],) and config.steps == ladder.steps
-            assert (config.alpha, config.random_steps) == (ladder.alpha[:1], ladder.random_steps[:1])
-            assert config.learning == ladder.learning and config.environment == ladder.environment
 
 
 @pytest.mark.parametrize(("task", "count"), [("run", 82_388), ("shapematch", 83_388)])

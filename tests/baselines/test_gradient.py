@@ -6,12 +6,11 @@ import pytest
 import torch
 from updates import EachUpdate
 
+import dittogym
 from baselines import Gradient, OpenLoop
 from baselines.trajectory.optimise import Episode
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.sections import EnvironmentConfig
-
-TASKS = ("shapematch", "run", "grow", "kick", "dig", "obstacle", "catch", "slot")
 
 
 def make(task="shapematch", **changes):
@@ -192,12 +191,12 @@ def test_only_polish_takes_place_where_the_result_is_evaluated():
         Gradient(make("run", environment=environment, train_particles=200, polish=1), stage) for stage in (1, 2)
     )
     for env, count, scaled in ((first.env, 200, True), (polish.env, 300, False)):
-        assert env.num_particles == count and (max(env.model.particle_weight) > 1) is scaled
+        assert env.num_particles == count and (max(env.model.camera.particle_weight) > 1) is scaled
         assert env.model.camera.pixels is not scaled
     assert first.env.action_layout == polish.env.action_layout == "grid"
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", dittogym.TASKS)
 def test_every_task_has_a_gradient(task):
     algorithm = shorten(Gradient(make(task, substeps=20, particles=100, train_particles=100)), 3)
     loss, _, _, gradient = algorithm.play(0.0)

@@ -9,12 +9,9 @@ import torch
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 import baselines
-import cfp
-from baselines.modular.env import segment
-from baselines.modular.kmeans import update
-from baselines.modular.networks import ModularActor, ModularCritics
+from baselines.modular.kmeans import fit, update
+from baselines.modular.networks import ModularActor, ModularCritics, SegmentPolicy
 from baselines.modular.nodes import Nodes, pack, visible_positions
-from baselines.modular.policy import SegmentPolicy
 from baselines.modular.train import GNN16, ModularConfig
 from baselines.registry import find
 from cfp.envs.disturbances import Case
@@ -189,18 +186,6 @@ def test_policy_must_be_shown_its_own_kind_of_task(tmp_path):
         SegmentPolicy.load(tmp_path / "a.safetensors")
 
 
-@pytest.mark.parametrize("algo", ["gnn-16", "gnn-64", "transformer-16", "transformer-64"])
-def test_presets_learn_as_the_first_stage_does(algo):
-    assert find(algo).sees == "state"
-    for task in cfp.presets.TASKS:
-        for name in ("quick", "paper"):
-            mine, ladder = find(algo).preset(task, name), cfp.preset(task, name)
-            mine.check()
-            assert (mine.learning, mine.environment, mine.steps) == (ladder.learning, ladder.environment, ladder.steps)
-            assert (mine.alpha, mine.random_steps) == (ladder.alpha[0], ladder.random_steps[0])
-            assert mine.segments == int(algo[-2:])
-
-
 @pytest.mark.parametrize("algo", ["gnn", "gnn-x", "mlp-16", "gnn-1"])
 def test_bad_names_are_refused(algo):
     with pytest.raises(ConfigError, match=f"algo.*{algo}"):
@@ -219,7 +204,7 @@ def test_matter_that_flew_off_leaves_finite_what_is_seen(graph):
     env = TorchEnv("shapematch", resolution=64, particles=200, substeps=1)
     env.reset(seed=0)
     nodes = Nodes(16, graph)
-    labels = segment(env, nodes, None, torch.ones(1, dtype=torch.bool))
+    labels = fit(visible_positions(env), 16)
     particles = env.state.clone()
     particles.x[0, 0], particles.v[0, 0] = 1e25, 1e30  # finite, and out of the window: the episode goes on
     env.env_state = replace(env.env_state, particles=particles)

@@ -15,6 +15,8 @@ from cfp.experiment.folder import holds_run
 from cfp.sections import EnvironmentConfig
 from cfp.tables import read_table
 
+OPTIONS = "--algo mpc --task shapematch --particles 60 --substeps 1 --grid 4 --horizon 2 --commit 2 --iterations 1"
+COMMON = [*OPTIONS.split(), "--no-video", "--device", "cpu"]
 ENVIRONMENT = EnvironmentConfig(num_envs=1, particles=100, substeps=2)
 CONFIG = MPCConfig(
     task="kick",
@@ -26,9 +28,7 @@ CONFIG = MPCConfig(
 
 
 def test_record_repeats_the_episode(tmp_path) -> None:
-    options = "--task shapematch --particles 60 --substeps 1 --grid 4 --horizon 2 --commit 2 --iterations 1"
-    arguments = ["--algo", "mpc", *options.split(), "--no-video", "--device", "cpu", "--log-every", "1"]
-    assert train.main([*arguments, "--out", str(tmp_path)]) == 0
+    assert train.main([*COMMON, "--log-every", "1", "--out", str(tmp_path)]) == 0
     planned = [float(row["train/return"]) for row in read_table(tmp_path / "progress.csv")]
     evaluated = [float(row["mean"]) for row in read_table(tmp_path / "evaluations.csv")]
     assert len(planned) == 30 and evaluated[-1] == pytest.approx(planned[-1], abs=1e-3)
@@ -51,10 +51,9 @@ def test_record_repeats_the_episode_exactly_in_double_precision() -> None:
 
 
 def test_options_that_only_the_model_can_refuse_leave_the_folder_free(tmp_path, capsys) -> None:
-    options = "--task shapematch --particles 60 --substeps 1 --grid 4 --horizon 2 --commit 2 --iterations 1"
-    arguments = ["--algo", "mpc", *options.split(), "--no-video", "--device", "cpu", "--out", str(tmp_path)]
+    arguments = [*COMMON, "--out", str(tmp_path)]
     assert train.main([*arguments, "--train-particles", "61"]) == 2
-    assert "train_particles: a reduced model must have at most 60 particles" in capsys.readouterr().err
+    assert "train_particles of a body must be at most 60, got 61" in capsys.readouterr().err
     assert not holds_run(tmp_path)
     assert train.main([*arguments, "--train-particles", "60"]) == 0
 

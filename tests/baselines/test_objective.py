@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 
-from baselines.trajectory.objective import gaussian_matrix, make_objective
+from baselines.trajectory.objective import Objective, gaussian_matrix
 from dittogym import TorchEnv
 
 
@@ -24,18 +24,18 @@ def test_loss_counts_the_pixels_that_differ():
     env.reset(seed=0)
     with torch.no_grad():
         reward = env.step(torch.zeros(1, 2, 8, 8))[4]["reward_terms"]["mismatch"]
-    loss = make_objective(env, (0.0,))(env, reward, 0.0)
+    loss = Objective(env, (0.0,))(env, reward, 0.0)
     assert 409.6 * loss.item() == pytest.approx(-reward.item(), rel=0.15)
 
 
 def test_blurs_follow_one_another():
     env = TorchEnv("shapematch", resolution=8, particles=300, substeps=1)
     env.reset(seed=0)
-    both, reward = make_objective(env, (4.0, 0.0)), torch.zeros(1)
+    both, reward = Objective(env, (4.0, 0.0)), torch.zeros(1)
     for progress, blur in ((0.0, 4.0), (0.49, 4.0), (0.5, 0.0), (1.0, 0.0)):
-        assert both(env, reward, progress) == make_objective(env, (blur,))(env, reward, 0.0)
+        assert both(env, reward, progress) == Objective(env, (blur,))(env, reward, 0.0)
 
 
 def test_tasks_without_a_picture_minimise_the_negative_reward():
     env = TorchEnv("run", resolution=8, particles=100, substeps=1)
-    assert make_objective(env, (0.0,))(env, torch.tensor([2.5]), 0.5).tolist() == [-2.5]
+    assert Objective(env, (0.0,))(env, torch.tensor([2.5]), 0.5).tolist() == [-2.5]

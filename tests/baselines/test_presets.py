@@ -11,12 +11,20 @@ from cfp.config import to_json
 
 @pytest.mark.parametrize("task", cfp.presets.TASKS)
 @pytest.mark.parametrize("preset", ["quick", "paper"])
-def test_presets_are_valid_survive_json_and_are_evaluated_alike(task, preset):
-    deterministic = cfp.preset(task, preset).report.eval_deterministic
+def test_presets_are_valid_survive_json_and_agree_with_that_of_cfp(task, preset):
+    own = cfp.preset(task, preset)
     for name in ALGORITHMS:
         algorithm = find(name)
         config = algorithm.preset(task, preset)
         config.check()
         assert configure(json.loads(json.dumps(to_json(config)))) == config, name
         if algorithm.sees in ("image", "state"):  # the others have no noise
-            assert config.report.eval_deterministic == deterministic, name
+            assert config.report.eval_deterministic == own.report.eval_deterministic, name
+        if hasattr(config, "learning"):  # soft actor-critic
+            assert (config.learning, config.environment, config.steps) == (own.learning, own.environment, own.steps)
+        if name in ("coarse", "fine"):
+            assert config.resolutions == (own.resolutions[0 if name == "coarse" else -1],)
+            assert (config.alpha, config.random_steps) == (own.alpha[:1], own.random_steps[:1])
+        if name.startswith(("gnn", "transformer")):
+            assert algorithm.sees == "state" and config.segments == int(name[-2:])
+            assert (config.alpha, config.random_steps) == (own.alpha[0], own.random_steps[0])

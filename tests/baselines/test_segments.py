@@ -144,14 +144,6 @@ def test_nodes_of_the_grid_get_the_value_of_the_nearest_segment(task, layout):
         assert field[0, :, i, j].tolist() == pytest.approx(values[0, nearest].tolist(), abs=1e-6)
 
 
-def test_other_action_grids_are_refused():
-    env = TorchEnv("run", 1, 8, particles=100)
-    env.reset(seed=0)
-    labels = torch.zeros(1, 100, dtype=torch.int64)
-    with pytest.raises(ValueError, match=r"64.*got 8"):
-        Nodes(2, False).to_grid(env, labels, torch.zeros(1, 2, 2))
-
-
 def test_reset_of_some_leaves_the_others_alone():
     env = segmented()
     env.step(torch.rand(2, 16, 2))

@@ -117,23 +117,6 @@ def test_next_level_replaces_the_replay_of_the_last(tmp_path):
     assert other.replay_buffer.size() == 4
 
 
-@pytest.mark.parametrize("damage", ["missing", "flipped"])
-def test_damaged_state_is_refused_with_its_name(tmp_path, damage):
-    checkpoint, algorithm = Checkpoint(tmp_path), make()
-    algorithm.learn(8)
-    checkpoint.save(algorithm, CONFIG, Position(2))
-    path = tmp_path / "state.pt"
-    content = bytearray(path.read_bytes())
-    if damage == "missing":
-        path.unlink()
-    else:
-        for index in range(1000, len(content), 5000):
-            content[index] ^= 0x55
-        path.write_bytes(content)
-    with pytest.raises(CheckpointError, match=r"state\.pt"):
-        Checkpoint(tmp_path).read()
-
-
 def test_state_of_another_network_is_refused(tmp_path):
     checkpoint, algorithm = Checkpoint(tmp_path), make(2)
     algorithm.learn(8)

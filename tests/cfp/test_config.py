@@ -68,21 +68,6 @@ def test_paper_presets_hold_the_published_numbers():
     assert {task: TASKS[task].seed for task in TASKS if TASKS[task].seed} == {"catch": 2, "slot": 1}
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"learning": {"gama": 3}}, "learning.gama is not an option"),
-        ({"steps": True}, "steps"),
-        ({"alpha": [0.1, "x"]}, "alpha must be a number, got 'x'"),
-        ({"environment": {"dtype": "float16"}}, "dtype must be"),
-        ({"environment": {"particles": [1, 2, 3]}}, "particles"),
-    ],
-)
-def test_wrong_json_is_named(values, message):
-    with pytest.raises(ConfigError, match=message):
-        from_json(values)
-
-
 def test_json_values_take_the_types_of_their_fields():
     config = update_from_dict(
         preset("shapematch"), {"alpha": [1, 0], "environment": {"particles": [500, 20], "target": None}}
@@ -114,14 +99,6 @@ def test_fewer_steps_shorten_every_level():
     assert half.handover == (config.handover[0] // 2,)
     explicit = parse(PROGRAM, ["--task", "run", "--steps", "1000", "--handover", "900"]).run
     assert explicit.handover == (900,)
-
-
-def test_ladder_of_any_length_can_be_asked_for():
-    arguments = "--resolutions 4 8 16 --handover 1000 2000 --alpha 0 0 0 --random-steps 9 9 9"
-    command = parse(PROGRAM, [*arguments.split(), "--gate-bias", "-1", "-2", "--gate-penalty", "0", "0.5"])
-    assert command.run.actor_spec(3).gate_bias == (-1.0, -2.0)
-    one = parse(PROGRAM, "--resolutions 16 --handover --alpha 0 --random-steps 9 --gate-bias --gate-penalty".split())
-    assert one.run.stage_steps(1) == one.run.steps
 
 
 def test_another_number_of_levels_stretches_what_each_has_one_of():

@@ -17,7 +17,7 @@ from cfp.envs.disturbances import Case, Disturbed, disturbed_env, make_cases, re
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from cfp.evaluate import open_policy, open_run
-from cfp.evaluation.evaluate import Result, ZeroPolicy, evaluate
+from cfp.evaluation.evaluate import Result, UntrainedPolicy, evaluate
 from cfp.files import write_json
 from cfp.presets import preset
 from cfp.train import PROGRAM
@@ -123,7 +123,7 @@ def test_interval_is_student_s():
 
 def test_returns_are_in_the_order_of_layouts():
     env = monitored(FakeEnv(num_envs=3, horizon=4, end_above=0.15))  # the third is too high, and ends at once
-    result = evaluate("", ZeroPolicy(8), env, 6, deterministic=True, seed=0)
+    result = evaluate("", UntrainedPolicy(8, np.zeros), env, 6, deterministic=True, seed=0)
     assert result.returns == pytest.approx([2.0, 2.0, 2.4, 2.4, 0.7, 0.7])
 
 
@@ -161,16 +161,7 @@ def test_command_writes_table_and_plot(folder, capsys):
 
 
 def test_single_policy_with_other_particles_needs_a_folder_to_write_into(folder, tmp_path, capsys):
-    single = [
-        "--policy",
-        str(folder / "policy.safetensors"),
-        "--episodes",
-        "1",
-        "--device",
-        "cpu",
-        "--particles",
-        "500",
-    ]
+    single = ["--policy", str(folder / "policy.safetensors"), *"--episodes 1 --device cpu --particles 500".split()]
     assert robustness.main([*single, "--cases", "noise"]) == 2
     assert "out must be given with a single policy" in capsys.readouterr().err
     assert robustness.main([*single, "--cases", "noise", "--out", str(tmp_path / "new")]) == 0
@@ -182,25 +173,20 @@ def test_single_policy_with_other_particles_needs_a_folder_to_write_into(folder,
     assert json.loads((tmp_path / "new" / "robustness.json").read_text())[0] == rows[0]
 
 
-def test_cases_are_chosen_by_words():
-    chosen = robustness.choose(make_cases(), ["dropout", "mu x 0.8"])
+def test_cases_are_chosen_by_words(folder):
+    run, policy, cases = make_spec("run"), open_run(PROGRAM, folder, "cpu")[1]["stage 2"], make_cases()
+    chosen = robustness.choose(cases, ["dropout", "mu x 0.8", "friction"], run, policy)
     names = ["unperturbed", "action dropout 20%", "observation dropout 20%", "mu x 0.8"]
-    assert [case.name for case in chosen] == names
-    assert robustness.choose(make_cases(), []) == make_cases()
-
-
-def test_chosen_cases_that_change_nothing_are_refused(folder):
-    words, run = ["friction"], make_spec("run")
-    policy = open_run(PROGRAM, folder, "cpu")[1]["stage 2"]
-    robustness.check_words(make_cases(), [*words, "observation"], run, policy)
+    assert [case.name for case in chosen] == names + [f"floor friction {value}" for value in (0, 0.5, "sticky")]
+    assert robustness.choose(cases, [], run, policy) == cases
     ground = [replace(item, name="ground") if item.name == "floor" else item for item in run.obstacles]
     with pytest.raises(ConfigError, match="floor friction 0: run has no obstacle named 'floor'; floor"):
-        robustness.check_words(make_cases(), words, replace(run, obstacles=tuple(ground)), policy)
+        robustness.choose(cases, ["friction"], replace(run, obstacles=tuple(ground)), policy)
     with pytest.raises(ConfigError, match="floor friction sticky: the floor of run has this friction"):
-        robustness.check_words(make_cases(), ["sticky"], run, policy)
+        robustness.choose(cases, ["sticky"], run, policy)
     policy.uses_image = False
     with pytest.raises(ConfigError, match="observation dropout 20%: the policy does not use the image"):
-        robustness.check_words(make_cases(), ["observation"], run, policy)
+        robustness.choose(cases, ["observation"], run, policy)
 
 
 def test_ratios_need_a_positive_return():

@@ -63,21 +63,6 @@ def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, caps
     assert_same_run(folder, finished)
 
 
-def test_killed_run_repeats_what_no_checkpoint_holds(finished, tmp_path):
-    class Killed(BaseException):
-        pass
-
-    def die():
-        raise Killed
-
-    folder = tmp_path / "killed"
-    with at_step(98, die), pytest.raises(Killed):
-        run(folder)
-    assert read_table(folder / "progress.csv")[-1]["step"] == "90"
-    assert run(folder, "--resume") == 0
-    assert_same_run(folder, finished)
-
-
 def test_layouts_that_are_drawn_anew_go_on_as_if_nothing_had_happened(tmp_path):
     options = "--resample --resolutions 4 --handover --random-steps 10 --steps 128 --eval-every 0 --eval-episodes 1"
     assert run(tmp_path / "whole", *options.split()) == 0

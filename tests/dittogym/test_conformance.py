@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import dittogym
-from dittogym.rewards import action_cost
+from dittogym.reward_ops import action_cost
 
 #: task: (first robot particle, last object particle, sum of the occupancy channel of the first observation)
 LAYOUT = {
@@ -31,13 +31,7 @@ REST = {
 }
 #: task: rewards of steps 1, 2, 5, 10 under the drive; centre and split after 10; action norm of step 1; channel sums
 DRIVE = {
-    "shapematch": (
-        None,  # depends on the artwork of the star, which is our own
-        (0.485055, 0.584913),
-        0.073781,
-        7565.763,
-        (44921, 541291, 540836),
-    ),
+    "shapematch": (None, (0.485055, 0.584913), 0.073781, 7565.763, (44921, 541291, 540836)),  # the star is our own
     "run": ((2.1769, 2.1763, 2.1771, 1.9352), (0.089831, 0.248279), 0.067400, 4115.537, (58040, 539921, 546293)),
     "grow": ((4.7089, 4.6504, 4.3958, 4.4764), (0.020033, 0.233428), 0.064515, 2743.691, (114340, 538636, 540495)),
     "kick": ((0.7370, 0.7366, 0.6714, -0.0458), (0.089501, 0.248437), 0.067695, 4572.818, (66496, 538641, 543477)),

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")
 def both(env: dittogym.TorchEnv) -> tuple[torch.Tensor, torch.Tensor]:
     """The present observation, natively and in torch."""
     assert env.model.camera.native
-    plain = replace(env.model, camera=replace(env.model.camera, native=False, _drawings={}))
+    plain = replace(env.model, camera=replace(env.model.camera, native=False))
     return core.observe(env.model, env.env_state), core.observe(plain, env.env_state)
 
 

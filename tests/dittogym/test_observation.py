@@ -6,7 +6,7 @@ import torch
 
 from dittogym.geometry import Box
 from dittogym.observation import raster as obs
-from dittogym.observation.image import quantise
+from dittogym.observation.image import encode
 
 
 def loop_raster(position: np.ndarray, velocity: np.ndarray, row: int, column: int, mask: np.ndarray) -> np.ndarray:
@@ -84,10 +84,9 @@ def test_coding() -> None:
     means = torch.zeros(1, 3, 64, 64)
     means[0, 0, 0, :4] = torch.tensor([0.0, 0.5, 1.0, 21 / 64])
     means[0, 1, 0, :4] = torch.tensor([0.0, 0.965, -1.036, 10.0])
-    code = quantise(means)
+    code = encode(means).to(torch.uint8)
     assert code[0, 0, 0, :4].tolist() == [0, 127, 255, 83]
     assert code[0, 1, 0, :4].tolist() == [132, 255, 0, 255]
-    assert code.dtype == torch.uint8
 
 
 def test_crop_stays_in_the_window() -> None:

@@ -14,7 +14,7 @@ from dittogym.core import observe, soft_observation
 from dittogym.geometry import Box
 from dittogym.model import EnvState
 from dittogym.observation.image import OCCUPIED_COUNT, OCCUPIED_WIDTH, RASTER, SATURATION, silhouette, soft_silhouette
-from dittogym.observation.smooth import box_fraction
+from dittogym.observation.raster import box_fraction
 from torchmpm import ParticleState
 
 

@@ -44,9 +44,9 @@ for name, dtype in (("tensor values", torch.float32), ("soil", torch.float64), (
     operator.native_step = lambda *arguments: calls.append(arguments) or arguments[0]
     state, field, origin = (t.to(dtype) for t in moving(6, 2))
     replace(solvers(6, 2)[name], backend="native").step(state, field, substeps=3, origin=origin)
-    (call,) = calls
-    cuda.forward(*call)
-    cuda.backward(call[0], *call, True, name == "tensor values")
+    ((*tensors, handle, substeps),) = calls
+    cuda.forward(*tensors, handle, substeps)
+    cuda.backward(*tensors, tensors[0], handle, substeps, True, name == "tensor values")
 """
 
 

@@ -1,13 +1,11 @@
-"""The observation as one C++ function, for CPUs with a compiler.
-
-With the pixel raster it yields the same bytes as ``dittogym.observation.raster``; splats may differ by one.
-"""
+"""The observation as one C++ function: the bytes of ``dittogym.observation.raster``, or for splats at most one off."""
 
 from __future__ import annotations
 
 import ctypes
+import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -24,7 +22,6 @@ _OPTIONS = (
     "-ffp-contract=off",
     *(f"-DDITTOGYM_{k}={v}" for k, v in {"SIZE": SIZE, "BLOCK": BLOCK, "RASTER": RASTER, "FRAME": FRAME}.items()),
 )
-_FUNCTIONS = {torch.float32: "dittogym_draw_float", torch.float64: "dittogym_draw_double"}
 
 
 class Picture(ctypes.Structure):
@@ -41,11 +38,13 @@ class Picture(ctypes.Structure):
     ]
 
 
+@functools.lru_cache(maxsize=64)
 def drawing(
-    view: Centre, boxes: Sequence[Box], bodies: Sequence[tuple[int, float, bool]], pixels: bool, dtype: torch.dtype
+    view: Centre, boxes: tuple[Box, ...], bodies: tuple[tuple[int, float, bool], ...], pixels: bool, dtype: torch.dtype
 ) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
     """A function that draws what a :class:`dittogym.observation.camera.Camera` sees, for tensors on the CPU."""
-    function = getattr(build(_SOURCE, *_OPTIONS), _FUNCTIONS[dtype])
+    kind = {torch.float32: "float", torch.float64: "double"}[dtype]
+    function = getattr(build(_SOURCE, *_OPTIONS), f"dittogym_draw_{kind}")
     body = torch.tensor(list(bodies), dtype=torch.float64, device="cpu")
     edges = [(b.left, b.right, b.bottom, b.top, b.closed) for b in boxes]
     box = torch.tensor(edges, dtype=torch.float64, device="cpu")

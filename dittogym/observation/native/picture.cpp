@@ -10,12 +10,8 @@
 
 #include "team.hpp"
 
-namespace {
-
 constexpr int SIZE = DITTOGYM_SIZE, BLOCK = DITTOGYM_BLOCK, RASTER = DITTOGYM_RASTER, FRAME = DITTOGYM_FRAME;
 constexpr int FINE = SIZE * BLOCK, WORDS = FINE / 64, WIDE = SIZE + 2 * FRAME;
-
-}  // namespace
 
 // As `class Picture` in __init__.py. Tensors are contiguous, of Real; where nothing else is said leading batch.
 struct Picture {
@@ -78,11 +74,10 @@ template <class Real> struct Drawing {
         const Real* origin = static_cast<const Real*>(picture.origin) + 2 * element;
         const Real* centre = static_cast<const Real*>(picture.centre) + 2 * element;
         left = origin[0], bottom = origin[1];
-        Real view[2];
-        for (int axis = 0; axis < 2; ++axis)
-            view[axis] = std::isnan(picture.view[axis]) ? centre[axis] - origin[axis] : Real(picture.view[axis]);
-        column = corner(view[0]);
-        row = RASTER - corner(view[1]) - FINE;
+        const auto view = [&](int axis) {
+            return std::isnan(picture.view[axis]) ? centre[axis] - origin[axis] : Real(picture.view[axis]);
+        };
+        column = corner(view(0)), row = RASTER - corner(view(1)) - FINE;
     }
 
     void read_particles() {
@@ -250,7 +245,5 @@ template <class Real> int draw(const Picture* picture) {
 }  // namespace
 
 // 0, or 1 where memory ran out.
-extern "C" {
-int dittogym_draw_float(const Picture* picture) { return draw<float>(picture); }
-int dittogym_draw_double(const Picture* picture) { return draw<double>(picture); }
-}
+extern "C" int dittogym_draw_float(const Picture* picture) { return draw<float>(picture); }
+extern "C" int dittogym_draw_double(const Picture* picture) { return draw<double>(picture); }

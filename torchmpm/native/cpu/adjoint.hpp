@@ -48,7 +48,7 @@ public:
             particles(s, s < substeps, s > 0);
             if (s == 0) break;
             nodes(s - 1);
-            member.finish(s, s == 1);
+            member.wait();
         }
         finish();
     }

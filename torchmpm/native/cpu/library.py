@@ -1,7 +1,5 @@
 """Compiles the kernels on first use, keeps them on disk, and loads them."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import hashlib
@@ -19,51 +17,32 @@ import torch
 _SOURCES = Path(__file__).parent
 #: Not -ffast-math: it lets compilers assume that there is no NaN.
 _FLAGS = (
-    "-std=c++17",
-    "-O3",
-    "-march=native",
-    "-ffp-contract=fast",
-    "-fno-math-errno",
-    "-fno-trapping-math",
-    "-fopenmp-simd",
-    "-fPIC",
-    "-shared",
-    "-pthread",
+    *("-std=c++17", "-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
+    *("-fopenmp-simd", "-fPIC", "-shared", "-pthread"),
 )
 _X86_FLAGS = ("-mprefer-vector-width=512",)
+_REAL = {torch.float32: "float", torch.float64: "double"}
 #: Completes the message "backend 'native' ...".
 NO_COMPILER = "needs a C++ compiler (g++, clang++ or $CXX), found none: use 'eager'"
 _logger = logging.getLogger(__name__)
-#: Libraries that this process has loaded; looking for a compiler again would cost more than a substep.
-_loaded: dict[tuple[Path, tuple[str, ...]], ctypes.CDLL] = {}
-
-
 #: Members of ``struct Pool`` in ``team.hpp``.
 POOL = ("pool_parallel", "pool_rank", "pool_team_size")
 
 
 @functools.cache
 def thread_pool() -> dict[str, int]:
-    """Addresses of the functions through which torch's OpenMP threads are reached; empty if torch uses other threads.
-
-    Also empty in a forked process, which does not have the threads of its parent: calling them would never return.
-    """
+    """Addresses of the functions through which torch's OpenMP threads are reached; empty if it uses other threads."""
     functions = ("GOMP_parallel", "omp_get_thread_num", "omp_get_num_threads")
     program = ctypes.CDLL(None)
-    if _forked or not all(hasattr(program, function) for function in functions):
+    if not all(hasattr(program, function) for function in functions):
         return {}
     addresses = [ctypes.cast(getattr(program, function), ctypes.c_void_p).value for function in functions]
     return {name: address for name, address in zip(POOL, addresses, strict=True) if address}
 
 
-_forked = False
-
-
 def _after_fork() -> None:
-    """Use one thread in a forked process, in which torch too would wait forever for the threads of its parent."""
-    global _forked
-    _forked = True
-    thread_pool.cache_clear()
+    """Reach no threads in a forked process: those of its parent are not there, and waiting for them would never end."""
+    thread_pool().clear()
     torch.set_num_threads(1)
 
 
@@ -85,24 +64,22 @@ def cache_folder() -> str:
     return os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "torchmpm")
 
 
-def load(real: str) -> ctypes.CDLL:
-    """The compiled kernels for the scalar type ``"float"`` or ``"double"``, see :func:`build`."""
-    return build(_SOURCES / "native.cpp", f"-DTORCHMPM_REAL={real}")
+def load(dtype: torch.dtype) -> ctypes.CDLL:
+    """The compiled kernels for a dtype, see :func:`build`."""
+    return build(_SOURCES / "native.cpp", f"-DTORCHMPM_REAL={_REAL[dtype]}")
 
 
+@functools.cache
 def build(source: Path, *options: str) -> ctypes.CDLL:
     """Compile a C++ file, which may include the headers of this folder and of its own, and load it.
 
     The first call on a machine takes some seconds; later processes find the library in :func:`cache_folder`, if that
     can be written. Raises a ValueError where there is no compiler, or it failed; the message holds what it said.
     """
-    library = _loaded.get((source, options))
-    if library is None:
-        found = _load(source, options, cache_folder(), os.environ.get("CXX"), os.environ.get("PATH"))
-        if isinstance(found, str):
-            raise ValueError(f"backend 'native' {found}")
-        library = _loaded[source, options] = found
-    return library
+    found = _load(source, options, cache_folder(), os.environ.get("CXX"), os.environ.get("PATH"))
+    if isinstance(found, str):
+        raise ValueError(f"backend 'native' {found}")
+    return found
 
 
 @functools.cache
@@ -129,9 +106,8 @@ def _load(source: Path, options: tuple[str, ...], folder: str, *_: str | None) -
         _logger.info("compiling %s with %s (once on this machine, some seconds)", source.name, compiler[0])
         done = subprocess.run([*command, str(fresh)], capture_output=True, text=True, check=False)
         if done.returncode != 0:
-            return (
-                f"could not be built: {shlex.join(command)} failed with code {done.returncode}:\n{done.stderr[-4000:]}"
-            )
+            failure = f"{shlex.join(command)} failed with code {done.returncode}:\n{done.stderr[-4000:]}"
+            return f"could not be built: {failure}"
         if path.name:
             os.replace(fresh, path)  # atomic: another process may build at the same time
             fresh = path

@@ -1,4 +1,4 @@
-// The C interface that torchmpm/native/library.py loads.
+// The C interface that torchmpm/native/cpu/library.py loads.
 #include <exception>
 #include <memory>
 
@@ -8,18 +8,17 @@ namespace {
 
 // Threads that share one simulation, and how many such teams there are.
 struct Shape {
-    int team = 1, teams = 1;
-
-    Shape() = default;
-    explicit Shape(const Scene& scene) {
-        const Call& call = scene.call;
-        // A thread costs as much to start as some thousand particle-substeps to compute.
-        const int64_t useful = 1 + call.batch * call.particles * call.substeps / 20000;
-        const int64_t threads = std::max<int64_t>(1, std::min(call.threads, useful));
-        team = int(std::max<int64_t>(1, std::min<int64_t>(scene.parts, threads / call.batch)));
-        teams = int(std::min<int64_t>(call.batch, threads / team));
-    }
+    int team, teams;
 };
+
+Shape choose_shape(const Scene& scene) {
+    const Call& call = scene.call;
+    // A thread costs as much to start as some thousand particle-substeps to compute.
+    const int64_t useful = 1 + call.batch * call.particles * call.substeps / 20000;
+    const int64_t threads = std::max<int64_t>(1, std::min(call.threads, useful));
+    const int64_t team = std::max<int64_t>(1, std::min<int64_t>(scene.parts, threads / call.batch));
+    return {int(team), int(std::min<int64_t>(call.batch, threads / team))};
+}
 
 // Each team takes the next simulation when it is done with its last; which one takes which makes no difference to the
 // numbers. Returns false where the system gives out no more threads.
@@ -31,22 +30,22 @@ template <class Pass> bool run_batch(const Scene& scene, Shape shape, char* scra
     std::atomic<int64_t> next{0};
     return run_together(scene.call.pool, shape.team * shape.teams, [&](int index) {
         Work& own = *work[index / shape.team];
-        Member member{index % shape.team, shape.team, own.team};
+        Member member{index % shape.team, shape.team, own.barrier};
         Pass pass(scene, own, member);
         while (true) {
             if (member.rank == 0) own.element = next.fetch_add(1);
-            member.wait(false);
+            member.wait();
             const int64_t element = own.element;
             if (element >= scene.call.batch) return;
             pass.run(element);
-            member.wait(false);
+            member.wait();
         }
     });
 }
 
 template <class Pass> size_t measure(const Call* call) {
     const Scene scene(*call);
-    const Shape shape(scene);
+    const Shape shape = choose_shape(scene);
     Arena arena(nullptr);
     for (int t = 0; t < shape.teams; ++t) typename Pass::Work(scene, arena, shape.team);
     return arena.used;
@@ -55,7 +54,7 @@ template <class Pass> size_t measure(const Call* call) {
 template <class Pass> int run(const Call* call, char* scratch) {
     try {
         const Scene scene(*call);
-        if (!run_batch<Pass>(scene, Shape(scene), scratch)) run_batch<Pass>(scene, Shape(), scratch);
+        if (!run_batch<Pass>(scene, choose_shape(scene), scratch)) run_batch<Pass>(scene, {1, 1}, scratch);
         return 0;
     } catch (const std::bad_alloc&) {
         return 1;

@@ -169,7 +169,7 @@ public:
         for (int64_t s = 0; s < substeps; ++s) {
             particles(s, s > 0, true);
             nodes(s);
-            member.finish(s, s == substeps - 1);
+            member.wait();
         }
         if (tape.states) return;
         particles(substeps, true, false);
@@ -201,8 +201,7 @@ private:
         if (member.rank == 0) work.rules.build(scene, scene.call.shift + 2 * element);
         if (member.rank == member.size - 1 && scene.muscles) load_field(scene, element, work.field);
         actuation.none();
-        member.wait(false);
-        if (member.rank == 0) work.team.begin(false);
+        member.wait();
     }
 
     void particles(int64_t substep, bool finishing, bool beginning) {

@@ -31,10 +31,10 @@ struct Workspace {
     Real* total;       // [threads of the team] one row of nodes of four numbers
     RuleCodes rules;
     std::vector<Sums> sums;  // [parts]
-    Team team;
+    Barrier barrier;
     std::atomic<int64_t> element{0};
 
-    Workspace(const Scene& scene, Arena& arena, int members) : team(members) {
+    Workspace(const Scene& scene, Arena& arena, int members) : barrier(members) {
         const size_t cells = size_t(scene.width) * scene.width, slack = 8;
         state = arena.take<Block>(scene.blocks);
         values = scene.varying ? arena.take<Real>(size_t(scene.blocks) * VALUES * LANES) : nullptr;

@@ -1,7 +1,5 @@
 """Keeps what was launched once as CUDA graphs, so that later calls of the same shapes launch everything at once."""
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
@@ -48,7 +46,7 @@ class Recorded:
             self.program.run()
         else:
             self.graph.replay()
-        return tuple(t.clone() for t in self.program.results())
+        return tuple(t.clone() for t in self.program.results)
 
     def size(self) -> int:
         """Bytes of all buffers."""
@@ -82,9 +80,6 @@ class Cache:
         """Forget everything."""
         with self._lock:
             self._kept.clear()
-
-    def __len__(self) -> int:
-        return len(self._kept)
 
 
 cache = Cache()

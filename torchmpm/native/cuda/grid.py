@@ -39,17 +39,15 @@ def rule_codes(codes, rules, shift, rule_count, width, cells, programs, BLOCK: t
 
 
 @triton.jit
-def read_rule(rules, code, SLOT: tl.constexpr):
-    """Axis, sign and friction of the rule of nodes in a slot, and where there is one."""
+def read_rule(rules, code, vx, vy, SLOT: tl.constexpr):
+    """The rule of nodes in a slot: whether along y, friction, normal and tangential velocity, and where it acts."""
     index = (code >> (8 * SLOT)) & 255
     some = index > 0
     rule = rules + RULE * (index - 1)
-    return (
-        tl.load(rule, some, other=0.0) > 0,
-        tl.load(rule + 1, some, other=0.0),
-        tl.load(rule + 6, some, other=0.0),
-        some,
-    )
+    on_y = tl.load(rule, some, other=0.0) > 0
+    sign, friction = tl.load(rule + 1, some, other=0.0), tl.load(rule + 6, some, other=0.0)
+    normal, tangent = tl.where(on_y, vy, vx), tl.where(on_y, vx, vy)
+    return on_y, friction.to(vx.dtype), normal, tangent, some & (normal * sign.to(vx.dtype) > 0)
 
 
 @triton.jit
@@ -61,10 +59,7 @@ def rubbed(tangent, normal, friction):
 @triton.jit
 def constrain(rules, code, vx, vy, SLOT: tl.constexpr):
     """Velocity of nodes under the rule of one slot."""
-    on_y, sign, friction, some = read_rule(rules, code, SLOT)
-    sign, friction = sign.to(vx.dtype), friction.to(vx.dtype)
-    normal, tangent = tl.where(on_y, vy, vx), tl.where(on_y, vx, vy)
-    hit = some & (normal * sign > 0)
+    on_y, friction, normal, tangent, hit = read_rule(rules, code, vx, vy, SLOT)
     left = rubbed(tangent, normal, friction)
     slowed = tl.where(left < 0, 0.0, tl.where(tangent < 0, -left, left))
     tangent = tl.where(hit & (friction != 0), slowed, tangent)
@@ -75,11 +70,8 @@ def constrain(rules, code, vx, vy, SLOT: tl.constexpr):
 @triton.jit
 def constrain_adjoint(rules, code, vx, vy, bar_x, bar_y, SLOT: tl.constexpr):
     """From derivatives in the velocity that a rule left to those in the one before it, (vx, vy)."""
-    on_y, sign, friction, some = read_rule(rules, code, SLOT)
-    sign, friction = sign.to(vx.dtype), friction.to(vx.dtype)
-    normal, tangent = tl.where(on_y, vy, vx), tl.where(on_y, vx, vy)
+    on_y, friction, normal, tangent, hit = read_rule(rules, code, vx, vy, SLOT)
     normal_bar, tangent_bar = tl.where(on_y, bar_y, bar_x), tl.where(on_y, bar_x, bar_y)
-    hit = some & (normal * sign > 0)
     rubs = hit & (friction != 0)
     slides = rubbed(tangent, normal, friction) > 0
     drag = tl.where((tangent > 0) == (normal > 0), -friction, friction) * tangent_bar
@@ -157,7 +149,13 @@ def node_adjoint(
         code = tl.zeros([BLOCK], tl.int32)
         if SLOTS > 0:
             code = tl.load(codes + node, exists, other=0)
-        vx, vy, bar_x, bar_y = constrain_both(rules, code, vx, vy, bar_x, bar_y, SLOTS)
+        for slot in tl.static_range(SLOTS - 1, -1, -1):
+            before_x, before_y = vx, vy
+            for earlier in tl.static_range(slot):
+                before_x, before_y = constrain(rules, code, before_x, before_y, earlier)
+            bar_x, bar_y = constrain_adjoint(rules, code, before_x, before_y, bar_x, bar_y, slot)
+        for slot in tl.static_range(SLOTS):
+            vx, vy = constrain(rules, code, vx, vy, slot)
         damping, dt = tl.load(constants + DAMPING), tl.load(constants + DT)
         bar_x *= damping
         bar_y *= damping
@@ -173,28 +171,3 @@ def node_adjoint(
         tl.store(answer + 4, -(raw_x * bar_x + raw_y * bar_y), used)
         for r in tl.static_range(5):
             tl.store(at + r, tl.zeros_like(vx), used)
-
-
-@triton.jit
-def constrain_both(rules, code, vx, vy, bar_x, bar_y, SLOTS: tl.constexpr):
-    """Velocity that all rules leave, and the derivative in the one before them."""
-    ax, ay, bx, by, cx, cy, dx, dy = vx, vy, vx, vy, vx, vy, vx, vy  # before each of four slots
-    if SLOTS > 0:
-        vx, vy = constrain(rules, code, ax, ay, 0)
-    bx, by = vx, vy
-    if SLOTS > 1:
-        vx, vy = constrain(rules, code, bx, by, 1)
-    cx, cy = vx, vy
-    if SLOTS > 2:
-        vx, vy = constrain(rules, code, cx, cy, 2)
-    dx, dy = vx, vy
-    if SLOTS > 3:
-        vx, vy = constrain(rules, code, dx, dy, 3)
-        bar_x, bar_y = constrain_adjoint(rules, code, dx, dy, bar_x, bar_y, 3)
-    if SLOTS > 2:
-        bar_x, bar_y = constrain_adjoint(rules, code, cx, cy, bar_x, bar_y, 2)
-    if SLOTS > 1:
-        bar_x, bar_y = constrain_adjoint(rules, code, bx, by, bar_x, bar_y, 1)
-    if SLOTS > 0:
-        bar_x, bar_y = constrain_adjoint(rules, code, ax, ay, bar_x, bar_y, 0)
-    return vx, vy, bar_x, bar_y

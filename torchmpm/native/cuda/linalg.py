@@ -1,7 +1,7 @@
 """2x2 matrices as the sum of a scaled rotation and a scaled reflection; see :mod:`torchmpm.materials.linalg`.
 
-A matrix is four numbers, row by row; its parts are the larger one (m1, m2), the smaller one (n1, n2), and whether the
-larger one is the rotation.
+A matrix is four numbers, row by row; its parts are the larger one (m1, m2), the smaller one (n1, n2), and ``proper``:
+whether the larger one is the rotation.
 """
 
 import triton
@@ -9,16 +9,11 @@ import triton.language as tl
 
 
 @triton.jit
-def larger_is_rotation(a, b, c, d):
-    """Whether the rotation is the larger part."""
-    return (a + d) * (a + d) + (c - b) * (c - b) >= (a - d) * (a - d) + (b + c) * (b + c)
-
-
-@triton.jit
-def split(a, b, c, d, proper):
-    """Parts (m1, m2, n1, n2)."""
-    p, q, r, s = a + d, c - b, a - d, b + c
-    return tl.where(proper, p, r), tl.where(proper, q, s), tl.where(proper, r, p), tl.where(proper, s, q)
+def split(a, b, c, d):
+    """Parts (m1, m2, n1, n2, proper)."""
+    proper = (a + d) * (a + d) + (c - b) * (c - b) >= (a - d) * (a - d) + (b + c) * (b + c)
+    m1, m2, n1, n2 = join_adjoint(a, b, c, d, proper)
+    return m1, m2, n1, n2, proper
 
 
 @triton.jit
@@ -27,6 +22,13 @@ def join(m1, m2, n1, n2, proper):
     p, q = tl.where(proper, m1, n1), tl.where(proper, m2, n2)
     r, s = tl.where(proper, n1, m1), tl.where(proper, n2, m2)
     return p + r, s - q, q + s, p - r
+
+
+@triton.jit
+def join_adjoint(a, b, c, d, proper):
+    """From derivatives in the result of join to those in (m1, m2, n1, n2)."""
+    p, q, r, s = a + d, c - b, a - d, b + c
+    return tl.where(proper, p, r), tl.where(proper, q, s), tl.where(proper, r, p), tl.where(proper, s, q)
 
 
 @triton.jit

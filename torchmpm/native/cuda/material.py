@@ -7,7 +7,7 @@ A particle's values are the eight numbers of :func:`torchmpm.native.tables.make_
 import triton
 import triton.language as tl
 
-from torchmpm.native.cuda.linalg import at_least, clamp, direction, join, larger_is_rotation, split
+from torchmpm.native.cuda.linalg import at_least, clamp, direction, join, matmul, split
 
 #: Places in ``tables.KINDS``.
 VON_MISES = tl.constexpr(1)
@@ -28,19 +28,23 @@ def read_values(values, values_batch, columns, at, mask):
 
 
 @triton.jit
-def von_mises_return(a, b, c, d, tanh2, exp, cosh2, sinh2, constants):
-    """Returned deformation gradient."""
-    proper = larger_is_rotation(a, b, c, d)
-    m1, m2, n1, n2 = split(a, b, c, d, proper)
-    total, _, cos, sin, _ = direction(m1, m2)
-    floor = tl.load(constants + STRETCH_FLOOR)
-    small = n1 * n1 + n2 * n2
+def von_mises_parts(total, m1, m2, n1, n2, tanh2, exp, constants):
+    """What the von Mises return and its adjoint share: difference of the stretches, these, and where they yield."""
+    floor, small = tl.load(constants + STRETCH_FLOOR), n1 * n1 + n2 * n2
     outside = small > tanh2 * (m1 * m1 + m2 * m2)
     total = tl.where(outside, total, 1.0)
     difference = tl.sqrt(tl.where(outside, small, 0.25))
-    major, minor = at_least(0.5 * (total + difference), floor), at_least(0.5 * (total - difference), floor)
-    yields = outside & (major > minor * exp)
-    mean = 0.5 * tl.sqrt(major * minor)
+    first, second = 0.5 * (total + difference), 0.5 * (total - difference)
+    major, minor = at_least(first, floor), at_least(second, floor)
+    return difference, first, second, major, minor, outside & (major > minor * exp), 0.5 * tl.sqrt(major * minor)
+
+
+@triton.jit
+def von_mises_return(a, b, c, d, tanh2, exp, cosh2, sinh2, constants):
+    """Returned deformation gradient."""
+    m1, m2, n1, n2, proper = split(a, b, c, d)
+    total, _, cos, sin, _ = direction(m1, m2)
+    difference, _, _, _, _, yields, mean = von_mises_parts(total, m1, m2, n1, n2, tanh2, exp, constants)
     grow_total, grow_difference = mean * cosh2, mean * (sinh2 / difference)
     e, f, g, h = join(grow_total * cos, grow_total * sin, grow_difference * n1, grow_difference * n2, proper)
     return tl.where(yields, e, a), tl.where(yields, f, b), tl.where(yields, g, c), tl.where(yields, h, d)
@@ -67,8 +71,7 @@ def snow_parts(m1, m2, n1, n2, low, high, shear_cutoff):
 @triton.jit
 def snow_return(a, b, c, d, Jp, low, high, constants, bounds):
     """Returned deformation gradient and Jp."""
-    proper = larger_is_rotation(a, b, c, d)
-    m1, m2, n1, n2 = split(a, b, c, d, proper)
+    m1, m2, n1, n2, proper = split(a, b, c, d)
     _, _, cos, sin, _ = direction(m1, m2)
     n1, n2, _, _, _, _, first, second, major, minor, ratio = snow_parts(m1, m2, n1, n2, low, high, tl.load(bounds + 2))
     sum = 0.5 * (major + minor)
@@ -100,8 +103,7 @@ def hardening_factor(Jp, hardening, bounds, KIND: tl.constexpr):
 @triton.jit
 def orthogonal(a, b, c, d):
     """R of the trial deformation; return maps keep it."""
-    proper = larger_is_rotation(a, b, c, d)
-    m1, m2, _, _ = split(a, b, c, d, proper)
+    m1, m2, _, _, proper = split(a, b, c, d)
     _, _, cos, sin, _ = direction(m1, m2)
     zero = tl.zeros_like(a)
     return join(cos, sin, zero, zero, proper)
@@ -119,3 +121,17 @@ def stress(a, b, c, d, r0, r1, r2, r3, mu2, lam, act_x, act_y, KIND: tl.constexp
     xy = mu2 * (e * c + f * d) + act_x * a * c + act_y * b * d
     yy = mu2 * (g * c + h * d) + pressure + act_x * c * c + act_y * d * d
     return xx, xy, yy
+
+
+@triton.jit
+def deform(
+    dt, c0, c1, c2, c3, f0, f1, f2, f3, Jp, factor, mu2, lam, s0, s1, s2, s3, act_x, act_y, constants, bounds,
+    KIND: tl.constexpr,
+):  # fmt: skip
+    """Deformation gradient and Jp after a substep, and ``-dt V 4/h^2 tau``."""
+    t0, t1, t2, t3 = matmul(1.0 + dt * c0, dt * c1, dt * c2, 1.0 + dt * c3, f0, f1, f2, f3)
+    a, b, c, d, after = return_map(t0, t1, t2, t3, Jp, s0, s1, s2, s3, constants, bounds, KIND)
+    r0, r1, r2, r3 = orthogonal(t0, t1, t2, t3)
+    hard = hardening_factor(Jp, s2, bounds, KIND)
+    xx, xy, yy = stress(a, b, c, d, r0, r1, r2, r3, hard * mu2, hard * lam, act_x, act_y, KIND)
+    return a, b, c, d, after, factor * xx, factor * xy, factor * yy

@@ -6,17 +6,17 @@ At corners the derivative is that of the side which automatic differentiation of
 import triton
 import triton.language as tl
 
-from torchmpm.native.cuda.linalg import at_least, direction, direction_adjoint, join, larger_is_rotation, split
+from torchmpm.native.cuda.linalg import direction, direction_adjoint, join, join_adjoint, split
 from torchmpm.native.cuda.material import (
     LARGEST_JP,
     SNOW,
-    STRETCH_FLOOR,
     VON_MISES,
     hardening_factor,
     orthogonal,
     return_map,
     snow_parts,
     stress,
+    von_mises_parts,
 )
 
 
@@ -30,7 +30,7 @@ def stress_adjoint(a, b, c, d, r0, r1, r2, r3, proper, mu2, lam, act_x, act_y, x
     e, f, g, h = a - r0, b - r1, c - r2, d - r3
     e_bar, f_bar = mu2 * (xx * a + xy * c), mu2 * (xx * b + xy * d)
     g_bar, h_bar = mu2 * yy * c, mu2 * yy * d
-    cos_bar, sin_bar, _, _ = split(e_bar, f_bar, g_bar, h_bar, proper)
+    cos_bar, sin_bar, _, _ = join_adjoint(e_bar, f_bar, g_bar, h_bar, proper)
     signed = a * d - b * c
     J, side = signed, 1.0
     if KIND == SNOW:
@@ -54,26 +54,19 @@ def von_mises_adjoint(
     a, b, c, d, tanh2, exp, cosh2, sinh2, a_bar, b_bar, c_bar, d_bar, cos_bar, sin_bar, constants
 ):  # fmt: skip
     """From derivatives in the returned F and in R to those in the trial F (four), in cosh2 and sinh2."""
-    floor = tl.load(constants + STRETCH_FLOOR)
-    proper = larger_is_rotation(a, b, c, d)
-    m1, m2, n1, n2 = split(a, b, c, d, proper)
+    m1, m2, n1, n2, proper = split(a, b, c, d)
     total, inverse_total, cos, sin, empty = direction(m1, m2)
-    small = n1 * n1 + n2 * n2
-    outside = small > tanh2 * (m1 * m1 + m2 * m2)
-    difference = tl.sqrt(tl.where(outside, small, 0.25))
+    difference, first, second, major, minor, yields, mean = von_mises_parts(
+        total, m1, m2, n1, n2, tanh2, exp, constants
+    )
     inverse = 1.0 / difference
-    total = tl.where(outside, total, 1.0)
-    first, second = 0.5 * (total + difference), 0.5 * (total - difference)
-    major, minor = at_least(first, floor), at_least(second, floor)
-    yields = outside & (major > minor * exp)
-    mean = 0.5 * tl.sqrt(major * minor)
     grow_total, grow_difference = mean * cosh2, mean * (sinh2 * inverse)
 
-    m1_bar, m2_bar, n1_bar, n2_bar = split(a_bar, b_bar, c_bar, d_bar, proper)
+    m1_bar, m2_bar, n1_bar, n2_bar = join_adjoint(a_bar, b_bar, c_bar, d_bar, proper)
     of_total, of_difference = m1_bar * cos + m2_bar * sin, n1_bar * n1 + n2_bar * n2
     mean_bar = of_total * cosh2 + of_difference * sinh2 * inverse
-    major_bar = tl.where(first >= floor, mean_bar * mean / (2.0 * major), 0.0)
-    minor_bar = tl.where(second >= floor, mean_bar * mean / (2.0 * minor), 0.0)
+    major_bar = tl.where(major == first, mean_bar * mean / (2.0 * major), 0.0)
+    minor_bar = tl.where(minor == second, mean_bar * mean / (2.0 * minor), 0.0)
     along = (0.5 * (major_bar - minor_bar) - of_difference * grow_difference * inverse) * inverse
     cosh2_bar = tl.where(yields, of_total * mean, 0.0)
     sinh2_bar = tl.where(yields, of_difference * mean * inverse, 0.0)
@@ -93,8 +86,7 @@ def snow_adjoint(
     a, b, c, d, Jp, low, high, a_bar, b_bar, c_bar, d_bar, cos_bar, sin_bar, Jp_bar, constants, bounds
 ):  # fmt: skip
     """From derivatives in the returned F, in R and Jp to those in the trial F (four), in Jp, and in low and high."""
-    proper = larger_is_rotation(a, b, c, d)
-    m1, m2, p1, p2 = split(a, b, c, d, proper)
+    m1, m2, p1, p2, proper = split(a, b, c, d)
     _, inverse, cos, sin, empty = direction(m1, m2)
     n1, n2, along, drop, even, root, first, second, major, minor, ratio = snow_parts(
         m1, m2, p1, p2, low, high, tl.load(bounds + 2)
@@ -104,7 +96,7 @@ def snow_adjoint(
     Jp_bar = tl.where(Jp * squeezed > tl.load(constants + LARGEST_JP), 0.0, Jp_bar)
     squeezed_bar = Jp_bar * Jp
 
-    m1_bar, m2_bar, n1_bar, n2_bar = split(a_bar, b_bar, c_bar, d_bar, proper)
+    m1_bar, m2_bar, n1_bar, n2_bar = join_adjoint(a_bar, b_bar, c_bar, d_bar, proper)
     sum_bar = m1_bar * cos + m2_bar * sin
     ratio_bar = tl.where(even, 0.0, n1_bar * n1 + n2_bar * n2)
     major_bar = 0.5 * (sum_bar + ratio_bar / root) - squeezed_bar * squeezed / major
@@ -132,8 +124,7 @@ def snow_adjoint(
 @triton.jit
 def elastic_adjoint(a, b, c, d, a_bar, b_bar, c_bar, d_bar, cos_bar, sin_bar):
     """From derivatives in F and in R to those in F alone."""
-    proper = larger_is_rotation(a, b, c, d)
-    m1, m2, _, _ = split(a, b, c, d, proper)
+    m1, m2, _, _, proper = split(a, b, c, d)
     _, inverse, cos, sin, empty = direction(m1, m2)
     zero = tl.zeros_like(a)
     m1_bar, m2_bar = direction_adjoint(inverse, cos, sin, empty, zero, cos_bar, sin_bar)
@@ -165,11 +156,12 @@ def material_adjoint(
     """
     e, f, g, h, _ = return_map(a, b, c, d, Jp, s0, s1, s2, s3, constants, bounds, KIND)
     r0, r1, r2, r3 = orthogonal(a, b, c, d)
+    _, _, _, _, proper = split(a, b, c, d)
     hard = hardening_factor(Jp, s2, bounds, KIND)
     xx, xy, yy = stress(e, f, g, h, r0, r1, r2, r3, hard * mu2, hard * lam, act_x, act_y, KIND)
     factor_bar = xx_bar * xx + xy_bar * xy + yy_bar * yy
     e_bar, f_bar, g_bar, h_bar, cos_bar, sin_bar, act_x_bar, act_y_bar, of_mu2, of_lam = stress_adjoint(
-        e, f, g, h, r0, r1, r2, r3, larger_is_rotation(a, b, c, d), hard * mu2, hard * lam, act_x, act_y,
+        e, f, g, h, r0, r1, r2, r3, proper, hard * mu2, hard * lam, act_x, act_y,
         factor * xx_bar, factor * xy_bar, factor * yy_bar, KIND,
     )  # fmt: skip
     a_bar, b_bar, c_bar, d_bar = a_bar + e_bar, b_bar + f_bar, c_bar + g_bar, d_bar + h_bar

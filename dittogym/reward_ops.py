@@ -1,6 +1,8 @@
-"""Pieces that the rewards of all tasks are made of (DittoGym, appendix on tasks)."""
+"""Operations that the rewards of all tasks are made of (DittoGym, appendix on tasks)."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,24 +19,23 @@ RELATIVE_WIDTH = 0.05
 SELECTION_WIDTH = 0.005
 
 
+@dataclass(frozen=True)
 class RewardOps:
-    """Operations that rewards need and that have no useful derivative, as the task defines them.
-
-    :class:`SmoothOps` has a smooth form of each, for gradients.
+    """Operations that rewards need and that have no useful derivative, each in an exact and a smooth form.
 
     Attributes:
-        smooth: Whether these are the smooth forms.
+        smooth: Whether these are the smooth forms, for gradients, or the exact ones, as the task defines them.
     """
 
-    smooth = False
+    smooth: bool
 
     def clamp(
         self, z: Tensor, low: float | None = None, high: float | None = None, *, width: float | None = None
     ) -> Tensor:
         """Bring ``z`` into [low, high].
 
-        The smooth form subtracts ``w ln(1 + exp((z - high) / w))``, and adds the like at ``low``. It differs from the
-        exact one by at most w ln 2, at the limit, where its slope is 1/2.
+        The smooth form subtracts ``w ln(1 + exp((z - high) / w))``, at most w ln 2 at the limit, and adds the like at
+        ``low``.
 
         Args:
             z: Of any shape.
@@ -45,52 +46,8 @@ class RewardOps:
         Raises:
             ValueError: ``width`` is not positive, or all limits are 0 and it is not given (smooth form only).
         """
-        return z.clamp(low, high)
-
-    def heaviside(self, z: Tensor, width: float) -> Tensor:
-        """1 where ``z`` is positive, else 0; smooth, the sigmoid of ``z / width``."""
-        return (z > 0).to(z.dtype)
-
-    def split_penalty(self, split: Tensor, limit: float) -> Tensor:
-        """Penalty ``-(20 s)^2``, (B,), once the spread s (B,) exceeds ``limit``.
-
-        The exact form counts s up to :data:`SPLIT_CAP` only. The smooth form sets in over a width of ``limit / 20`` and
-        keeps growing.
-        """
-        return -(20.0 * split.clamp_max(SPLIT_CAP)).square() * self.heaviside(split - limit, 0.0)
-
-    def mean_over_nearest(self, values: Tensor, x: Tensor, point: Tensor, fraction: float) -> Tensor:
-        """Mean of ``values`` over the particles nearest to a point, those that :func:`nearest` chooses.
-
-        In the smooth form the weights of particles fall off around the distance within which there are as many, over
-        :data:`SELECTION_WIDTH`, and no particle is left out.
-
-        Args:
-            values: (B, N, K).
-            x: (B, N, 2) positions of the particles, m.
-            point: (B, 2), m.
-            fraction: How many to choose, as a fraction of all.
-
-        Returns:
-            (B, K).
-        """
-        index = nearest(x.detach(), point.detach(), fraction)
-        return pick(values, index).mean(1)
-
-    def silhouette(self, observation: Tensor) -> Tensor:
-        """Pixels (B, 64, 64) in which an observation shows matter: bool, or probabilities in the smooth form."""
-        return silhouette(observation)
-
-
-class SmoothOps(RewardOps):
-    """The smooth forms of the operations."""
-
-    smooth = True
-
-    def clamp(
-        self, z: Tensor, low: float | None = None, high: float | None = None, *, width: float | None = None
-    ) -> Tensor:
-        """Soft clamp."""
+        if not self.smooth:
+            return z.clamp(low, high)
         if width is not None:
             checks.number("width", width, above=0.0)
         largest = max((abs(limit) for limit in (low, high) if limit is not None), default=0.0)
@@ -104,15 +61,35 @@ class SmoothOps(RewardOps):
         return z
 
     def heaviside(self, z: Tensor, width: float) -> Tensor:
-        """Sigmoid."""
-        return torch.sigmoid(z / width)
+        """1 where ``z`` is positive, else 0; smooth, the sigmoid of ``z / width``."""
+        return torch.sigmoid(z / width) if self.smooth else (z > 0).to(z.dtype)
 
     def split_penalty(self, split: Tensor, limit: float) -> Tensor:
-        """Penalty that sets in around the limit."""
-        return -(20.0 * split).square() * self.heaviside(split - limit, RELATIVE_WIDTH * limit)
+        """Penalty ``-(20 s)^2``, (B,), once the spread s (B,) exceeds ``limit``.
+
+        The exact form counts s up to :data:`SPLIT_CAP` only. The smooth form sets in over a width of ``limit / 20`` and
+        keeps growing.
+        """
+        counted = split if self.smooth else split.clamp_max(SPLIT_CAP)
+        return -(20.0 * counted).square() * self.heaviside(split - limit, RELATIVE_WIDTH * limit)
 
     def mean_over_nearest(self, values: Tensor, x: Tensor, point: Tensor, fraction: float) -> Tensor:
-        """Weighted mean."""
+        """Mean of ``values`` over the particles nearest to a point, those that :func:`nearest` chooses.
+
+        In the smooth form all particles count, with weights that fall off around the distance within which there are
+        as many, over :data:`SELECTION_WIDTH`.
+
+        Args:
+            values: (B, N, K).
+            x: (B, N, 2) positions of the particles, m.
+            point: (B, 2), m.
+            fraction: How many to choose, as a fraction of all.
+
+        Returns:
+            (B, K).
+        """
+        if not self.smooth:
+            return pick(values, nearest(x.detach(), point.detach(), fraction)).mean(1)
         squared = _squared_distance(x, point)
         edge = squared.topk(count_of(fraction, x), largest=False).values[:, -1:]
         width = 2.0 * SELECTION_WIDTH * edge.clamp_min(SELECTION_WIDTH**2).sqrt()
@@ -120,11 +97,11 @@ class SmoothOps(RewardOps):
         return (weight * values).sum(1) / weight.sum(1)
 
     def silhouette(self, observation: Tensor) -> Tensor:
-        """Probabilities that pixels are occupied."""
-        return soft_silhouette(observation)
+        """Pixels (B, 64, 64) in which an observation shows matter: bool, or probabilities in the smooth form."""
+        return soft_silhouette(observation) if self.smooth else silhouette(observation)
 
 
-EXACT, SMOOTH = RewardOps(), SmoothOps()
+EXACT, SMOOTH = RewardOps(smooth=False), RewardOps(smooth=True)
 
 
 def signed_quadratic(z: Tensor, k: float) -> Tensor:
