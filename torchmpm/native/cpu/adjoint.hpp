@@ -106,12 +106,6 @@ private:
         member.wait();
     }
 
-    // The tape of a large scene does not fit into the caches, and its blocks are too far apart for hardware prefetching.
-    static void prefetch(const Block* block, size_t size) {
-        const char* start = reinterpret_cast<const char*>(block);
-        for (size_t line = 0; line < size; line += 64) __builtin_prefetch(start + line, 0, 2);
-    }
-
     void block_adjoint(int index, const Block& state, int part) {
         const Body& body = scene.body(index);
         Block& bar = work.bars[index];

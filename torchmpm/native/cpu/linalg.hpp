@@ -17,8 +17,8 @@ INLINE Mat2 matmul(Mat2 m, Mat2 n) {
 INLINE Mat2 transposed(Mat2 m) { return {m.a, m.c, m.b, m.d}; }
 INLINE Real det(Mat2 m) { return m.a * m.d - m.b * m.c; }
 
-// The larger of the two parts as (m1, m2), the smaller as (n1, n2); `sign` is 1 if the larger one is the rotation, else -1.
-// A factor costs less than a choice between two vectors.
+// The larger of the two parts as (m1, m2), the smaller as (n1, n2); `sign` is 1 if the larger one is the rotation, else
+// -1. A factor costs less than choosing each number.
 struct Parts {
     Real m1, m2, n1, n2, sign;
 };

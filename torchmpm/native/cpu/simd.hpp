@@ -42,7 +42,7 @@ INLINE Real square(Real a) { return a * a; }
 // Propagates a NaN in `a`.
 INLINE Real at_least(Real a, Real low) { return a < low ? low : a; }
 
-// Takes two numbers of each operand, from both halves alike: one instruction, which runs on more ports than an unpacking.
+// Two numbers of each operand, from all quarters alike. On x86 these shuffles run on more ports than unpacking does.
 #define PAIRS4(a, b, i, j) SHUFFLE(a, b, i, j, 4 + i, 4 + j)
 #define PAIRS8(a, b, i, j) SHUFFLE(a, b, i, j, 8 + i, 8 + j, 4 + i, 4 + j, 12 + i, 12 + j)
 

@@ -86,10 +86,11 @@ template <class Function> INLINE void read_eight(const int32_t* node, int width,
     });
 }
 
-// A grid that collects sums of particles. Each node holds the sums of a row of three nodes, over the particles whose stencil
-// has a row that begins there: two numbers of each of the three (six, and two unused), then a third of each where there is
-// one (three, and five unused). So a particle adds to three places instead of nine, and these are either the same as
-// another's or do not overlap: a recent store is forwarded to the next load. Only nodes within `cleared` have defined values.
+// A grid that collects sums of particles. Each node holds the sums of a row of three nodes, over the particles whose
+// stencil has a row that begins there: two numbers of each of the three (six, and two unused), then a third of each where
+// there is one (three, and five unused). So a particle adds to three places instead of nine. Two particles add to the
+// same place or to separate ones, so a recent store is forwarded to the next load. Only nodes within `cleared` have
+// defined values.
 struct Sums {
     static constexpr int PAIRS = 8, TRIPLES = 16;  // numbers of a row
     Real* nodes;
@@ -122,7 +123,8 @@ struct Sums {
 };
 
 // Add `numbers`, two of each of the three nodes, times the weight of row p to the sums of particle k.
-template <int row> INLINE void add_pairs(const Scene& scene, const Stencil& at, int k, int p, Real* grid, const Real8& numbers) {
+template <int row>
+INLINE void add_pairs(const Scene& scene, const Stencil& at, int k, int p, Real* grid, const Real8& numbers) {
     const Real w = at.wx[p][k];
     Real* to = grid + row * (int64_t(at.node[k]) + p * int64_t(scene.width));
     *reinterpret_cast<Real8*>(to) += Real8{w, w, w, w, w, w, w, w} * numbers;
