@@ -9,7 +9,7 @@ struct alignas(64) Nodes {
 
     PASS_MEMBER void read(const Scene& scene, const Stencil& at, const Real* grid) {
         for (int k = 0; k < LANES; k += 8)
-            read_eight(at.node + k, scene.width, grid, [&](int p, const Real8(&row)[8]) {
+            read_eight(scene, at, k, grid, [&](int p, const Real8(&row)[8]) {
                 for (int n = 0; n < 6; ++n) put(row[n], &v[3 * p + n / 2][n % 2][k]);
             });
     }

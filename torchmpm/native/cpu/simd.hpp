@@ -65,12 +65,6 @@ INLINE Real4 half(const Real8& v, int which) {
     return result;
 }
 
-// Both halves from memory.
-INLINE Real8 join_halves(const Real* low, const Real* high) {
-    const Real4 a = *reinterpret_cast<const Row4*>(low), b = *reinterpret_cast<const Row4*>(high);
-    return SHUFFLE(a, b, 0, 1, 2, 3, 4, 5, 6, 7);
-}
-
 INLINE void transpose(Real8 (&v)[8]) {
     Real8 low[4] = {v[0], v[1], v[2], v[3]}, high[4] = {v[4], v[5], v[6], v[7]};
     transpose(low), transpose(high);

@@ -39,7 +39,7 @@ PASS void advance(const Scene& scene, const Real* velocity, const Stencil& at, B
         const Real8 w0 = eight(at.wy[0] + k), w1 = eight(at.wy[1] + k), w2 = eight(at.wy[2] + k);
         const Real8 d0 = w0 * -fy, d1 = w1 * (1 - fy), d2 = w2 * (2 - fy);
         Real8 v[2] = {}, slope_x[2] = {}, slope_y[2] = {};
-        read_eight(at.node + k, scene.width, velocity, [&](int p, const Real8(&row)[8]) {
+        read_eight(scene, at, k, velocity, [&](int p, const Real8(&row)[8]) {
             const Real8 w = eight(at.wx[p] + k), d = w * (Real(p) - fx);
             for (int c = 0; c < 2; ++c) {
                 const Real8 across = w0 * row[c] + w1 * row[2 + c] + w2 * row[4 + c];

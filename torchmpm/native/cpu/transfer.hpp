@@ -65,20 +65,22 @@ INLINE Real8 eight(const Real* from) { return *reinterpret_cast<const Real8*>(fr
 
 INLINE void put(Real8 value, Real* to) { *reinterpret_cast<Real8*>(to) = value; }
 
+// Row p of the nodes of particle k, two numbers each: six, and two more to ignore. The address is also valid for particles
+// that take no part, but the values read there are meaningless.
 INLINE Real8 load_row(const Scene& scene, const Stencil& at, int k, int p, const Real* grid) {
     return *reinterpret_cast<const Row8*>(grid + 2 * (int64_t(at.node[k]) + p * int64_t(scene.width)));
 }
 
-// Read the nodes of eight particles, two numbers each: `use(p, row)` gets the nodes (p, q) as row[2 q] and row[2 q + 1]. A
-// row of three nodes is six numbers; two more are loaded and ignored. Addresses are also valid for particles that take
-// no part, but the values read there are meaningless.
-template <class Function> INLINE void read_eight(const int32_t* node, int width, const Real* grid, Function use) {
+// Read the nodes of particles k to k + 7, two numbers each: `use(p, row)` gets the nodes (p, q) as row[2 q] and
+// row[2 q + 1].
+template <class Function>
+INLINE void read_eight(const Scene& scene, const Stencil& at, int k, const Real* grid, Function use) {
     three([&](int p) INLINE_LAMBDA {
+        // Particles 0 to 3 in the lower halves, 4 to 7 in the upper ones; the first four numbers apart from the last.
         Real8 low[4], high[4];
         for (int l = 0; l < 4; ++l) {
-            const Real* first = grid + 2 * int64_t(node[l]) + 2 * p * int64_t(width);
-            const Real* other = grid + 2 * int64_t(node[l + 4]) + 2 * p * int64_t(width);
-            low[l] = join_halves(first, other), high[l] = join_halves(first + 4, other + 4);
+            const Real8 a = load_row(scene, at, k + l, p, grid), b = load_row(scene, at, k + l + 4, p, grid);
+            low[l] = SHUFFLE(a, b, 0, 1, 2, 3, 8, 9, 10, 11), high[l] = SHUFFLE(a, b, 4, 5, 6, 7, 12, 13, 14, 15);
         }
         transpose(low), transpose(high);
         const Real8 row[8] = {low[0], low[1], low[2], low[3], high[0], high[1]};
