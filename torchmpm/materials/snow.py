@@ -77,11 +77,13 @@ class Snow(Elastic):
     hardening: Value = 10.0
     hardening_range: tuple[float, float] = (0.1, 5.0)
     shear_cutoff: float = 1e-5
+    exact_gradients: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_not_negative(self, "compression", "stretch", "hardening")
         checks.number("shear_cutoff", self.shear_cutoff, least=0.0)
+        checks.flag("exact_gradients", self.exact_gradients)
         if not isinstance(self.compression, Tensor) and not self.compression < 1:
             raise ValueError(f"compression must be below 1, got {self.compression}")
         given = self.hardening_range
@@ -101,12 +103,12 @@ class Snow(Elastic):
 
     def stress(self, F: Mat2, Jp: Tensor) -> Sym2:
         """Kirchhoff stress at ``F`` and ``Jp``, planes (B, N), Pa; an inverted element rests in its mirrored shape."""
-        mu, lam = self._hardened(Jp)
+        mu, lam = self.hardened(Jp)
         return corotated_stress(F, mu, lam, det(F).abs())
 
     def energy(self, F: Mat2, Jp: Tensor) -> Tensor:
         """Stored energy per unit volume at ``F`` and ``Jp``, (B, N), J/m^2."""
-        mu, lam = self._hardened(Jp)
+        mu, lam = self.hardened(Jp)
         return corotated_energy(F, mu, lam, det(F).abs())
 
     def stiffness(self) -> Value:
@@ -114,7 +116,7 @@ class Snow(Elastic):
         low, high = self.hardening_range
         return min(max(1.0, low), high) * super().stiffness()
 
-    def _hardened(self, Jp: Tensor) -> tuple[Value, Value]:
+    def hardened(self, Jp: Tensor) -> tuple[Value, Value]:
         """Elastic constants at ``Jp``."""
         low, high = self.hardening_range
         exponent = broadcast_plane(self.hardening, Jp, "hardening") * (1.0 - Jp)
