@@ -3,8 +3,6 @@
 ``substep`` reads like the algorithm in those papers: particles to grid, grid velocities, boundary, grid to particles.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,7 +16,7 @@ from torchmpm.materials.base import broadcast_plane
 from torchmpm.materials.body import Body, slices
 from torchmpm.materials.linalg import Mat2, Sym2, matmul
 from torchmpm.materials.muscle import muscle_stress
-from torchmpm.materials.resolved import detach_unresolved, resolved_tangent
+from torchmpm.materials.resolved import detach_unresolved, resolved_stress
 from torchmpm.spline import Stencil, stencil
 
 #: Added to the mass of a node before the division, kg, so that an empty node has velocity zero.
@@ -87,7 +85,7 @@ def _deform(scene: Scene, nodes: Stencil, trial: Mat2, Jp: Tensor) -> tuple[Mat2
         a, b, c, d = trial
         before = Jp[:, part]
         F, after = body.material.return_map((a[:, part], b[:, part], c[:, part], d[:, part]), before)
-        tau = body.material.stress(resolved_tangent(body, F, before, scene.grid.h, scene.dt), before)
+        tau = resolved_stress(body, F, before, scene.grid.h, scene.dt)
         if body.muscle and scene.actuation is not None:
             active = muscle_stress(F, transfer.interpolate(nodes.part(part), scene.actuation))
             tau = (tau[0] + active[0], tau[1] + active[1], tau[2] + active[2])

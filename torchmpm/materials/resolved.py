@@ -9,7 +9,8 @@ from torch import Tensor
 
 from torchmpm.materials.base import broadcast_plane
 from torchmpm.materials.body import Body
-from torchmpm.materials.linalg import Mat2
+from torchmpm.materials.elastic import corotated_stress
+from torchmpm.materials.linalg import Mat2, Sym2, det
 from torchmpm.materials.snow import Snow
 
 #: Change of displacement gradient in a substep, ``dt |C|``, beyond which snow passes no derivative on.
@@ -21,23 +22,23 @@ def is_limited(body: Body) -> bool:
     return isinstance(body.material, Snow) and not body.material.exact_gradients
 
 
-def resolved_tangent(body: Body, F: Mat2, Jp: Tensor, h: float, dt: float) -> Mat2:
-    """The planes ``F`` (B, N), through which the derivative of a stress is that of a stiffness stable at ``dt``.
+def resolved_stress(body: Body, F: Mat2, Jp: Tensor, h: float, dt: float) -> Sym2:
+    """Stress of a body at ``F`` and ``Jp``, planes (B, N), Pa; that of snow has a limited derivative with respect to F.
 
-    For a stiffness k of snow at ``Jp`` above the largest stable one, ``(h / dt)^2 m / V``, derivatives are scaled by
-    the ratio of the two. The values are those of ``F``.
+    Where the stiffness of hardened snow exceeds the largest one for which substeps of ``dt`` are stable,
+    ``(h / dt)^2 m / V``, the derivative is that of the stable one. All other derivatives are exact.
     """
-    material = body.material
-    if not is_limited(body):
-        return F
-    assert isinstance(material, Snow)
+    material, tau = body.material, body.material.stress(F, Jp)
+    if not (isinstance(material, Snow) and is_limited(body)):
+        return tau
     with torch.no_grad():
         mass, volume = (broadcast_plane(getattr(body, name), Jp, name) for name in ("mass", "volume"))
         mu, lam = (torch.as_tensor(value) for value in material.hardened(Jp))
-        share = (h / dt) ** 2 * mass / (volume * 2.0 * (mu + lam.clamp_min(0.0)))
-        share = share.clamp_max(1.0)
-    a, b, c, d = (torch.lerp(entry.detach(), entry, share) for entry in F)
-    return a, b, c, d
+        stable = (h / dt) ** 2 * mass / volume
+        excess = (1.0 - stable / (2.0 * (mu + lam.clamp_min(0.0)))).clamp_min(0.0)
+    removed = corotated_stress(F, excess * mu, excess * lam, det(F).abs())
+    xx, xy, yy = (value - (part - part.detach()) for value, part in zip(tau, removed, strict=True))
+    return xx, xy, yy
 
 
 def detach_unresolved(bodies: Sequence[Body], planes: tuple[Tensor, ...], dt: float) -> tuple[Tensor, ...]:
