@@ -67,12 +67,9 @@ def test_gradients_are_bounded_and_lead_upwards() -> None:
         found = gradient(env, state, actions)
         assert found.isfinite().all()
         norms = found.flatten(1).norm(dim=1)
-        print(found.norm(), gradient(exact, state, actions).double().norm())
         huge += not gradient(exact, state, actions).double().norm() < 1e3 * found.norm()
         with torch.no_grad():
             ahead = (actions + 0.2 * found / norms[:, None, None, None, None]).clamp(-1, 1)
             improved += bool(returns(env, state, ahead) > returns(env, state, actions))
-            print(returns(env, state, ahead) - returns(env, state, actions))
-    print(improved, huge)
     assert improved >= 6
-    assert huge >= 2
+    assert huge >= 4
