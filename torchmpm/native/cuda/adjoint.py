@@ -120,12 +120,13 @@ def add_matrix(planes, stride, a, b, c, d, mask):
 
 
 @triton.jit
-def drop_unresolved(bars, stride, c0, c1, c2, c3, bounds, mask):
+def drop_unresolved(bars, stride, c0, c1, c2, c3, bounds, mask, KIND: tl.constexpr):
     """Forget the derivatives in snow that moves faster than a substep resolves, see ``torchmpm.materials.resolved``."""
-    limit = LARGEST_STRAIN * tl.load(bounds + 3)
-    drop, zero = mask & (c0 * c0 + c1 * c1 + c2 * c2 + c3 * c3 > limit * limit), tl.zeros_like(c0)
-    for plane in tl.static_range(13):
-        tl.store(bars + plane * stride, zero, drop)
+    if KIND == SNOW:
+        limit, zero = LARGEST_STRAIN * tl.load(bounds + 3), tl.zeros_like(c0)
+        drop = mask & (c0 * c0 + c1 * c1 + c2 * c2 + c3 * c3 > limit * limit)
+        for plane in tl.static_range(13):
+            tl.store(bars + plane * stride, zero, drop)
 
 
 @triton.jit(do_not_specialize=SIZES)
@@ -182,8 +183,7 @@ def finish_adjoint(
     store_matrix(bars + 4 * stride, stride, d0, d1, d2, d3, on)
     store_matrix(bars + 8 * stride, stride, e0_bar, e1_bar, e2_bar, e3_bar, on)
     tl.store(bars + 12 * stride, new_Jp_bar, on)
-    if KIND == SNOW:
-        drop_unresolved(bars, stride, c0, c1, c2, c3, bounds, valid)
+    drop_unresolved(bars, stride, c0, c1, c2, c3, bounds, valid, KIND)
     if MUSCLE and WANT_FIELD:
         scatter_actuation(field_bar, i, j, fx, fy, act_x_bar, act_y_bar, on, resolution)
     if WANT_VALUES:
