@@ -126,6 +126,7 @@ private:
                        values_bar);
         const auto positions = actuated ? position_adjoint<true> : position_adjoint<false>;
         positions(scene, at, velocity, p_bar, mass_bar, field, state, momentum, bar, origin_bar(part), values_bar);
+        if (body.kind == Kind::snow) drop_unresolved(body.bounds, state, bar);
         if (actuated && !work.field_bar.empty()) {
             work.field_bar[part].reserve(at.box, scene.width);
             scatter_actuation(scene, momentum, at, work.field_bar[part].nodes);

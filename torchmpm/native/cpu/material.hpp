@@ -18,7 +18,8 @@ struct Values {
     INLINE Real hardening() const { return cosh2; }
 };
 constexpr int VALUES = 8;
-constexpr Real LARGEST_JP = Real(1e30);  // as in snow.py
+constexpr Real LARGEST_JP = Real(1e30);      // as in snow.py
+constexpr Real LARGEST_STRAIN = Real(0.03);  // as in resolved.py
 
 // Column k of a block whose particles have their own values, or the only column.
 template <bool varying> INLINE Values values_at(const Real* table, int k) {
@@ -29,7 +30,7 @@ template <bool varying> INLINE Values values_at(const Real* table, int k) {
 }
 
 struct Bounds {
-    Real hardening_low, hardening_high, shear_cutoff, stretch_floor;
+    Real hardening_low, hardening_high, shear_cutoff, resolved_rate, stretch_floor;
 };
 
 struct Sym2 {
