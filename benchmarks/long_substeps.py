@@ -34,39 +34,47 @@ LAYOUTS, PLANNED_LAYOUTS = 6, 4
 WAVE_STEPS, PLANNED_STEPS = 100, 64
 WINDOW, WARMUP, ACTION_RANGE = 16, 8, 0.3
 
-Act = Callable[[dittogym.TorchEnv, Tensor, int], Tensor]
-"""From the environment, its observation and the step to actions (B, 2, R, R)."""
+Act = Callable[[Tensor, int], Tensor]
+"""From observations (B, 3, 64, 64) and the step to actions (B, 2, R, R)."""
 
 
 @dataclass(frozen=True)
-class Episodes:
-    """Episodes from several layouts, side by side."""
+class Episode:
+    """An episode from one layout of particles."""
 
-    returns: np.ndarray  # (B,)
-    centres: np.ndarray  # (T, B, 2) centre of mass before each step, m
-    lengths: np.ndarray  # (B,) steps until the end
+    total: float  # return
+    centres: np.ndarray  # (T, 2) centre of mass before each step, m
 
 
-def make_env(task: str, dt: float, count: int, **options: Any) -> dittogym.TorchEnv:
-    """The task at the lite tier, at the start of episodes from the first layouts."""
-    env = dittogym.TorchEnv(task, count, particles="lite", dt=dt, **options)
-    env.reset(seed=0)
-    return env
+def make_envs(task: str, dt: float, count: int, **options: Any) -> list[dittogym.TorchEnv]:
+    """The task at the lite tier from several layouts of particles, ``count`` in all.
+
+    They are a batch; or where nothing is drawn at random, single robots of 2,000, 1,960, 1,920, ... particles.
+    """
+    options |= {"dt": dt}
+    if any(body.shape.draws for body in dittogym.make_spec(task).bodies):
+        envs = [dittogym.TorchEnv(task, count, particles="lite", **options)]
+    else:
+        envs = [dittogym.TorchEnv(task, particles=2000 - 40 * k, **options) for k in range(count)]
+    for env in envs:
+        env.reset(seed=0)
+    return envs
 
 
 @torch.no_grad()
-def play(env: dittogym.TorchEnv, act: Act, steps: int) -> Episodes:
-    """Play episodes; what comes after an end does not count."""
+def play(env: dittogym.TorchEnv, act: Act, steps: int) -> list[Episode]:
+    """Play episodes side by side; what comes after an end does not count."""
     observation, running = observe(env.model, env.env_state), torch.ones(env.num_envs, dtype=torch.bool)
     returns, lengths, centres = torch.zeros(env.num_envs), torch.zeros(env.num_envs, dtype=torch.int64), []
     for step in range(min(steps, env.spec.horizon)):
         centres.append(env.env_state.centre.numpy())
-        observation, reward, terminated, *_ = env.step(act(env, observation, step))
+        observation, reward, terminated, *_ = env.step(act(observation, step))
         returns, lengths = returns + reward * running, lengths + running
         running &= ~terminated
         if not running.any():
             break
-    return Episodes(returns.numpy(), np.stack(centres), lengths.numpy())
+    together = np.stack(centres, 1)
+    return [Episode(float(returns[i]), together[i, : lengths[i]]) for i in range(env.num_envs)]
 
 
 def rms(differences: np.ndarray) -> float:
@@ -74,76 +82,85 @@ def rms(differences: np.ndarray) -> float:
     return float(np.sqrt(np.square(differences.reshape(len(differences), -1)).sum(1).mean()))
 
 
-def row(task: str, kind: str, short: Episodes, long: Episodes) -> dict[str, object]:
+def row(task: str, kind: str, short: list[Episode], long: list[Episode]) -> dict[str, object]:
     """How much the longer substep changes, and how much two layouts differ; root mean squares."""
-    last = np.minimum(short.lengths, long.lengths) - 1
-    here, there = (each.centres[last, np.arange(len(last))] for each in (short, long))
+    last = [min(len(one.centres), len(other.centres)) - 1 for one, other in zip(short, long, strict=True)]
+    totals, centres = (
+        [np.array([each(episode, k) for episode, k in zip(episodes, last, strict=True)]) for episodes in (short, long)]
+        for each in (lambda episode, _: episode.total, lambda episode, k: episode.centres[k])
+    )
     first, second = np.triu_indices(len(last), 1)
     return {
         "task": task,
         "episodes": kind,
-        "steps": int(short.lengths.max()),
-        "return, 0.1 ms": f"{short.returns.mean():.1f}",
-        "return, 0.2 ms": f"{long.returns.mean():.1f}",
-        "changed by": f"{rms(long.returns - short.returns):.1f}",
-        "between layouts": f"{rms(short.returns[first] - short.returns[second]):.1f}",
-        "centre of mass moved by (mm)": f"{1e3 * rms(there - here):.3g}",
-        "between layouts (mm)": f"{1e3 * rms(here[first] - here[second]):.3g}",
+        "steps": max(len(episode.centres) for episode in short),
+        "return, 0.1 ms": f"{totals[0].mean():.1f}",
+        "return, 0.2 ms": f"{totals[1].mean():.1f}",
+        "changed by": f"{rms(totals[1] - totals[0]):.1f}",
+        "between layouts": f"{rms(totals[0][first] - totals[0][second]):.1f}",
+        "centre of mass moved by (mm)": f"{1e3 * rms(centres[1] - centres[0]):.3g}",
+        "between layouts (mm)": f"{1e3 * rms(centres[0][first] - centres[0][second]):.3g}",
     }
 
 
-def wave(env: dittogym.TorchEnv, observation: Tensor, step: int) -> Tensor:
-    """The wave of the recorded episodes of the reference implementation."""
-    return sine(env, step).expand(env.num_envs, -1, -1, -1)
+def play_wave(task: str, dt: float) -> list[Episode]:
+    """Episodes with the moving wave of the reference implementation's recorded episodes."""
+
+    def episodes(env: dittogym.TorchEnv) -> list[Episode]:
+        return play(env, lambda _, step: sine(env, step).expand(env.num_envs, -1, -1, -1), WAVE_STEPS)
+
+    return [each for env in make_envs(task, dt, LAYOUTS, action_layout="grid") for each in episodes(env)]
 
 
-def play_wave(task: str, dt: float) -> Episodes:
-    """Episodes with the moving wave."""
-    return play(make_env(task, dt, LAYOUTS, action_layout="grid"), wave, WAVE_STEPS)
-
-
-def play_policy(task: str, dt: float) -> Episodes:
+def play_policy(task: str, dt: float) -> list[Episode]:
     """Whole episodes of the pretrained policy, without noise."""
     policy = cfp.load(task)
-    env = make_env(task, dt, LAYOUTS, resolution=policy.resolution)
-    return play(env, lambda _, observation, step: policy(observation, deterministic=True), env.spec.horizon)
+    envs = make_envs(task, dt, LAYOUTS, resolution=policy.resolution)
+    return [each for env in envs for each in play(env, lambda seen, _: policy(seen, True), env.spec.horizon)]
 
 
-def play_plan(task: str, dt: float) -> Episodes:
+def play_plan(task: str, dt: float) -> list[Episode]:
     """Episodes with substeps of 0.1 ms, planned by gradients with substeps of ``dt``."""
     config = MPC.preset(task, "quick")
-    env, model = (make_env(task, each, PLANNED_LAYOUTS, resolution=config.resolution(1)) for each in (DT, dt))
-    planner = GradientPlanner(model, config.planner)
 
-    def act(env: dittogym.TorchEnv, observation: Tensor, step: int) -> Tensor:
-        model.env_state = env.env_state
-        return planner.act()
+    def episodes(env: dittogym.TorchEnv, model: dittogym.TorchEnv) -> list[Episode]:
+        planner = GradientPlanner(model, config.planner)
 
-    return play(env, act, PLANNED_STEPS)
+        def act(observation: Tensor, step: int) -> Tensor:
+            model.env_state = env.env_state
+            return planner.act()
+
+        return play(env, act, PLANNED_STEPS)
+
+    envs, models = (make_envs(task, each, PLANNED_LAYOUTS, resolution=config.resolution(1)) for each in (DT, dt))
+    return [each for env, model in zip(envs, models, strict=True) for each in episodes(env, model)]
 
 
-def gradients(task: str) -> dict[str, object]:
-    """The gradient of a window's smooth return in its actions, from the same states with both substeps."""
-    short, long = (make_env(task, dt, LAYOUTS) for dt in (DT, LONG))
-    shape = (WARMUP + WINDOW, 1, *short.action_shape)
-    noise = torch.rand(shape, generator=torch.Generator().manual_seed(0))
-    actions = (ACTION_RANGE * (2.0 * noise - 1.0)).repeat(1, LAYOUTS, 1, 1, 1)
+def window_gradients(short: dittogym.TorchEnv, long: dittogym.TorchEnv) -> list[Tensor]:
+    """Gradients (B, T 2 R R) of a window's smooth return in its actions, from the same states with both substeps."""
+    noise = torch.rand(WARMUP + WINDOW, 1, *short.action_shape, generator=torch.Generator().manual_seed(0))
+    actions = (ACTION_RANGE * (2.0 * noise - 1.0)).repeat(1, short.num_envs, 1, 1, 1)
     with torch.no_grad():
         for action in actions[:WARMUP]:
             short.step(action)
-    state, window, found = short.env_state, actions[WARMUP:].requires_grad_(), []
-    for env in (short, long):
-        total = rollout(env.model, state, window).rewards.sum()
-        found.append(torch.autograd.grad(total, window)[0].transpose(0, 1).flatten(1))  # (B, T 2 R R)
-    cosines, ratios = cosine_similarity(*found), found[1].norm(dim=1) / found[0].norm(dim=1)
-    others = torch.stack([cosine_similarity(*pair, dim=0) for pair in combinations(found[0], 2)])
+    window = actions[WARMUP:].requires_grad_()
+    totals = [rollout(env.model, short.env_state, window).rewards.sum() for env in (short, long)]
+    return [torch.autograd.grad(total, window)[0].transpose(0, 1).flatten(1) for total in totals]
+
+
+def gradients(task: str) -> dict[str, object]:
+    """Angle and length of the gradients with the longer substeps, and how much those of two layouts differ."""
+    envs = zip(*(make_envs(task, dt, LAYOUTS) for dt in (DT, LONG)), strict=True)
+    short, long = (torch.cat(parts) for parts in zip(*(window_gradients(*pair) for pair in envs), strict=True))
+    cosines, ratios = cosine_similarity(short, long), long.norm(dim=1) / short.norm(dim=1)
+    others = torch.stack([cosine_similarity(*pair, dim=0) for pair in combinations(short, 2)])
     return {
         "task": task,
         "cosine": f"{cosines.mean():.3f}",
         "least cosine": f"{cosines.min():.3f}",
         "cosine between layouts": f"{others.mean():.3f}",
         "ratio of norms": f"{ratios.min():.2f} to {ratios.max():.2f}",
-        "norms between layouts": f"{found[0].norm(dim=1).std() / found[0].norm(dim=1).mean():.0%}",
+        "norms between layouts": f"{short.norm(dim=1).std() / short.norm(dim=1).mean():.0%}",
     }
 
 
@@ -163,7 +180,7 @@ def main() -> None:
     returns, slopes = [], []
     for task in arguments.tasks:
         try:
-            make_env(task, LONG, 1)
+            dittogym.TorchEnv(task, particles="lite", dt=LONG)
         except ValueError as error:
             print(f"{task}: {error}", flush=True)
             continue
