@@ -78,10 +78,6 @@ def step(model: Model, state: EnvState, action: Tensor, *, soft: bool = False) -
         state: The present state.
         action: (B, 2, R, R) in grid indexing, see :func:`dittogym.action.to_grid_indexing`.
         soft: Whether the reward is the smooth one, for gradients; all else is as without.
-
-    Raises:
-        ValueError: The task returns what it must not, or a term that is not finite although the simulation is.
-        TypeError: The task returns something else than an :class:`dittogym.Outcome`.
     """
     return evaluate(model, *transition(model, state, action), soft=soft)
 

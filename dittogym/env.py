@@ -21,10 +21,8 @@ RENDER_FPS = 30
 
 def spaces(env: TorchEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     """Observation and action space of one simulation."""
-    return (
-        gymnasium.spaces.Box(0, 255, env.observation_shape, np.uint8),
-        gymnasium.spaces.Box(-1.0, 1.0, env.action_shape, np.float32),
-    )
+    observation = gymnasium.spaces.Box(0, 255, env.observation_shape, np.uint8)
+    return observation, gymnasium.spaces.Box(-1.0, 1.0, env.action_shape, np.float32)
 
 
 def as_tensor(action: Any, env: TorchEnv, single: bool = False) -> torch.Tensor:

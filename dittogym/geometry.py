@@ -14,8 +14,6 @@ from torchmpm.boundary import Range
 NODES = 128
 #: Top of the floor in nodes; the surface lies between this node and the next.
 FLOOR_NODE = 19
-#: Half the width of the mark of a goal: ten fine pixels of the observation's raster, m.
-MARK = 10 / RASTER
 
 
 @dataclass(frozen=True)
@@ -36,8 +34,8 @@ def nodes(left: float = -inf, right: float = inf, bottom: float = -inf, top: flo
 
 def mark(point: tuple[float, float]) -> Box:
     """What the observation shows of a goal: fine pixels less than ten away in both directions."""
-    x, y = point
-    return Box(x - MARK, x + MARK, y - MARK, y + MARK)
+    (x, y), half = point, 10 / RASTER
+    return Box(x - half, x + half, y - half, y + half)
 
 
 @dataclass(frozen=True)
@@ -54,10 +52,6 @@ class Obstacle:
         rules: What it does to matter instead of what follows from the boxes; of several rules for one direction on a
             node the first in the task's list counts.
         observed: The boxes that the robot sees instead, in the occupancy channel; ``()``: it is invisible.
-
-    Raises:
-        ValueError: A box has edges between nodes, or is so thin that its faces would overlap.
-        TypeError: A field is something else.
     """
 
     name: str

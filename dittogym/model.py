@@ -75,7 +75,6 @@ class Model:
         spec: The task.
         solver: Its physics.
         substeps: Substeps of a control step.
-        particle_weight: By body, the full-size particles that one particle stands for.
         camera: Draws observations.
         segment: Substeps between checkpoints where gradients are enabled, see :meth:`torchmpm.Solver.step`.
         checked: Names that the task has returned so far.
@@ -84,7 +83,6 @@ class Model:
     spec: TaskSpec
     solver: Solver
     substeps: int
-    particle_weight: tuple[float, ...]
     camera: Camera
     segment: Segment = "auto"
     checked: set[tuple[object, ...]] = field(default_factory=set, repr=False)
@@ -98,7 +96,7 @@ class Model:
         """The solver with the constants of :func:`dittogym.physics.physics_values` in place of the task's own."""
         if not physics:
             return self.solver
-        bodies = _bodies(self.spec, self.camera.counts, self.particle_weight, physics)
+        bodies = _bodies(self.spec, self.camera.counts, self.camera.particle_weight, physics)
         return self.solver.with_constants(bodies, physics.get("gravity", self.spec.gravity))
 
 
@@ -124,9 +122,6 @@ def make_model(
         parity: ``"reference"``: particles of unit volume and the pixel raster at every tier.
         segment: See :class:`Model`.
         dt: Duration of a substep, s.
-
-    Raises:
-        ValueError: The matter is too stiff for the substeps.
     """
     full = tuple(body.count for body in spec.bodies)
     weight = tuple(1.0 if parity == "reference" else n / m for n, m in zip(full, counts, strict=True))
@@ -144,7 +139,7 @@ def make_model(
     native = backend in ("auto", "native") and solver.kernels.unsupported(torch.device("cpu")) is None
     hidden = tuple(body.hidden_velocity for body in spec.bodies)
     camera = Camera(spec.view, spec.window, spec.observed_boxes, counts, weight, hidden, pixels, native)
-    model = Model(spec, solver, substeps, weight, camera, segment)
+    model = Model(spec, solver, substeps, camera, segment)
     check_stability(model, {})
     return model
 

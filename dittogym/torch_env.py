@@ -125,8 +125,6 @@ class TorchEnv:
 
         Raises:
             RuntimeError: It was neither reset nor assigned.
-            TypeError: What is assigned is not an EnvState.
-            ValueError: It has another number of simulations or particles, another dtype or device.
         """
         if self._env_state is None:
             raise RuntimeError("call reset() first: the environment has no state yet")
@@ -174,7 +172,7 @@ class TorchEnv:
     def save(self) -> Snapshot:
         """A copy of the present moment, to which :meth:`load` returns; keeps the autograd graph."""
         state, observation = tree.map(Tensor.clone, (self.env_state, self._present_observation()))
-        return Snapshot(self.spec.name, self.model.camera.counts, self.model.particle_weight, state, observation)
+        return Snapshot(self.spec.name, self.model.camera.counts, self.model.camera.particle_weight, state, observation)
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Continue from a saved moment, to the last bit as if nothing had happened since.
@@ -189,13 +187,12 @@ class TorchEnv:
             The observation (B, 3, 64, 64) uint8.
 
         Raises:
-            TypeError: Not a snapshot.
             ValueError: The snapshot is of another task, other numbers of particles, another type, device or batch size.
         """
         checks.instance("snapshot", snapshot, Snapshot)
         chosen = find_mask("mask", mask, self.num_envs, self.device)
         x, size = snapshot.state.particles.x, len(snapshot.state.steps)
-        own = self.spec.name, self.model.camera.counts, self.model.particle_weight, self.dtype, self.device
+        own = self.spec.name, self.model.camera.counts, self.model.camera.particle_weight, self.dtype, self.device
         kind = snapshot.task, snapshot.counts, snapshot.particle_weight, x.dtype, x.device
         if kind != own or size not in (1, self.num_envs):
             raise ValueError(
@@ -242,8 +239,10 @@ class TorchEnv:
         fresh, observation = core.reset(self.model, drawn.positions[index], tree.map(lambda t: t[index], physics))
         info = core.measured_info(self.model, fresh, fresh.start)
         if self._env_state is not None:
-            if self._as_reference:
-                fresh, observation = self._stale(fresh, observation, index)
+            if self._as_reference:  # its reset leaves the last episode's centre, memory and observation
+                old, observation = self._env_state, self._present_observation()[index]
+                memory = {name: old.memory[name][index].detach() for name in self.spec.stale_memory}
+                fresh = replace(fresh, centre=old.centre[index].detach(), memory={**fresh.memory, **memory})
             if len(index) < self.num_envs:
                 fresh, observation, info = self._insert(index, fresh, observation, info)
                 fresh = replace(fresh, physics=merged(self.spec, self.env_state.physics, physics, mask, self._like))
@@ -261,13 +260,6 @@ class TorchEnv:
         physics = merged(self.spec, self._physics, values, mask, self._like)
         check_stability(self.model, physics)
         return physics
-
-    def _stale(self, fresh: EnvState, observation: Tensor, index: Tensor) -> tuple[EnvState, Tensor]:
-        """What the reference implementation's reset leaves of the last episodes of the elements ``index``."""
-        old = self.env_state
-        memory = {name: old.memory[name][index].detach() for name in self.spec.stale_memory}
-        fresh = replace(fresh, centre=old.centre[index].detach(), memory={**fresh.memory, **memory})
-        return fresh, self._present_observation()[index]
 
     def _insert(self, index: Tensor, state: EnvState, *seen: Any) -> tuple[Any, ...]:
         """The present state, observation and info of all elements, with others in place of the elements ``index``."""

@@ -24,9 +24,6 @@ class Window:
     Attributes:
         left: Its left end for a fixed window, m.
         follow: For a moving window the distance of the robot's centre from its left end, m; then ``left`` is unused.
-
-    Raises:
-        ValueError: A number is not finite.
     """
 
     left: float = 0.0

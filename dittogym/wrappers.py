@@ -21,9 +21,6 @@ def action_resolution(env: AnyEnv, size: int) -> Any:
     """Actions of (2, size, size), enlarged to the resolution of ``env`` by bicubic interpolation.
 
     The option ``resolution=size`` of :func:`gymnasium.make` enlarges them in one step with the physics instead.
-
-    Raises:
-        ValueError: ``size`` is no whole number between 1 and the resolution of ``env``.
     """
     box = _box(env, "action_space")
     size = checks.whole("size", size, 1, box.shape[-1])
@@ -41,11 +38,7 @@ def action_resolution(env: AnyEnv, size: int) -> Any:
 
 
 def observation_resolution(env: AnyEnv, size: int) -> Any:
-    """Observations of (3, size, size), reduced by averaging over areas.
-
-    Raises:
-        ValueError: ``size`` is no whole number between 1 and the resolution of ``env``.
-    """
+    """Observations of (3, size, size), reduced by averaging over areas."""
     size = checks.whole("size", size, 1, _box(env, "observation_space").shape[-1])
     reduce = functools.partial(_resized, size=size, interpolation=cv2.INTER_AREA)
     small = gymnasium.spaces.Box(0, 255, (3, size, size), np.uint8)

@@ -54,7 +54,7 @@ def frame(model: Model, state: EnvState, index: int, actuation: Tensor | None, s
     if actuation is not None:
         colours[: model.num_robot_particles] = _muscle_colours(model, state, index, actuation)
     parts = [part for _, part in slices(model.solver.bodies)]
-    for part, weight in reversed(list(zip(parts, model.particle_weight, strict=True))):  # the robot last, on top
+    for part, weight in reversed(list(zip(parts, model.camera.particle_weight, strict=True))):  # the robot last, on top
         radius = max(1, round(FULL_SIZE_RADIUS * np.sqrt(weight) * canvas.pixels))
         canvas.dots(x[part], colours[part], radius)
     return cv2.resize(canvas.image, (size, size), interpolation=cv2.INTER_AREA)

@@ -7,6 +7,7 @@ from typing import Literal
 
 from torch import Tensor
 
+from dittogym.arguments import choice
 from dittogym.bodies.shapes import Disc, Rectangle
 from dittogym.contract import Memory, Moment, Outcome
 from dittogym.geometry import Obstacle, ceiling, floor, nodes
@@ -102,13 +103,8 @@ def slot(variant: Literal["registered", "published"] = "registered") -> TaskSpec
 
     Args:
         variant: ``"registered"``, or ``"published"`` for the matter of the published training run.
-
-    Raises:
-        ValueError: No such variant.
     """
-    if variant not in VARIANTS:
-        raise ValueError(f"variant must be one of {', '.join(VARIANTS)}, got {variant!r}")
-    mu, yield_stress, max_actuation = VARIANTS[variant]
+    mu, yield_stress, max_actuation = choice("variant", variant, VARIANTS)
     return TaskSpec(
         name="slot",
         horizon=1500,

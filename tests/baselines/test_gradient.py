@@ -199,7 +199,7 @@ def test_only_polish_takes_place_where_the_result_is_evaluated():
         Gradient(make("run", environment=environment, train_particles=200, polish=1), stage) for stage in (1, 2)
     )
     for env, count, scaled in ((first.env, 200, True), (polish.env, 300, False)):
-        assert env.num_particles == count and (max(env.model.particle_weight) > 1) is scaled
+        assert env.num_particles == count and (max(env.model.camera.particle_weight) > 1) is scaled
         assert env.model.camera.pixels is not scaled
     assert first.env.action_layout == polish.env.action_layout == "grid"
 

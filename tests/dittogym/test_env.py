@@ -23,9 +23,6 @@ def test_checkers_have_nothing_to_say(name: str) -> None:
         check_env(gymnasium.make(name, render_mode="rgb_array", **SMALL).unwrapped)
         check_env_sb3(gymnasium.make(name, **SMALL))
 
-
-@pytest.mark.parametrize("name", IDS)
-def test_spaces_and_horizon(name: str) -> None:
     env = gymnasium.make(name, **SMALL)
     spec = env.unwrapped.torch_env.spec
     resolution = spec.fine if "fine" in name else spec.coarse

@@ -168,15 +168,6 @@ def test_a_function_that_returns_something_else_is_refused(result: object, kind:
     assert "hop" not in dittogym.TASKS and "dittogym/hop-coarse-v0" not in gymnasium.registry
 
 
-def test_options_need_defaults() -> None:
-    def needy(pull: float) -> TaskSpec:
-        return hop(pull)
-
-    with pytest.raises(TypeError, match="pull"):
-        dittogym.register("needy", needy)
-    assert "needy" not in dittogym.TASKS
-
-
 def test_a_specification_needs_no_registration() -> None:
     env = dittogym.Env(hop(), particles=50, substeps=1)
     check_env(env, skip_render_check=True)
@@ -292,16 +283,8 @@ def test_a_target_that_is_replaced_is_rewarded() -> None:
     ("remembered", "error", "message"),
     [
         ("peak", TypeError, "initial_memory must be a function of a Moment and a TaskSpec, got 'peak'"),
-        (
-            lambda moment, spec: None,
-            TypeError,
-            "initial_memory of task 'hop' must return tensors by name, got NoneType",
-        ),
-        (
-            lambda moment, spec: {"peak": 1.0},
-            ValueError,
-            r"must return memory of shape \(B, ...\), got float for 'peak'",
-        ),
+        (lambda moment, spec: None, TypeError, "initial_memory of task 'hop' must return .* by name, got NoneType"),
+        (lambda moment, spec: {"peak": 1.0}, ValueError, r"memory of shape \(B, ...\), got float for 'peak'"),
     ],
 )
 def test_memory_that_cannot_be_kept_is_refused(remembered: object, error: type, message: str) -> None:
@@ -357,17 +340,11 @@ def test_a_longer_limit_than_the_horizon() -> None:
     [
         ({"terminated": torch.zeros(2, 2, dtype=torch.bool)}, r"terminated as bool of shape \(B,\), got torch.bool of"),
         ({"success": torch.zeros(2)}, r"success as bool of shape \(B,\), got torch.float32 of shape \(2,\)"),
-        (
-            {"terms": {"height": torch.zeros(3)}},
-            r"terms of shape \(B,\), got torch.float32 of shape \(3,\) for 'height'",
-        ),
+        ({"terms": {"height": torch.zeros(3)}}, r"terms of shape \(B,\), got .* of shape \(3,\) for 'height'"),
         ({"terms": {"alive": torch.zeros(2)}}, r"must not return the engine's own terms, got \['alive'\]"),
         ({"info": {"com": torch.zeros(2)}}, r"must not return the engine's own info, got \['com'\]"),
         ({"info": {"risen": 1.0}}, r"must return info of shape \(B, ...\), got float for 'risen'"),
-        (
-            {"memory": {"best": torch.zeros(2)}},
-            r"memory like that of initial_memory, {'first': .*got {'best': 'torch.float32",
-        ),
+        ({"memory": {"best": torch.zeros(2)}}, r"like that of initial_memory, {'first': .*got {'best': 'torch"),
         ({"memory": {"first": torch.zeros(2)}}, r"{'first': 'torch.float64 of shape \(2, 2\)'}, got {'first': 'torch"),
     ],
 )

@@ -56,10 +56,10 @@ def test_one_number_for_all(form, dtype: str) -> None:
 
 
 def test_gravity_for_all_and_for_each() -> None:
-    for value in ((1.0, -2.0), np.array([1.0, -2.0]), torch.tensor([1.0, -2.0])):
-        assert given(tiny("kick", 3), gravity=value).env_state.physics["gravity"].tolist() == [[1.0, -2.0]] * 3
     each = [[0.0, -1.0], [2.0, 0.0], [0.0, 0.0]]
-    assert given(tiny("kick", 3), gravity=each).env_state.physics["gravity"].tolist() == each
+    for value in ((1.0, -2.0), np.array([1.0, -2.0]), torch.tensor([1.0, -2.0]), each):
+        found = given(tiny("kick", 3), gravity=value).env_state.physics["gravity"]
+        assert found.tolist() == torch.as_tensor(value).expand(3, 2).tolist()
 
 
 @torch.no_grad()
@@ -295,16 +295,10 @@ def test_gradients_stay_with_the_masked_elements() -> None:
 @pytest.mark.parametrize(
     ("physics", "message"),
     [
-        (
-            3.0,
-            "physics must be a mapping from mu, lam, yield_stress, max_actuation, gravity, mass to values, got float",
-        ),
+        (3.0, "physics must be a mapping from mu, lam, .* gravity, mass to values, got float"),
         ({"nu": 0.3}, "physics may hold mu, lam, yield_stress, max_actuation, gravity, mass, got 'nu'"),
         ({"mu": [1.0, 2.0, 3.0]}, r"physics\['mu'\] must have shape \(\) or \(2,\) or \(2, 120\), got \(3,\)"),
-        (
-            {"max_actuation": torch.ones(2, 120)},
-            r"physics\['max_actuation'\] must have shape \(\) or \(2,\), got \(2, 120\)",
-        ),
+        ({"max_actuation": torch.ones(2, 120)}, r"\['max_actuation'\] must have shape \(\) or \(2,\), got \(2, 120\)"),
         ({"gravity": -9.0}, r"physics\['gravity'\] must have shape \(2,\) or \(2, 2\), got \(\)"),
         ({"mu": [1.0, -2.0]}, r"physics\['mu'\] must be finite, positive, got -2.0"),
         ({"yield_stress": -1.0}, r"physics\['yield_stress'\] must be finite, not negative"),

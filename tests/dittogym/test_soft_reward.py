@@ -25,16 +25,10 @@ def normal(*shape: int, seed: int = 1) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def soft_reward(env: TorchEnv, state: EnvState) -> Tensor:
-    """The task's soft reward (B,) of a state, under a full actuation."""
+def reward(env: TorchEnv, state: EnvState, soft: bool = False) -> Tensor:
+    """The task's reward (B,) of a state, under a full actuation."""
     field = torch.ones(env.num_envs, 2, env.spec.patch, env.spec.patch, dtype=env.dtype)
-    return evaluate(env.model, state, field, soft=True).reward
-
-
-def reward(env: TorchEnv, state: EnvState) -> Tensor:
-    """The true one."""
-    field = torch.ones(env.num_envs, 2, env.spec.patch, env.spec.patch, dtype=env.dtype)
-    return evaluate(env.model, state, field).reward
+    return evaluate(env.model, state, field, soft=soft).reward
 
 
 def placed(env: TorchEnv, x: Tensor, v: Tensor | None = None) -> EnvState:
@@ -73,7 +67,7 @@ def test_gradient_at_thresholds_against_central_differences(task: str, name: str
 
     def total(value: Tensor) -> Tensor:
         values = [value if i == which else t for i, t in enumerate(given)]
-        return (soft_reward(env, placed(env, *values)) * torch.tensor([1.0, 0.7])).sum()
+        return (reward(env, placed(env, *values), soft=True) * torch.tensor([1.0, 0.7])).sum()
 
     slope = (torch.autograd.grad(total(leaf), leaf)[0] * direction).sum().item()
     with torch.no_grad():
@@ -108,7 +102,7 @@ def test_soft_rewards_pass_thresholds_without_a_jump(task: str) -> None:
             z[0, robot:, 0] += 0.03
         element = 1 if task == "run" else 0
         state = placed(env, z)
-        soft.append(soft_reward(env, state)[element].item())
+        soft.append(reward(env, state, soft=True)[element].item())
         true.append(reward(env, state)[element].item())
     assert jumps(soft) < 0.12
     assert jumps(true) > 0.3
@@ -120,7 +114,7 @@ def test_gap_from_rest(task: str) -> None:
     """Away from thresholds the soft reward is the true one; SHAPE MATCH counts pixels, and CATCH and SLOT particles."""
     env = tiny(task, 2, particles=2000)
     env.reset(seed=0)
-    gap = (soft_reward(env, env.env_state) - reward(env, env.env_state)).abs().max()
+    gap = (reward(env, env.env_state, soft=True) - reward(env, env.env_state)).abs().max()
     bounds = {"shapematch": 2.5, "catch": 0.15, "slot": 0.6}
     assert gap <= bounds.get(task, 0.01)
 

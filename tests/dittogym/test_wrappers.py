@@ -83,19 +83,6 @@ def test_observations_are_area_means(size: int) -> None:
         assert ours[0].std() > 0
 
 
-def test_both_together() -> None:
-    for make in (single, batch):
-        env = observation_resolution(action_resolution(make(), 4), 16)
-        twin = action_resolution(observation_resolution(make(), 16), 4)
-        env.reset(seed=0)
-        twin.reset(seed=0)
-        env.action_space.seed(0)
-        action = env.action_space.sample()
-        ours, theirs = env.step(action), twin.step(action)
-        assert ours[0].shape[-3:] == (3, 16, 16) and np.array_equal(ours[0], theirs[0])
-        assert env.unwrapped.state.x.shape[1] == SMALL["particles"]
-
-
 @pytest.mark.parametrize("make", [single, batch])
 @pytest.mark.parametrize("size", [0, -1, 65])
 def test_bad_observation_sizes(make, size: int) -> None:

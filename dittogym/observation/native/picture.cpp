@@ -245,7 +245,5 @@ template <class Real> int draw(const Picture* picture) {
 }  // namespace
 
 // 0, or 1 where memory ran out.
-extern "C" {
-int dittogym_draw_float(const Picture* picture) { return draw<float>(picture); }
-int dittogym_draw_double(const Picture* picture) { return draw<double>(picture); }
-}
+extern "C" int dittogym_draw_float(const Picture* picture) { return draw<float>(picture); }
+extern "C" int dittogym_draw_double(const Picture* picture) { return draw<double>(picture); }
