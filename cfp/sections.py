@@ -19,7 +19,7 @@ TASK_OPTIONS = ("target", "variant")
 
 LONG_DT = 2e-4
 """Duration of a substep, s, in the simulations of gradient methods and planners in `LONG_DT_TASKS`."""
-LONG_DT_TASKS = ("run", "grow", "kick", "obstacle", "catch", "slot")
+LONG_DT_TASKS = ("run",)
 """Tasks in which it changes no more than another layout of particles does (benchmarks/long_substeps.py)."""
 
 

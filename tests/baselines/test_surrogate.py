@@ -67,7 +67,7 @@ def test_plans_are_tried_in_longer_substeps_and_carried_out_in_the_tasks_own() -
     """With the same particles the surrogate starts from the very state that is planned for."""
     config = replace(CONFIG, environment=EnvironmentConfig(1, 300, dtype="float64"))
     assert MPC(replace(config, train_dt=1e-4)).surrogate is None
-    mpc = MPC(replace(config, task="kick"))
+    mpc = MPC(replace(config, task="run"))
     assert mpc.env.model.solver.dt == 1e-4 and mpc.planner.env.model.solver.dt == 2e-4
     mpc.learn(2)
     before = mpc.env.state
