@@ -25,7 +25,7 @@ INLINE void stress_adjoint(const Values& m, Real hard, Real tangent, Mat2 F, Dir
     const Mat2 D = F + Real(-1) * orthogonal(R);
     const Real mu2 = tangent * m.mu2, xx = bar.xx, xy = bar.xy, yy = bar.yy;
     const Mat2 D_bar{mu2 * (xx * F.a + xy * F.c), mu2 * (xx * F.b + xy * F.d), mu2 * yy * F.c, mu2 * yy * F.d};
-    const Parts R_bar = split(D_bar, R.proper);
+    const Parts R_bar = split(D_bar, R.sign);
     out.R = {0, -R_bar.m1, -R_bar.m2};
 
     const Real signed_J = det(F), J = kind == Kind::snow ? std::abs(signed_J) : signed_J;
@@ -75,7 +75,7 @@ INLINE void von_mises_adjoint(const Values& m, Bounds bounds, Mat2 F, MaterialBa
     const Real mean = Real(0.5) * std::sqrt(major * minor);
     const Real grow_total = mean * m.cosh2, grow_difference = mean * (m.sinh2 * inverse);
 
-    const Parts v_bar = split(F_bar, v.proper);
+    const Parts v_bar = split(F_bar, v.sign);
     const Real of_total = v_bar.m1 * R.cos + v_bar.m2 * R.sin, of_difference = v_bar.n1 * v.n1 + v_bar.n2 * v.n2;
     const Real mean_bar = of_total * m.cosh2 + of_difference * m.sinh2 * inverse;
     const Real major_bar = first >= bounds.stretch_floor ? mean_bar * mean / (2 * major) : 0;
@@ -114,7 +114,7 @@ INLINE void snow_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, Materi
     Jp_bar = Jp * squeezed > LARGEST_JP ? Real(0) : Jp_bar;
     const Real squeezed_bar = Jp_bar * Jp;
 
-    const Parts v_bar = split(F_bar, v.proper);
+    const Parts v_bar = split(F_bar, v.sign);
     const Real sum_bar = v_bar.m1 * R.cos + v_bar.m2 * R.sin;
     const Real ratio_bar = round ? 0 : v_bar.n1 * n1 + v_bar.n2 * n2;
     const Real major_bar = Real(0.5) * (sum_bar + ratio_bar / root) - squeezed_bar * squeezed / major;
