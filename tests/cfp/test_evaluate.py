@@ -6,7 +6,10 @@ import torch
 from fakes import FakeEnv
 
 from cfp.envs.vec_env import monitored
+from cfp.errors import ConfigError
+from cfp.evaluate import Selection
 from cfp.evaluation.evaluate import evaluate
+from cfp.train import PROGRAM
 
 
 class LinearPolicy:
@@ -31,3 +34,10 @@ def test_evaluation_does_not_depend_on_the_number_of_threads(threads):
         assert torch.get_num_threads() == count
     for one, other in zip(*(policy.actions for policy in policies), strict=True):
         assert np.array_equal(one, other)
+
+
+def test_a_policy_can_be_evaluated_with_other_substeps():
+    config, _ = Selection(policy="run", dt=2e-4).open(PROGRAM)
+    assert (config.environment.dt, config.environment.substeps) == (2e-4, 50)
+    with pytest.raises(ConfigError, match="dt must divide"):
+        Selection(policy="run", dt=3e-4).open(PROGRAM)
