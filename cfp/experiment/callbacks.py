@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,14 +10,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from tqdm import tqdm
 
 from cfp.config import RunConfig
-from cfp.envs.make import make_env
-from cfp.evaluation.evaluate import evaluate
+from cfp.evaluation.evaluate import evaluate, make_trial
 from cfp.evaluation.video import film_episode, write_video
 from cfp.experiment.algorithm import Algorithm, Position
 from cfp.experiment.checkpoint import Checkpoint
 from cfp.experiment.folder import policy_path
 from cfp.experiment.loggers import Tracker
 from cfp.experiment.process import Stopped, StopSignals
+from cfp.progress import progress_bar
 from cfp.tables import Table
 from cfp.weights import describe_run
 
@@ -110,12 +109,11 @@ class ProgressBarCallback(StageCallback):
         self.bar = tqdm(disable=True)
 
     def _on_training_start(self) -> None:
-        self.bar = tqdm(
+        self.bar = progress_bar(
             total=self.stage.config.ends()[-1],
             initial=self.stage.step,
             desc=f"stage {self.stage.number}",
             unit="step",
-            mininterval=0.1 if sys.stderr.isatty() else 15.0,  # a log file needs fewer lines than a terminal
         )
 
     def _on_step(self) -> bool:
@@ -181,9 +179,9 @@ class EvaluationCallback(StageCallback):
     def _act(self) -> None:
         start, stage, config = time.perf_counter(), self.stage, self.stage.config
         seed, episodes = config.evaluation(stage.number)
-        deterministic = config.report.eval_deterministic
-        env = make_env(config, config.action_size(stage.number), episodes)
-        result = evaluate("", stage.algorithm, env, episodes, deterministic=deterministic, seed=seed)
+        size, deterministic = config.action_size(stage.number), config.report.eval_deterministic
+        trial = make_trial(config, "", stage.algorithm, size, episodes, deterministic=deterministic, seed=seed)
+        result = evaluate([trial])[0]
         if result.mean > max(self.means, default=-float("inf")):
             stage.save_policy()  # before the row: a crash between the two repeats the evaluation
         self.means.append(result.mean)
