@@ -1,7 +1,5 @@
 """From an action image to an actuation field on the nodes of the window."""
 
-from __future__ import annotations
-
 import functools
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The simulated window of 1 m x 1 m: where it lies, what is inside, and where in it the robot looks and acts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TypeAlias
 

@@ -1,7 +1,5 @@
 """Names of the backends, and what can and cannot go through them."""
 
-from __future__ import annotations
-
 import functools
 import logging
 from collections.abc import Callable, Iterable

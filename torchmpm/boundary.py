@@ -3,8 +3,6 @@
 The native kernels have the same formulas in ``native/cpu/grid.hpp`` and ``native/cuda/grid.py``.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -91,6 +89,12 @@ class Face:
     friction: Tensor | None  # (1 or B, cells) Coulomb coefficients, if any
 
 
+def limits(ends: Range) -> tuple[int | float, int | float]:
+    """A range of nodes whose open ends are infinite."""
+    low, high = ends
+    return -math.inf if low is None else low, math.inf if high is None else high
+
+
 def node_shift(grid: Grid, origin: Tensor) -> Tensor:
     """Whole nodes between the world's origin and the window's, truncated towards zero, (B, 2) int64."""
     return torch.trunc(origin.detach() * (1.0 / grid.h)).to(torch.int64)
@@ -103,17 +107,16 @@ def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Fa
 
     def covered(rule: VelocityRule) -> Tensor:
         inside = []
-        for axis, (low, high) in enumerate((rule.i, rule.j)):
-            bounded = low is not None or high is not None
-            node = window + shift[:, axis : axis + 1] if bounded and rule.frame == "world" else window
-            first, last = (-math.inf if low is None else low), (math.inf if high is None else high)
+        for axis, ends in enumerate((rule.i, rule.j)):
+            node = window + shift[:, axis : axis + 1] if ends != (None, None) and rule.frame == "world" else window
+            first, last = limits(ends)
             inside.append((node >= first) & (node <= last))
-        return inside[0][:, :, None] & inside[1][:, None, :]
+        return (inside[0][:, :, None] & inside[1][:, None, :]).flatten(1)
 
     result = []
     for direction in dict.fromkeys(rule.direction for rule in rules):
         same = [rule for rule in rules if rule.direction == direction]
-        active = torch.zeros(1, grid.width, grid.width, dtype=torch.bool, device=origin.device)
+        active = torch.zeros(1, grid.width**2, dtype=torch.bool, device=origin.device)
         stick, friction = active, torch.zeros_like(active, dtype=origin.dtype)
         for rule in same:
             new = covered(rule) & ~active
@@ -122,15 +125,12 @@ def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Fa
                 stick = stick | new
             elif rule.friction:
                 friction = torch.where(new, rule.friction, friction)
-        result.append(
-            Face(
-                axis="xy".index(direction[1]),
-                sign=1 if direction[0] == "+" else -1,
-                active=active.flatten(1),
-                stick=stick.flatten(1) if any(math.isinf(rule.friction) for rule in same) else None,
-                friction=friction.flatten(1) if any(0 < rule.friction < math.inf for rule in same) else None,
-            )
+        sticks, rubs = (
+            any(math.isinf(rule.friction) for rule in same),
+            any(0 < rule.friction < math.inf for rule in same),
         )
+        axis, sign = "xy".index(direction[1]), 1 if direction[0] == "+" else -1
+        result.append(Face(axis, sign, active, stick if sticks else None, friction if rubs else None))
     return tuple(result)
 
 

@@ -1,7 +1,5 @@
 """Checks of arguments: every message names the argument, what it must be, and what was given."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from numbers import Integral, Real

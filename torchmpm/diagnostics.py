@@ -1,7 +1,5 @@
 """Balances of a simulation: mass, momentum and energy, and a check for non-finite values."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """The background grid: a square window of nodes that may follow the particles."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Memory that gradients need, estimated before they are computed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch
@@ -22,6 +20,8 @@ GRIDS = 16
 
 #: Where a step starts, or (B, N, dtype) of a state on the CPU.
 Start = ParticleState | tuple[int, int, torch.dtype]
+#: Bytes as a function of the segment.
+Need = Callable[[Segment], int]
 
 
 def estimate_memory(
@@ -75,8 +75,7 @@ def segment_for(solver: Solver, state: Start, *, substeps: int, budget: int, env
     )
 
 
-def _estimate(solver: Solver, start: Start, substeps: int, env_steps: int) -> Callable[[Segment], int]:
-    """The bytes as a function of the segment."""
+def _estimate(solver: Solver, start: Start, substeps: int, env_steps: int) -> Need:
     if isinstance(start, ParticleState):
         state = start
     else:  # nothing is written to the memory of this state, so it takes none
@@ -100,7 +99,7 @@ def _sizes(solver: Solver, state: ParticleState) -> tuple[int, int]:
     return PLANES * state.num_particles * size, 2 * solver.grid.resolution**2 * size
 
 
-def _eager(solver: Solver, state: ParticleState, substeps: int, env_steps: int) -> Callable[[Segment], int]:
+def _eager(solver: Solver, state: ParticleState, substeps: int, env_steps: int) -> Need:
     (state_bytes, field_bytes), graph = _sizes(solver, state), _graph_bytes(solver, state)
     # A further step of a trajectory keeps its start, and the derivative in its actuation.
     others = (env_steps - 1) * (state_bytes + field_bytes)
@@ -143,9 +142,7 @@ def _occupied(solver: Solver, state: ParticleState) -> float:
     return float(nodes.prod(1).max() / solver.grid.width**2)
 
 
-def _native(
-    solver: Solver, state: ParticleState, substeps: int, env_steps: int, share: float
-) -> Callable[[Segment], int]:
+def _native(solver: Solver, state: ParticleState, substeps: int, env_steps: int, share: float) -> Need:
     planes, (state_bytes, field_bytes) = state.stack(), _sizes(solver, state)
     # Each team of threads has two states of its own, some grids, and a tape. Memory of nodes that no particle comes
     # near is never written to and takes none.

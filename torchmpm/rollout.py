@@ -1,7 +1,5 @@
 """Loops over steps, with checkpoints so that memory stays bounded under autograd."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from numbers import Integral
@@ -18,7 +16,7 @@ Input = TypeVar("Input")
 Output = TypeVar("Output")
 
 #: Substeps between checkpoints; ``None`` for none, ``"auto"`` to leave it to the backend.
-Segment: TypeAlias = "int | Literal['auto'] | None"
+Segment: TypeAlias = int | Literal["auto"] | None
 #: Segment of ``"auto"`` where only checkpoints bound the memory.
 SEGMENT = 10
 

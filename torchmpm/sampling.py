@@ -4,8 +4,6 @@ Each shape is a map of the unit square: give it ``uniform(count, generator)`` fo
 evenly spread particles. No function here touches a global generator.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -18,56 +16,44 @@ Points = NDArray[np.float64]
 
 
 def uniform(count: int, generator: np.random.Generator) -> Points:
-    """Independent points of the unit square.
+    """Independent points (N, 2) of the unit square.
 
     Args:
         count: N, at least 1.
         generator: Where they are drawn from.
-
-    Returns:
-        (N, 2).
     """
     return generator.random((checks.whole("count", count, 1), 2))
 
 
 def sobol(count: int, seed: int) -> Points:
-    """Points of a scrambled Sobol sequence in the unit square: far fewer clumps and holes than random ones.
+    """Points (N, 2) of a scrambled Sobol sequence in the unit square: far fewer clumps and holes than random ones.
 
     Args:
         count: N, at least 1.
         seed: Of the scrambling.
-
-    Returns:
-        (N, 2).
     """
     engine = torch.quasirandom.SobolEngine(2, scramble=True, seed=seed)
     return engine.draw(checks.whole("count", count, 1), dtype=torch.float64).numpy()
 
 
 def box(numbers: Points, corner: tuple[float, float], size: tuple[float, float]) -> Points:
-    """A filled axis-aligned box.
+    """Positions (N, 2), m, in a filled axis-aligned box.
 
     Args:
         numbers: (N, 2) points of the unit square.
         corner: Lower left corner, m.
         size: Width and height, m.
-
-    Returns:
-        (N, 2) positions, m.
     """
     return np.asarray(corner) + numbers * np.asarray(size)
 
 
 def disc(numbers: Points, centre: tuple[float, float], radius: float) -> Points:
-    """A filled disc of uniform density.
+    """Positions (N, 2), m, in a filled disc of uniform density.
 
     Args:
         numbers: (N, 2) points of the unit square.
         centre: Centre, m.
         radius: Radius, m.
-
-    Returns:
-        (N, 2) positions, m.
     """
     checks.number("radius", radius, above=0.0)
     distance, angle = radius * np.sqrt(numbers[:, 0]), 2.0 * math.pi * numbers[:, 1]
@@ -75,7 +61,7 @@ def disc(numbers: Points, centre: tuple[float, float], radius: float) -> Points:
 
 
 def chord_disc(numbers: Points, centre: tuple[float, float], radius: float) -> Points:
-    """A filled disc that is uniform over its width and, at each x, over the chord: denser towards left and right.
+    """Positions (N, 2), m, uniform over the width of a disc and, at each x, over the chord: denser to left and right.
 
     The distribution of DittoGym's round robots; with constant particle mass it also makes them stiffer at both ends.
 
@@ -83,9 +69,6 @@ def chord_disc(numbers: Points, centre: tuple[float, float], radius: float) -> P
         numbers: (N, 2) points of the unit square.
         centre: Centre, m.
         radius: Radius, m.
-
-    Returns:
-        (N, 2) positions, m.
     """
     checks.number("radius", radius, above=0.0)
     across, along = 2.0 * numbers[:, 0] - 1.0, 2.0 * numbers[:, 1] - 1.0
@@ -94,15 +77,12 @@ def chord_disc(numbers: Points, centre: tuple[float, float], radius: float) -> P
 
 
 def lattice(cells: tuple[int, int], corner: tuple[float, float], size: tuple[float, float]) -> Points:
-    """A box filled by a regular lattice, one particle in the middle of each cell; rows from the bottom up.
+    """Positions (N, 2), m, in the middle of the N cells of a box; rows from the bottom up.
 
     Args:
         cells: Number of cells in x and y.
         corner: Lower left corner, m.
         size: Width and height, m.
-
-    Returns:
-        (N, 2) positions, m, N the number of cells.
     """
     for axis, count in zip("xy", cells, strict=True):
         checks.whole(f"cells in {axis}", count, 1)
@@ -111,7 +91,7 @@ def lattice(cells: tuple[int, int], corner: tuple[float, float], size: tuple[flo
 
 
 def image(numbers: Points, mask: NDArray[np.bool_], corner: tuple[float, float], size: tuple[float, float]) -> Points:
-    """Fill the pixels of a mask with uniform density.
+    """Positions (N, 2), m, that fill the pixels of a mask with uniform density.
 
     The first number chooses the column by its share of the pixels and the place within it, the second the place in the
     column's pixels, so that evenly spread numbers give evenly spread particles.
@@ -121,9 +101,6 @@ def image(numbers: Points, mask: NDArray[np.bool_], corner: tuple[float, float],
         mask: (H, W), row 0 at the top.
         corner: Lower left corner of the whole image, m.
         size: Width and height of the whole image, m.
-
-    Returns:
-        (N, 2) positions, m.
 
     Raises:
         ValueError: The mask has no pixel set.

@@ -1,7 +1,5 @@
 """The solver: a frozen description of grid, bodies and boundary, and the step that advances a state."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
@@ -18,7 +16,7 @@ from torchmpm.boundary import VelocityRule, faces
 from torchmpm.grid import PAD, Grid
 from torchmpm.materials.base import Value
 from torchmpm.materials.body import Body, per_particle
-from torchmpm.native.cpu.library import NO_COMPILER
+from torchmpm.native.cpu.library import NO_COMPILER, load
 from torchmpm.native.kernels import Kernels
 from torchmpm.rollout import Segment, check_repetition, repeated
 from torchmpm.state import ParticleState
@@ -98,7 +96,7 @@ class Solver:
         """The fields alone: cached tables are built anew in a copy."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    def with_constants(self, bodies: tuple[Body, ...], gravity: tuple[float, float] | Tensor) -> Solver:
+    def with_constants(self, bodies: tuple[Body, ...], gravity: tuple[float, float] | Tensor) -> "Solver":
         """The same solver with other constants, for those that change in every step; skips all checks.
 
         Args:
@@ -213,7 +211,7 @@ class Solver:
             reason = "on CUDA the native backend runs only if backend='native' asks for it"
         if reason is None:
             try:
-                self.kernels.load(state.dtype)
+                load(state.dtype)
             except ValueError as error:
                 reason = str(error)
         if reason is not None:

@@ -1,7 +1,5 @@
 """Quadratic B-spline weights, node addresses, and the scatter and gather built on them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -31,7 +29,7 @@ class Stencil:
         """(B, 3, 3, N) products of the weights of both axes."""
         return self.wx[:, :, None] * self.wy[:, None]
 
-    def part(self, particles: slice) -> Stencil:
+    def part(self, particles: slice) -> "Stencil":
         """The stencils of some of the particles."""
         if particles == slice(0, self.fx.shape[-1]):
             return self

@@ -1,7 +1,5 @@
 """The largest stable substep."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

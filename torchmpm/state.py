@@ -77,8 +77,7 @@ class ParticleState:
         checks.instance("x", x, Tensor)
         if x.ndim not in (2, 3) or x.shape[-1] != 2:
             raise ValueError(f"x must have shape (B, N, 2) or (N, 2), got {tuple(x.shape)}")
-        if x.ndim == 2:
-            x = x[None]
+        x = x[None] if x.ndim == 2 else x
         batch, count = x.shape[:2]
         identity = torch.eye(2, dtype=x.dtype, device=x.device)
         return cls(
@@ -144,13 +143,8 @@ class ParticleState:
 
     def planes(self) -> tuple[Tensor, ...]:
         """The 13 component planes, each (B, N): x, v, C and F row by row, Jp."""
-        return (
-            *self.x.unbind(-1),
-            *self.v.unbind(-1),
-            *self.C.flatten(-2).unbind(-1),
-            *self.F.flatten(-2).unbind(-1),
-            self.Jp,
-        )
+        fields = (self.x, self.v, self.C.flatten(-2), self.F.flatten(-2))
+        return (*(plane for field in fields for plane in field.unbind(-1)), self.Jp)
 
     @classmethod
     def from_planes(cls, planes: tuple[Tensor, ...]) -> ParticleState:

@@ -3,8 +3,6 @@
 ``substep`` reads like the algorithm in those papers: particles to grid, grid velocities, boundary, grid to particles.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Particles to grid and grid to particles (affine particle-in-cell, MLS-MPM)."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

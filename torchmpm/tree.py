@@ -5,8 +5,6 @@ that ``torch.func``, ``torch.utils.checkpoint`` and ``torch.compile`` consult. I
 release of torch offers it under a public name, and a second registry would not be seen by those functions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields
 from typing import Any, TypeVar
@@ -26,9 +24,6 @@ def register(cls: type[Tree]) -> type[Tree]:
 
     Args:
         cls: A dataclass all of whose fields are containers of tensors.
-
-    Returns:
-        The same class.
     """
     names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
 
@@ -49,15 +44,12 @@ def register(cls: type[Tree]) -> type[Tree]:
 
 
 def map(function: Callable[..., Any], tree: Tree, *others: Tree) -> Tree:
-    """Apply a function to every tensor of a tree, together with the tensors in the same place of other trees.
+    """Apply a function to every tensor of a tree, with the tensors in the same place of other trees, for a new tree.
 
     Args:
         function: Called as ``function(tensor, *other_tensors)``.
         tree: The tree; leaves that are not tensors are kept.
         others: Trees of the same structure.
-
-    Returns:
-        A tree of the same structure.
 
     Raises:
         ValueError: The structures differ.
@@ -86,9 +78,6 @@ def where(mask: Tensor, tree: Tree, other: Tree) -> Tree:
         mask: (B,) bool.
         tree: A tensor (B, ...) or a tree of them.
         other: A tree of the same structure and shapes.
-
-    Returns:
-        A tree of the same structure and shapes.
     """
 
     def select(chosen: Tensor, otherwise: Tensor) -> Tensor:

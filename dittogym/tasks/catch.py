@@ -1,7 +1,5 @@
 """CATCH: reach into a narrow shaft, take hold of a cube, and put it on a shelf."""
 
-from __future__ import annotations
-
 import math
 
 from dittogym.bodies.shapes import Disc, Rectangle

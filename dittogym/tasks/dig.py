@@ -1,7 +1,5 @@
 """DIG: get through loose soil to a point in it."""
 
-from __future__ import annotations
-
 from dittogym.bodies.shapes import Disc, Rectangle
 from dittogym.contract import Moment, Outcome
 from dittogym.geometry import ceiling, floor, side_walls

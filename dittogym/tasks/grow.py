@@ -1,7 +1,5 @@
 """GROW: reach a point above, past two beams."""
 
-from __future__ import annotations
-
 from dittogym.bodies.shapes import Lattice
 from dittogym.contract import Memory, Moment, Outcome
 from dittogym.geometry import Obstacle, ceiling, floor, nodes, side_walls

@@ -1,7 +1,5 @@
 """KICK: drive a cube to the right and stay behind it."""
 
-from __future__ import annotations
-
 from dittogym.bodies.shapes import Disc, Rectangle
 from dittogym.contract import Moment, Outcome
 from dittogym.geometry import ceiling, floor

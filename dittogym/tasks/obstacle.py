@@ -1,7 +1,5 @@
 """OBSTACLE: run to the right, over a staircase."""
 
-from __future__ import annotations
-
 from dittogym.bodies.shapes import Lattice
 from dittogym.geometry import Obstacle, ceiling, floor, nodes
 from dittogym.spec import BodySpec, TaskSpec

@@ -1,7 +1,5 @@
 """RUN: run to the right, as far and as fast as possible."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from dittogym.bodies.shapes import Disc

@@ -1,7 +1,5 @@
 """SHAPE MATCH: take the shape of a picture, without gravity."""
 
-from __future__ import annotations
-
 import torch
 
 from dittogym.bodies.shapes import Disc

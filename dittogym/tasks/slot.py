@@ -1,7 +1,5 @@
 """SLOT: get through a low passage and knock a cap off its shelf on the far side."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

@@ -225,7 +225,7 @@ def test_what_native_wants_on_other_devices(monkeypatch: pytest.MonkeyPatch) -> 
     assert "needs a C compiler for Triton ($CC, gcc or clang)" in str(kernels.unsupported(cuda))
     monkeypatch.setenv("CC", "cc")
     assert kernels.unsupported(cuda) is None
-    monkeypatch.setattr(torch, "are_deterministic_algorithms_enabled", lambda: True)
+    monkeypatch.setattr(torch, "get_deterministic_debug_mode", lambda: 2)
     assert "adds in no fixed order" in str(kernels.unsupported(cuda))
     triton_missing.cache_clear()
 

@@ -58,7 +58,7 @@ def test_no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match=message):
         robot(5, backend="native")
     with pytest.raises(ValueError, match=message):
-        library.load("float")
+        library.load(torch.float32)
 
 
 def test_failing_compiler_is_quoted_and_not_asked_twice(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -71,36 +71,36 @@ def test_failing_compiler_is_quoted_and_not_asked_twice(monkeypatch: pytest.Monk
 
 
 def test_kept_on_disk(quick_compiler: None, tmp_path: Path) -> None:
-    first = library.load("float")
-    assert library.load("float") is first
+    first = library.load(torch.float32)
+    assert library.load(torch.float32) is first
     forget()
-    assert isinstance(library.load("float"), ctypes.CDLL)
+    assert isinstance(library.load(torch.float32), ctypes.CDLL)
     assert runs(tmp_path) == 1
-    library.load("double")
+    library.load(torch.float64)
     assert runs(tmp_path) == 2
     files = list((tmp_path / "cache" / "torchmpm").iterdir())
     assert len(files) == 2 and all(file.suffix == ".so" for file in files)
 
 
 def test_damaged_file_is_replaced(quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    library.load("float")
+    library.load(torch.float32)
     (file,) = (tmp_path / "cache" / "torchmpm").iterdir()
     damaged = tmp_path / "other" / "torchmpm" / file.name
     damaged.parent.mkdir(parents=True)
     damaged.write_bytes(b"half a library")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
     forget()
-    library.load("float")
+    library.load(torch.float32)
     assert runs(tmp_path) == 2
     assert damaged.read_bytes() == file.read_bytes()
 
 
 def test_another_source_is_another_file(quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    library.load("float")
+    library.load(torch.float32)
     for name, value in (("processor", lambda: "another processor"), ("_FLAGS", ("-O0",))):
         monkeypatch.setattr(library, name, value)
         forget()
-        library.load("float")
+        library.load(torch.float32)
     assert runs(tmp_path) == 3
     assert len(list((tmp_path / "cache" / "torchmpm").iterdir())) == 3
 
@@ -108,9 +108,9 @@ def test_another_source_is_another_file(quick_compiler: None, monkeypatch: pytes
 def test_folder_that_cannot_be_written(quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Then each process compiles for itself and leaves nothing behind."""
     (tmp_path / "cache").write_text("a file where the folder should be")
-    assert isinstance(library.load("float"), ctypes.CDLL)
+    assert isinstance(library.load(torch.float32), ctypes.CDLL)
     forget()
-    library.load("float")
+    library.load(torch.float32)
     assert runs(tmp_path) == 2
 
 

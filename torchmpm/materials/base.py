@@ -1,7 +1,5 @@
 """What all materials share: their interface, and the shapes of their constants."""
 
-from __future__ import annotations
-
 from typing import Protocol, TypeAlias, runtime_checkable
 
 import torch
@@ -11,7 +9,7 @@ from torchmpm import checks
 from torchmpm.materials.linalg import Mat2, Sym2
 
 #: A number, or a tensor of shape (), (B,) for one value per simulation, or (B, N) for one per particle.
-Value: TypeAlias = "float | Tensor"
+Value: TypeAlias = float | Tensor
 
 
 @runtime_checkable

@@ -1,7 +1,5 @@
 """Bodies: runs of consecutive particles of one material."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

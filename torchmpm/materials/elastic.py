@@ -1,7 +1,5 @@
 """Fixed corotated elasticity (Stomakhin et al., "Energetically consistent invertible elasticity", 2012)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -7,8 +7,6 @@ of the orthogonal factor R of ``F = R S``. All that the materials need follows f
 derivative breaks down at equal singular values, hence at F = I.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple, TypeAlias
 
 import torch

@@ -1,7 +1,5 @@
 """Muscles: active stress along material directions."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from torchmpm.materials.linalg import Mat2, Sym2

@@ -1,7 +1,5 @@
 """Snow plasticity (Stomakhin et al., "A material point method for snow simulation", 2013)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from numbers import Real

@@ -3,8 +3,6 @@
 The native kernels have the same formulas in ``native/cpu/material.hpp`` and ``native/cuda/material.py``.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

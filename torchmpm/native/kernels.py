@@ -1,7 +1,5 @@
 """What the solver calls: whether the kernels can run, and a step through them."""
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import os
@@ -23,8 +21,7 @@ from torchmpm.state import ParticleState
 
 #: A node remembers its rule in one byte.
 MAX_RULES = 254
-#: Addresses of a node's numbers, at most eight, and of particles within one simulation have 32 bits. Those of all
-#: simulations together have 64.
+#: Addresses within one simulation have 32 bits; a node has at most eight numbers.
 MAX_RESOLUTION, MAX_PARTICLES = 16_000, 2**30
 #: The tape on CUDA takes no more than this, bytes.
 CUDA_TAPE_BYTES = 2**31
@@ -49,9 +46,7 @@ class Kernels:
             missing = triton_missing(os.environ.get("CC"), os.environ.get("PATH"))
             if missing is not None:
                 return missing
-            if torch.are_deterministic_algorithms_enabled() and not (
-                torch.is_deterministic_algorithms_warn_only_enabled()
-            ):
+            if torch.get_deterministic_debug_mode() == 2:  # not allowed, rather than warned of
                 return "on CUDA it adds in no fixed order, which torch.use_deterministic_algorithms(True) forbids"
         return self._unsupported
 
@@ -71,10 +66,6 @@ class Kernels:
         if particles > MAX_PARTICLES:
             return f"it takes at most {MAX_PARTICLES:,} particles per simulation, got {particles:,}"
         return None
-
-    def load(self, dtype: torch.dtype) -> None:
-        """Compile and load the C++ kernels for a dtype; raises ValueError where there is no compiler or it fails."""
-        call.library_for(dtype)
 
     @functools.cached_property
     def handle(self) -> int:

@@ -1,33 +1,23 @@
-"""The kernels as operators of torch with an adjoint, for tensors on the CPU and on CUDA.
-
-``native_step`` advances all simulations by some substeps: it takes the tensors of
-:class:`torchmpm.native.tables.Inputs`, a handle of :func:`torchmpm.native.tables.make_tables` and the number of
-substeps, and returns the planes (13, B, N) of the new state. ``native_step_backward`` replays the substeps, then goes
-back through them.
-"""
-
-from __future__ import annotations
+"""The kernels as operators of torch with an adjoint, for tensors on the CPU and on CUDA."""
 
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchmpm import tree
 from torchmpm.native.cpu import call
-from torchmpm.native.tables import VALUES, Inputs, bodies_of
+from torchmpm.native.tables import Bars, Inputs, bodies_of
 
 _INPUTS = "Tensor planes, Tensor? field, Tensor origin, Tensor gravity, Tensor values, Tensor shift"
 _NUMBERS = "int handle, int substeps"
-#: Derivatives in planes, field, origin and gravity, in their shapes, and in the values, (8, B, N): one column per
-#: particle. Those that are not wanted are empty.
-Bars = tuple[Tensor, ...]
 
 
 @torch.library.custom_op("torchmpm::native_step", mutates_args=(), schema=f"({_INPUTS}, {_NUMBERS}) -> Tensor")
 def native_step(*arguments: Any) -> Tensor:
-    """Advance all simulations: tensors, handle and substeps -> planes (13, B, N)."""
+    """Planes (13, B, N) after some substeps, from the tensors of Inputs, a handle of make_tables, and their number."""
     *tensors, handle, substeps = arguments
-    inputs = _contiguous(tensors)
+    inputs = tree.map(Tensor.contiguous, Inputs(*tensors))
     result = torch.empty_like(inputs.planes)
     call.run(inputs, handle, substeps, result=result)
     return result
@@ -42,17 +32,12 @@ def native_step(*arguments: Any) -> Tensor:
     ),
 )
 def native_step_backward(*arguments: Any) -> Bars:
-    """Adjoint of :func:`native_step`: tensors, derivative in the result, handle, substeps, wishes -> derivatives."""
+    """Replay the substeps, then go back: tensors, handle, substeps, whether field and values count -> derivatives."""
     *tensors, handle, substeps, wants_field, wants_values = arguments
-    inputs = _contiguous(tensors)
-    bars = _empty_bars(inputs, wants_field, wants_values)
+    inputs = tree.map(Tensor.contiguous, Inputs(*tensors))
+    bars = inputs.empty_bars(wants_field, wants_values)
     call.run(inputs, handle, substeps, **{n: bar for n, bar in zip(call.BARS, bars, strict=True) if bar.numel()})
     return bars
-
-
-def _contiguous(tensors: list[Any]) -> Inputs:
-    contiguous: list[Any] = [None if tensor is None else tensor.contiguous() for tensor in tensors]
-    return Inputs(*contiguous)
 
 
 @native_step.register_kernel("cuda")
@@ -69,19 +54,6 @@ def _(*arguments: Any) -> Bars:
     return cuda.backward(*arguments)
 
 
-def _empty_bars(inputs: Inputs, wants_field: bool, wants_values: bool) -> Bars:
-    """Room for the derivatives."""
-    planes, field = inputs.planes, inputs.field
-    nothing = planes.new_empty(0)
-    return (
-        torch.empty_like(planes, memory_format=torch.contiguous_format),
-        torch.empty_like(field) if wants_field and field is not None else nothing,
-        torch.empty_like(inputs.origin),
-        torch.empty_like(inputs.gravity),
-        planes.new_empty(VALUES, *planes.shape[1:]) if wants_values else nothing.clone(),
-    )
-
-
 @native_step.register_fake
 def _(planes: Tensor, *_: object) -> Tensor:
     return torch.empty_like(planes, memory_format=torch.contiguous_format)
@@ -90,7 +62,7 @@ def _(planes: Tensor, *_: object) -> Tensor:
 @native_step_backward.register_fake
 def _(*arguments: Any) -> Bars:
     *tensors, _handle, _substeps, wants_field, wants_values = arguments
-    return _empty_bars(Inputs(*tensors), wants_field, wants_values)
+    return Inputs(*tensors).empty_bars(wants_field, wants_values)
 
 
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:

@@ -1,9 +1,6 @@
 """What the kernels read: a solver as typed tables built once, a table of its constants, and the tensors of a call."""
 
-from __future__ import annotations
-
 import ctypes
-import math
 import threading
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -11,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchmpm.boundary import VelocityRule
+from torchmpm.boundary import VelocityRule, limits
 from torchmpm.grid import Grid
 from torchmpm.materials.base import Value, broadcast_plane
 from torchmpm.materials.body import Body, slices
@@ -69,6 +66,11 @@ class Tables(ctypes.Structure):
     ]
 
 
+#: Derivatives in planes, field, origin and gravity, in their shapes, and in the values, (8, B, N): one column per
+#: particle. Those that are not wanted are empty.
+Bars = tuple[Tensor, ...]
+
+
 class Inputs(NamedTuple):
     """Tensors of a call, a tree for ``torchmpm.tree``."""
 
@@ -79,6 +81,17 @@ class Inputs(NamedTuple):
     values: Tensor  # (8, 1 or B, columns) from make_values
     shift: Tensor  # (B, 2) int64, nodes between the world's origin and the window's
     result_bar: Tensor | None = None  # (13, B, N) derivative of a loss in the new planes, for the adjoint
+
+    def empty_bars(self, wants_field: bool, wants_values: bool) -> Bars:
+        """Room for the derivatives."""
+        nothing = self.planes.new_empty(0)
+        return (
+            torch.empty_like(self.planes, memory_format=torch.contiguous_format),
+            torch.empty_like(self.field) if wants_field and self.field is not None else nothing,
+            torch.empty_like(self.origin),
+            torch.empty_like(self.gravity),
+            self.planes.new_empty(VALUES, *self.planes.shape[1:]) if wants_values else nothing.clone(),
+        )
 
 
 _lock = threading.Lock()
@@ -131,12 +144,8 @@ def _varying(body: Body) -> bool:
 
 
 def _rule_table(rule: VelocityRule, slot: int) -> RuleTable:
-    (i_low, j_low), (i_high, j_high) = (
-        [absent if end is None else end for end in ends]
-        for ends, absent in zip(zip(rule.i, rule.j, strict=True), (-math.inf, math.inf), strict=True)
-    )
     axis, sign = "xy".index(rule.direction[1]), 1.0 if rule.direction[0] == "+" else -1.0
-    return RuleTable(axis, rule.frame == "world", slot, sign, i_low, i_high, j_low, j_high, rule.friction)
+    return RuleTable(axis, rule.frame == "world", slot, sign, *limits(rule.i), *limits(rule.j), rule.friction)
 
 
 def upload(numbers: Sequence[float], like: Tensor) -> Tensor:

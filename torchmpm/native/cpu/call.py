@@ -1,7 +1,5 @@
 """Runs the C++ kernels on tensors."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +10,6 @@ from torch import Tensor
 from torchmpm.native.cpu.library import POOL, load, thread_pool
 from torchmpm.native.tables import Inputs, Tables, tables_of
 
-_REAL = {torch.float32: "float", torch.float64: "double"}
 #: Scratch memory up to this size, bytes, is kept for the next call, as fresh pages cost a third of a backward pass.
 #: It is enough for 190 substeps of 22,000 particles in single precision; longer steps are cut.
 KEPT_BYTES = 2**28
@@ -34,18 +31,13 @@ class _Call(ctypes.Structure):
     ]
 
 
-def library_for(dtype: torch.dtype) -> ctypes.CDLL:
-    """The kernels for a dtype."""
-    return load(_REAL[dtype])
-
-
 def run(inputs: Inputs, handle: int, substeps: int, **outputs: Tensor) -> None:
     """Advance all simulations and write ``result``, or go back through the substeps and write some of :data:`BARS`.
 
     All tensors are contiguous.
     """
     name = "torchmpm_forward" if "result" in outputs else "torchmpm_backward"
-    library, (_, batch, particles) = library_for(inputs.planes.dtype), inputs.planes.shape
+    library, (_, batch, particles) = load(inputs.planes.dtype), inputs.planes.shape
     call = _Call(
         batch=batch,
         particles=particles,

@@ -1,7 +1,5 @@
 """Compiles the kernels on first use, keeps them on disk, and loads them."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import hashlib
@@ -24,6 +22,7 @@ _FLAGS = (
     *("-fopenmp-simd", "-fPIC", "-shared", "-pthread"),
 )
 _X86_FLAGS = ("-mprefer-vector-width=512",)
+_REAL = {torch.float32: "float", torch.float64: "double"}
 #: Completes the message "backend 'native' ...".
 NO_COMPILER = "needs a C++ compiler (g++, clang++ or $CXX), found none: use 'eager'"
 _logger = logging.getLogger(__name__)
@@ -67,9 +66,9 @@ def cache_folder() -> str:
     return os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser(usual), "torchmpm")
 
 
-def load(real: str) -> ctypes.CDLL:
-    """The compiled kernels for the scalar type ``"float"`` or ``"double"``, see :func:`build`."""
-    return build(_SOURCES / "native.cpp", f"-DTORCHMPM_REAL={real}")
+def load(dtype: torch.dtype) -> ctypes.CDLL:
+    """The compiled kernels for a dtype, see :func:`build`."""
+    return build(_SOURCES / "native.cpp", f"-DTORCHMPM_REAL={_REAL[dtype]}")
 
 
 @functools.cache

@@ -8,18 +8,17 @@ namespace {
 
 // Threads that share one simulation, and how many such teams there are.
 struct Shape {
-    int team = 1, teams = 1;
-
-    Shape() = default;
-    explicit Shape(const Scene& scene) {
-        const Call& call = scene.call;
-        // A thread costs as much to start as some thousand particle-substeps to compute.
-        const int64_t useful = 1 + call.batch * call.particles * call.substeps / 20000;
-        const int64_t threads = std::max<int64_t>(1, std::min(call.threads, useful));
-        team = int(std::max<int64_t>(1, std::min<int64_t>(scene.parts, threads / call.batch)));
-        teams = int(std::min<int64_t>(call.batch, threads / team));
-    }
+    int team, teams;
 };
+
+Shape choose_shape(const Scene& scene) {
+    const Call& call = scene.call;
+    // A thread costs as much to start as some thousand particle-substeps to compute.
+    const int64_t useful = 1 + call.batch * call.particles * call.substeps / 20000;
+    const int64_t threads = std::max<int64_t>(1, std::min(call.threads, useful));
+    const int64_t team = std::max<int64_t>(1, std::min<int64_t>(scene.parts, threads / call.batch));
+    return {int(team), int(std::min<int64_t>(call.batch, threads / team))};
+}
 
 // Each team takes the next simulation when it is done with its last; which one takes which makes no difference to the
 // numbers. Returns false where the system gives out no more threads.
@@ -46,7 +45,7 @@ template <class Pass> bool run_batch(const Scene& scene, Shape shape, char* scra
 
 template <class Pass> size_t measure(const Call* call) {
     const Scene scene(*call);
-    const Shape shape(scene);
+    const Shape shape = choose_shape(scene);
     Arena arena(nullptr);
     for (int t = 0; t < shape.teams; ++t) typename Pass::Work(scene, arena, shape.team);
     return arena.used;
@@ -55,7 +54,7 @@ template <class Pass> size_t measure(const Call* call) {
 template <class Pass> int run(const Call* call, char* scratch) {
     try {
         const Scene scene(*call);
-        if (!run_batch<Pass>(scene, Shape(scene), scratch)) run_batch<Pass>(scene, Shape(), scratch);
+        if (!run_batch<Pass>(scene, choose_shape(scene), scratch)) run_batch<Pass>(scene, {1, 1}, scratch);
         return 0;
     } catch (const std::bad_alloc&) {
         return 1;

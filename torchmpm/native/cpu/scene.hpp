@@ -82,7 +82,9 @@ struct Scene {
         for (const RuleTable* r = t.rules; r != t.rules + t.num_rules; ++r)
             rules.push_back({int(r->axis), Real(r->sign), {{r->i_low, r->i_high}, {r->j_low, r->j_high}},
                              Real(r->friction), r->world != 0, int(r->slot)});
-        parts = choose_parts();
+        // The groups of blocks that are summed separately depend only on the particles of one simulation, so results do
+        // not depend on threads or on the other simulations of the batch.
+        parts = blocks < 16 ? 1 : blocks < 128 ? 2 : blocks < 512 ? 4 : 8;
     }
 
     void add(const BodyTable& b, Real stretch_floor) {
@@ -94,10 +96,6 @@ struct Scene {
         muscles |= bodies.back().muscle && call.field;
         varying |= bodies.back().varying;
     }
-
-    // The number of groups of blocks that are summed separately depends only on the particles of one simulation, so the
-    // result does not depend on threads or on the other simulations of the batch.
-    int choose_parts() const { return blocks < 16 ? 1 : blocks < 128 ? 2 : blocks < 512 ? 4 : 8; }
 
     int part_begin(int part) const { return int(int64_t(blocks) * part / parts); }
     const Body& body(int block) const { return bodies[body_of_block[block]]; }

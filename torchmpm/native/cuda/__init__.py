@@ -7,11 +7,7 @@ adjoint ``material_adjoint``, ``adjoint``. They compute the formulas of the C++ 
 A substep takes two launches: one over the particles, which reads velocities from the nodes, moves and deforms the
 particles, and adds mass and momentum to the nodes for the next substep; one over the nodes that are in use. Additions
 are atomic, in no fixed order: results differ from call to call in their last bits.
-
-Only this package imports Triton.
 """
-
-from __future__ import annotations
 
 from typing import Any
 
@@ -50,17 +46,12 @@ def _run(kind: type[Program], inputs: Inputs, handle: int, substeps: int, *wants
         return kind(own, tables, substeps, *wants)
 
     if planes.device.type != "cuda":
-        return _launched(build(inputs))
+        return build(inputs).run()
     with torch.cuda.device(planes.device):
         if torch.cuda.is_current_stream_capturing():
-            return _launched(build(inputs))
+            return build(inputs).run()
         shapes = (planes.shape, inputs.field is None, inputs.values.shape, planes.dtype, planes.device)
         # Two streams may run at once, so each has buffers of its own.
         stream = torch.cuda.current_stream().cuda_stream
         most = KEPT_SHARE * torch.cuda.get_device_properties(planes.device).total_memory
         return cache.run((kind, handle, substeps, wants, shapes, stream), build, inputs, most)
-
-
-def _launched(program: Program) -> tuple[Tensor, ...]:
-    program.run()
-    return program.results

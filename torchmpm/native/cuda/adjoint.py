@@ -5,9 +5,9 @@ import triton.language as tl
 
 from torchmpm.native.cuda.grid import ADJOINT
 from torchmpm.native.cuda.linalg import matmul
-from torchmpm.native.cuda.material import DT, INVERSE_H, H, read_values
+from torchmpm.native.cuda.material import DT, INVERSE_H, H, deform, read_values
 from torchmpm.native.cuda.material_adjoint import material_adjoint
-from torchmpm.native.cuda.step import deform, load_matrix, own_particles, store_matrix, values_at
+from torchmpm.native.cuda.step import load_matrix, own_particles, store_matrix, values_at
 from torchmpm.native.cuda.transfer import (
     SIZES,
     actuation_at,
@@ -89,10 +89,7 @@ def begin_adjoint(
     on, i, j, fx, fy = locate(x, y, origin + 2 * element, valid, constants, resolution)
     node = i * width + j
     sums += ADJOINT * element * width * width
-    act_x, act_y = tl.zeros_like(x), tl.zeros_like(x)
-    if MUSCLE:
-        plane = 2 * resolution * resolution * element
-        act_x, act_y = actuation_at(field + plane, i, j, fx, fy, on, resolution)
+    act_x, act_y = actuation_at(field, element, i, j, fx, fy, on, resolution, MUSCLE)
     _, _, _, _, _, xx, xy, yy = deform(
         dt, c0, c1, c2, c3, f0, f1, f2, f3, Jp, factor, mu2, lam, s0, s1, s2, s3, act_x, act_y, constants, bounds,
         KIND,
@@ -134,18 +131,6 @@ def add_values(to, stride, mass, factor, mu2, lam, s0, s1, s2, s3, mask):
     add(to + 7 * stride, s3, mask)
 
 
-@triton.jit
-def store_bars(bars, stride, x, y, vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, Jp, mask):
-    """Store derivatives in the state of particles."""
-    tl.store(bars, x, mask)
-    tl.store(bars + stride, y, mask)
-    tl.store(bars + 2 * stride, vx, mask)
-    tl.store(bars + 3 * stride, vy, mask)
-    store_matrix(bars + 4 * stride, stride, c0, c1, c2, c3, mask)
-    store_matrix(bars + 8 * stride, stride, f0, f1, f2, f3, mask)
-    tl.store(bars + 12 * stride, Jp, mask)
-
-
 @triton.jit(do_not_specialize=SIZES)
 def finish_adjoint(
     state, bars, values_bar, field_bar, origin_bar, answers, field, origin, values, constants, bounds,
@@ -166,11 +151,9 @@ def finish_adjoint(
     on, i, j, fx, fy = locate(x, y, origin + 2 * element, valid, constants, resolution)
     node = i * width + j
     answers += ADJOINT * element * width * width
+    act_x, act_y = actuation_at(field, element, i, j, fx, fy, on, resolution, MUSCLE)
     field += 2 * resolution * resolution * element
     field_bar += 2 * resolution * resolution * element
-    act_x, act_y = tl.zeros_like(x), tl.zeros_like(x)
-    if MUSCLE:
-        act_x, act_y = actuation_at(field, i, j, fx, fy, on, resolution)
     # Derivatives in the momentum (m v) and the affine momentum.
     px_bar, py_bar, pxx_bar, pxy_bar, pyx_bar, pyy_bar = gather(answers + 2, node, width, fx, fy, on, ADJOINT)
     pxx_bar, pxy_bar, pyx_bar, pyy_bar = h * pxx_bar, h * pxy_bar, h * pyx_bar, h * pyy_bar
@@ -197,10 +180,11 @@ def finish_adjoint(
     fx_bar, fy_bar = tl.where(on, fx_bar * inverse_h, 0.0), tl.where(on, fy_bar * inverse_h, 0.0)
     tl.atomic_add(origin_bar + 2 * element, -tl.sum(fx_bar, axis=0), sem="relaxed")
     tl.atomic_add(origin_bar + 2 * element + 1, -tl.sum(fy_bar, axis=0), sem="relaxed")
-    store_bars(
-        bars + at, stride, x_bar + fx_bar, y_bar + fy_bar, mass * px_bar, mass * py_bar,
-        d0, d1, d2, d3, e0_bar, e1_bar, e2_bar, e3_bar, new_Jp_bar, on,
-    )  # fmt: skip
+    bars += at
+    store_matrix(bars, stride, x_bar + fx_bar, y_bar + fy_bar, mass * px_bar, mass * py_bar, on)
+    store_matrix(bars + 4 * stride, stride, d0, d1, d2, d3, on)
+    store_matrix(bars + 8 * stride, stride, e0_bar, e1_bar, e2_bar, e3_bar, on)
+    tl.store(bars + 12 * stride, new_Jp_bar, on)
     if MUSCLE and WANT_FIELD:
         scatter_actuation(field_bar, i, j, fx, fy, act_x_bar, act_y_bar, on, resolution)
     if WANT_VALUES:

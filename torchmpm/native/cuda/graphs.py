@@ -1,7 +1,5 @@
 """Keeps what was launched once as CUDA graphs, so that later calls of the same shapes launch everything at once."""
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable

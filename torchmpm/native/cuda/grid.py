@@ -39,17 +39,15 @@ def rule_codes(codes, rules, shift, rule_count, width, cells, programs, BLOCK: t
 
 
 @triton.jit
-def read_rule(rules, code, SLOT: tl.constexpr):
-    """Axis, sign and friction of the rule of nodes in a slot, and where there is one."""
+def read_rule(rules, code, vx, vy, SLOT: tl.constexpr):
+    """The rule of nodes in a slot: whether along y, friction, normal and tangential velocity, and where it acts."""
     index = (code >> (8 * SLOT)) & 255
     some = index > 0
     rule = rules + RULE * (index - 1)
-    return (
-        tl.load(rule, some, other=0.0) > 0,
-        tl.load(rule + 1, some, other=0.0),
-        tl.load(rule + 6, some, other=0.0),
-        some,
-    )
+    on_y = tl.load(rule, some, other=0.0) > 0
+    sign, friction = tl.load(rule + 1, some, other=0.0), tl.load(rule + 6, some, other=0.0)
+    normal, tangent = tl.where(on_y, vy, vx), tl.where(on_y, vx, vy)
+    return on_y, friction.to(vx.dtype), normal, tangent, some & (normal * sign.to(vx.dtype) > 0)
 
 
 @triton.jit
@@ -61,10 +59,7 @@ def rubbed(tangent, normal, friction):
 @triton.jit
 def constrain(rules, code, vx, vy, SLOT: tl.constexpr):
     """Velocity of nodes under the rule of one slot."""
-    on_y, sign, friction, some = read_rule(rules, code, SLOT)
-    sign, friction = sign.to(vx.dtype), friction.to(vx.dtype)
-    normal, tangent = tl.where(on_y, vy, vx), tl.where(on_y, vx, vy)
-    hit = some & (normal * sign > 0)
+    on_y, friction, normal, tangent, hit = read_rule(rules, code, vx, vy, SLOT)
     left = rubbed(tangent, normal, friction)
     slowed = tl.where(left < 0, 0.0, tl.where(tangent < 0, -left, left))
     tangent = tl.where(hit & (friction != 0), slowed, tangent)
@@ -75,11 +70,8 @@ def constrain(rules, code, vx, vy, SLOT: tl.constexpr):
 @triton.jit
 def constrain_adjoint(rules, code, vx, vy, bar_x, bar_y, SLOT: tl.constexpr):
     """From derivatives in the velocity that a rule left to those in the one before it, (vx, vy)."""
-    on_y, sign, friction, some = read_rule(rules, code, SLOT)
-    sign, friction = sign.to(vx.dtype), friction.to(vx.dtype)
-    normal, tangent = tl.where(on_y, vy, vx), tl.where(on_y, vx, vy)
+    on_y, friction, normal, tangent, hit = read_rule(rules, code, vx, vy, SLOT)
     normal_bar, tangent_bar = tl.where(on_y, bar_y, bar_x), tl.where(on_y, bar_x, bar_y)
-    hit = some & (normal * sign > 0)
     rubs = hit & (friction != 0)
     slides = rubbed(tangent, normal, friction) > 0
     drag = tl.where((tangent > 0) == (normal > 0), -friction, friction) * tangent_bar

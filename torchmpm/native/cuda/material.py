@@ -7,7 +7,7 @@ A particle's values are the eight numbers of :func:`torchmpm.native.tables.make_
 import triton
 import triton.language as tl
 
-from torchmpm.native.cuda.linalg import at_least, clamp, direction, join, split
+from torchmpm.native.cuda.linalg import at_least, clamp, direction, join, matmul, split
 
 #: Places in ``tables.KINDS``.
 VON_MISES = tl.constexpr(1)
@@ -121,3 +121,17 @@ def stress(a, b, c, d, r0, r1, r2, r3, mu2, lam, act_x, act_y, KIND: tl.constexp
     xy = mu2 * (e * c + f * d) + act_x * a * c + act_y * b * d
     yy = mu2 * (g * c + h * d) + pressure + act_x * c * c + act_y * d * d
     return xx, xy, yy
+
+
+@triton.jit
+def deform(
+    dt, c0, c1, c2, c3, f0, f1, f2, f3, Jp, factor, mu2, lam, s0, s1, s2, s3, act_x, act_y, constants, bounds,
+    KIND: tl.constexpr,
+):  # fmt: skip
+    """Deformation gradient and Jp after a substep, and ``-dt V 4/h^2 tau``."""
+    t0, t1, t2, t3 = matmul(1.0 + dt * c0, dt * c1, dt * c2, 1.0 + dt * c3, f0, f1, f2, f3)
+    a, b, c, d, after = return_map(t0, t1, t2, t3, Jp, s0, s1, s2, s3, constants, bounds, KIND)
+    r0, r1, r2, r3 = orthogonal(t0, t1, t2, t3)
+    hard = hardening_factor(Jp, s2, bounds, KIND)
+    xx, xy, yy = stress(a, b, c, d, r0, r1, r2, r3, hard * mu2, hard * lam, act_x, act_y, KIND)
+    return a, b, c, d, after, factor * xx, factor * xy, factor * yy

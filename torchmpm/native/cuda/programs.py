@@ -1,19 +1,18 @@
 """The sequences of kernels behind the operators of torch: a step, and its adjoint."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchmpm.grid import PAD
 from torchmpm.native.cuda.adjoint import begin_adjoint, finish_adjoint
 from torchmpm.native.cuda.grid import ADJOINT, SUMS, node_adjoint, node_velocities, rule_codes
 from torchmpm.native.cuda.step import particles_pass
 from torchmpm.native.cuda.tables import DeviceTables
 from torchmpm.native.cuda.transfer import NOWHERE
-from torchmpm.native.tables import VALUES, Inputs
+from torchmpm.native.tables import Inputs
 
 #: Particles, or nodes, of a program: one per thread.
 BLOCK = 128
@@ -36,7 +35,7 @@ class Program:
     results: tuple[Tensor, ...]  # buffers with what the last run has found
 
     def __init__(self, inputs: Inputs, tables: DeviceTables, substeps: int, numbers: int) -> None:
-        planes, self.width = inputs.planes, tables.width
+        planes, self.width = inputs.planes, tables.tables.resolution + 2 * PAD
         self.inputs, self.device_tables, self.tables, self.substeps = inputs, tables, tables.tables, substeps
         self.batch, self.particles, self.cells = *planes.shape[1:], self.width**2
         self.sums = planes.new_zeros(self.batch * self.cells * numbers)
@@ -44,8 +43,8 @@ class Program:
         nodes = self.batch * self.cells if tables.slots else 1
         self.codes = torch.empty(nodes, dtype=torch.int32, device=planes.device)
 
-    def run(self) -> None:
-        """Launch everything; allocates nothing."""
+    def run(self) -> tuple[Tensor, ...]:
+        """Launch everything, and return the results; allocates nothing."""
         raise NotImplementedError
 
     def prepare(self) -> None:
@@ -101,11 +100,12 @@ class Forward(Program):
         self.velocity = inputs.planes.new_empty(self.batch * self.cells * 2)
         self.results = (self.state,)
 
-    def run(self) -> None:
+    def run(self) -> tuple[Tensor, ...]:
         """Take all substeps."""
         self.state.copy_(self.inputs.planes)
         self.prepare()
         self.advance([self.state] * (self.substeps + 1), self.velocity, TAPE=False)
+        return self.results
 
 
 class Backward(Program):
@@ -118,17 +118,14 @@ class Backward(Program):
         self, inputs: Inputs, tables: DeviceTables, substeps: int, wants_field: bool, wants_values: bool
     ) -> None:
         super().__init__(inputs, tables, substeps, ADJOINT.value)
-        planes, nothing = inputs.planes, inputs.planes.new_empty(0)
+        planes = inputs.planes
         length = -(-planes.numel() // 4) * 4  # whole fours, see tables
         self.tape = planes.new_empty(substeps, length)[:, : planes.numel()].unflatten(1, planes.shape)
         self.answers = planes.new_empty(self.batch * self.cells * ADJOINT.value)
-        self.bars, self.origin_bar = torch.empty_like(planes), torch.empty_like(inputs.origin)
-        self.gravity_bar = torch.empty_like(inputs.gravity)
-        self.field_bar = nothing if inputs.field is None or not wants_field else torch.empty_like(inputs.field)
-        self.values_bar = planes.new_empty(VALUES, *planes.shape[1:]) if wants_values else nothing.clone()
-        self.results = (self.bars, self.field_bar, self.origin_bar, self.gravity_bar, self.values_bar)
+        self.results = inputs.empty_bars(wants_field, wants_values)
+        self.bars, self.field_bar, self.origin_bar, self.gravity_bar, self.values_bar = self.results
 
-    def run(self) -> None:
+    def run(self) -> tuple[Tensor, ...]:
         """Take all substeps, then go back."""
         assert self.inputs.result_bar is not None
         self.prepare()
@@ -138,14 +135,10 @@ class Backward(Program):
         self.bars.copy_(self.inputs.result_bar)
         for bar in self.results[1:]:
             bar.zero_()
-        for s in range(self.substeps - 1, -1, -1):
-            self.go_back(s)
-
-    def go_back(self, substep: int) -> None:
-        """From derivatives in the state after a substep to those in the state before it."""
-        state, box = self.tape[substep], self.boxes[substep]
-        self.over_particles(begin_adjoint, state, self.bars, self.sums, box)
-        self.over_nodes(node_adjoint, self.sums, self.answers, box, bars=(self.gravity_bar,))
-        buffers = (state, self.bars, self.values_bar, self.field_bar, self.origin_bar, self.answers)
         wants = {"WANT_FIELD": self.field_bar.numel() > 0, "WANT_VALUES": self.values_bar.numel() > 0}
-        self.over_particles(finish_adjoint, *buffers, **wants)
+        buffers = (self.bars, self.values_bar, self.field_bar, self.origin_bar, self.answers)
+        for s in range(self.substeps - 1, -1, -1):
+            self.over_particles(begin_adjoint, self.tape[s], self.bars, self.sums, self.boxes[s])
+            self.over_nodes(node_adjoint, self.sums, self.answers, self.boxes[s], bars=(self.gravity_bar,))
+            self.over_particles(finish_adjoint, self.tape[s], *buffers, **wants)
+        return self.results

@@ -4,17 +4,7 @@ import triton
 import triton.language as tl
 
 from torchmpm.native.cuda.grid import SUMS
-from torchmpm.native.cuda.linalg import matmul
-from torchmpm.native.cuda.material import (
-    DT,
-    INVERSE_H,
-    H,
-    hardening_factor,
-    orthogonal,
-    read_values,
-    return_map,
-    stress,
-)
+from torchmpm.native.cuda.material import DT, INVERSE_H, H, deform, read_values
 from torchmpm.native.cuda.transfer import SIZES, actuation_at, gather, include, locate, scatter
 
 
@@ -52,20 +42,6 @@ def values_at(values, element, k, column, columns, values_batch, VARYING: tl.con
     else:
         at += tl.zeros_like(k)
     return at
-
-
-@triton.jit
-def deform(
-    dt, c0, c1, c2, c3, f0, f1, f2, f3, Jp, factor, mu2, lam, s0, s1, s2, s3, act_x, act_y, constants, bounds,
-    KIND: tl.constexpr,
-):  # fmt: skip
-    """Deformation gradient and Jp after a substep, and ``-dt V 4/h^2 tau``."""
-    t0, t1, t2, t3 = matmul(1.0 + dt * c0, dt * c1, dt * c2, 1.0 + dt * c3, f0, f1, f2, f3)
-    a, b, c, d, after = return_map(t0, t1, t2, t3, Jp, s0, s1, s2, s3, constants, bounds, KIND)
-    r0, r1, r2, r3 = orthogonal(t0, t1, t2, t3)
-    hard = hardening_factor(Jp, s2, bounds, KIND)
-    xx, xy, yy = stress(a, b, c, d, r0, r1, r2, r3, hard * mu2, hard * lam, act_x, act_y, KIND)
-    return a, b, c, d, after, factor * xx, factor * xy, factor * yy
 
 
 @triton.jit
@@ -120,10 +96,7 @@ def particles_pass(
         mass, factor, mu2, lam, s0, s1, s2, s3 = read_values(values, values_batch, columns, place, valid)
         f0, f1, f2, f3 = load_matrix(now + 8 * stride + at, stride, valid)
         Jp = tl.load(now + 12 * stride + at, valid, other=1.0)
-        act_x, act_y = tl.zeros_like(x), tl.zeros_like(x)
-        if MUSCLE:
-            plane = resolution * resolution
-            act_x, act_y = actuation_at(field + 2 * plane * element, i, j, fx, fy, on, resolution)
+        act_x, act_y = actuation_at(field, element, i, j, fx, fy, on, resolution, MUSCLE)
         e0, e1, e2, e3, grown, xx, xy, yy = deform(
             dt, c0, c1, c2, c3, f0, f1, f2, f3, Jp, factor, mu2, lam, s0, s1, s2, s3, act_x, act_y, constants,
             bounds, KIND,

@@ -1,14 +1,11 @@
 """The tables of :mod:`torchmpm.native.tables` on a CUDA device."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchmpm.grid import PAD
 from torchmpm.materials.snow import LARGEST_JP
 from torchmpm.native.tables import BodyTable, Tables, bodies_of, tables_of
 
@@ -24,11 +21,6 @@ class DeviceTables:
     #: the bounds of hardening and the shear cutoff, from :meth:`bounds_of`.
     constants: Tensor
     rules: Tensor  # (rules, 9) float64: the numbers of each rule
-
-    @property
-    def width(self) -> int:
-        """Nodes per axis with their padding."""
-        return int(self.tables.resolution) + 2 * PAD
 
     def bounds_of(self, body: int) -> Tensor:
         """The constants from the first one of a body."""

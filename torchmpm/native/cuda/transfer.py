@@ -111,15 +111,17 @@ def field_at(field, i, j, p: tl.constexpr, q: tl.constexpr, on, resolution):
 
 
 @triton.jit
-def actuation_at(field, i, j, fx, fy, on, resolution):
-    """Muscle actuation of particles from the field (2, G, G)."""
+def actuation_at(field, element, i, j, fx, fy, on, resolution, MUSCLE: tl.constexpr):
+    """Muscle actuation of particles from the field (B, 2, G, G); zero where they have no muscles."""
     ax, ay = tl.zeros_like(fx), tl.zeros_like(fx)
-    for p in tl.static_range(3):
-        for q in tl.static_range(3):
-            at, exists = field_at(field, i, j, p, q, on, resolution)
-            w = weight(fx, p) * weight(fy, q)
-            ax += w * tl.load(at, exists, other=0.0)
-            ay += w * tl.load(at + resolution * resolution, exists, other=0.0)
+    if MUSCLE:
+        field += 2 * resolution * resolution * element
+        for p in tl.static_range(3):
+            for q in tl.static_range(3):
+                at, exists = field_at(field, i, j, p, q, on, resolution)
+                w = weight(fx, p) * weight(fy, q)
+                ax += w * tl.load(at, exists, other=0.0)
+                ay += w * tl.load(at + resolution * resolution, exists, other=0.0)
     return ax, ay
 
 
