@@ -2,12 +2,10 @@
 
 import functools
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor
-from torch.autograd import forward_ad
 
 from torchmpm.native.cpu.library import find_compiler
 
@@ -23,11 +21,6 @@ def compiler_found() -> bool:
 def transforming() -> bool:
     """Whether a transform of ``torch.func`` is active."""
     return bool(torch._C._are_functorch_transforms_active())  # torch.func has no public query for this
-
-
-def has_tangents(tensors: Iterable[Tensor]) -> bool:
-    """Whether any of the tensors is a dual tensor of :mod:`torch.autograd.forward_ad`."""
-    return any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
 
 
 @functools.cache

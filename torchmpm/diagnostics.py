@@ -42,10 +42,8 @@ def elastic_energy(solver: Solver, state: ParticleState) -> Tensor:
     """Energy stored in deformation, (B,), J; muscles are not counted."""
     total = torch.zeros_like(state.Jp[:, 0])
     for body, part in slices(solver.bodies):
-        F = state.F[:, part]
-        planes = (F[..., 0, 0], F[..., 0, 1], F[..., 1, 0], F[..., 1, 1])
-        Jp = state.Jp[:, part]
-        total = total + (broadcast_plane(body.volume, Jp, "volume") * body.material.energy(planes, Jp)).sum(-1)
+        (a, b, c, d), Jp = state.F[:, part].flatten(-2).unbind(-1), state.Jp[:, part]
+        total = total + (broadcast_plane(body.volume, Jp, "volume") * body.material.energy((a, b, c, d), Jp)).sum(-1)
     return total
 
 

@@ -8,10 +8,11 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 from torch.nn.functional import pad
 
 from torchmpm import checks, stability
-from torchmpm.backends import BACKENDS, compiled, compiler_found, has_tangents, transforming, warn_eager
+from torchmpm.backends import BACKENDS, compiled, compiler_found, transforming, warn_eager
 from torchmpm.boundary import VelocityRule, faces
 from torchmpm.grid import PAD, Grid
 from torchmpm.materials.base import Value
@@ -197,7 +198,7 @@ class Solver:
         if self.backend == "eager":
             return False
         tensors = (state.x, state.v, state.C, state.F, state.Jp, *fields, *self.constants.values())
-        tangents = not transforming() and has_tangents(tensor for tensor in tensors if tensor is not None)
+        tangents = not transforming() and any(unpack_dual(t).tangent is not None for t in tensors if t is not None)
         if self.backend == "compile":
             if tangents:
                 raise ValueError("backend 'compile' loses the tangents of forward_ad; use 'eager', or torch.func.jvp")

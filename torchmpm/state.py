@@ -79,14 +79,8 @@ class ParticleState:
             raise ValueError(f"x must have shape (B, N, 2) or (N, 2), got {tuple(x.shape)}")
         x = x[None] if x.ndim == 2 else x
         batch, count = x.shape[:2]
-        identity = torch.eye(2, dtype=x.dtype, device=x.device)
-        return cls(
-            x=x,
-            v=torch.zeros_like(x),
-            C=x.new_zeros(batch, count, 2, 2),
-            F=identity.repeat(batch, count, 1, 1),
-            Jp=x.new_ones(batch, count),
-        )
+        C, F = x.new_zeros(batch, count, 2, 2), torch.eye(2, dtype=x.dtype, device=x.device).repeat(batch, count, 1, 1)
+        return cls(x=x, v=torch.zeros_like(x), C=C, F=F, Jp=x.new_ones(batch, count))
 
     @property
     def batch_size(self) -> int:

@@ -30,16 +30,13 @@ def register(cls: type[Tree]) -> type[Tree]:
     def flatten(instance: Tree) -> tuple[list[Any], None]:
         return [getattr(instance, name) for name in names], None
 
-    def flatten_with_keys(instance: Tree) -> tuple[list[tuple[Any, Any]], None]:
-        return [(pytree.GetAttrKey(name), getattr(instance, name)) for name in names], None
-
     def unflatten(children: Any, _: None) -> Tree:
         instance = object.__new__(cls)
         for name, child in zip(names, children, strict=True):
             object.__setattr__(instance, name, child)
         return instance
 
-    pytree.register_pytree_node(cls, flatten, unflatten, flatten_with_keys_fn=flatten_with_keys)
+    pytree.register_pytree_node(cls, flatten, unflatten)
     return cls
 
 

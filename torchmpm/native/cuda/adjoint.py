@@ -54,12 +54,6 @@ def position_adjoint(
 
 
 @triton.jit
-def add(to, value, mask):
-    """Add to numbers that belong to this program alone."""
-    tl.store(to, tl.load(to, mask, other=0.0) + value, mask)
-
-
-@triton.jit
 def read_particle(state, at, stride, valid):
     """The components of a state, or derivatives in them."""
     x, y = tl.load(state + at, valid, other=0.0), tl.load(state + stride + at, valid, other=0.0)
@@ -119,16 +113,10 @@ def scatter_actuation(field_bar, i, j, fx, fy, act_x_bar, act_y_bar, on, resolut
 
 
 @triton.jit
-def add_values(to, stride, mass, factor, mu2, lam, s0, s1, s2, s3, mask):
-    """Add derivatives in the eight values of particles."""
-    add(to, mass, mask)
-    add(to + stride, factor, mask)
-    add(to + 2 * stride, mu2, mask)
-    add(to + 3 * stride, lam, mask)
-    add(to + 4 * stride, s0, mask)
-    add(to + 5 * stride, s1, mask)
-    add(to + 6 * stride, s2, mask)
-    add(to + 7 * stride, s3, mask)
+def add_matrix(planes, stride, a, b, c, d, mask):
+    """Add to four planes, in numbers that belong to this program alone."""
+    e, f, g, h = load_matrix(planes, stride, mask)
+    store_matrix(planes, stride, e + a, f + b, g + c, h + d, mask)
 
 
 @triton.jit(do_not_specialize=SIZES)
@@ -189,4 +177,5 @@ def finish_adjoint(
         scatter_actuation(field_bar, i, j, fx, fy, act_x_bar, act_y_bar, on, resolution)
     if WANT_VALUES:
         mass_bar = vx * px_bar + vy * py_bar + pxx_bar * c0 + pxy_bar * c1 + pyx_bar * c2 + pyy_bar * c3 + masses
-        add_values(values_bar + at, stride, mass_bar, factor_bar, mu2_bar, lam_bar, s0_bar, s1_bar, s2_bar, s3_bar, on)
+        add_matrix(values_bar + at, stride, mass_bar, factor_bar, mu2_bar, lam_bar, on)
+        add_matrix(values_bar + 4 * stride + at, stride, s0_bar, s1_bar, s2_bar, s3_bar, on)
