@@ -18,13 +18,13 @@ import torch
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
+from tqdm import tqdm
 
 from cfp.agent.actor_policy import Memory
 from cfp.envs.disturbances import Disturbed
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.evaluation.cache import Episode, EpisodeCache
 from cfp.policy_protocols import DisturbablePolicy, SeesState
-from cfp.progress import progress_bar
 
 
 def attached(policy: PolicyPredictor, env: VecEnv) -> PolicyPredictor:
@@ -127,15 +127,14 @@ def play(trials: Sequence[Trial], steps: int | None = None) -> list[list[Episode
 
     Args:
         trials: What to play.
-        steps: Steps of an episode at most, to show a progress bar; None shows none.
+        steps: Steps of an episode at most, to show a progress bar on a terminal; None shows none.
     """
     known = {(trial, *span): trial.known(*span) for trial in trials for span in trial.spans()}
     missing = [key for key, episodes in known.items() if episodes is None]
     threads, stop = torch.get_num_threads(), Event()
     workers = min(threads, len(missing)) if all(trial.batch == 1 for trial in trials) else 1
-    bar = progress_bar(
-        total=(steps or 0) * sum(count for *_, count in missing), unit="step", disable=not (steps and missing)
-    )
+    total = (steps or 0) * sum(count for *_, count in missing)
+    bar = tqdm(total=total, unit="step", disable=None if total else True)  # None: only a terminal shows it
 
     def play_span(trial: Trial, first: int, count: int) -> list[Episode]:
         taken = 0

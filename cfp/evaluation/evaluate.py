@@ -80,7 +80,7 @@ def evaluate(trials: Sequence[Trial], steps: int | None = None) -> list[Result]:
 
     Args:
         trials: Episodes, all played side by side.
-        steps: Steps of an episode at most, to show a progress bar; None shows none.
+        steps: Steps of an episode at most, to show a progress bar on a terminal; None shows none.
     """
     results = []
     for trial, episodes in zip(trials, play(trials, steps), strict=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,6 @@ from cfp.experiment.checkpoint import Checkpoint
 from cfp.experiment.folder import policy_path
 from cfp.experiment.loggers import Tracker
 from cfp.experiment.process import Stopped, StopSignals
-from cfp.progress import progress_bar
 from cfp.tables import Table
 from cfp.weights import describe_run
 
@@ -109,11 +109,12 @@ class ProgressBarCallback(StageCallback):
         self.bar = tqdm(disable=True)
 
     def _on_training_start(self) -> None:
-        self.bar = progress_bar(
+        self.bar = tqdm(
             total=self.stage.config.ends()[-1],
             initial=self.stage.step,
             desc=f"stage {self.stage.number}",
             unit="step",
+            mininterval=0.1 if sys.stderr.isatty() else 15.0,  # a log file needs fewer lines than a terminal
         )
 
     def _on_step(self) -> bool:
