@@ -14,6 +14,7 @@ from cfp.weights import read_policy
 
 ALGORITHMS: dict[str, str] = {
     "cfp": "cfp.experiment.coarse_to_fine:CoarseToFine",
+    "analytic": "cfp.analytic.learner:AnalyticLearner",
     "coarse": "baselines.common.single_stage:Coarse",
     "fine": "baselines.common.single_stage:Fine",
     "gnn-16": "baselines.modular.train:GNN16",

@@ -10,7 +10,7 @@ PROGRAM = training.Program(
     "baselines",
     f"Train an algorithm (--algo {'|'.join(ALGORITHMS)}) on a DittoGym task; name it to see its options here.",
     configure,
-    find,
+    lambda config: find(config.algo),
     load,
 )
 

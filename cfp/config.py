@@ -19,6 +19,7 @@ from dittogym import make_spec
 from dittogym.tasks import allowed_instead, task_name
 
 Preset = Literal["quick", "paper"]
+Learner = Literal["analytic", "sac"]
 
 LARGEST_SEED = 2**31 - 1
 EVALUATION_SEED = 10_000
@@ -189,20 +190,35 @@ class StagedConfig(RunConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(StagedConfig):
-    """A run of the coarse-to-fine policy; `cfp.preset` supplies the values for a task."""
+class CoarseToFineConfig(StagedConfig):
+    """A run of the coarse-to-fine policy with either learner; `cfp.preset` supplies the values for a task."""
 
+    learner: Learner
+    """analytic: learns by exact gradients of the simulation; sac: from rewards alone, as in the paper."""
+    start_from: str | None = None
+    """Policy of the first stages (a run folder, policy.safetensors, or the name of one that comes with the package):
+    training begins with the stage after it."""
+    refine: bool = False
+    """Continue to train the last stage of start_from instead."""
+
+    def check(self) -> None:
+        """Check what the types do not express."""
+        super().check()
+        if self.refine and self.start_from is None:
+            raise ConfigError("refine requires start_from, which names the policy")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(CoarseToFineConfig):
+    """A run of the coarse-to-fine policy that learns from rewards alone, by soft actor-critic."""
+
+    learner: Learner = "sac"
     random_steps: tuple[int, ...]
     """Uniformly random environment steps at the start of each stage (none where a policy is refined)."""
     alpha: tuple[float, ...]
     """Entropy temperature of each stage."""
     gate_penalty: tuple[float, ...]
     """Weight of the gate penalty (one less than stages)."""
-    start_from: str | None = None
-    """Policy of the first stages (a run folder, policy.safetensors, or the name of one that comes with the package):
-    training begins with the stage after it."""
-    refine: bool = False
-    """Continue to train the last stage of start_from instead."""
     learning: LearningConfig = field(default_factory=LearningConfig)
 
     per_stage: ClassVar[tuple[str, ...]] = ("random_steps", "alpha")
@@ -230,8 +246,6 @@ class Config(StagedConfig):
             check_at_least(0, **{name: min(getattr(self, name), default=0)})
         if self.learning.warm_critic and self.start_from is not None:
             raise ConfigError("warm_critic must be False with start_from, got True (a policy file has no critics)")
-        if self.refine and self.start_from is None:
-            raise ConfigError("refine requires start_from, which names the policy")
 
 
 def check_training_layouts(name: str, count: int, before: int = 0) -> None:

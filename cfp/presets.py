@@ -11,7 +11,9 @@ from typing import Any, Literal
 
 import dittogym
 from cfp.agent.hyperparameters import LearningConfig
-from cfp.config import Config, Preset, check_task
+from cfp.analytic.config import AnalyticConfig
+from cfp.analytic.reward import RewardConfig
+from cfp.config import CoarseToFineConfig, Config, Learner, Preset, check_task
 from cfp.errors import ConfigError
 from cfp.from_dict import update_from_dict
 from cfp.sections import EnvironmentConfig, NetworkConfig, ReportConfig
@@ -47,34 +49,112 @@ TASKS: dict[str, TaskNumbers] = {
     "catch": TaskNumbers((0.1, 0.1), -1.0, 0.01, 380_000, 243_000, seed=2),
     "slot": TaskNumbers((0.05, 0.05), -2.0, 0.1, 600_000, 293_000, seed=1, variant="published"),
 }
+
+
+@dataclass(frozen=True)
+class AnalyticNumbers:
+    """How the learner ``analytic`` trains on a task; found by the experiments that the documentation reports.
+
+    Attributes:
+        steps: Environment steps of both stages.
+        handover: Step at which stage 2 begins.
+        action_step: Step on the actions in stages 1 and 2.
+        on_speed: Trained on speed to the right instead of the task's reward.
+        num_envs: Robots side by side.
+        windows_kept: Latest windows that the regression draws from.
+        minibatches: Steps of the regression after each window.
+        minibatch_size: Images in each.
+        weight_average: Decay of the average of the actor's weights.
+    """
+
+    steps: int = 25_600
+    handover: int = 19_200
+    action_step: tuple[float, float] = (0.1, 0.1)
+    on_speed: bool = False
+    num_envs: int = 8
+    windows_kept: int = 40
+    minibatches: int = 48
+    minibatch_size: int = 128
+    weight_average: float = 0.995
+
+
+ANALYTIC: dict[str, AnalyticNumbers] = {
+    "shapematch": AnalyticNumbers(4_800, 3_200, (0.3, 0.3), False, 4, 8, 24, 64, 0.98),
+    "run": AnalyticNumbers(on_speed=True),
+    "obstacle": AnalyticNumbers(on_speed=True),
+    "kick": AnalyticNumbers(action_step=(0.15, 0.15)),
+}
+"""Those of the tasks that differ from the defaults of `AnalyticNumbers`."""
+
 DEFAULT_TASK = "shapematch"
 """Task of a command line that names none."""
 CUSTOM_TASK = TASKS["run"]
 """Numbers of a custom task, for which nothing was published; its action grids are its own."""
 
 
-def preset(task: str, name: str = "quick") -> Config:
+def preset(task: str, name: Preset = "quick", learner: Learner | None = None) -> CoarseToFineConfig:
     """The defaults of a task.
 
     Args:
         task: One of `dittogym.TASKS`, or ``"MODULE:NAME"``. A custom task, for which nothing was published, gets the
             numbers of RUN with its own action grids, and has no preset ``"paper"``.
         name: ``"paper"``: one robot at full size, the published numbers, the reference's interpolation and faults.
-            ``"quick"``: sixteen robots with fewer particles, larger steps, minutes instead of days.
+            ``"quick"``: several robots with fewer particles, minutes instead of days.
+        learner: ``"analytic"`` or ``"sac"``; by default ``"sac"`` for ``"paper"``, which has no other, and
+            ``"analytic"`` for ``"quick"``.
 
     Raises:
-        ConfigError: There is no such task or preset.
+        ConfigError: There is no such task, preset or learner.
     """
+    if learner is None:
+        learner = "sac" if name == "paper" else "analytic"
+    if learner not in typing.get_args(Learner):
+        raise ConfigError(f"learner must be analytic or sac, got {learner!r}")
+    return sac_preset(task, name) if learner == "sac" else analytic_preset(task, name)
+
+
+def sac_preset(task: str, name: str = "quick") -> Config:
+    """The defaults of the learner ``sac``, see `preset`."""
     check_task(task)
     allowed = typing.get_args(Preset) if task in TASKS else ("quick",)
     if name not in allowed:
         raise ConfigError(f"preset must be {' or '.join(allowed)} for {task}, got {name!r}")
-    if task in TASKS:
-        numbers = TASKS[task]
-    else:
-        spec = dittogym.make_spec(task)
-        numbers = replace(CUSTOM_TASK, resolutions=(spec.coarse, spec.fine))
+    numbers = _numbers(task)
     return _paper(task, numbers) if name == "paper" else _quick(task, numbers)
+
+
+def analytic_preset(task: str, name: str = "quick") -> AnalyticConfig:
+    """The defaults of the learner ``analytic``, see `preset`."""
+    check_task(task)
+    if name != "quick":
+        raise ConfigError(f"preset must be quick for learner analytic, got {name!r}")
+    published, own = _quick(task, _numbers(task)), ANALYTIC.get(task, AnalyticNumbers())
+    return AnalyticConfig(
+        task=task,
+        steps=own.steps,
+        handover=(own.handover,),
+        resolutions=published.resolutions,
+        gate_bias=published.gate_bias,
+        action_step=own.action_step,
+        windows_kept=own.windows_kept,
+        minibatches=own.minibatches,
+        minibatch_size=own.minibatch_size,
+        weight_average=own.weight_average,
+        displacement=not own.on_speed,
+        reward=RewardConfig("speed" if own.on_speed else "task"),
+        environment=EnvironmentConfig(num_envs=own.num_envs),
+        network=published.network,
+        report=replace(published.report, eval_every=own.steps // 12, checkpoint_every=own.steps // 12, log_every=320),
+    )
+
+
+def _numbers(task: str) -> TaskNumbers:
+    return TASKS[task] if task in TASKS else _custom_numbers(task)
+
+
+def _custom_numbers(task: str) -> TaskNumbers:
+    spec = dittogym.make_spec(task)
+    return replace(CUSTOM_TASK, resolutions=(spec.coarse, spec.fine))
 
 
 def _paper(task: str, numbers: TaskNumbers) -> Config:
@@ -115,10 +195,10 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
     )
 
 
-def from_json(values: dict[str, Any]) -> Config:
+def from_json(values: dict[str, Any]) -> CoarseToFineConfig:
     """A configuration from JSON values; those that are left out come from the preset that the values name."""
     if (algo := values.get("algo", "cfp")) != "cfp":
         programs = "python -m baselines.train, baselines.evaluate and baselines.robustness run other algorithms"
         raise ConfigError(f"algo must be 'cfp', got {algo!r}; {programs}")
-    base = preset(values.get("task", DEFAULT_TASK), values.get("preset", "quick"))
+    base = preset(values.get("task", DEFAULT_TASK), values.get("preset", "quick"), values.get("learner"))
     return update_from_dict(base, values)

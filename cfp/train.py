@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+from cfp.analytic.config import AnalyticConfig
+from cfp.analytic.learner import AnalyticLearner
 from cfp.experiment import training
 from cfp.experiment.coarse_to_fine import CoarseToFine
 from cfp.presets import from_json
@@ -14,7 +16,7 @@ PROGRAM = training.Program(
     "cfp",
     "Train the coarse-to-fine policy on a DittoGym task, one stage after the other.",
     from_json,
-    lambda _: CoarseToFine,
+    lambda config: AnalyticLearner if isinstance(config, AnalyticConfig) else CoarseToFine,
     load,
 )
 

@@ -11,8 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cfp.agent.actor_policy import ActorPolicy
-from cfp.agent.spec import ActorSpec
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
 
@@ -94,13 +92,6 @@ class StateBasedPolicy(ABC):
         self, env: TorchEnv, state: tuple[np.ndarray, ...] | None, deterministic: bool
     ) -> tuple[Tensor, tuple[np.ndarray, ...] | None]:
         """Actions (B, 2, R, R) for the state of an environment, and the memory for the next step."""
-
-
-def image_policy(spec: ActorSpec, actor: nn.Module, deterministic: bool) -> ActorPolicy:
-    """Policy of the image with a copy of an actor's weights, on the actor's device."""
-    policy = ActorPolicy(spec, deterministic)
-    policy.actor.load_state_dict(actor.state_dict())
-    return policy.to(next(actor.parameters()).device)
 
 
 def load_network(build: Callable[[], Network], tensors: Mapping[str, Tensor], device: str) -> Network:

@@ -7,11 +7,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import cfp
 from baselines.common.grid import GridConfig
 from baselines.common.open_loop import OpenLoop
 from cfp.evaluation.untrained import UntrainedPolicy
 from cfp.policy_protocols import Policy
+from cfp.presets import sac_preset
 from cfp.sections import ReportConfig
 from dittogym import make_spec
 from dittogym.action import ActionIndexing, from_grid_indexing
@@ -32,7 +32,7 @@ class ReferenceConfig(GridConfig):
 
 def reference_preset(algo: str, task: str, name: str) -> ReferenceConfig:
     """Default options: ``quick`` evaluates with few particles, ``paper`` in the paper's environment."""
-    base = cfp.preset(task, name)
+    base = sac_preset(task, name)
     return ReferenceConfig(
         algo=algo,
         task=task,

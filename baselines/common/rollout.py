@@ -87,11 +87,6 @@ class _Step(NamedTuple):
     ended: Tensor
 
 
-def split_cost(split: Tensor, limit: float, margin: float, weight: float) -> Tensor:
-    """Cost (B,) of robots' spread (B,), m, beyond a fraction ``margin`` of the ``limit`` at which they are torn."""
-    return weight * (split / limit - margin).clamp_min(0.0).square()
-
-
 def repeat(state: EnvState, copies: int) -> EnvState:
     """The first simulation of a state, ``copies`` times."""
     return tree.map(lambda t: t[:1].expand(copies, *t.shape[1:]), state)

@@ -3,10 +3,10 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-import cfp
 from cfp.config import Config
 from cfp.errors import ConfigError
 from cfp.experiment.coarse_to_fine import CoarseToFine
+from cfp.presets import sac_preset
 from dittogym.tasks import task_name
 
 
@@ -36,7 +36,7 @@ class Coarse(CoarseToFine):
     @classmethod
     def preset(cls, task: str, name: str) -> SingleStageConfig:
         """The first stage of `cfp.preset`, for all its steps, on the task's coarse or fine action grid."""
-        base = cfp.preset(task, name)
+        base = sac_preset(task, name)
         single = replace(
             base,
             algo=cls.algo,

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from baselines.common.episodes import Episodes
-from baselines.common.stateful import Stateful
 from baselines.distillation.teachers import Teacher, project
+from cfp.analytic.episodes import Episodes
+from cfp.analytic.stateful import Stateful
 from cfp.envs import disturbances
 from dittogym import TorchEnv
 from dittogym import core as dynamics

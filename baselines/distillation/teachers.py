@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from baselines.common.open_loop import OpenLoop
-from baselines.common.stateful import Stateful
 from baselines.distillation.config import DistillConfig
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.registry import configure, find, load
+from cfp.analytic.stateful import Stateful
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.folder import copy_policy, policy_path
 from cfp.experiment.process import StopSignals

@@ -14,26 +14,24 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-import cfp
-from baselines.common.episodes import Episodes
 from baselines.common.grid import grid_size
-from baselines.common.policies import image_policy
-from baselines.common.schedules import linear_decay, stage_progress
-from baselines.common.stateful import Stateful
 from baselines.distillation import teachers
 from baselines.distillation.config import DistillConfig
 from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entries
 from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
 from baselines.planning.gradient import GradientPlannerConfig
-from baselines.shac.networks import fix_std
 from cfp.agent.actor import build_actor
-from cfp.agent.actor_policy import ActorPolicy
+from cfp.agent.actor_policy import ActorPolicy, image_policy
+from cfp.analytic.episodes import Episodes
+from cfp.analytic.stateful import Stateful
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device, make_torch_env
 from cfp.errors import NonFiniteError
 from cfp.experiment.algorithm import Algorithm, Position, Scalars, Sees
 from cfp.experiment.folder import policy_path
 from cfp.experiment.process import StopSignals
+from cfp.experiment.schedules import linear_decay, stage_progress
+from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
 from cfp.weights import KIND, load, save_policy
 from dittogym import make_spec
@@ -77,7 +75,7 @@ class Distill(Stateful, Algorithm):
         self.spec = config.actor_spec(stage)
         with self._seeded():
             self.actor = build_actor(self.spec)
-        fix_std(self.actor)
+        self.actor.fix_std()
         if start is not None:
             self.actor.get_submodule("coarse").load_state_dict(start.actor.state_dict())
         self.actor.to(self.env.device)
@@ -181,7 +179,7 @@ class Distill(Stateful, Algorithm):
         Both presets teach at the lite tier; ``quick`` is evaluated there, ``paper`` in the paper's environment. SHAPE
         MATCH, whose episodes are alike and whose actions are fine, gets fewer labels and more, smaller updates.
         """
-        base, shape_match = cfp.preset(task, name), task == "shapematch"
+        base, shape_match = sac_preset(task, name), task == "shapematch"
         steps = 24_000 if shape_match else 48_000
         config = DistillConfig(
             task=task,

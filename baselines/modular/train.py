@@ -8,7 +8,6 @@ from typing import Any, ClassVar, cast, get_args
 
 from stable_baselines3.common.vec_env import VecMonitor
 
-import cfp
 from baselines.common.policies import StateBasedPolicy
 from baselines.modular.env import SegmentedEnv
 from baselines.modular.networks import Kind, ModularActor, ModularCritics, SegmentPolicy
@@ -21,6 +20,7 @@ from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Sees
 from cfp.experiment.coarse_to_fine import SACAlgorithm
+from cfp.presets import sac_preset
 from cfp.validation import check_at_least
 from dittogym import make_spec
 
@@ -115,7 +115,7 @@ class Modular(SACAlgorithm):
     @classmethod
     def preset(cls, task: str, name: str) -> ModularConfig:
         """The environment, learning and temperature of the first stage of `cfp.preset`, for all its steps."""
-        base = cfp.preset(task, name)
+        base = sac_preset(task, name)
         return ModularConfig(
             algo=cls.algo,
             task=task,

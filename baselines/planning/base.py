@@ -9,8 +9,9 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
-from baselines.common.rollout import StepFunction, rollout, soft_step, split_cost
-from baselines.common.stateful import Stateful
+from baselines.common.rollout import StepFunction, rollout, soft_step
+from cfp.analytic.reward import split_cost
+from cfp.analytic.stateful import Stateful
 from cfp.errors import ConfigError
 from cfp.validation import check_at_least
 from dittogym import TorchEnv

@@ -6,7 +6,6 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-import cfp
 from baselines.common.grid import GridConfig
 from baselines.common.open_loop import OpenLoop, OpenLoopAlgorithm
 from baselines.planning.base import Planner, PlannerConfig
@@ -16,6 +15,7 @@ from baselines.planning.surrogate import Surrogate
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Scalars, Sees
+from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig, Particles, ReportConfig
 from dittogym import make_spec
 
@@ -77,7 +77,7 @@ class CEMConfig(PlannedConfig):
 def episode_preset(task: str, name: str) -> dict[str, Any]:
     """Options of `PlannedConfig` for a task; SHAPE MATCH, whose reward is all detail, gets an action grid of 16."""
     quick = name == "quick"
-    environment = cfp.preset(task, name).environment
+    environment = sac_preset(task, name).environment
     horizon = make_spec(task).horizon
     return {
         "task": task,

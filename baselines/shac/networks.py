@@ -11,30 +11,14 @@ import torch
 from torch import Tensor, nn
 
 from baselines.common.policies import StateBasedPolicy, load_network
-from baselines.shac.features import StateFeatures
 from cfp.agent.actor import Actor
 from cfp.agent.networks import LATENT, Encoder, initialise
 from cfp.agent.spec import ActorSpec
+from cfp.analytic.critic import mlp
+from cfp.analytic.features import StateFeatures
 from cfp.weights import read_policy, report_mismatch, write_policy
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
-
-WIDTH = 128
-"""Width of the hidden layers."""
-STD_BIAS = -0.4
-"""Bias of an image actor's standard deviation: 0.105 before tanh, near the smallest that the network allows."""
-
-
-def mlp(inputs: int, outputs: int) -> nn.Sequential:
-    """Two hidden layers of 128 units with layer normalisation and ELU; the last layer starts with small weights."""
-    layers: list[nn.Module] = []
-    for size in (inputs, WIDTH):
-        layers += [nn.Linear(size, WIDTH), nn.LayerNorm(WIDTH), nn.ELU()]
-    last = nn.Linear(WIDTH, outputs)
-    with torch.no_grad():
-        last.weight.mul_(0.1)
-        last.bias.zero_()
-    return nn.Sequential(*layers, last)
 
 
 class StateActor(nn.Module):
@@ -51,15 +35,6 @@ class StateActor(nn.Module):
         return output.unflatten(1, (2, self.resolution, self.resolution))
 
 
-def fix_std(actor: Actor) -> None:
-    """Fix the standard deviation of an actor of the coarse-to-fine policy at 0.105 before tanh."""
-    layers = [layer for layer in actor.std.modules() if isinstance(layer, nn.Linear | nn.ConvTranspose2d)]
-    nn.init.zeros_(layers[-1].weight)
-    assert layers[-1].bias is not None
-    nn.init.constant_(layers[-1].bias, STD_BIAS)
-    actor.std.requires_grad_(False)
-
-
 class ImageActor(nn.Module):
     """The coarsest actor of the coarse-to-fine policy; its mean is trained and its standard deviation fixed."""
 
@@ -67,7 +42,7 @@ class ImageActor(nn.Module):
         super().__init__()
         self.spec = ActorSpec((resolution,))
         self.actor = Actor(resolution)
-        fix_std(self.actor)
+        self.actor.fix_std()
 
     def forward(self, image: Tensor) -> Tensor:
         """Mean before tanh, (B, 2, R, R), of images (B, 3, 64, 64) in [-1, 1]."""

@@ -8,28 +8,27 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-import cfp
-from baselines.common.episodes import Episodes
 from baselines.common.grid import GridConfig
-from baselines.common.policies import StateBasedPolicy, image_policy
-from baselines.common.schedules import linear_decay, stage_progress
-from baselines.common.stateful import Stateful
-from baselines.shac.features import StateFeatures
-from baselines.shac.networks import ImageActor, StateActor, StatePolicy, fix_std, image_critic, state_critic
-from baselines.shac.reward import RewardConfig
-from baselines.shac.rollout import Rollout, Window
-from cfp.agent.actor_policy import ActorPolicy
+from baselines.common.policies import StateBasedPolicy
+from baselines.shac.networks import ImageActor, StateActor, StatePolicy, image_critic, state_critic
+from cfp.agent.actor_policy import ActorPolicy, image_policy
+from cfp.analytic.critic import BETAS, Critic
+from cfp.analytic.episodes import Episodes
+from cfp.analytic.features import StateFeatures
+from cfp.analytic.reward import RewardConfig
+from cfp.analytic.stateful import Stateful
+from cfp.analytic.window import Window, WindowCollector, short_horizon_loss
 from cfp.config import RunConfig, check_training_layouts
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.algorithm import Algorithm, Scalars, Sees
+from cfp.experiment.schedules import linear_decay, stage_progress
 from cfp.policy_protocols import Policy
+from cfp.presets import sac_preset
 from cfp.sections import Particles, ReportConfig
 from cfp.validation import check_at_least, check_fraction, check_positive
 from cfp.weights import KIND, load, policy_for, read_policy, save_policy
 
-BETAS = (0.7, 0.95)
-"""Of Adam."""
 PATIENCE = 10
 """Updates in a row without a finite gradient after which training gives up."""
 
@@ -127,8 +126,8 @@ class Shac(Stateful, Algorithm):
     """
 
     sees: ClassVar[Sees] = "state"
-    parts = ("actor", "critic", "target", "actor_adam", "critic_adam", "rollout")
-    values = ("skipped", "skipped_in_a_row")
+    parts = ("actor", "actor_adam", "critic", "collector")
+    values = ("generator", "skipped", "skipped_in_a_row")
 
     def __init__(self, config: ShacConfig, stage: int = 1, start: Policy | None = None) -> None:
         self.config = config
@@ -137,19 +136,27 @@ class Shac(Stateful, Algorithm):
         self.features = StateFeatures(config.deformation, config.clock, config.displacement)
         with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             torch.manual_seed(config.seed)
-            self.actor, self.critic, self.target = self._make_networks()
+            self.actor, critic, target = self._make_networks()
         if start is not None:
             assert isinstance(self.actor, ImageActor) and isinstance(start, ActorPolicy)
             self.actor.actor.load_state_dict(start.actor.state_dict())
-            fix_std(self.actor.actor)
-        self.target.load_state_dict(self.critic.state_dict())
-        self.target.requires_grad_(False)
+            self.actor.actor.fix_std()
+        self.critic = Critic(
+            critic,
+            target,
+            gamma=config.gamma,
+            td_lambda=config.td_lambda,
+            learning_rate=config.learning_rate,
+            updates=config.critic_updates,
+            tau=config.tau,
+            max_grad_norm=config.max_grad_norm,
+        )
         trained = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
         self.actor_adam = torch.optim.Adam(trained, config.learning_rate, BETAS)
-        self.critic_adam = torch.optim.Adam(self.critic.parameters(), config.learning_rate, BETAS)
         self.skipped, self.skipped_in_a_row = 0, 0
+        self.generator = torch.Generator().manual_seed(config.seed)
         episodes = Episodes(self.env, config.seed, config.max_episode_steps, config.num_layouts)
-        self.rollout = Rollout(episodes, self.observe, config.reward, config.window, config.noise, config.seed)
+        self.collector = WindowCollector(episodes, self.observe, config.reward, config.window)
 
     def _make_networks(self) -> tuple[StateActor | ImageActor, nn.Module, nn.Module]:
         size, device = self.features.size(len(self.env.spec.bodies) - 1), self.env.device
@@ -164,25 +171,22 @@ class Shac(Stateful, Algorithm):
             return self.features(self.env).float()
         return self.env.soft_observation().float() * (2.0 / 255.0) - 1.0
 
-    def value(self, critic: nn.Module, observation: Tensor) -> Tensor:
-        """Values (B,) that a ``critic`` gives to an ``observation`` (B, ...)."""
-        value: Tensor = critic(observation)[..., 0] / max(1.0 - self.config.gamma, 1e-2)
-        return value
+    def act(self, observation: Tensor) -> Tensor:
+        """Actions (B, 2, R, R) with noise for an ``observation`` (B, ...), with the autograd graph of the actor."""
+        mean: Tensor = self.actor(observation)
+        noise = torch.randn(mean.shape, generator=self.generator).to(mean)
+        return (mean + self.config.noise * noise).tanh()
 
     def update(self) -> Scalars:
         """Learn from one more window; a `NonFiniteError` if actions, or ten gradients in a row, are not finite."""
         config = self.config
         learning_rate = config.learning_rate * linear_decay(stage_progress(config, 1, self.num_timesteps))
-        for adam in (self.actor_adam, self.critic_adam):
-            adam.param_groups[0]["lr"] = learning_rate
-        window = self.rollout.collect(self.actor, lambda observation: self.value(self.target, observation))
+        self.actor_adam.param_groups[0]["lr"] = learning_rate
+        window = self.collector.collect(self.act, self.critic)
         gradient_norm = self._update_actor(window)
-        critic_loss = self._update_critic(window)
-        with torch.no_grad():
-            for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
-                slow.lerp_(fast, config.tau)
+        critic_loss = self.critic.update(window, learning_rate)
         self.num_timesteps += config.window * self.env.num_envs
-        return self.rollout.episodes.scalars() | {
+        return self.collector.episodes.scalars() | {
             "train/reward": float(window.rewards.detach().mean()) / config.reward.scale,
             "train/true_reward": window.true_reward,
             "train/value": float(window.next_values.detach().mean()),
@@ -195,7 +199,7 @@ class Shac(Stateful, Algorithm):
     def _update_actor(self, window: Window) -> float | None:
         """Take one step of Adam; returns the gradient's norm, or None if it was not finite and no step was taken."""
         self.actor_adam.zero_grad()
-        actor_loss(window, self.config.gamma).backward()
+        short_horizon_loss(window, self.config.gamma).backward()
         self.env.detach()
         parameters = self.actor_adam.param_groups[0]["params"]
         norm = float(nn.utils.clip_grad_norm_(parameters, self.config.max_grad_norm))
@@ -212,21 +216,9 @@ class Shac(Stateful, Algorithm):
             )
         return None
 
-    def _update_critic(self, window: Window) -> float:
-        """Take some steps of Adam towards TD(lambda) targets; returns the last loss."""
-        targets = td_lambda_targets(window, self.config.gamma, self.config.td_lambda).flatten()
-        observations, loss = window.observations.flatten(0, 1), torch.zeros(())
-        for _ in range(self.config.critic_updates):
-            self.critic_adam.zero_grad()
-            loss = (self.value(self.critic, observations) - targets).square().mean()
-            loss.backward()
-            nn.utils.clip_grad_norm_(self.critic.parameters(), self.config.max_grad_norm)
-            self.critic_adam.step()
-        return float(loss.detach())
-
     def row(self) -> Scalars:
         """Scalars of the last update, with the mean return of the episodes that ended since the last row."""
-        self.rollout.episodes.recent_returns = []
+        self.collector.episodes.recent_returns = []
         return self.scalars
 
     @property
@@ -249,7 +241,7 @@ class Shac(Stateful, Algorithm):
         ``paper`` trains four times as long in smaller steps and is evaluated in the paper's environment. Both train at
         the lite tier. RUN and OBSTACLE are trained on speed, the others on their own smooth reward.
         """
-        base = cfp.preset(task, name)
+        base = sac_preset(task, name)
         quick, on_speed = name == "quick", task in ("run", "obstacle")
         return ShacConfig(
             task=task,
@@ -286,29 +278,3 @@ class Shac(Stateful, Algorithm):
     def load(cls, path: Path, device: str = "cpu") -> StatePolicy | ActorPolicy:
         """Load a policy of either kind."""
         return load(path, device) if read_policy(path)[1]["kind"] == KIND else StatePolicy.load(path, device)
-
-
-def actor_loss(window: Window, gamma: float) -> Tensor:
-    """Negative discounted rewards of a window and final values of its episodes, mean over simulations and steps.
-
-    Of an episode within the window, the sum of ``gamma^t r_t`` plus ``gamma^h V(s_h)`` (Xu et al., equation 5).
-    """
-    steps = len(window.rewards)
-    total, discount = torch.zeros_like(window.rewards[0]), torch.ones_like(window.rewards[0])
-    for step, (reward, value, done) in enumerate(zip(window.rewards, window.next_values, window.done, strict=True)):
-        total = total + discount * reward
-        total = total + torch.where(done | (step + 1 == steps), gamma * discount * value, 0.0)
-        discount = torch.where(done, 1.0, gamma * discount)
-    return -total.mean() / steps
-
-
-@torch.no_grad()
-def td_lambda_targets(window: Window, gamma: float, td_lambda: float) -> Tensor:
-    """TD(lambda) targets (T, B) of the values of a window's observations."""
-    targets = torch.empty_like(window.rewards)
-    target = window.next_values[-1]
-    for step in reversed(range(len(targets))):
-        value = window.next_values[step]
-        target = torch.where(window.done[step], value, (1.0 - td_lambda) * value + td_lambda * target)
-        target = targets[step] = window.rewards[step] + gamma * target
-    return targets

@@ -8,16 +8,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-import cfp
 from baselines.common.grid import Grid, GridConfig, grid_size
 from baselines.common.open_loop import OpenLoop, OpenLoopAlgorithm
-from baselines.common.schedules import cosine_decay, stage_progress
-from baselines.common.stateful import Stateful
 from baselines.trajectory.objective import Objective
+from cfp.analytic.stateful import Stateful
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.algorithm import Scalars, Sees
+from cfp.experiment.schedules import cosine_decay, stage_progress
+from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig, Particles, ReportConfig
 from cfp.validation import check_at_least, check_positive
 from dittogym import make_spec
@@ -235,7 +235,7 @@ class Gradient(Stateful, OpenLoopAlgorithm):
         Both are evaluated at full size. Tasks other than SHAPE MATCH get fewer iterations of gradients that reach back
         16 steps, on the coarse grid.
         """
-        environment = cfp.preset(task, name).environment
+        environment = sac_preset(task, name).environment
         quick, horizon = name == "quick", make_spec(task).horizon
         config = GradientConfig(
             task=task,

@@ -18,6 +18,38 @@ STD_BOUNDS = (0.1, 6.0)
 """Bounds of the standard deviation before tanh; the lower one keeps sampling stochastic."""
 
 
+STD_BIAS = -0.4
+"""Bias of a standard deviation that is not trained: 0.105 before tanh, near the smallest that is allowed."""
+
+
+class Outputs(NamedTuple):
+    """What an actor's networks make of observations, before noise, tanh and composition.
+
+    Attributes:
+        mean: (B, 2, R, R), before tanh.
+        raw_std: (B, 2, R, R), see `sample_squashed_gaussian`.
+        gate_logit: (B, 2, R, R) before `ActorSpec.gate_bias`, or None for a plain actor.
+        coarse: Sample of the coarser actor, or None for a plain actor.
+    """
+
+    mean: Tensor
+    raw_std: Tensor
+    gate_logit: Tensor | None = None
+    coarse: Sample | None = None
+
+    @property
+    def location(self) -> Tensor:
+        """Mean and gate logit in one tensor, (B, 2, R, R) or (B, 4, R, R): what a deterministic action depends on."""
+        return self.mean if self.gate_logit is None else torch.cat([self.mean, self.gate_logit], 1)
+
+    def at(self, location: Tensor) -> Outputs:
+        """The same outputs with another `location`."""
+        if self.gate_logit is None:
+            return self._replace(mean=location)
+        mean, gate_logit = location.chunk(2, 1)
+        return self._replace(mean=mean, gate_logit=gate_logit)
+
+
 class Sample(NamedTuple):
     """One sample of an actor."""
 
@@ -33,10 +65,14 @@ def squashed_log_prob(noise: Tensor, std: Tensor, action: Tensor) -> Tensor:
     return (normal - torch.log(1 - action.square() + 1e-6)).flatten(1).sum(1)
 
 
-def sample_squashed_gaussian(mean: Tensor, raw_std: Tensor, deterministic: bool) -> tuple[Tensor, Tensor]:
+def sample_squashed_gaussian(
+    mean: Tensor, raw_std: Tensor, deterministic: bool, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
     """Sample tanh(mean + s eps) with s = clip(softplus(3 raw_std - 1), 0.1, 6), and its log-density (B,)."""
     std = F.softplus(3 * raw_std - 1).clamp(*STD_BOUNDS)
-    noise = torch.zeros_like(mean) if deterministic else torch.randn_like(mean)
+    noise = torch.zeros_like(mean)
+    if not deterministic:
+        noise.normal_(generator=generator)
     action = torch.tanh(mean + std * noise)
     return action, squashed_log_prob(noise, std, action)
 
@@ -79,12 +115,38 @@ class Actor(SquashedActor):
         self.std = make_head(resolution)
         initialise(self)
 
-    def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
-        """Sample an action for uint8 observations (B, 3, 64, 64)."""
+    def outputs(
+        self, observation: Tensor, deterministic: bool = False, generator: torch.Generator | None = None
+    ) -> Outputs:
+        """Evaluate the networks for uint8 observations (B, 3, 64, 64).
+
+        Args:
+            observation: The images.
+            deterministic: Whether a coarser actor acts without noise.
+            generator: Of its noise; None for torch's own.
+        """
         latent = self.encoder(normalise_image(observation))
         mean, raw_std = fused.decode([self.mean, self.std], latent)
-        action, log_prob = sample_squashed_gaussian(mean, raw_std, deterministic)
+        return Outputs(mean, raw_std)
+
+    def act(self, outputs: Outputs, deterministic: bool = False, generator: torch.Generator | None = None) -> Sample:
+        """Sample an action from the networks' outputs, without noise if ``deterministic``."""
+        action, log_prob = sample_squashed_gaussian(outputs.mean, outputs.raw_std, deterministic, generator)
         return Sample(action, log_prob, None, (action,))
+
+    def sample(
+        self, observation: Tensor, deterministic: bool = False, generator: torch.Generator | None = None
+    ) -> Sample:
+        """Sample an action for uint8 observations (B, 3, 64, 64); a residual actor's ``log_prob`` is its own part's."""
+        return self.act(self.outputs(observation, deterministic, generator), deterministic, generator)
+
+    def fix_std(self) -> None:
+        """Set the standard deviation to 0.105 before tanh, and exclude it from training."""
+        layers = [layer for layer in self.std.modules() if isinstance(layer, nn.Linear | nn.ConvTranspose2d)]
+        nn.init.zeros_(layers[-1].weight)
+        assert layers[-1].bias is not None
+        nn.init.constant_(layers[-1].bias, STD_BIAS)
+        self.std.requires_grad_(False)
 
 
 class ResidualActor(Actor):
@@ -105,18 +167,26 @@ class ResidualActor(Actor):
         initialise(self.gate)
         self.coarse = coarse.requires_grad_(False)
 
-    def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
-        """Sample a composed action; ``log_prob`` is that of the residual part alone, as in the reference."""
+    def outputs(
+        self, observation: Tensor, deterministic: bool = False, generator: torch.Generator | None = None
+    ) -> Outputs:
+        """Evaluate the networks; the coarser actor is sampled."""
         with torch.no_grad():
-            coarse_sample = self.coarse.sample(observation, deterministic)
-            coarse = self._enlarge(coarse_sample.action)
-        patch = upsample(coarse, IMAGE_SIZE, self.interpolation)
+            coarse = self.coarse.sample(observation, deterministic, generator)
+            coarse = coarse._replace(action=self._enlarge(coarse.action))
+        patch = upsample(coarse.action, IMAGE_SIZE, self.interpolation)
         latent = self.encoder(normalise_image(observation), patch)
         mean, raw_std, gate_logit = fused.decode([self.mean, self.std, self.gate], latent)
-        residual, log_prob = sample_squashed_gaussian(mean, raw_std, deterministic)
+        return Outputs(mean, raw_std, gate_logit, coarse)
+
+    def act(self, outputs: Outputs, deterministic: bool = False, generator: torch.Generator | None = None) -> Sample:
+        """Compose an action; ``log_prob`` is that of the residual part alone, as in the reference."""
+        mean, raw_std, gate_logit, coarse = outputs
+        assert gate_logit is not None and coarse is not None
+        residual, log_prob = sample_squashed_gaussian(mean, raw_std, deterministic, generator)
         gate = self.gate_scale * torch.sigmoid(gate_logit + self.gate_bias)
-        action = blend(coarse, residual, gate, self._enlarge)
-        return Sample(action, log_prob, gate, (*coarse_sample.parts, residual, gate))
+        action = blend(coarse.action, residual, gate, self._enlarge)
+        return Sample(action, log_prob, gate, (*coarse.parts, residual, gate))
 
     def _enlarge(self, image: Tensor) -> Tensor:
         return upsample(image, self.action_size, self.interpolation)

@@ -85,3 +85,10 @@ class ActorPolicy(nn.Module):
         action: np.ndarray = self(batch.reshape(-1, *IMAGE_SHAPE), deterministic).cpu().numpy()
         action = (action + 1) - 1  # rounds as stable-baselines3 does when it maps [-1, 1] to the bounds of the space
         return action if observation.ndim == 4 else action[0], state
+
+
+def image_policy(spec: ActorSpec, actor: nn.Module, deterministic: bool) -> ActorPolicy:
+    """Policy with a copy of an actor's weights, on the actor's device."""
+    policy = ActorPolicy(spec, deterministic)
+    policy.actor.load_state_dict(actor.state_dict())
+    return policy.to(next(actor.parameters()).device)

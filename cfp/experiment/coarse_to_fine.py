@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -12,22 +12,19 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecMonitor
 
-from cfp.agent.actor_policy import ActorPolicy
+from cfp.agent.actor import Actor
 from cfp.agent.hyperparameters import Hyperparameters
 from cfp.agent.policies import CFPPolicy, NetworkPolicy
 from cfp.agent.sac import CFP
 from cfp.config import Config, RunConfig
 from cfp.envs.make import choose_device, make_env
-from cfp.errors import ConfigError
 from cfp.evaluation.pictures import policy_pictures
-from cfp.experiment.algorithm import Algorithm, Position, Scalars
-from cfp.experiment.folder import policy_path
+from cfp.experiment.algorithm import Algorithm, Scalars
 from cfp.experiment.sac_state import load_model_state_dict, model_state_dict
-from cfp.presets import preset
-from cfp.weights import KIND, load, policy_for, read_policy, report_mismatch, save_policy, write_policy
+from cfp.experiment.stages import CoarseToFineStages, refines, start_path
+from cfp.presets import sac_preset
+from cfp.weights import load
 
-START = "start.safetensors"
-"""The run's own copy of the policy that it refines."""
 ROLLOUT_METRICS: dict[str, str] = {
     "rollout/return": "mean undiscounted return of the last training episodes (with action noise)",
     "rollout/length": "their mean length in environment steps",
@@ -125,7 +122,7 @@ class SACAlgorithm(Algorithm):
         load_model_state_dict(self.model, state)
 
 
-class CoarseToFine(SACAlgorithm):
+class CoarseToFine(SACAlgorithm, CoarseToFineStages):
     """The stages of the coarse-to-fine policy, each over the frozen policy of the coarser one (paper, Section 4.2)."""
 
     config: Config
@@ -133,53 +130,24 @@ class CoarseToFine(SACAlgorithm):
     @staticmethod
     def preset(task: str, name: str) -> Config:
         """Default options for a task, see `cfp.preset`."""
-        return preset(task, name)
-
-    @classmethod
-    def initialize(cls, config: Config, folder: Path) -> Position:
-        """Take the first stages from a policy if the options say so; its steps count as those before its handover."""
-        if config.start_from is None:
-            return Position()
-        policy, refine = policy_for(config, config.start_from), config.refine
-        stages, resolutions = len(policy.spec.resolutions), config.resolutions
-        if policy.spec.resolutions != resolutions[:stages] or (stages == len(resolutions) and not refine):
-            allowed = f"the first resolutions of {resolutions}" + ("" if refine else ", but not all")
-            raise ConfigError(f"start_from must be a policy of {allowed}, got {policy.spec.resolutions}")
-        if stages > 1 and policy.spec != (allowed_spec := config.actor_spec(stages)):
-            raise ConfigError(f"start_from must have networks {allowed_spec}, got {policy.spec}")
-        stage = stages if refine else stages + 1
-        copy = folder / START if refine else policy_path(folder, stages)
-        write_policy(copy, *read_policy(config.start_from))
-        return Position(stage, (0, *config.handover)[stage - 1])
+        return sac_preset(task, name)
 
     @classmethod
     def hyperparameters(cls, config: Config, stage: int, folder: Path) -> Hyperparameters:
         """Hyperparameters of a stage; a policy that is refined does not act at random."""
         own = super().hyperparameters(config, stage, folder)
-        return replace(own, random_steps=0) if _refines(config, folder, stage) else own
+        return replace(own, random_steps=0) if refines(config, folder, stage) else own
 
     @classmethod
     def create(cls, config: Config, stage: int, folder: Path, resumed: bool = False) -> CoarseToFine:
         """Networks, replay memory and environment of a stage."""
         env, spec = make_env(config, config.action_size(stage)), config.actor_spec(stage)
         model = cls.make_model(config, env, CFPPolicy, {"spec": spec}, cls.hyperparameters(config, stage, folder))
-        actor, refines = model.networks()[0], _refines(config, folder, stage)
-        if refines:
-            model.origin = load(folder / START, str(model.device)).actor
-            actor.load_state_dict(model.origin.state_dict())
-        elif stage > 1:
-            path = policy_path(folder, stage - 1)
-            coarse = load(path, str(model.device)).actor
-            with report_mismatch(path):
-                actor.get_submodule("coarse").load_state_dict(coarse.state_dict())
         algorithm = cls(config, stage, model)
-        algorithm.starts_trained = stage > 1 or refines
+        algorithm.starts_trained = cls.begin(config, stage, folder, algorithm.trained_actor)
+        if refines(config, folder, stage):
+            model.origin = load(start_path(folder), str(model.device)).actor
         return algorithm
-
-    @classmethod
-    def load(cls, path: Path, device: str = "cpu") -> ActorPolicy:
-        """Load a policy."""
-        return load(path, device)
 
     def warm_start(self, previous: CoarseToFine) -> None:
         """Take critics and reward statistics from the ``previous`` stage, if the options say so."""
@@ -192,15 +160,9 @@ class CoarseToFine(SACAlgorithm):
     def images(self) -> dict[str, np.ndarray]:
         """What the actor does with the observation of the first robot."""
         observation = torch.as_tensor(np.asarray(self.model._last_obs)[:1], device=self.model.device)
-        return policy_pictures(self.model.networks()[0], observation)
+        return policy_pictures(self.trained_actor, observation)
 
-    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
-        """Write the actor."""
-        network = asdict(self.config.actor_spec(self.stage))
-        save_policy(path, self.model.networks()[0], description | {"kind": KIND, "network": network})
-
-
-def _refines(config: Config, folder: Path, stage: int) -> bool:
-    """Whether the actor of a stage begins as the one that is refined."""
-    start = folder / START
-    return config.refine and start.exists() and bool(read_policy(start)[1]["stage"] == stage)
+    @property
+    def trained_actor(self) -> Actor:
+        """The actor of the model."""
+        return self.model.networks()[0]

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import tyro
 
@@ -32,7 +32,7 @@ class Program:
     package: str  # python -m PACKAGE.train
     about: str  # first words of the help
     configure: Callable[[dict[str, Any]], RunConfig]  # options from JSON values; the others come from the preset
-    find: Callable[[str], type[Algorithm]]  # the algorithm of a name
+    find: Callable[[RunConfig], type[Algorithm]]  # the algorithm that the options name
     load: Callable[[Path, str], Policy]  # loads a policy file onto a device
 
 
@@ -58,9 +58,13 @@ class Command:
 class _Choice:
     """What must be known before the defaults are: the same options, read first."""
 
+    decisive: ClassVar[tuple[str, ...]] = ("algo", "task", "preset", "learner")
+    """Those that choose the defaults."""
+
     algo: str | None = None
     task: str | None = None
     preset: str | None = None
+    learner: str | None = None
     out: Path | None = None
     resume: bool = False
     config: Path | None = None
@@ -70,8 +74,7 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
     """Read a command line; ``SystemExit`` after ``--help``, or for an option that does not exist or cannot be read."""
     choice, _ = tyro.cli(_Choice, args=list(arguments), return_unknown_args=True, add_help=False, console_outputs=False)
     values = _values(choice)
-    preset = program.configure({name: values[name] for name in ("algo", "task", "preset") if name in values})
-    base = program.configure(values)
+    preset = program.configure({name: values[name] for name in _Choice.decisive if name in values})
 
     def read(defaults: RunConfig) -> Command:
         command = tyro.cli(
@@ -83,17 +86,17 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
             config=(tyro.conf.OmitArgPrefixes,),
         )
         # the command line may spell the name of the algorithm in another way
-        return command if choice.algo is None else replace(command, run=replace(command.run, algo=base.algo))
+        return command if choice.algo is None else replace(command, run=replace(command.run, algo=defaults.algo))
 
     if choice.resume:
-        folder = choice.out or Path("runs") / read(base).run.name
+        folder = choice.out or Path("runs") / read(program.configure(values)).run.name
         if (folder / "config.json").exists():
             past = read_config(folder, program.configure)
             # a value of the file that differs from the run's is refused later
             command = read(past if choice.config is None else update_from_dict(past, values))
             command.run.check()
             return replace(command, out=folder)
-    command = read(base)
+    command = read(program.configure(values))
     named = {word[2:].partition("=")[0].replace("-", "_") for word in arguments if word.startswith("--")}
     run = command.run.with_derived(preset, values.keys() | named)
     run.check()
@@ -109,7 +112,7 @@ def _values(choice: _Choice) -> dict[str, Any]:
             values = read_json(choice.config)
         except (OSError, ValueError) as error:
             raise ConfigError(f"config: {choice.config} cannot be read as JSON ({error})") from error
-    names = ("algo", "task", "preset")
+    names = _Choice.decisive
     return values | {name: value for name in names if (value := getattr(choice, name)) is not None}
 
 
@@ -134,7 +137,7 @@ def _train(program: Program, arguments: Sequence[str], started: str) -> None:
     print(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed} -> {folder}")
     with run_lock(folder):
         with StopSignals() as signals:
-            run = Run(program.find(config.algo), config, folder, command.resume, signals)
+            run = Run(program.find(config), config, folder, command.resume, signals)
             if config.environment.backend == "compile":
                 print("compiling the physics; the first time on a machine this takes half a minute ...")
             try:

@@ -21,11 +21,10 @@ import dittogym
 
 folder = tempfile.TemporaryDirectory()
 out = Path(folder.name) / "run"
-small = (
-    "--num-envs 8 --particles 1000 --batch-size 64 --update-start 64 --random-steps 120 40 --gradient-steps 1".split()
-)
-budget = "--steps 1440 --handover 960 --eval-every 480 --eval-episodes 2 --no-video".split()
-command = [sys.executable, "-m", "cfp.train", "--task", "shapematch", "--seed", "0", "--out", str(out), *small, *budget]
+small = "--learner sac --num-envs 8 --particles 1000 --batch-size 64 --update-start 64 --random-steps 120 40"
+budget = "--gradient-steps 1 --steps 1440 --handover 960 --eval-every 480 --eval-episodes 2 --no-video"
+command = [sys.executable, "-m", "cfp.train", "--task", "shapematch", "--seed", "0", "--out", str(out)]
+command += [*small.split(), *budget.split()]
 
 
 def run(*more: str) -> str:

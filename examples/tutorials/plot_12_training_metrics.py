@@ -19,7 +19,9 @@ import matplotlib.pyplot as plt
 
 folder = tempfile.TemporaryDirectory()
 out = Path(folder.name) / "run"
-options = "--task shapematch --seed 0 --num-envs 8 --particles 500 --batch-size 64 --update-start 64 --no-video"
+options = (
+    "--task shapematch --learner sac --seed 0 --num-envs 8 --particles 500 --batch-size 64 --update-start 64 --no-video"
+)
 budget = "--random-steps 120 40 --steps 1200 --handover 800 --gradient-steps 1 --log-every 40 --eval-every 400"
 command = [
     sys.executable,

@@ -12,9 +12,9 @@ from cfp import train
 from cfp.weights import SHIPPED, read_policy, write_policy
 
 TINY = (
-    "--task shapematch --particles 100 --substeps 1 --num-envs 2 --resolutions 4 --steps 20 --random-steps 10 "
-    "--batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 --eval-every 0 --eval-episodes 1 "
-    "--checkpoint-every 10 --log-every 10 --no-video --device cpu --backend eager"
+    "--learner sac --task shapematch --particles 100 --substeps 1 --num-envs 2 --resolutions 4 --steps 20 "
+    "--random-steps 10 --batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 --eval-every 0 "
+    "--eval-episodes 1 --checkpoint-every 10 --log-every 10 --no-video --device cpu --backend eager"
 )
 
 

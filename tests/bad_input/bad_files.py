@@ -132,7 +132,7 @@ POLICIES = [
             lambda desk: desk.policy({"kind": "alchemy"}),
             lambda desk: baselines.load(desk.folder / "stranger.safetensors"),
         ),
-        ("algo must be one of cfp, coarse",),
+        ("algo must be one of cfp, analytic, coarse",),
     ),
 ]
 
@@ -228,10 +228,10 @@ CONFIGS = [
     file_of_options("too large", " " * (2**20 + 1), "options.json cannot be read", "larger than 1048576 bytes"),
     file_of_options("of a list", "[1]", "cannot be read as JSON (it must hold an object, got list"),
     file_of_options("with an unknown name", '{"stepz": 1}', "stepz is not an option"),
-    file_of_options("with a group of nothing", '{"learning": null}', "learning must be an object, got None"),
+    file_of_options("with a group of nothing", '{"report": null}', "report must be an object, got None"),
     file_of_options("with steps as text", '{"steps": "x"}', "steps must be an integer, got 'x'"),
-    file_of_options("with a rate of NaN", '{"learning": {"learning_rate": NaN}}', "learning_rate must be finite,"),
-    file_of_options("with a rate of 400 digits", f'{{"learning": {{"tau": 1{"0" * 400}}}}}', "tau must be a number"),
+    file_of_options("with a rate of NaN", '{"learning_rate": NaN}', "learning_rate must be finite,"),
+    file_of_options("with a rate of 400 digits", f'{{"tau": 1{"0" * 400}}}', "tau must be a number"),
     file_of_options("with floats of 16 bits", '{"environment": {"dtype": "float16"}}', "dtype must be 'float32' or"),
     file_of_options("with half particles", '{"environment": {"particles": [1.5, 2]}}', "a list of 2, each an integer"),
     Case(

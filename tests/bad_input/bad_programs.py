@@ -99,7 +99,7 @@ TRAIN = [
 ]
 
 OTHERS = [
-    learning("alchemy", "gold", "", "algo must be one of cfp, coarse, fine, gnn-16", "got 'alchemy'"),
+    learning("alchemy", "gold", "", "algo must be one of cfp, analytic, coarse, fine, gnn-16", "got 'alchemy'"),
     learning("coarse", "two grids", "--resolutions 4 8", "resolutions must have one value, got (4, 8)"),
     learning("gnn-16", "ten particles", "--particles 10", "particles of the robot must be at least 16", "got 10"),
     learning("gnn-16", "a negative temperature", "--alpha -1", "alpha must be at least 0, got -1.0"),

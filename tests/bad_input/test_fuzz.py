@@ -15,7 +15,7 @@ from cfp.agent.actor import build_actor
 from cfp.config import to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.process import peak_memory
-from cfp.presets import preset
+from cfp.presets import sac_preset
 from cfp.weights import describe, save_policy
 from dittogym.tasks.targets import load_target
 
@@ -108,7 +108,7 @@ def test_pictures_of_any_bytes(kind, tmp_path_factory, cuts, changes):
         assert target.shape == (64, 64) and target.dtype == bool
 
 
-CONFIG = replace(preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,))
+CONFIG = replace(sac_preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,))
 OF_OTHERS = {"inputs": 10, "noise": 0.1, "features": {}, "nodes": {"count": 16, "graph": True}}
 DESCRIPTION = json.loads(json.dumps(describe(CONFIG, 1, 7))) | OF_OTHERS
 

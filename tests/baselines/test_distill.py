@@ -11,7 +11,6 @@ import baselines
 import cfp
 import cfp.train
 from baselines import Distill, GradientPlannerConfig, OpenLoop, Shac, distill
-from baselines.common.episodes import Episodes
 from baselines.compare.final_evaluation import Protocol
 from baselines.compare.jobs import Job
 from baselines.compare.results import read_result
@@ -23,6 +22,7 @@ from baselines.modular import env as modular_env
 from baselines.modular.networks import ModularActor, SegmentPolicy
 from baselines.modular.nodes import Nodes
 from baselines.registry import configure
+from cfp.analytic.episodes import Episodes
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.process import StopSignals
 from cfp.sections import EnvironmentConfig, ReportConfig
@@ -299,7 +299,7 @@ def test_privileged_policy_becomes_one_of_images_that_cfp_refines(privileged, tm
     std = policy.actor.std(torch.zeros(1, 32, 4, 4))
     assert torch.nn.functional.softplus(3 * std - 1).mean() == pytest.approx(0.105, abs=1e-3)
     options = "--steps 24 --handover 12 --batch-size 4 --update-start 8 --actor-start 6 --eval-every 12".split()
-    refined = [*TINY, *options, "--refine", "--start-from", str(folder)]
+    refined = [*TINY, *options, "--learner", "sac", "--refine", "--start-from", str(folder)]
     assert cfp.train.main([*refined, "--out", str(tmp_path / "refined")]) == 0
     first = read_table(tmp_path / "refined" / "evaluations.csv")[0]
     assert (first["step"], first["stage"]) == ("12", "2")

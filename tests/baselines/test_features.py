@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from baselines.shac.features import CELLS, StateFeatures
-from baselines.shac.reward import RADIUS, TOLERANCE, Neighbours, RewardConfig, training_reward
+from cfp.analytic.features import CELLS, StateFeatures
+from cfp.analytic.reward import RADIUS, TOLERANCE, Neighbours, RewardConfig, training_reward
 from dittogym import TorchEnv
 
 

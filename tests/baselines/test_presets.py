@@ -4,16 +4,18 @@ import json
 
 import pytest
 
-import cfp
 from baselines.registry import ALGORITHMS, configure, find
 from cfp.config import to_json
+from cfp.presets import TASKS, sac_preset
 
 
-@pytest.mark.parametrize("task", cfp.presets.TASKS)
+@pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("preset", ["quick", "paper"])
 def test_presets_are_valid_survive_json_and_agree_with_that_of_cfp(task, preset):
-    own = cfp.preset(task, preset)
+    own = sac_preset(task, preset)
     for name in ALGORITHMS:
+        if name == "analytic" and preset == "paper":  # which it does not have
+            continue
         algorithm = find(name)
         config = algorithm.preset(task, preset)
         config.check()

@@ -10,13 +10,13 @@ from updates import EachUpdate
 import baselines
 from baselines import Shac, StatePolicy
 from baselines.registry import configure
-from baselines.shac import rollout as shac_rollout
 from baselines.shac import train as shac_train
-from baselines.shac.reward import RewardConfig
-from baselines.shac.rollout import Window
-from baselines.shac.train import METRICS, actor_loss, td_lambda_targets
+from baselines.shac.train import METRICS
 from cfp.agent.actor import build_actor
 from cfp.agent.spec import ActorSpec
+from cfp.analytic import window as analytic_window
+from cfp.analytic.reward import RewardConfig
+from cfp.analytic.window import Window, short_horizon_loss, td_lambda_targets
 from cfp.envs.make import make_env
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
 from cfp.evaluation.episodes import attached
@@ -81,16 +81,16 @@ def speed(algorithm, steps=32):
 def test_gradient_of_the_window_is_that_of_the_loss(sees):
     environment = EnvironmentConfig(2, 300, 4, dtype="float64")
     algorithm = Shac(make(environment=environment, sees=sees, noise=0.0))
-    algorithm.actor.double(), algorithm.target.double()
+    algorithm.actor.double(), algorithm.critic.target.double()
     env = algorithm.env
     inputs = {"state": lambda: algorithm.features(env), "image": lambda: env.soft_observation() * (2.0 / 255.0) - 1.0}
-    algorithm.rollout.observe = inputs[sees]
+    algorithm.collector.observe = inputs[sees]
     weight = [p for p in algorithm.actor.parameters() if p.requires_grad][-1]
     start = algorithm.env.save()
 
     def loss():
         algorithm.env.load(start)
-        return actor_loss(collect(algorithm), algorithm.config.gamma)
+        return short_horizon_loss(collect(algorithm), algorithm.config.gamma)
 
     (gradient,) = torch.autograd.grad(loss(), weight)
     index = tuple(int(i) for i in np.unravel_index(int(gradient.abs().argmax()), gradient.shape))
@@ -102,7 +102,7 @@ def test_gradient_of_the_window_is_that_of_the_loss(sees):
 
 
 def collect(algorithm):
-    return algorithm.rollout.collect(algorithm.actor, lambda seen: algorithm.value(algorithm.target, seen))
+    return algorithm.collector.collect(algorithm.act, algorithm.critic)
 
 
 @pytest.mark.parametrize("sees", ["state", "image"])
@@ -117,7 +117,7 @@ def test_resumed_training_is_the_same_to_the_last_bit(sees):
     second.learn(24, EachUpdate(rows.append))
     assert torch.equal(parameters(whole), parameters(second))
     assert torch.equal(whole.env.state.x, second.env.state.x)
-    assert rows[-1]["train/episodes"] == whole.rollout.episodes.counts["episodes"] > 0
+    assert rows[-1]["train/episodes"] == whole.collector.episodes.counts["episodes"] > 0
 
 
 def test_simulation_that_is_not_finite_is_reset_and_counted(monkeypatch):
@@ -164,7 +164,7 @@ def test_updates_without_a_finite_gradient_end_the_training(monkeypatch):
     algorithm = Shac(make())
     before, rows = parameters(algorithm), []
     weight = next(algorithm.actor.parameters())
-    monkeypatch.setattr(shac_train, "actor_loss", lambda window, gamma: weight.sum() * float("nan"))
+    monkeypatch.setattr(shac_train, "short_horizon_loss", lambda window, gamma: weight.sum() * float("nan"))
     with pytest.raises(NonFiniteError, match="10 updates in a row"):
         algorithm.learn(8 * 20, EachUpdate(rows.append))
     assert rows[-1]["train/skipped"] == 9 and torch.equal(before, parameters(algorithm))
@@ -181,9 +181,12 @@ def test_actor_that_has_diverged_does_not_act():
 def test_episodes_are_cut_at_staggered_ages_and_change_layouts():
     algorithm = Shac(make(max_episode_steps=8, num_layouts=3))
     first = algorithm.env.state.x[0].clone()
-    assert algorithm.rollout.episodes.limit.tolist() == [4, 8]
+    assert algorithm.collector.episodes.limit.tolist() == [4, 8]
     collect(algorithm)
-    assert algorithm.rollout.episodes.counts["episodes"] == 1 and algorithm.rollout.episodes.limit.tolist() == [8, 8]
+    assert algorithm.collector.episodes.counts["episodes"] == 1 and algorithm.collector.episodes.limit.tolist() == [
+        8,
+        8,
+    ]
     assert algorithm.env.env_state.steps.tolist() == [0, 4]
     assert not torch.equal(algorithm.env.state.x[0], first)
 
@@ -195,13 +198,17 @@ def test_no_more_layouts_are_trained_on_than_there_shall_be():
 
 
 def test_restart_of_a_neighbour_leaves_the_particles_that_were_close(monkeypatch):
-    algorithm, seen, reward = Shac(make(max_episode_steps=8, window=6, substeps=20)), [], shac_rollout.training_reward
+    algorithm, seen, reward = (
+        Shac(make(max_episode_steps=8, window=6, substeps=20)),
+        [],
+        analytic_window.training_reward,
+    )
 
     def watch(*given):
         seen.append(given[-1])
         return reward(*given)
 
-    monkeypatch.setattr(shac_rollout, "training_reward", watch)
+    monkeypatch.setattr(analytic_window, "training_reward", watch)
     collect(algorithm)
     assert algorithm.env.env_state.steps.tolist() == [2, 6]  # the first robot began anew after four steps
     for first, last in zip(*((pairs.neighbours, pairs.distance) for pairs in (seen[0], seen[-1])), strict=True):
@@ -211,17 +218,17 @@ def test_restart_of_a_neighbour_leaves_the_particles_that_were_close(monkeypatch
 def test_return_is_that_of_all_episodes_since_the_last_row():
     algorithm, rows = Shac(make(max_episode_steps=4)), []  # a window is as long as an episode
     algorithm.learn(8, EachUpdate(rows.append))
-    first = list(algorithm.rollout.episodes.recent_returns)
+    first = list(algorithm.collector.episodes.recent_returns)
     again = Shac(algorithm.config)
     again.load_state_dict(algorithm.state_dict())
     for each in (algorithm, again):
         each.learn(8, EachUpdate(rows.append))
-        ended = each.rollout.episodes.recent_returns
+        ended = each.collector.episodes.recent_returns
         assert len(ended) > len(first) > 0 and ended[: len(first)] == first
         assert rows[-1]["rollout/return"] == np.mean(ended)
     algorithm.row()
     algorithm.learn(8, EachUpdate(rows.append))
-    assert len(algorithm.rollout.episodes.recent_returns) < len(ended)
+    assert len(algorithm.collector.episodes.recent_returns) < len(ended)
 
 
 def window(done=(False, False, False)):
@@ -231,8 +238,8 @@ def window(done=(False, False, False)):
 
 
 def test_actor_loss_is_the_discounted_return_with_the_value_of_the_end():
-    assert actor_loss(window(), 0.5).item() == pytest.approx(-(1 + 0.5 * 2 + 0.25 * 3 + 0.125 * 16) / 3)
-    cut = actor_loss(window((False, True, False)), 0.5)
+    assert short_horizon_loss(window(), 0.5).item() == pytest.approx(-(1 + 0.5 * 2 + 0.25 * 3 + 0.125 * 16) / 3)
+    cut = short_horizon_loss(window((False, True, False)), 0.5)
     assert cut.item() == pytest.approx(-(1 + 0.5 * 2 + 0.25 * 8 + 3 + 0.5 * 16) / 3)
 
 

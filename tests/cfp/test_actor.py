@@ -9,7 +9,7 @@ from cfp.agent.actor import Sample, build_actor
 from cfp.agent.networks import normalise_image, upsample
 from cfp.agent.spec import ActorSpec
 from cfp.envs.make import make_torch_env
-from cfp.presets import preset
+from cfp.presets import sac_preset
 from dittogym import TASKS, make_spec
 
 
@@ -92,7 +92,7 @@ def test_closed_gates_leave_the_coarsest_action(resolutions):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_closed_gates_leave_the_coarsest_field(task):
-    config = preset(task, "quick")
+    config = sac_preset(task, "quick")
     config = replace(config, environment=replace(config.environment, particles=100, substeps=1, num_envs=2))
     ladders = {config.resolutions, tuple(size for size in (4, 8, 16, 32, 64) if size <= make_spec(task).patch)}
     for ladder in ladders:
@@ -103,7 +103,7 @@ def test_closed_gates_leave_the_coarsest_field(task):
         while hasattr(levels[0], "coarse"):
             levels.insert(0, levels[0].coarse)
         drawn = Sample(3 * torch.rand(2, 2, ladder[0], ladder[0]) - 1.5, torch.zeros(2), None)
-        levels[0].sample = lambda observation, deterministic, drawn=drawn: drawn  # some of the field is clipped
+        levels[0].sample = lambda *_, drawn=drawn: drawn  # some of the field is clipped
         with torch.no_grad():
             for stage, actor in enumerate(levels, 1):
                 env = make_torch_env(shut, shut.action_size(stage))

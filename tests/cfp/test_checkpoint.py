@@ -14,9 +14,9 @@ from cfp.errors import CheckpointError
 from cfp.experiment.algorithm import Position
 from cfp.experiment.checkpoint import Checkpoint
 from cfp.experiment.coarse_to_fine import CoarseToFine
-from cfp.presets import preset
+from cfp.presets import sac_preset
 
-CONFIG = replace(preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,))
+CONFIG = replace(sac_preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,))
 
 
 def make(stage=2):

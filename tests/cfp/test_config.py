@@ -11,7 +11,7 @@ from cfp.errors import ConfigError
 from cfp.experiment.checkpoint import check_same
 from cfp.experiment.training import parse
 from cfp.from_dict import update_from_dict
-from cfp.presets import TASKS, from_json, preset
+from cfp.presets import TASKS, from_json, sac_preset
 from cfp.train import PROGRAM
 from dittogym import make_spec
 
@@ -19,7 +19,7 @@ from dittogym import make_spec
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("name", ["quick", "paper"])
 def test_every_preset_is_valid_and_survives_json(task, name):
-    config = preset(task, name)
+    config = sac_preset(task, name)
     config.check()
     assert from_json(json.loads(json.dumps(to_json(config)))) == config
     stages = range(1, len(config.resolutions) + 1)
@@ -30,12 +30,12 @@ def test_every_preset_is_valid_and_survives_json(task, name):
 def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):
     spec = replace(make_spec("run"), name="hop", coarse=4, fine=32)
     monkeypatch.setitem(dittogym.TASKS, "hop", lambda: spec)
-    config = preset("hop")
+    config = sac_preset("hop")
     config.check()
     assert (config.task, config.resolutions) == ("hop", (4, 32))
-    assert replace(config, task="run", resolutions=(8, 16)) == preset("run")
+    assert replace(config, task="run", resolutions=(8, 16)) == sac_preset("run")
     with pytest.raises(ConfigError, match="preset must be quick for hop, got 'paper'"):
-        preset("hop", "paper")
+        sac_preset("hop", "paper")
 
 
 def test_paper_presets_hold_the_published_numbers():
@@ -51,7 +51,7 @@ def test_paper_presets_hold_the_published_numbers():
     }
     assert set(published) == set(TASKS)
     for task, (first, second, bias, penalty, random_steps, handover, steps) in published.items():
-        config = preset(task, "paper")
+        config = sac_preset(task, "paper")
         assert config.alpha == (first, second)
         assert (config.gate_bias, config.gate_penalty) == ((bias,), (penalty,))
         assert config.random_steps == (random_steps, 100)
@@ -70,7 +70,7 @@ def test_paper_presets_hold_the_published_numbers():
 
 def test_json_values_take_the_types_of_their_fields():
     config = update_from_dict(
-        preset("shapematch"), {"alpha": [1, 0], "environment": {"particles": [500, 20], "target": None}}
+        sac_preset("shapematch"), {"alpha": [1, 0], "environment": {"particles": [500, 20], "target": None}}
     )
     assert config.alpha == (1.0, 0.0)
     assert all(isinstance(value, float) for value in config.alpha)
@@ -81,38 +81,51 @@ def test_command_line_beats_file_beats_preset(tmp_path):
     file = tmp_path / "options.json"
     file.write_text(json.dumps({"task": "run", "learning": {"gamma": 0.5, "tau": 0.25}, "report": {"video": True}}))
     command = parse(
-        PROGRAM, ["--config", str(file), "--gamma", "0.75", "--no-video", "--particles", "300", "--out", "x"]
+        PROGRAM,
+        [
+            "--config",
+            str(file),
+            "--learner",
+            "sac",
+            "--gamma",
+            "0.75",
+            "--no-video",
+            "--particles",
+            "300",
+            "--out",
+            "x",
+        ],
     )
     assert command.run.task == "run"
     assert (command.run.learning.gamma, command.run.learning.tau) == (0.75, 0.25)
     assert command.run.report.video is False
     assert command.run.environment.particles == 300
-    assert command.run.learning.batch_size == preset("run").learning.batch_size
+    assert command.run.learning.batch_size == sac_preset("run").learning.batch_size
     assert parse(PROGRAM, ["--video"]).run.report.video is True
     assert parse(PROGRAM, ["--particles", "full"]).run.environment.particles == "full"
     assert parse(PROGRAM, ["--particles", "500", "20"]).run.environment.particles == (500, 20)
 
 
 def test_fewer_steps_shorten_every_level():
-    config = preset("run")
-    half = parse(PROGRAM, ["--task", "run", "--steps", str(config.steps // 2)]).run
+    config = sac_preset("run")
+    half = parse(PROGRAM, ["--learner", "sac", "--task", "run", "--steps", str(config.steps // 2)]).run
     assert half.handover == (config.handover[0] // 2,)
-    explicit = parse(PROGRAM, ["--task", "run", "--steps", "1000", "--handover", "900"]).run
+    explicit = parse(PROGRAM, ["--learner", "sac", "--task", "run", "--steps", "1000", "--handover", "900"]).run
     assert explicit.handover == (900,)
 
 
 def test_another_number_of_levels_stretches_what_each_has_one_of():
-    five = parse(PROGRAM, "--resolutions 4 8 16 32 64 --steps 5000".split()).run
+    five = parse(PROGRAM, "--learner sac --resolutions 4 8 16 32 64 --steps 5000".split()).run
     assert five.handover == (1000, 2000, 3000, 4000)
     assert five.alpha == (0.005, 0.0, 0.0, 0.0, 0.0)
     assert five.gate_bias == (-2.0,) * 4 and five.gate_penalty == (0.8,) * 4
     assert five.random_steps == (480, 100, 100, 100, 100)
-    three = parse(PROGRAM, "--resolutions 4 8 16 --alpha 1 2 3 --handover 100 200".split()).run
+    three = parse(PROGRAM, "--learner sac --resolutions 4 8 16 --alpha 1 2 3 --handover 100 200".split()).run
     assert (three.alpha, three.handover) == ((1.0, 2.0, 3.0), (100, 200))
-    one = parse(PROGRAM, "--resolutions 16".split()).run
+    one = parse(PROGRAM, "--learner sac --resolutions 16".split()).run
     assert (one.handover, one.gate_bias, one.alpha) == ((), (), (0.005,))
     with pytest.raises(ConfigError, match="alpha must have 3 values"):
-        parse(PROGRAM, "--resolutions 4 8 16 --alpha 1 2 3 4".split())
+        parse(PROGRAM, "--learner sac --resolutions 4 8 16 --alpha 1 2 3 4".split())
 
 
 def test_matter_of_the_published_run_of_slot_can_be_chosen():
@@ -144,7 +157,7 @@ def test_layout_of_actions_can_be_chosen():
 
 
 def test_resumed_run_may_change_only_what_does_not_alter_it():
-    config = preset("run")
+    config = sac_preset("run")
     stored = json.loads(json.dumps(to_json(config)))
     check_same(stored, replace(config, steps=99_000, device="cpu", report=replace(config.report, eval_every=7)))
     check_same(stored, replace(config, environment=replace(config.environment, backend="eager")))

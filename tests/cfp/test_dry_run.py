@@ -7,16 +7,16 @@ from cfp.config import Config
 from cfp.experiment.coarse_to_fine import CoarseToFine
 from cfp.experiment.training import parse
 from cfp.from_dict import update_from_dict
-from cfp.presets import preset
+from cfp.presets import sac_preset
 
-TINY = "--particles 100 --substeps 1 --num-envs 2 --device cpu --steps 400 --batch-size 4".split()
+TINY = "--learner sac --particles 100 --substeps 1 --num-envs 2 --device cpu --steps 400 --batch-size 4".split()
 
 
 def test_dry_run_prints_the_options_and_writes_nothing(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert train.main([*TINY, "--dry-run"]) == 0
     assert not list(tmp_path.iterdir())
-    config: Config = update_from_dict(preset("shapematch"), json.loads(capsys.readouterr().out))
+    config: Config = update_from_dict(sac_preset("shapematch"), json.loads(capsys.readouterr().out))
     assert (config.steps, config.handover, config.environment.particles) == (400, (267,), 100)
 
 

@@ -19,7 +19,7 @@ from cfp.errors import ConfigError
 from cfp.evaluate import open_policy, open_run
 from cfp.evaluation.evaluate import Result
 from cfp.files import write_json
-from cfp.presets import preset
+from cfp.presets import sac_preset
 from cfp.train import PROGRAM
 from cfp.weights import describe, save_policy
 from dittogym import make_spec
@@ -90,7 +90,7 @@ def test_late_actions_stay_in_their_episode():
 
 @pytest.mark.parametrize("task", TASKS)
 def test_constants_reach_the_physics_of_every_task(task):
-    spec, config = make_spec(task), preset(task)
+    spec, config = make_spec(task), sac_preset(task)
     config = replace(config, environment=replace(config.environment, particles=100, substeps=1))
     env = disturbed_env(config, 8, Case("soft", physics={"mu": 0.5, "yield_stress": 0.5, "gravity": 2.0}), None, 3, 2)
     env.seed(5)
@@ -123,7 +123,7 @@ def test_interval_is_student_s():
 
 @pytest.fixture
 def folder(tmp_path):
-    config = preset("shapematch")
+    config = sac_preset("shapematch")
     environment = replace(config.environment, particles=1000, substeps=10)
     config = replace(config, environment=environment)
     write_json(tmp_path / "config.json", to_json(config))
@@ -186,5 +186,5 @@ def test_cases_are_chosen_by_words(folder):
 def test_ratios_need_a_positive_return():
     rows = robustness.to_rows([Result("unperturbed", 8, (-2.0, -1.0)), Result("noise", 8, (-4.0, -3.0))])
     assert [row["ratio"] for row in rows] == [None, None]
-    config = preset("dig")
+    config = sac_preset("dig")
     assert "not positive" in robustness.to_markdown(config, rows)

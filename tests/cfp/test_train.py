@@ -22,7 +22,7 @@ from cfp.agent.spec import ActorSpec
 from cfp.evaluation import video
 from cfp.evaluation.evaluate import compare
 from cfp.experiment.cli import program_name
-from cfp.presets import preset
+from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
 from cfp.tables import read_table
 from cfp.weights import describe, policy_file, save_policy, shipped
@@ -119,7 +119,7 @@ def test_video_plays_or_tells_how_to_install(finished, tmp_path, monkeypatch, ca
 
 def test_evaluation_is_not_haunted_by_the_one_before():
     """With reference parity a reset shows what was before; the environments of an evaluation have nothing before."""
-    config = replace(preset("shapematch"), seed=3)
+    config = replace(sac_preset("shapematch"), seed=3)
     environment = replace(config.environment, particles=100, substeps=1, num_envs=2, parity="reference")
     config = replace(config, environment=environment)
     policy = ActorPolicy(ActorSpec((8,)), True)
@@ -169,7 +169,7 @@ def test_single_policy_need_not_have_the_grids_of_its_task(tmp_path, monkeypatch
     tens = replace(dittogym.make_spec("run"), name="tens", coarse=10, fine=20, horizon=2)
     dittogym.register("tens", lambda: tens)
     environment = EnvironmentConfig(particles=60, substeps=1)
-    config = replace(cfp.preset("tens"), resolutions=(4, 8, 16), gate_bias=(-1.0, -2.0), environment=environment)
+    config = replace(sac_preset("tens"), resolutions=(4, 8, 16), gate_bias=(-1.0, -2.0), environment=environment)
     save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(3)), describe(config, 3, 0))
     command = evaluate.Command(policy=str(tmp_path), episodes=1, device="cpu")
     opened, _ = command.open(train.PROGRAM)
@@ -178,7 +178,7 @@ def test_single_policy_need_not_have_the_grids_of_its_task(tmp_path, monkeypatch
 
 
 def test_other_particles_are_not_those_of_the_reference_s_faults(tmp_path):
-    config = cfp.preset("shapematch", "paper")
+    config = sac_preset("shapematch", "paper")
     save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(1)), describe(config, 1, 0))
     for particles, parity in ((None, "reference"), ("full", "reference"), ("lite", "clean"), (60, "clean")):
         chosen = evaluate.Selection(policy=str(tmp_path), particles=particles)

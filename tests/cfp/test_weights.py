@@ -14,14 +14,14 @@ from cfp.agent.networks import normalise_image
 from cfp.agent.policies import CFPPolicy
 from cfp.agent.spec import ActorSpec
 from cfp.errors import ConfigError
-from cfp.presets import preset
+from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
 from cfp.weights import check_trained_for, describe, save_policy
 
 
 @pytest.fixture
 def saved(tmp_path):
-    config = replace(preset("shapematch"), resolutions=(8, 16), gate_bias=(-1.0,))
+    config = replace(sac_preset("shapematch"), resolutions=(8, 16), gate_bias=(-1.0,))
     actor = build_actor(config.actor_spec(2))
     save_policy(tmp_path / "policy.safetensors", actor, describe(config, 2, 123))
     return tmp_path, actor

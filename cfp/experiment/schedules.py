@@ -13,9 +13,9 @@ def stage_progress(config: RunConfig, stage: int, num_timesteps: int) -> float:
     return min(num_timesteps / config.stage_steps(stage), 1.0)
 
 
-def linear_decay(progress: float) -> float:
-    """Factor that falls from 1 to `FINAL_FRACTION` along a line as ``progress`` goes from 0 to 1."""
-    return 1.0 - (1.0 - FINAL_FRACTION) * progress
+def linear_decay(progress: float, final: float = FINAL_FRACTION) -> float:
+    """Factor that falls from 1 to ``final`` along a line as ``progress`` goes from 0 to 1."""
+    return 1.0 - (1.0 - final) * progress
 
 
 def cosine_decay(progress: float) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from baselines.common.stateful import Stateful
+from cfp.analytic.stateful import Stateful
 from cfp.envs.vec_env import TorchVecEnv
 from dittogym import TorchEnv
 

@@ -1,0 +1,1 @@
+"""The learner ``analytic``: the coarse-to-fine policy, trained by gradients through the simulation."""

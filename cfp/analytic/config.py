@@ -1,0 +1,78 @@
+"""The options of the learner ``analytic``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from cfp.analytic.reward import RewardConfig
+from cfp.config import CoarseToFineConfig, Learner, check_training_layouts
+from cfp.sections import Particles
+from cfp.validation import check_at_least, check_fraction, check_positive
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnalyticConfig(CoarseToFineConfig):
+    """A run of the coarse-to-fine policy that learns by gradients through the simulation.
+
+    The environment options say where the policy is evaluated; train_particles, where it is trained.
+    """
+
+    learner: Learner = "analytic"
+    train_particles: Particles = "lite"
+    """Particles of the simulations in training."""
+    window: int = 16
+    """Control steps that a gradient reaches back."""
+    gamma: float = 0.98
+    """Discount factor."""
+    action_step: tuple[float, ...]
+    """Root mean square of the step on the actions of a window, for each stage."""
+    final_step: float = 0.4
+    """Fraction of action_step at the end of a stage; it falls linearly."""
+    minibatches: int = 48
+    """Steps of the regression after each window."""
+    minibatch_size: int = 128
+    """Images in a step of the regression."""
+    windows_kept: int = 40
+    """Latest windows that the regression draws from."""
+    weight_average: float = 0.995
+    """Decay of the average of the actor's weights, which is the policy; 0: the actor itself."""
+    learning_rate: float = 1e-3
+    """Adam's step size for actor and critic at the beginning of a stage; it falls to a tenth."""
+    td_lambda: float = 0.95
+    """Lambda of the critic's TD(lambda) targets: 0 for single steps, 1 for the whole window."""
+    critic_updates: int = 16
+    """Updates of the critic after each window."""
+    tau: float = 0.4
+    """Fraction of the critic that goes into its target after each window."""
+    max_grad_norm: float = 1.0
+    """Largest norm of a gradient of the networks, of actor and critic each."""
+    max_episode_steps: int = 10_000
+    """Control steps after which a training episode is truncated, if the task does not do so earlier."""
+    num_layouts: int = 256
+    """Particle layouts that training episodes start from in turn."""
+    displacement: bool = True
+    """The critic sees the robot's displacement since the reset."""
+    reward: RewardConfig = field(default_factory=RewardConfig)
+
+    per_stage: ClassVar[tuple[str, ...]] = ("action_step",)
+
+    def check(self) -> None:
+        """Check what the types do not express."""
+        super().check()
+        check_at_least(
+            1,
+            window=self.window,
+            minibatches=self.minibatches,
+            minibatch_size=self.minibatch_size,
+            windows_kept=self.windows_kept,
+            critic_updates=self.critic_updates,
+            max_episode_steps=self.max_episode_steps,
+            num_layouts=self.num_layouts,
+        )
+        check_training_layouts("num_layouts", self.num_layouts, self.environment.num_envs)
+        check_fraction(gamma=self.gamma, td_lambda=self.td_lambda, tau=self.tau, final_step=self.final_step)
+        check_fraction(weight_average=self.weight_average)
+        check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
+        for size in self.action_step:
+            check_positive(action_step=size)

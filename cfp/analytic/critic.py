@@ -1,0 +1,84 @@
+"""The value function of short-horizon actor-critic (SHAC; Xu et al., ICLR 2022)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
+
+from cfp.analytic.stateful import Stateful
+from cfp.analytic.window import Window, td_lambda_targets
+
+WIDTH = 128
+"""Width of the hidden layers."""
+BETAS = (0.7, 0.95)
+"""Of Adam."""
+
+
+def mlp(inputs: int, outputs: int) -> nn.Sequential:
+    """Two hidden layers of 128 units with layer normalisation and ELU; the last layer starts with small weights."""
+    layers: list[nn.Module] = []
+    for size in (inputs, WIDTH):
+        layers += [nn.Linear(size, WIDTH), nn.LayerNorm(WIDTH), nn.ELU()]
+    last = nn.Linear(WIDTH, outputs)
+    with torch.no_grad():
+        last.weight.mul_(0.1)
+        last.bias.zero_()
+    return nn.Sequential(*layers, last)
+
+
+class Critic(Stateful):
+    """A value network, its slowly following target, and their training on TD(lambda) targets.
+
+    Args:
+        network: Maps observations (B, ...) to (B, 1).
+        target: A network of the same structure.
+        gamma: Discount factor.
+        td_lambda: Lambda of the targets: 0 for single steps, 1 for the whole window.
+        updates: Steps of Adam for each window.
+        tau: Fraction of the network that goes into its target after each window.
+        max_grad_norm: Largest norm of a gradient.
+    """
+
+    parts = ("network", "target", "adam")
+
+    def __init__(
+        self,
+        network: nn.Module,
+        target: nn.Module,
+        *,
+        gamma: float,
+        td_lambda: float,
+        learning_rate: float,
+        updates: int,
+        tau: float,
+        max_grad_norm: float,
+    ) -> None:
+        self.network, self.target = network, target
+        target.load_state_dict(network.state_dict())
+        target.requires_grad_(False)
+        self.adam = torch.optim.Adam(network.parameters(), learning_rate, BETAS)
+        self.gamma, self.td_lambda, self.updates, self.tau = gamma, td_lambda, updates, tau
+        self.max_grad_norm = max_grad_norm
+
+    def __call__(self, observations: Tensor) -> Tensor:
+        """Values (B,) of the target network."""
+        return self._value(self.target, observations)
+
+    def _value(self, network: nn.Module, observations: Tensor) -> Tensor:
+        value: Tensor = network(observations)[..., 0] / max(1.0 - self.gamma, 1e-2)
+        return value
+
+    def update(self, window: Window, learning_rate: float) -> float:
+        """Learn the values of a window's states; returns the last mean squared error."""
+        self.adam.param_groups[0]["lr"] = learning_rate
+        targets = td_lambda_targets(window, self.gamma, self.td_lambda).flatten()
+        observations, loss = window.observations.flatten(0, 1), torch.zeros(())
+        for _ in range(self.updates):
+            self.adam.zero_grad()
+            loss = (self._value(self.network, observations) - targets).square().mean()
+            loss.backward()
+            nn.utils.clip_grad_norm_(self.network.parameters(), self.max_grad_norm)
+            self.adam.step()
+        get_ema_multi_avg_fn(1 - self.tau)(list(self.target.parameters()), list(self.network.parameters()), 1)
+        return float(loss.detach())

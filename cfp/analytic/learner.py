@@ -1,0 +1,174 @@
+"""The learner: windows of simulation, a step on their actions, regression of the actor, and a critic.
+
+The policy sees the image only. The critic sees the state of the simulation, and is needed in training only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cfp.agent.actor import Actor, build_actor
+from cfp.agent.actor_policy import ActorPolicy, image_policy
+from cfp.analytic.action_step import BOUND, ActionStep
+from cfp.analytic.config import AnalyticConfig
+from cfp.analytic.critic import Critic, mlp
+from cfp.analytic.episodes import Episodes
+from cfp.analytic.features import StateFeatures
+from cfp.analytic.regression import ImageMemory, Regression
+from cfp.analytic.stateful import Stateful
+from cfp.analytic.window import WindowCollector, short_horizon_loss
+from cfp.envs.make import choose_device, make_torch_env
+from cfp.evaluation.pictures import policy_pictures
+from cfp.experiment.algorithm import Scalars
+from cfp.experiment.schedules import linear_decay, stage_progress
+from cfp.experiment.stages import CoarseToFineStages
+from cfp.presets import analytic_preset
+from dittogym import core
+
+METRICS: dict[str, str] = {
+    "rollout/return": "mean undiscounted true return of the episodes that ended since the last row, None for none",
+    "train/reward": "mean training reward of a step, before its scale",
+    "train/true_reward": "mean true reward of a step, at the particle count of training",
+    "train/value": "mean value that the target critic gives to the window's states",
+    "train/critic_loss": "mean squared error of the critic in the last of its updates",
+    "train/regression_loss": "mean squared error of the actor's actions in the last step of the regression",
+    "train/action_step": "root mean square of the step on the actions",
+    "train/learning_rate": "Adam's step size",
+    "train/limited": "gradients of single actions that were shortened as outliers",
+    "train/episodes": "episodes ended in this stage",
+    "train/terminated": "those that the task ended early",
+    "train/nonfinite": "simulations that were not finite and were reset",
+    "train/dropped": "gradients of single actions that were not finite and were left out",
+}
+"""Every scalar that `AnalyticLearner.update` logs, and what it means."""
+
+
+class AnalyticLearner(Stateful, CoarseToFineStages):
+    """Learns a stage of the coarse-to-fine policy by gradients through the simulation.
+
+    Each update rolls out a window (SHAC), takes a normalised gradient step on its actions and regresses the actor onto
+    the result (PODS), and trains a privileged critic that values the window's end (SHAC, D.Va).
+    """
+
+    config: AnalyticConfig
+    parts = ("regression", "memory", "critic", "collector", "action_step")
+    values = ("generator",)
+
+    def __init__(self, config: AnalyticConfig, stage: int, actor: Actor) -> None:
+        self.config, self.stage = config, stage
+        training = replace(config, environment=config.environment.for_training(config.train_particles))
+        self.env = make_torch_env(training, config.action_size(stage))
+        actor.fix_std()
+        self.actor = actor
+        self.regression = Regression(actor, config.learning_rate, config.weight_average, config.max_grad_norm)
+        features = StateFeatures(displacement=config.displacement)
+        size = features.size(len(self.env.spec.bodies) - 1)
+        with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
+            torch.manual_seed(config.seed)
+            networks = [mlp(size, 1).to(self.env.device) for _ in range(2)]
+        self.critic = Critic(
+            *networks,
+            gamma=config.gamma,
+            td_lambda=config.td_lambda,
+            learning_rate=config.learning_rate,
+            updates=config.critic_updates,
+            tau=config.tau,
+            max_grad_norm=config.max_grad_norm,
+        )
+        episodes = Episodes(self.env, config.seed, config.max_episode_steps, config.num_layouts)
+        self.collector = WindowCollector(episodes, lambda: features(self.env).float(), config.reward, config.window)
+        self.action_step = ActionStep()
+        self.generator = torch.Generator(self.env.device).manual_seed(config.seed)
+        image = self._image()
+        example = (image[0], actor.outputs(image).location[0].detach())
+        self.memory = ImageMemory(config.windows_kept * config.window * self.env.num_envs, example)
+
+    @staticmethod
+    def preset(task: str, name: str) -> AnalyticConfig:
+        """Default options for a task, see `cfp.preset`."""
+        return replace(analytic_preset(task, name), algo="analytic")
+
+    @classmethod
+    def create(cls, config: AnalyticConfig, stage: int, folder: Path, resumed: bool = False) -> AnalyticLearner:
+        """Networks, memory and environment of a stage."""
+        with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
+            torch.manual_seed(config.seed)
+            actor = build_actor(config.actor_spec(stage)).to(choose_device(config.device))
+        trained = cls.begin(config, stage, folder, actor)
+        algorithm = cls(config, stage, actor)
+        algorithm.starts_trained = trained
+        return algorithm
+
+    def _image(self) -> Tensor:
+        return core.observe(self.env.model, self.env.env_state)
+
+    def update(self) -> Scalars:
+        """Play one window and learn from it.
+
+        Raises:
+            NonFiniteError: Actions are not finite.
+        """
+        config, progress = self.config, stage_progress(self.config, self.stage, self.num_timesteps)
+        learning_rate = config.learning_rate * linear_decay(progress)
+        step_size = config.action_step[self.stage - 1] * linear_decay(progress, config.final_step)
+        images: list[Tensor] = []
+        locations: list[Tensor] = []
+
+        def act(_: Tensor) -> Tensor:
+            images.append(self._image())
+            with torch.no_grad():
+                outputs = self.actor.outputs(images[-1], generator=self.generator)
+                locations.append(outputs.location.clamp(-BOUND, BOUND))
+            return self.actor.act(outputs.at(locations[-1].requires_grad_()), generator=self.generator).action
+
+        window = self.collector.collect(act, self.critic)
+        gradients = torch.autograd.grad(short_horizon_loss(window, config.gamma), locations)
+        self.env.detach()
+        improved = self.action_step(torch.stack(locations).detach(), torch.stack(gradients), step_size)
+        self.memory.add(torch.cat(images), improved.flatten(0, 1))
+        regression_loss = torch.zeros(())
+        for _ in range(config.minibatches):
+            batch = self.memory.sample(config.minibatch_size, self.generator)
+            regression_loss = self.regression.update(*batch, learning_rate)
+        critic_loss = self.critic.update(window, learning_rate)
+        self.num_timesteps += config.window * self.env.num_envs
+        return self.collector.episodes.scalars() | {
+            "train/reward": float(window.rewards.detach().mean()) / config.reward.scale,
+            "train/true_reward": window.true_reward,
+            "train/value": float(window.next_values.detach().mean()),
+            "train/critic_loss": critic_loss,
+            "train/regression_loss": float(regression_loss),
+            "train/action_step": step_size,
+            "train/learning_rate": learning_rate,
+            "train/limited": float(self.action_step.limited),
+        }
+
+    def row(self) -> Scalars:
+        """Scalars of the last update, with the mean return of the episodes that ended since the last row."""
+        self.collector.episodes.recent_returns = []
+        return self.scalars
+
+    def images(self) -> dict[str, np.ndarray]:
+        """What the policy does with the observation of the first robot."""
+        return policy_pictures(self.trained_actor, self._image()[:1])
+
+    @property
+    def trained_actor(self) -> Actor:
+        """The actor with averaged weights."""
+        return cast(Actor, self.regression.average.module)
+
+    @property
+    def policy(self) -> ActorPolicy:
+        """What has been learned so far."""
+        deterministic = self.config.report.eval_deterministic
+        return image_policy(self.config.actor_spec(self.stage), self.trained_actor, deterministic)
+
+    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
+        """Write the actor with averaged weights."""
+        super().save_policy(path, description | {"trained_by": self.config.learner})

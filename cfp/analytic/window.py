@@ -1,0 +1,119 @@
+"""Windows of differentiable simulation, within which episodes end and start anew (SHAC; Xu et al., ICLR 2022)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from cfp.analytic.episodes import Episodes
+from cfp.analytic.reward import Neighbours, RewardConfig, training_reward
+from cfp.analytic.stateful import Stateful
+from cfp.errors import NonFiniteError
+from torchmpm import tree
+
+
+class Window(NamedTuple):
+    """T control steps of B simulations, with their autograd graph."""
+
+    observations: Tensor  # (T, B, ...) inputs of the critic, detached
+    rewards: Tensor  # (T, B) training rewards
+    next_values: Tensor  # (T, B) values of the states after each step; 0 where the task has ended the episode
+    done: Tensor  # (T, B) bool, whether the episode was over after the step
+    true_reward: float  # mean of the task's own rewards
+
+
+class WindowCollector(Stateful):
+    """Collects windows from an environment.
+
+    Gradients with respect to the action of one simulation in one step that are not finite are left out and counted.
+
+    Args:
+        episodes: Of the environment.
+        observe: Inputs (B, ...) of the critic in the present state.
+        reward: The training reward.
+        steps: T, control steps of a window.
+    """
+
+    parts = ("episodes",)
+
+    def __init__(self, episodes: Episodes, observe: Callable[[], Tensor], reward: RewardConfig, steps: int) -> None:
+        self.env, self.episodes, self.observe = episodes.env, episodes, observe
+        self.reward, self.steps = reward, steps
+        self.episodes.counts["dropped"] = 0
+
+    def collect(self, act: Callable[[Tensor], Tensor], value: Callable[[Tensor], Tensor]) -> Window:
+        """Collect the next window.
+
+        Args:
+            act: Actions (B, 2, R, R) to execute, from the critic's inputs; it may look at the environment instead.
+            value: Values (B,) of the critic's inputs.
+
+        Raises:
+            NonFiniteError: Actions are not finite.
+        """
+        env, true_reward = self.env, 0.0
+        steps: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+        observation, neighbours = self.observe(), Neighbours.find(self._robot_positions())
+        for _ in range(self.steps):
+            centre = env.env_state.centre
+            _, smooth_reward, terminated, _, info = env.step(self._guarded(act(observation)), soft=True)
+            reward = training_reward(self.reward, env, centre, smooth_reward, info, neighbours).float()
+            next_observation = self.observe()
+            next_value = torch.where(terminated, 0.0, value(next_observation))
+            true_reward += float(info["true_reward"].detach().mean())
+            is_over = self.episodes.record(info["true_reward"].detach(), terminated)
+            steps.append((observation.detach(), reward, next_value, is_over))
+            if bool(is_over.any()):
+                self.episodes.restart(is_over, terminated, info["finite"])
+                neighbours = tree.where(is_over, Neighbours.find(self._robot_positions()), neighbours)
+                next_observation = tree.where(is_over, self.observe(), next_observation)
+            observation = next_observation
+        observations, rewards, next_values, done = (torch.stack(values) for values in zip(*steps, strict=True))
+        return Window(observations, rewards, next_values, done, true_reward / self.steps)
+
+    def _robot_positions(self) -> Tensor:
+        return self.env.state.x[:, : self.env.model.num_robot_particles].detach()
+
+    def _guarded(self, action: Tensor) -> Tensor:
+        """The same actions, through which only finite gradients go back."""
+        if not bool(action.isfinite().all()):
+            raise NonFiniteError("the actor's actions became NaN or infinite; the last checkpoint is untouched")
+        if not action.requires_grad:
+            return action
+        view = action.view_as(action)
+        view.register_hook(self._drop_nonfinite)
+        return view
+
+    def _drop_nonfinite(self, gradient: Tensor) -> Tensor:
+        finite = gradient.isfinite().flatten(1).all(1)
+        self.episodes.counts["dropped"] += int((~finite).sum())
+        return torch.where(finite[:, None, None, None], gradient, 0.0)
+
+
+def short_horizon_loss(window: Window, gamma: float) -> Tensor:
+    """Negative discounted rewards of a window and final values of its episodes, mean over simulations and steps.
+
+    Of an episode within the window, the sum of ``gamma^t r_t`` plus ``gamma^h V(s_h)`` (Xu et al., equation 5).
+    """
+    steps = len(window.rewards)
+    total, discount = torch.zeros_like(window.rewards[0]), torch.ones_like(window.rewards[0])
+    for step, (reward, value, done) in enumerate(zip(window.rewards, window.next_values, window.done, strict=True)):
+        total = total + discount * reward
+        total = total + torch.where(done | (step + 1 == steps), gamma * discount * value, 0.0)
+        discount = torch.where(done, 1.0, gamma * discount)
+    return -total.mean() / steps
+
+
+@torch.no_grad()
+def td_lambda_targets(window: Window, gamma: float, td_lambda: float) -> Tensor:
+    """TD(lambda) targets (T, B) of the values of a window's observations."""
+    targets = torch.empty_like(window.rewards)
+    target = window.next_values[-1]
+    for step in reversed(range(len(targets))):
+        value = window.next_values[step]
+        target = torch.where(window.done[step], value, (1.0 - td_lambda) * value + td_lambda * target)
+        target = targets[step] = window.rewards[step] + gamma * target
+    return targets

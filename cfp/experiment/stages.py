@@ -1,0 +1,80 @@
+"""The stages of the coarse-to-fine policy, whatever learns them: where each one begins, and its files."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from cfp.agent.actor import Actor
+from cfp.agent.actor_policy import ActorPolicy
+from cfp.config import StagedConfig
+from cfp.errors import ConfigError
+from cfp.experiment.algorithm import Algorithm, Position
+from cfp.experiment.folder import policy_path
+from cfp.weights import KIND, load, policy_for, read_policy, report_mismatch, save_policy, write_policy
+
+
+class CoarseToFineStages(Algorithm):
+    """Trains the coarse-to-fine policy, each stage over the frozen policy of the coarser one (paper, Section 4.2)."""
+
+    config: StagedConfig
+    stage: int
+
+    @classmethod
+    def initialize(cls, config: Any, folder: Path) -> Position:
+        """Take the first stages from a policy if the options say so; its steps count as those before its handover."""
+        if config.start_from is None:
+            return Position()
+        policy, refine = policy_for(config, config.start_from), config.refine
+        stages, resolutions = len(policy.spec.resolutions), config.resolutions
+        if policy.spec.resolutions != resolutions[:stages] or (stages == len(resolutions) and not refine):
+            allowed = f"the first resolutions of {resolutions}" + ("" if refine else ", but not all")
+            raise ConfigError(f"start_from must be a policy of {allowed}, got {policy.spec.resolutions}")
+        if stages > 1 and policy.spec != (allowed_spec := config.actor_spec(stages)):
+            raise ConfigError(f"start_from must have networks {allowed_spec}, got {policy.spec}")
+        stage = stages if refine else stages + 1
+        copy = start_path(folder) if refine else policy_path(folder, stages)
+        write_policy(copy, *read_policy(config.start_from))
+        return Position(stage, (0, *config.handover)[stage - 1])
+
+    @classmethod
+    def load(cls, path: Path, device: str = "cpu") -> ActorPolicy:
+        """Load a policy."""
+        return load(path, device)
+
+    @property
+    @abstractmethod
+    def trained_actor(self) -> Actor:
+        """The actor that is the policy."""
+
+    @classmethod
+    def begin(cls, config: Any, stage: int, folder: Path, actor: Actor) -> bool:
+        """Give a freshly built ``actor`` the weights with which a stage begins; tell whether it is trained already."""
+        device = str(next(actor.parameters()).device)
+        if refines(config, folder, stage):
+            actor.load_state_dict(load(start_path(folder), device).actor.state_dict())
+        elif stage > 1:
+            path = policy_path(folder, stage - 1)
+            with report_mismatch(path):
+                actor.get_submodule("coarse").load_state_dict(load(path, device).actor.state_dict())
+        else:
+            return False
+        return True
+
+    def save_policy(self, path: Path, description: dict[str, Any]) -> None:
+        """Write the actor."""
+        network = asdict(self.config.actor_spec(self.stage))
+        save_policy(path, self.trained_actor, description | {"kind": KIND, "network": network})
+
+
+def start_path(folder: Path) -> Path:
+    """The run's own copy of the policy that it refines."""
+    return folder / "start.safetensors"
+
+
+def refines(config: Any, folder: Path, stage: int) -> bool:
+    """Whether the actor of a stage begins as the one that is refined."""
+    start = start_path(folder)
+    return config.refine and start.exists() and bool(read_policy(start)[1]["stage"] == stage)

@@ -1,0 +1,174 @@
+"""The learner `analytic`, on robots of a few hundred particles."""
+
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tiny_runs import assert_same_run, at_step
+
+import cfp
+from cfp import train
+from cfp.agent.actor import build_actor
+from cfp.agent.spec import ActorSpec
+from cfp.analytic.action_step import ActionStep
+from cfp.analytic.learner import METRICS, AnalyticLearner
+from cfp.analytic.regression import ImageMemory, Regression
+from cfp.errors import ConfigError
+from cfp.experiment.folder import policy_path
+from cfp.sections import EnvironmentConfig
+from cfp.weights import describe_run
+
+TINY = (
+    "--task run --learner analytic --particles 300 --train-particles 300 --substeps 4 --num-envs 2 --resolutions 4 8 "
+    "--window 4 --steps 96 --handover 48 --minibatches 4 --minibatch-size 8 --windows-kept 3 --num-layouts 4 "
+    "--eval-every 48 --eval-episodes 1 --checkpoint-every 16 --log-every 8 --no-video --device cpu"
+).split()
+
+
+def make(task="run", stages=1, **changes):
+    environment = EnvironmentConfig(changes.pop("num_envs", 2), 300, changes.pop("substeps", 4))
+    grids = (4, 8)[:stages]
+    defaults = {"resolutions": grids, "handover": (48,)[: stages - 1], "gate_bias": (-1.0,)[: stages - 1], "steps": 96}
+    defaults |= {"action_step": (0.1, 0.1)[:stages], "environment": environment, "train_particles": 300}
+    defaults |= {"device": "cpu", "window": 4, "minibatches": 4, "minibatch_size": 8, "windows_kept": 3}
+    return replace(cfp.preset(task, "quick", "analytic"), **defaults | changes)
+
+
+def parameters(module):
+    return torch.nn.utils.parameters_to_vector(module.parameters()).detach().clone()
+
+
+def test_quick_learns_by_gradients_and_paper_from_rewards():
+    assert cfp.preset("run").learner == "analytic" and cfp.preset("run", "paper").learner == "sac"
+    assert cfp.preset("run", "quick", "sac").learner == "sac"
+    with pytest.raises(ConfigError, match="preset must be quick for learner analytic, got 'paper'"):
+        cfp.preset("run", "paper", "analytic")
+    with pytest.raises(ConfigError, match="learner must be analytic or sac, got 'ppo'"):
+        cfp.preset("run", "quick", "ppo")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"window": 0}, "window must be at least 1, got 0"),
+        ({"action_step": (0.0,)}, "action_step must be positive, got 0"),
+        ({"action_step": (0.1, 0.1)}, "action_step must have 1 values"),
+        ({"weight_average": 1.5}, "weight_average must be between 0 and 1, got 1.5"),
+        ({"refine": True}, "refine requires start_from"),
+    ],
+)
+def test_impossible_options_are_named(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        make(**changes).check()
+
+
+def test_training_shapes_the_robot(tmp_path):
+    config = make("shapematch", resolutions=(8,), action_step=(0.2,), window=16, steps=640, max_episode_steps=80)
+    config = replace(config, learning_rate=2e-3, weight_average=0.9, minibatches=16, minibatch_size=32, windows_kept=4)
+    config = replace(config, environment=EnvironmentConfig(2, 600), train_particles=600, num_layouts=2)
+    learner, rewards = AnalyticLearner.create(config, 1, tmp_path), []
+    while learner.num_timesteps < config.steps:
+        scalars = learner.update()
+        rewards.append(scalars["train/true_reward"])
+    assert set(scalars) == set(METRICS)
+    assert np.mean(rewards[-5:]) > np.mean(rewards[:5]) + 1.5
+
+
+def test_step_has_the_given_size_and_goes_down_the_gradient():
+    torch.manual_seed(0)
+    step, locations, gradients = ActionStep(), torch.zeros(4, 3, 2, 4, 4), torch.randn(4, 3, 2, 4, 4)
+    change = step(locations, gradients, 0.1)
+    assert change.square().mean().sqrt().item() == pytest.approx(0.1, rel=1e-5)
+    assert torch.allclose(change / gradients, (change / gradients)[0, 0, 0, 0, 0].expand_as(change), atol=1e-5)
+    assert (change * gradients).sum() < 0
+    assert step(torch.full_like(locations, 2.5), -gradients.abs(), 0.1).max() == 2.5
+    assert torch.equal(ActionStep()(locations, torch.zeros_like(gradients), 0.1), locations)
+
+
+def test_outlying_gradient_does_not_drown_the_others():
+    torch.manual_seed(0)
+    step, locations, gradients = ActionStep(), torch.zeros(4, 3, 2, 4, 4), torch.randn(4, 3, 2, 4, 4)
+    gradients[1, 2] *= 1e30  # its square overflows in single precision
+    change = step(locations, gradients, 0.1)
+    norms = change.flatten(2).norm(dim=2)
+    assert step.limited == 1 and change.isfinite().all()
+    assert 2.5 < norms[1, 2] / norms.median() < 3.5
+    assert norms.min() > 0.2 * norms.median()
+
+
+def test_memory_keeps_the_latest_pairs():
+    image, location = torch.zeros(3, 64, 64, dtype=torch.uint8), torch.zeros(2, 4, 4)
+    memory = ImageMemory(6, (image, location))
+    for value in range(5):
+        memory.add((image + value).expand(2, -1, -1, -1), (location + value).expand(2, -1, -1, -1))
+    images, locations = memory.sample(200, torch.Generator().manual_seed(0))
+    assert set(images.unique().tolist()) == {2, 3, 4}
+    assert torch.equal(images[:, 0, 0, 0].float(), locations[:, 0, 0, 0])
+
+
+@pytest.mark.parametrize("grids", [(4,), (4, 8)])
+def test_regression_reaches_locations_and_leaves_coarse_actor_and_deviation(grids):
+    torch.manual_seed(0)
+    actor = build_actor(ActorSpec(grids, (-1.0,) * (len(grids) - 1), patch=16))
+    actor.fix_std()
+    images = torch.randint(0, 256, (6, 3, 64, 64), dtype=torch.uint8)
+    targets = torch.randn_like(actor.outputs(images, deterministic=True).location)
+    frozen = {name: value.clone() for name, value in actor.named_parameters() if not value.requires_grad}
+    assert any(name.startswith("coarse") for name in frozen) == (len(grids) > 1)
+    regression = Regression(actor, 3e-3, 0.9, 1.0)
+    losses = [regression.update(images, targets, 3e-3).item() for _ in range(150)]
+    assert losses[-1] < 0.3 * losses[0]
+    assert all(torch.equal(value, dict(actor.named_parameters())[name]) for name, value in frozen.items())
+    std = actor.act(actor.outputs(images)).log_prob
+    assert std.isfinite().all()
+
+
+def test_second_stage_learns_residual_and_gate_on_the_frozen_policy(tmp_path):
+    first = AnalyticLearner.create(make(), 1, tmp_path)
+    first.learn(16)
+    first.save_policy(policy_path(tmp_path, 1), describe_run(first.config, "cfp", 1, 16))
+    second = AnalyticLearner.create(make(stages=2), 2, tmp_path)
+    coarse, gate = (second.actor.get_submodule(name) for name in ("coarse", "gate"))
+    assert second.starts_trained and torch.equal(parameters(coarse), parameters(first.trained_actor))
+    before = parameters(gate)
+    second.learn(16)
+    assert torch.equal(parameters(coarse), parameters(first.trained_actor))
+    assert not torch.equal(before, parameters(gate))
+    observation = np.zeros((3, 64, 64), np.uint8)
+    action, _ = second.policy.predict(observation, deterministic=True)
+    assert action.shape == (2, second.policy.resolution, second.policy.resolution)
+
+
+def test_gradients_of_a_window_are_those_of_its_return(tmp_path):
+    """The step on the actions, were it small, increases the return of the same window."""
+    config = make(substeps=100, gamma=1.0, num_envs=1)
+    learner = AnalyticLearner.create(config, 1, tmp_path)
+    env, collector = learner.env, learner.collector
+    start = env.save()
+    leaf = torch.randn(4, 1, *env.action_shape, generator=torch.Generator().manual_seed(0)).requires_grad_()
+
+    def window_return(actions):
+        env.load(start)
+        steps = iter(actions)
+        return collector.collect(lambda _: next(steps).tanh(), learner.critic).rewards.sum()
+
+    before = window_return(leaf)
+    (gradient,) = torch.autograd.grad(-before, leaf)
+    improved = learner.action_step(leaf.detach(), gradient, 0.1)
+    after = window_return(improved)
+    expected = -(gradient * (improved - leaf)).sum()
+    assert (after - before).item() == pytest.approx(expected.item(), rel=0.2) and after > before
+
+
+def test_run_of_two_stages_and_the_same_run_with_an_interruption(tmp_path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert train.main([*TINY, "--out", str(whole)]) == 0
+    with at_step(56, lambda: signal.raise_signal(signal.SIGINT)):  # in the second stage
+        assert train.main([*TINY, "--out", str(parts)]) == 128 + signal.SIGINT
+    assert train.main(["--out", str(parts), "--resume"]) == 0
+    assert_same_run(whole, parts, ("progress.csv",))
+    policies = [cfp.load(folder) for folder in (whole, parts)]
+    assert torch.equal(parameters(policies[0]), parameters(policies[1]))
+    assert policies[0].spec.resolutions == (4, 8) and policies[0].description["trained_by"] == "analytic"
