@@ -40,6 +40,7 @@ def main() -> None:
             policy.resolution,
             particles=arguments.particles,
             substeps=own.substeps,
+            dt=own.dt,
             dtype=own.dtype,
             action_layout=own.action_indexing,
         )

@@ -41,6 +41,8 @@ class Selection:
     """Seed of layouts and noise; the run's own if not given."""
     particles: Particles | None = None
     """Particles: full (the paper's), lite, or counts; the run's own if not given."""
+    dt: float | None = None
+    """Duration of a physics step, s; the run's own if not given."""
     device: str = "auto"
     """cpu, cuda, or auto."""
 
@@ -55,7 +57,9 @@ class Selection:
             raise ConfigError(f"either policy or a folder must be given, got {self.policy!r} and {self.folder}")
         if self.particles is not None and self.particles != config.environment.particles:
             config = replace(config, environment=config.environment.for_evaluation(self.particles))
-            config.check()
+        if self.dt is not None:
+            config = replace(config, environment=config.environment.with_dt(self.dt))
+        config.check()
         return config, policies
 
 

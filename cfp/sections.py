@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 from cfp.agent.spec import Interpolation
 from cfp.errors import ConfigError
 from cfp.validation import check_at_least, check_positive
+from dittogym.spec import CONTROL_STEP, DT
 
 Particles: TypeAlias = Literal["full", "lite"] | int | tuple[int, int]
 """Particle count: the paper's, about 2,000, a number, or one number for the robot and one for the object."""
 
 TASK_OPTIONS = ("target", "variant")
 """Fields of `EnvironmentConfig` that are options of some tasks only."""
+
+LONG_DT = 2e-4
+"""Duration of a substep, s, in the simulations of gradient methods and planners in `LONG_DT_TASKS`."""
+LONG_DT_TASKS = ("run",)
+"""Tasks in which it changes no more than another layout of particles does (benchmarks/long_substeps.py)."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +31,10 @@ class EnvironmentConfig:
     """Number of robots simulated side by side."""
     particles: Particles = "lite"
     """Particles: full (the paper's), lite (about 2,000), a count, or one count for robot and one for object."""
-    substeps: int = 100
-    """Physics steps in one environment step."""
+    substeps: int | None = None
+    """Physics steps in one environment step; None: as many as take 10 ms."""
+    dt: float = DT
+    """Duration of a physics step, s."""
     dtype: Literal["float32", "float64"] = "float32"
     """Precision of the physics."""
     backend: str = "auto"
@@ -51,6 +60,35 @@ class EnvironmentConfig:
         """Orientation of the action array that these options result in."""
         return self.action_layout or ("grid" if self.parity == "reference" else "image")
 
+    @property
+    def control_step(self) -> float:
+        """Duration of an environment step, s."""
+        return CONTROL_STEP if self.substeps is None else self.substeps * self.dt
+
+    def with_dt(self, dt: float, option: str = "dt") -> EnvironmentConfig:
+        """These options with the same environment step in substeps of ``dt`` s, the value of an option."""
+        check_positive(**{option: dt})
+        substeps = round(self.control_step / dt)
+        if not math.isclose(substeps * dt, self.control_step):
+            raise ConfigError(f"{option} must divide an environment step of {self.control_step} s, got {dt}")
+        return self if dt == self.dt else replace(self, dt=dt, substeps=substeps)
+
+    def for_optimisation(
+        self, task: str, particles: Particles | None = None, dt: float | None = None
+    ) -> EnvironmentConfig:
+        """These options for the simulations of a gradient method or a planner.
+
+        Args:
+            task: The task.
+            particles: As in `for_training`; None: these options as they are.
+            dt: Duration of a substep, s; None: `LONG_DT` in `LONG_DT_TASKS` if these options leave ``substeps`` and
+                ``dt`` at their defaults, else as it is.
+        """
+        if dt is None:
+            is_default = self.substeps is None and self.dt == DT
+            dt = LONG_DT if is_default and task in LONG_DT_TASKS else self.dt
+        return (self if particles is None else self.for_training(particles)).with_dt(dt, "train_dt")
+
     def for_training(self, particles: Particles) -> EnvironmentConfig:
         """These options with other particles, without the reference's faults, and with actions oriented as here."""
         return replace(self, particles=particles, parity="clean", action_layout=self.action_indexing)
@@ -61,7 +99,10 @@ class EnvironmentConfig:
 
     def check(self) -> None:
         """Raise a `ConfigError` for values out of range."""
-        check_at_least(1, num_envs=self.num_envs, substeps=self.substeps)
+        check_at_least(1, num_envs=self.num_envs)
+        if self.substeps is not None:
+            check_at_least(1, substeps=self.substeps)
+        check_positive(dt=self.dt)
 
 
 @dataclass(frozen=True)

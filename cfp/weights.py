@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -192,12 +193,12 @@ def policy_for(config: RunConfig, path: str) -> ActorPolicy:
 
 
 def check_trained_for(option: str, description: Mapping[str, Any], task: str, environment: EnvironmentConfig) -> None:
-    """Check that a policy, named by an option, was trained for a task, its target and material, and the substeps."""
+    """Check that a policy, named by an option, was trained for a task, its target, material and control step."""
     if (found := description["task"]) != task:
         raise ConfigError(f"{option} must be a policy for {task}, got one for {found}")
     own = update_from_dict(EnvironmentConfig(), description["environment"])
-    if own.substeps != environment.substeps:
-        raise ConfigError(f"{option} must be a policy for substeps {environment.substeps}, got {own.substeps}")
+    if not math.isclose(found := own.control_step, allowed := environment.control_step):
+        raise ConfigError(f"{option} must be a policy for environment steps of {allowed} s, got {found}")
     for name in TASK_OPTIONS:
         given, expected = getattr(own, name), getattr(environment, name)
         try:

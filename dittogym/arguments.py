@@ -10,7 +10,8 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from dittogym.spec import TaskSpec
+from dittogym.spec import CONTROL_STEP, TaskSpec
+from torchmpm import checks
 
 Value = TypeVar("Value")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -31,6 +32,17 @@ def find_resolution(spec: TaskSpec, resolution: str | int) -> int:
     if isinstance(size, bool) or not isinstance(size, Integral) or not 1 <= int(size) <= spec.patch:
         raise ValueError(f"resolution must be 'coarse', 'fine' or 1 to {spec.patch}, got {resolution!r}")
     return int(size)
+
+
+def find_substeps(dt: float, substeps: int | None) -> int:
+    """Substeps of ``dt`` s in a control step; ``None`` stands for as many as take :data:`CONTROL_STEP`."""
+    checks.number("dt", dt, above=0.0)
+    if substeps is not None:
+        return checks.whole("substeps", substeps, 1)
+    count = round(CONTROL_STEP / dt)
+    if not math.isclose(count * dt, CONTROL_STEP):
+        raise ValueError(f"dt must divide the control step of {CONTROL_STEP} s if substeps is not given, got {dt}")
+    return count
 
 
 def find_mask(name: str, given: Any, num_envs: int, device: torch.device) -> Tensor:

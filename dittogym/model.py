@@ -12,7 +12,7 @@ from torch import Tensor
 from dittogym.contract import Measurement
 from dittogym.observation.camera import Camera
 from dittogym.physics import Physics, part_of
-from dittogym.spec import TaskSpec
+from dittogym.spec import DT, TaskSpec
 from dittogym.window import GRID
 from torchmpm import Body, Elastic, ParticleState, Solver, VonMises, tree
 from torchmpm.rollout import Segment
@@ -101,7 +101,13 @@ class Model:
 
 
 def make_model(
-    spec: TaskSpec, counts: tuple[int, ...], substeps: int, backend: str, parity: Parity, segment: Segment = "auto"
+    spec: TaskSpec,
+    counts: tuple[int, ...],
+    substeps: int,
+    backend: str,
+    parity: Parity,
+    segment: Segment = "auto",
+    dt: float = DT,
 ) -> Model:
     """Build the physics of a task.
 
@@ -115,6 +121,7 @@ def make_model(
         backend: Of the solver.
         parity: ``"reference"``: particles of unit volume and the pixel raster at every tier.
         segment: See :class:`Model`.
+        dt: Duration of a substep, s.
     """
     full = tuple(body.count for body in spec.bodies)
     weight = tuple(1.0 if parity == "reference" else n / m for n, m in zip(full, counts, strict=True))
@@ -122,8 +129,9 @@ def make_model(
         GRID,
         _bodies(spec, counts, weight, {}),
         gravity=spec.gravity,
-        damping=spec.damping,
+        damping=spec.damping ** (dt / DT),
         rules=tuple(rule for obstacle in spec.obstacles for rule in obstacle.velocity_rules),
+        dt=dt,
         backend=backend,
         allow_unstable=True,  # checked with the muscles, here and when a reset changes the matter
     )
@@ -141,8 +149,8 @@ def check_stability(model: Model, physics: Physics) -> None:
     solver = model.solver_for(physics)
     limit = solver.stable_dt(physics.get("max_actuation", model.spec.max_actuation))
     if solver.dt > limit:
-        matter = f"got matter so stiff and light that substeps would have to be at most {limit} s"
-        raise ValueError(f"mu, lam, max_actuation and mass must allow substeps of {solver.dt} s, {matter}")
+        matter = "matter of these mu, lam, max_actuation and mass"
+        raise ValueError(f"dt must be at most {limit} s to be stable with {matter}, got {solver.dt}")
 
 
 def _bodies(spec: TaskSpec, counts: tuple[int, ...], weight: tuple[float, ...], physics: Physics) -> tuple[Body, ...]:

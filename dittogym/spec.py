@@ -15,6 +15,11 @@ from dittogym.observation.image import SIZE
 from dittogym.window import Centre, Window
 from torchmpm import Material, checks
 
+#: Duration of a control step, s.
+CONTROL_STEP = 1e-2
+#: Duration of a substep in the reference implementation, s, which damping is given for.
+DT = 1e-4
+
 
 @dataclass(frozen=True)
 class BodySpec:
@@ -67,7 +72,7 @@ class TaskSpec:
             is a ``split_limit``), ``action`` (norm of the actuation field) and ``alive`` (every step).
         objects: Bodies besides the robot, at most one.
         gravity: (x, y), m/s^2.
-        damping: Factor on node velocities in every substep.
+        damping: Factor on node velocities in every :data:`DT`.
         window: Fixed or moving window.
         view: Centre of the observed half-window.
         reach: Centre of the patch of nodes on which actions act.

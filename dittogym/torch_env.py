@@ -12,14 +12,23 @@ from torch import Tensor
 
 from dittogym import core
 from dittogym.action import ActionIndexing, to_grid_indexing
-from dittogym.arguments import DTYPES, check_action, choice, find_device, find_mask, find_resolution, reset_options
+from dittogym.arguments import (
+    DTYPES,
+    check_action,
+    choice,
+    find_device,
+    find_mask,
+    find_resolution,
+    find_substeps,
+    reset_options,
+)
 from dittogym.bodies.positions import InitialPositions, Particles, Seed, get_state, particle_counts, set_state
 from dittogym.contract import measure
 from dittogym.model import EnvState, Parity, Snapshot, check_stability, make_model
 from dittogym.observation.image import SHAPE
 from dittogym.physics import Physics, merged, physics_values
 from dittogym.render.frame import frame
-from dittogym.spec import TaskSpec
+from dittogym.spec import DT, TaskSpec
 from dittogym.tasks import make_spec
 from torchmpm import ParticleState, checks, tree
 from torchmpm.rollout import Segment, check_repetition
@@ -38,7 +47,8 @@ class TorchEnv:
         num_envs: B, the number of simulations.
         resolution: ``"coarse"``, ``"fine"``, or R itself, at most the task's patch.
         particles: ``"full"``, ``"lite"`` (2,000, evenly spread), the robot's number, or (robot, object).
-        substeps: Substeps of 1e-4 s in a control step.
+        substeps: Substeps in a control step; ``None``: as many as take 10 ms.
+        dt: Duration of a substep, s. The task's damping per second stays the same.
         dtype: ``"float32"`` or ``"float64"``, by name or as torch's.
         device: Where it runs.
         backend: Of the solver, see :class:`torchmpm.Solver`.
@@ -67,7 +77,8 @@ class TorchEnv:
         resolution: str | int = "coarse",
         *,
         particles: Particles = "full",
-        substeps: int = 100,
+        substeps: int | None = None,
+        dt: float = DT,
         dtype: str | torch.dtype = "float32",
         device: str | torch.device = "cpu",
         backend: str = "auto",
@@ -79,7 +90,7 @@ class TorchEnv:
         **task_options: Any,
     ) -> None:
         self.spec = make_spec(task, **task_options)
-        self.num_envs, substeps = checks.whole("num_envs", num_envs, 1), checks.whole("substeps", substeps, 1)
+        self.num_envs, substeps = checks.whole("num_envs", num_envs, 1), find_substeps(dt, substeps)
         check_repetition(substeps, segment)
         for name, flag in (("resample", resample), ("deterministic", deterministic)):
             checks.flag(name, flag)
@@ -93,7 +104,7 @@ class TorchEnv:
         own: ActionIndexing = "grid" if self._as_reference else "image"
         self.action_layout = choice("action_layout", action_layout, {"image": "image", "grid": "grid", None: own})
         counts = particle_counts(self.spec, particles)
-        self.model = make_model(self.spec, counts, substeps=substeps, backend=backend, parity=parity, segment=segment)
+        self.model = make_model(self.spec, counts, substeps, backend, parity, segment, float(dt))
         random = self._as_reference or counts == tuple(body.count for body in self.spec.bodies)
         self._initial_positions = InitialPositions(self.spec, counts, self.num_envs, random=random, resample=resample)
         self._like = torch.empty(self.num_envs, dtype=self.dtype, device=self.device)

@@ -136,7 +136,7 @@ def numbers(spec: TaskSpec) -> list[tuple[str, str]]:
         ("yield stress", f"{spec.yield_stress:g} Pa"),
         ("muscle stress for an action of 1", f"{spec.max_actuation:g} Pa"),
         ("gravity", f"{spec.gravity[1]:g} m/s²"),
-        ("damping factor of the node velocities per substep", f"{spec.damping:g}"),
+        ("damping factor of the node velocities per 0.1 ms", f"{spec.damping:g}"),
         (
             "simulation window",
             f"from x = {window.left:g} m"

@@ -16,6 +16,7 @@ from torchmpm.materials.base import broadcast_plane
 from torchmpm.materials.body import Body, slices
 from torchmpm.materials.linalg import Mat2, Sym2, matmul
 from torchmpm.materials.muscle import muscle_stress
+from torchmpm.materials.resolved import detach_unresolved, resolved_stress
 from torchmpm.spline import Stencil, stencil
 
 #: Added to the mass of a node before the division, kg, so that an empty node has velocity zero.
@@ -53,6 +54,7 @@ class Scattered(NamedTuple):
 
 def substep(scene: Scene, planes: Planes) -> Planes:
     """Advance all particles by one substep: from planes (B, N) to planes (B, N)."""
+    planes = detach_unresolved(scene.bodies, planes, scene.dt)
     scattered = particles_to_grid(scene, planes)
     velocity = grid_velocity(scene, scattered.momentum)
     velocity = constrain(scene.faces, velocity)
@@ -83,7 +85,7 @@ def _deform(scene: Scene, nodes: Stencil, trial: Mat2, Jp: Tensor) -> tuple[Mat2
         a, b, c, d = trial
         before = Jp[:, part]
         F, after = body.material.return_map((a[:, part], b[:, part], c[:, part], d[:, part]), before)
-        tau = body.material.stress(F, before)
+        tau = resolved_stress(body, F, before, scene.grid.h, scene.dt)
         if body.muscle and scene.actuation is not None:
             active = muscle_stress(F, transfer.interpolate(nodes.part(part), scene.actuation))
             tau = (tau[0] + active[0], tau[1] + active[1], tau[2] + active[2])

@@ -23,7 +23,7 @@ from dittogym.tasks import task_name
 LARGEST_SEED = EVALUATION_SEED - 1001  # larger ones would train on the layouts of the final evaluation
 IRRELEVANT_OPTIONS = ("device", "environment.backend", "report.video", "report.checkpoint_every", "report.log_every")
 """Options that change neither what a run learns nor which policy it keeps."""
-TASK_DEFINING_OPTIONS = ("substeps", "dtype", "parity", "resample", "target", "variant")
+TASK_DEFINING_OPTIONS = ("substeps", "dt", "dtype", "parity", "resample", "target", "variant")
 """Options of the environment on which all algorithms of a task must agree."""
 Options = dict[str, Any]
 """Options of a run by name, in the form of its ``config.json``."""

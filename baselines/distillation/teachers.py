@@ -145,7 +145,7 @@ def train_teacher(config: DistillConfig, folder: Path, signals: StopSignals) -> 
     if config.teacher not in TRAINED or teacher_path(folder).exists():
         return
     chosen = configure({"algo": config.teacher, "task": config.task})
-    same = {name: getattr(config.environment, name) for name in ("substeps", "dtype", "backend", *TASK_OPTIONS)}
+    same = {name: getattr(config.environment, name) for name in ("substeps", "dt", "dtype", "backend", *TASK_OPTIONS)}
     environment = replace(chosen.environment, **same)
     chosen = replace(chosen, seed=config.seed, device=config.device, environment=environment)
     algorithm, own = find(config.teacher), folder / "teacher"

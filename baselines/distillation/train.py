@@ -91,7 +91,9 @@ class Distill(Stateful, Algorithm):
         config = self.config
         if path is None and config.teacher == "mpc":
             size = grid_size(config.task, config.planner_grid)
-            return PlannerTeacher(make_torch_env(training, size), config.planner, config.seed)
+            environment = training.environment.for_optimisation(config.task)
+            model = make_torch_env(replace(training, environment=environment), size)
+            return PlannerTeacher(model, config.planner, config.seed)
         policy = read_teacher(path or config.teacher, config.task, config.environment)
         trained_in = EnvironmentConfig(**policy.description["environment"])
         return PolicyTeacher(policy, trained_in.action_indexing, config.environment.action_indexing)

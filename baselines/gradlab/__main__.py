@@ -19,6 +19,7 @@ from cfp.errors import ConfigError
 from cfp.experiment.cli import run_command
 from cfp.validation import check_at_least
 from dittogym import TorchEnv
+from dittogym.spec import DT
 from dittogym.tasks import task_name
 
 ACTION_RANGE = 0.3
@@ -48,8 +49,10 @@ class GradLabConfig:
     """Particles: full, lite (about 2,000) or a count."""
     resolution: Literal["coarse", "fine"] | int = "coarse"
     """Action grid."""
-    substeps: int = 100
-    """Physics steps in a control step."""
+    substeps: int | None = None
+    """Physics steps in a control step; None: as many as take 10 ms."""
+    dt: float = DT
+    """Duration of a physics step, s."""
     backend: str = "auto"
     """How the physics is computed: auto, eager, compile, ..."""
     horizons: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64)
@@ -81,7 +84,7 @@ def parse(arguments: Sequence[str]) -> GradLabConfig:
 
 def make_env(config: GradLabConfig) -> TorchEnv:
     """Build and reset the task in float64; a `ConfigError` if it refuses an option or the episode is too short."""
-    options = {name: getattr(config, name) for name in ("resolution", "particles", "substeps", "backend")}
+    options = {name: getattr(config, name) for name in ("resolution", "particles", "substeps", "dt", "backend")}
     try:
         env = TorchEnv(config.task, dtype="float64", device=choose_device(config.device), **options)
         env.reset(seed=config.seed)

@@ -37,6 +37,9 @@ class PlannedConfig(GridConfig):
 
     train_particles: Particles | None = None
     """Particles of the simulations in which plans are tried, at most the environment's; None: as many."""
+    train_dt: float | None = None
+    """Duration of a substep in them, s; None: 2e-4 in tasks where this changes little, unless substeps or
+    dt are given."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
 
     def ends(self) -> tuple[int, ...]:
@@ -105,11 +108,11 @@ class MPC(OpenLoopAlgorithm):
         self.env = make_torch_env(config, config.resolution(1), 1)
         self.env.reset(seed=config.seed)
         self.surrogate = None
-        if config.train_particles is not None:
-            training = replace(config, environment=config.environment.for_training(config.train_particles))
-            small = make_torch_env(training, config.resolution(1), 1)
-            small.reset(seed=config.seed)
-            self.surrogate = Surrogate(self.env, small)
+        environment = config.environment.for_optimisation(config.task, config.train_particles, config.train_dt)
+        if environment != config.environment:
+            cheap = make_torch_env(replace(config, environment=environment), config.resolution(1), 1)
+            cheap.reset(seed=config.seed)
+            self.surrogate = Surrogate(self.env, cheap)
         planning_env = self.surrogate.env if self.surrogate else self.env
         self.planner = self.planner_type(planning_env, config.planner, seed=config.seed)
         self.actions = torch.zeros(0, *self.env.action_shape)

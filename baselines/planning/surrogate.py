@@ -1,4 +1,4 @@
-"""A cheaper model to plan in: the state of one simulation copied into another with fewer particles."""
+"""A cheaper model to plan in: the state of one simulation copied into another with fewer particles or substeps."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ NEIGHBOURS = 16
 
 
 class Surrogate:
-    """Copies the states of one environment into another of the same task with fewer particles.
+    """Copies the states of one environment into another of the same task, with as many particles or fewer.
 
     Each particle of the small environment stands for the nearest of the large in the initial positions of both, and
     takes over its position, velocity and deformation; masses and volumes are the small environment's own.
@@ -44,6 +44,8 @@ class Surrogate:
 
 def _nearest_particles(large: TorchEnv, small: TorchEnv) -> Tensor:
     """Indices (B, n) of the large environment's nearest particles, body by body, each at most once."""
+    if torch.equal(large.state.x, small.state.x):
+        return torch.arange(large.num_particles, device=large.device).expand(large.num_envs, -1)
     indices, start, small_start = [], 0, 0
     for many, few in zip(large.model.solver.bodies, small.model.solver.bodies, strict=True):
         if few.count > many.count:

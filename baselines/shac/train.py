@@ -66,6 +66,9 @@ class ShacConfig(GridConfig):
     """Policy of the image with one stage from which the actor starts, except for its standard deviation."""
     train_particles: Particles = "lite"
     """Particles of the simulations in training."""
+    train_dt: float | None = None
+    """Duration of a substep in training, s; None: 2e-4 in tasks where this changes little, unless substeps or
+    dt are given."""
     window: int = 16
     """Control steps that a gradient reaches back."""
     gamma: float = 0.98
@@ -131,7 +134,8 @@ class Shac(Stateful, Algorithm):
 
     def __init__(self, config: ShacConfig, stage: int = 1, start: Policy | None = None) -> None:
         self.config = config
-        training = replace(config, environment=config.environment.for_training(config.train_particles))
+        environment = config.environment.for_optimisation(config.task, config.train_particles, config.train_dt)
+        training = replace(config, environment=environment)
         self.env = make_torch_env(training, config.resolution(stage))
         self.features = StateFeatures(config.deformation, config.clock, config.displacement)
         with torch.random.fork_rng(devices=range(torch.cuda.device_count())):

@@ -47,7 +47,7 @@ METRICS: dict[str, str] = {
 class GradientConfig(GridConfig):
     """A run of open-loop gradient descent. An iteration simulates num_envs episodes on fixed particle layouts.
 
-    The environment options say where the actions are evaluated; train_particles, where they are optimised.
+    The environment options say where the actions are evaluated; train_particles and train_dt, where they are optimised.
     """
 
     algo: str = "gradient"
@@ -62,6 +62,9 @@ class GradientConfig(GridConfig):
     """Control steps that a gradient reaches back; 0: the whole episode."""
     train_particles: Particles = "lite"
     """Particles of the simulation in the first stage."""
+    train_dt: float | None = None
+    """Duration of a substep in the first stage, s; None: 2e-4 in tasks where this changes little, unless substeps or
+    dt are given."""
     blur: tuple[float, ...] = (4.0, 2.0, 1.0, 0.0)
     """SHAPE MATCH: standard deviations, in pixels, of the blur of both pictures, one after the other."""
     polish: int = 0
@@ -127,7 +130,9 @@ class Gradient(Stateful, OpenLoopAlgorithm):
 
     def __init__(self, config: GradientConfig, stage: int = 1, start: OpenLoop | None = None) -> None:
         self.config, self.stage, polishes = config, stage, stage > 1
-        environment = config.environment if polishes else config.environment.for_training(config.train_particles)
+        environment = config.environment
+        if not polishes:
+            environment = environment.for_optimisation(config.task, config.train_particles, config.train_dt)
         training = replace(config, environment=environment)
         self.env = make_torch_env(training, config.resolution(stage), 1 if polishes else None)
         self.env.reset(seed=config.seed)

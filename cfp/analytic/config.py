@@ -15,12 +15,14 @@ from cfp.validation import check_at_least, check_fraction, check_positive
 class AnalyticConfig(CoarseToFineConfig):
     """A run of the coarse-to-fine policy that learns by gradients through the simulation.
 
-    The environment options say where the policy is evaluated; train_particles, where it is trained.
+    The environment options say where the policy is evaluated; train_particles and train_dt, where it is trained.
     """
 
     learner: Learner = "analytic"
     train_particles: Particles = "lite"
     """Particles of the simulations in training."""
+    train_dt: float | None = None
+    """Duration of a substep in training, s; None: as in the environment."""
     window: int = 16
     """Control steps that a gradient reaches back."""
     gamma: float = 0.98

@@ -25,6 +25,14 @@ def shorten(algorithm, horizon):
     return algorithm
 
 
+def test_only_the_first_stage_takes_longer_substeps():
+    config = make("run", environment=EnvironmentConfig(1, 100), polish=1)
+    assert [Gradient(config, stage).env.model.solver.dt for stage in (1, 2)] == [2e-4, 1e-4]
+    assert Gradient(replace(config, train_dt=1e-4)).env.model.substeps == 100
+    with pytest.raises(ConfigError, match="train_dt must be positive"):
+        Gradient(replace(config, train_dt=0.0))
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -37,6 +37,15 @@ def parameters(algorithm):
     return torch.nn.utils.parameters_to_vector(algorithm.actor.parameters()).detach().clone()
 
 
+def test_trains_with_longer_substeps_and_is_evaluated_with_the_tasks_own():
+    config = make(environment=EnvironmentConfig(2, 100), train_particles=100)
+    algorithm = Shac(config)
+    assert algorithm.env.model.solver.dt == 2e-4 and algorithm.env.model.substeps == 50
+    assert make_env(config, 8, 1).venv.torch_env.model.solver.dt == 1e-4
+    with pytest.raises(ConfigError, match=r"dt must be at most .*, got 0\.0002"):
+        Shac(replace(config, task="dig", train_dt=2e-4))
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -1,5 +1,7 @@
 """Planning in a simulation with fewer particles than the one that the plan is for."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -11,6 +13,7 @@ from dittogym import TASKS, TorchEnv
 
 ENVIRONMENT = EnvironmentConfig(num_envs=1, particles=600, substeps=2)
 PLANNER = GradientPlannerConfig(horizon=3, commit=2, iterations=1)
+CONFIG = MPCConfig(task="grow", device="cpu", grid=4, environment=ENVIRONMENT, planner=PLANNER)
 
 
 def make(task: str, particles: int, seed: int = 0) -> TorchEnv:
@@ -60,8 +63,20 @@ def test_takes_over_constants_of_particles() -> None:
     small.step(torch.zeros(2, *small.action_shape))
 
 
+def test_plans_are_tried_in_longer_substeps_and_carried_out_in_the_tasks_own() -> None:
+    """With the same particles the surrogate starts from the very state that is planned for."""
+    config = replace(CONFIG, environment=EnvironmentConfig(1, 300, dtype="float64"))
+    assert MPC(replace(config, train_dt=1e-4)).surrogate is None
+    mpc = MPC(replace(config, task="run"))
+    assert mpc.env.model.solver.dt == 1e-4 and mpc.planner.env.model.solver.dt == 2e-4
+    mpc.learn(2)
+    before = mpc.env.state
+    mpc.learn(1)
+    assert torch.equal(mpc.planner.env.state.x, before.x) and torch.equal(mpc.planner.env.state.F, before.F)
+
+
 def test_plans_in_it_are_carried_out_in_the_other() -> None:
-    config = MPCConfig(task="grow", device="cpu", grid=4, environment=ENVIRONMENT, planner=PLANNER, train_particles=80)
+    config = replace(CONFIG, train_particles=80)
     first, second = MPC(config), MPC(config)
     first.learn(5)
     assert first.env.num_particles == 600 and first.planner.env.num_particles == 80

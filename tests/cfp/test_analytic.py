@@ -36,6 +36,13 @@ def make(task="run", stages=1, **changes):
     return replace(cfp.preset(task, "quick", "analytic"), **defaults | changes)
 
 
+def test_can_train_with_longer_substeps_than_it_is_evaluated_with():
+    config = make(train_dt=2e-4)
+    for changed, expected in ((config, (2e-4, 2)), (replace(config, train_dt=None), (1e-4, 4))):
+        model = AnalyticLearner(changed, 1, build_actor(changed.actor_spec(1))).env.model
+        assert (model.solver.dt, model.substeps) == expected
+
+
 def parameters(module):
     return torch.nn.utils.parameters_to_vector(module.parameters()).detach().clone()
 

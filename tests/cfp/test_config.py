@@ -12,6 +12,7 @@ from cfp.experiment.checkpoint import check_same
 from cfp.experiment.training import parse
 from cfp.from_dict import update_from_dict
 from cfp.presets import TASKS, from_json, sac_preset
+from cfp.sections import EnvironmentConfig
 from cfp.train import PROGRAM
 from dittogym import make_spec
 
@@ -139,6 +140,33 @@ def test_matter_of_the_published_run_of_slot_can_be_chosen():
     assert matter("--task", "slot", "--preset", "paper") == (650.0, 90.0, 45.0)
     with pytest.raises(ConfigError, match="has no option 'variant'"):
         matter("--task", "run", "--variant", "published")
+
+
+def test_a_step_keeps_its_duration_with_other_substeps():
+    def substeps(*arguments):
+        config = parse(PROGRAM, ["--task", "run", "--particles", "100", *arguments]).run
+        model = make_env(config, 8, 1).venv.torch_env.model
+        return model.solver.dt, model.substeps
+
+    assert substeps() == (1e-4, 100)
+    assert substeps("--dt", "2e-4") == (2e-4, 50)
+    assert substeps("--dt", "2e-4", "--substeps", "10") == (2e-4, 10)
+    for wrong, message in (("3e-4", "dt must divide"), ("0", "dt must be positive"), ("5e-4", "dt must be at most")):
+        with pytest.raises(ConfigError, match=message):
+            substeps("--dt", wrong)
+
+
+def test_gradient_methods_simulate_with_longer_substeps_where_that_was_measured():
+    own = EnvironmentConfig()
+    assert own.for_optimisation("run", 500) == replace(own.for_training(500), dt=2e-4, substeps=50)
+    for task in ("shapematch", "dig", "custom:task"):
+        assert own.for_optimisation(task) == own
+    for given in (replace(own, substeps=100), replace(own, dt=5e-5)):
+        assert given.for_optimisation("run") == given
+    assert own.for_optimisation("dig", dt=1.25e-4) == replace(own, dt=1.25e-4, substeps=80)
+    assert replace(own, substeps=20).for_optimisation("run", dt=2e-4) == replace(own, dt=2e-4, substeps=10)
+    with pytest.raises(ConfigError, match=r"train_dt must divide an environment step of 0\.01 s, got 0\.0003"):
+        own.for_optimisation("run", dt=3e-4)
 
 
 def test_layout_of_actions_can_be_chosen():

@@ -9,11 +9,14 @@ import torch
 from fakes import FakeEnv
 
 from cfp.envs.vec_env import monitored
+from cfp.errors import ConfigError
+from cfp.evaluate import Selection
 from cfp.evaluation.cache import VARIABLE
 from cfp.evaluation.episodes import Trial
 from cfp.evaluation.evaluate import compare, evaluate, make_trial
 from cfp.evaluation.untrained import UntrainedPolicy
 from cfp.presets import preset
+from cfp.train import PROGRAM
 from dittogym import TorchEnv
 
 
@@ -161,3 +164,10 @@ def test_baselines_are_played_once_for_the_same_conditions(short, tmp_path, monk
     assert steps_of(tiny()) == (24, results)
     monkeypatch.setenv(VARIABLE, __file__)  # no folder
     assert steps_of(tiny()) == (24, results)
+
+
+def test_a_policy_can_be_evaluated_with_other_substeps():
+    config, _ = Selection(policy="run", dt=2e-4).open(PROGRAM)
+    assert (config.environment.dt, config.environment.substeps) == (2e-4, 50)
+    with pytest.raises(ConfigError, match="dt must divide"):
+        Selection(policy="run", dt=3e-4).open(PROGRAM)

@@ -89,6 +89,17 @@ def test_default_of_a_task_may_be_named_or_not(task, option, one, other, same):
             check_trained_for("start_from", description, task, EnvironmentConfig(**{option: wanted}))
 
 
+def test_the_duration_of_a_step_must_be_that_of_the_training():
+    for own, here, fits in (
+        ({"substeps": 100}, {"dt": 2e-4}, True),
+        ({"dt": 2e-4, "substeps": 50}, {}, True),
+        ({"substeps": 50}, {}, False),
+        ({}, {"dt": 2e-4, "substeps": 100}, False),
+    ):
+        with nullcontext() if fits else pytest.raises(ConfigError, match="must be a policy for environment steps of"):
+            check_trained_for("teacher", {"task": "run", "environment": own}, "run", EnvironmentConfig(**here))
+
+
 def images(count=3):
     return np.random.default_rng(0).integers(0, 256, (count, 3, 64, 64)).astype(np.uint8)
 

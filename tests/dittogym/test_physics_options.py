@@ -333,14 +333,14 @@ def test_matter_too_stiff_for_the_substeps_is_refused() -> None:
     before = env.state
     limit = 1.0 / 128 / math.sqrt(2 * (9000.0 + 50.0 + 45.0) / 2.0)
     for physics in ({"mu": [9000.0, 650.0]}, {"mu": 650.0, "mass": 0.05}, {"max_actuation": 1e4}, {"lam": 1e4}):
-        message = r"mu, lam, max_actuation and mass must allow substeps of 0\.0001 s, got matter"
+        message = r"dt must be at most (\S+) s .* mu, lam, max_actuation and mass, got 0\.0001"
         with pytest.raises(ValueError, match=message) as raised:
             env.reset(options={"physics": physics})
         if "mu" in physics and "mass" not in physics:
-            assert float(str(raised.value).split()[-2]) == pytest.approx(limit, rel=1e-6)
+            assert float(str(raised.value).split()[5]) == pytest.approx(limit, rel=1e-6)
     assert env.state is before
     env.reset(options={"physics": {"mu": 3000.0}})
-    with pytest.raises(ValueError, match="got matter so stiff and light"):
+    with pytest.raises(ValueError, match="dt must be at most"):
         tiny(replace(dittogym.make_spec("run"), mu=9000.0))
 
 

@@ -18,6 +18,7 @@ from test_native_adjoint import (
     value_leaves,
     varied,
 )
+from test_resolved import hard_soil, hardened
 from torch import Tensor
 
 from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises
@@ -98,6 +99,13 @@ def test_gradient_in_one_thing_alone(wanted: str) -> None:
 def test_corners_have_the_derivatives_of_the_plain_substep(material: Elastic) -> None:
     solver = robot(12, bodies=(Body(12, material, muscle=True),))
     both_gradients(lambda _: solver, corner_leaves(), STATE, 1)
+
+
+@pytest.mark.parametrize("substeps", [1, 5])
+def test_limited_gradients_of_soil(substeps: int) -> None:
+    """Hardened soil and spinning grains, see test_resolved.py."""
+    given = hardened(batch=2)
+    both_gradients(lambda _: hard_soil(), given, tuple(given), substeps)
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 4, len(RULES)])

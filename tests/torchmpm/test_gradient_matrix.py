@@ -8,7 +8,7 @@ import torch
 from scenes import normal, positions, robot
 from torch import Tensor
 
-from torchmpm import Body, ParticleState, VonMises
+from torchmpm import Body, ParticleState, Snow, VonMises
 
 pytestmark = pytest.mark.usefixtures("backend")
 
@@ -126,3 +126,28 @@ def test_gradients_are_bounded_beside_singular_elements(small: float, sign: floa
     start = ParticleState(single["x"], single["v"], single["C"], single["F"].requires_grad_(), torch.ones(1, COUNT))
     final = robot(COUNT).step(replace(start), single["actuation"], substeps=2)
     assert torch.autograd.grad(final.v.square().sum(), single["F"])[0].isfinite().all()
+
+
+def soil_loss(given: dict[str, Tensor]) -> Tensor:
+    """Of soil like that of DIG: up to a hardening factor of 1.95 its derivative is the exact one."""
+    material = Snow(6e4 * given["mu"], 4e4, shear_cutoff=0.0)
+    solver = robot(COUNT, bodies=(Body(COUNT, material, given["mass"]),), gravity=given["gravity"])
+    start = ParticleState(given["x"], given["v"], given["C"], given["F"], given["Jp"])
+    final = solver.step(start, substeps=2)
+    parts = ((final.x, 100.0), (final.v, 1.0), (final.C, 0.05), (final.F, 1.0), (final.Jp, 1.0))
+    return sum(size * (normal(*t.shape, seed=10 + k) * t).sum() for k, (t, size) in enumerate(parts))
+
+
+@pytest.mark.parametrize("name", ["x", "v", "C", "F", "Jp", "mu", "mass", "gravity"])
+@pytest.mark.parametrize("factor", [0.5, 1.0, 1.9])
+def test_soil_against_central_differences(factor: float, name: str) -> None:
+    given = inputs((stretch(1.002, 0.998), stretch(1.02, 0.999), stretch(0.999, 0.996)))
+    one = torch.ones((), dtype=torch.float64)
+    given |= {"Jp": (1.0 - 0.1 * math.log(factor)) * torch.ones(1, COUNT).double(), "mu": one, "mass": one}
+    direction = normal(*given[name].shape, seed=20)
+    leaf = given[name].clone().requires_grad_()
+    slope = (torch.autograd.grad(soil_loss(given | {name: leaf}), leaf)[0] * direction).sum().item()
+    step = 1e-6 * max(given[name].abs().max().item(), 1.0)
+    ahead, behind = (soil_loss(given | {name: given[name] + side * step * direction}).item() for side in (1, -1))
+    difference = (ahead - behind) / (2 * step)
+    assert abs(slope - difference) <= 1e-5 * abs(difference) + 1e-15 * max(abs(ahead), 1.0) / step

@@ -56,6 +56,13 @@ class Snow(Elastic):
     stretches lost to their bounds; the elastic constants are multiplied by ``exp(hardening (1 - Jp))`` within
     ``hardening_range``, with Jp of the substep before. A constant is a number or a tensor of shape (), (B,) or (B, N).
 
+    Gradients are deliberately not exact where a substep does not resolve the motion. Forward, plastic flow bounds such
+    motion; its exact derivative grows in every substep, until it overflows. So where hardened snow is stiffer than
+    substeps of this length allow (see :meth:`torchmpm.Solver.stable_dt`), its stress is differentiated with respect to
+    F with the largest stiffness that they do allow. And grains whose affine matrix C is so large that ``dt |C|``
+    exceeds 0.03 (Frobenius norm), such as grains that spin in the air, pass no derivative on to earlier substeps.
+    States are not affected, nor are gradients elsewhere. ``exact_gradients=True`` turns both limits off.
+
     Attributes:
         mu: Second Lame parameter at Jp = 1, Pa.
         lam: First Lame parameter at Jp = 1, Pa.
@@ -65,9 +72,11 @@ class Snow(Elastic):
         hardening_range: Bounds of the factor on the elastic constants.
         shear_cutoff: Shear stretch below this is dropped in every substep, so the material creeps. 1e-5 is the
             threshold of the reference implementation's singular value decomposition, and part of DIG; 0 turns it off.
+        exact_gradients: Whether a solver differentiates the motion that its substeps do not resolve, too.
 
     Raises:
-        ValueError: A value is negative, ``compression`` is not below 1, or ``hardening_range`` is not a range.
+        ValueError: A value is negative, ``compression`` is not below 1, ``hardening_range`` is not a range, or
+            ``exact_gradients`` is not True or False.
     """
 
     compression: Value = 0.025
@@ -75,11 +84,13 @@ class Snow(Elastic):
     hardening: Value = 10.0
     hardening_range: tuple[float, float] = (0.1, 5.0)
     shear_cutoff: float = 1e-5
+    exact_gradients: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_not_negative(self, "compression", "stretch", "hardening")
         checks.number("shear_cutoff", self.shear_cutoff, least=0.0)
+        checks.flag("exact_gradients", self.exact_gradients)
         if not isinstance(self.compression, Tensor) and not self.compression < 1:
             raise ValueError(f"compression must be below 1, got {self.compression}")
         given = self.hardening_range
@@ -99,12 +110,12 @@ class Snow(Elastic):
 
     def stress(self, F: Mat2, Jp: Tensor) -> Sym2:
         """Kirchhoff stress at ``F`` and ``Jp``, planes (B, N), Pa; an inverted element rests in its mirrored shape."""
-        mu, lam = self._hardened(Jp)
+        mu, lam = self.hardened(Jp)
         return corotated_stress(F, mu, lam, det(F).abs())
 
     def energy(self, F: Mat2, Jp: Tensor) -> Tensor:
         """Stored energy per unit volume at ``F`` and ``Jp``, (B, N), J/m^2."""
-        mu, lam = self._hardened(Jp)
+        mu, lam = self.hardened(Jp)
         return corotated_energy(F, mu, lam, det(F).abs())
 
     def stiffness(self) -> Value:
@@ -112,8 +123,8 @@ class Snow(Elastic):
         low, high = self.hardening_range
         return min(max(1.0, low), high) * super().stiffness()
 
-    def _hardened(self, Jp: Tensor) -> tuple[Value, Value]:
-        """Elastic constants at ``Jp``."""
+    def hardened(self, Jp: Tensor) -> tuple[Value, Value]:
+        """Lame parameters mu and lam at ``Jp`` (B, N), Pa."""
         low, high = self.hardening_range
         exponent = broadcast_plane(self.hardening, Jp, "hardening") * (1.0 - Jp)
         if high > 0:  # beyond it the exponential could overflow, and its derivative would be NaN even where clamped

@@ -1,6 +1,7 @@
 """What the kernels read: a solver as typed tables built once, a table of its constants, and the tensors of a call."""
 
 import ctypes
+import math
 import threading
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -32,12 +33,13 @@ class BodyTable(ctypes.Structure):
 
     ``first`` particle and ``count``; ``kind``, the index of its material in :data:`KINDS`; ``muscle``, whether the
     actuation acts on it; ``varying``, whether its values have one column per particle instead of one for all, and the
-    first ``column``; for snow the bounds of the hardening factor and the cutoff of shear.
+    first ``column``; for snow the bounds of the hardening factor, the cutoff of shear, and the rate ``1 / dt`` up to
+    which derivatives follow its motion, infinite for exact ones.
     """
 
     _fields_ = [
         *_members(ctypes.c_int64, "first", "count", "kind", "muscle", "varying", "column"),
-        *_members(ctypes.c_double, "hardening_low", "hardening_high", "shear_cutoff"),
+        *_members(ctypes.c_double, "hardening_low", "hardening_high", "shear_cutoff", "resolved_rate"),
     ]
 
 
@@ -103,7 +105,7 @@ def make_tables(grid: Grid, bodies: Sequence[Body], rules: Sequence[VelocityRule
     """Describe a solver to the kernels; its handle, which operators of torch can take, is for :func:`tables_of`."""
     directions = list(dict.fromkeys(rule.direction for rule in rules))
     rule_tables = (RuleTable * len(rules))(*(_rule_table(rule, directions.index(rule.direction)) for rule in rules))
-    body_tables = (BodyTable * len(bodies))(*_body_tables(bodies))
+    body_tables = (BodyTable * len(bodies))(*_body_tables(bodies, dt))
     numbers = (grid.h, dt, grid.margin, damping, MASS_EPSILON, STRETCH_FLOOR)
     key = bytes(Tables(grid.resolution, len(bodies), len(rules), *numbers)) + bytes(body_tables) + bytes(rule_tables)
     with _lock:
@@ -125,13 +127,14 @@ def bodies_of(handle: int) -> list[BodyTable]:
     return tables.bodies[: tables.num_bodies]
 
 
-def _body_tables(bodies: Sequence[Body]) -> Iterator[BodyTable]:
+def _body_tables(bodies: Sequence[Body], dt: float) -> Iterator[BodyTable]:
     column = 0
     for body, part in slices(bodies):
         material, varying = body.material, _varying(body)
-        bounds = (1.0, 1.0, 0.0)
+        bounds = (1.0, 1.0, 0.0, math.inf)
         if isinstance(material, Snow):
-            bounds = (*material.hardening_range, material.shear_cutoff)
+            rate = math.inf if material.exact_gradients else 1.0 / dt
+            bounds = (*material.hardening_range, material.shear_cutoff, rate)
         yield BodyTable(part.start, body.count, KINDS.index(type(material)), body.muscle, varying, column, *bounds)
         column += body.count if varying else 1
 

@@ -27,7 +27,7 @@ struct AdjointWorkspace : Workspace {
         values_bar = scene.call.values_bar ? arena.take<Real>(size_t(scene.blocks) * VALUES * LANES) : nullptr;
         if (!scene.muscles || !scene.call.field_bar) return;
         field_bar.resize(scene.parts);
-        for (Sums& part : field_bar) part.nodes = arena.take<Real>(4 * cells);
+        for (Sums& part : field_bar) part.nodes = arena.take<Real>(Sums::PAIRS * cells);
     }
 };
 
@@ -72,7 +72,8 @@ private:
         actuation.none();
         for (int part = member.rank; part < scene.parts; part += member.size) {
             std::fill_n(origin_bar(part), 2 * LANES, Real(0));
-            if (!work.field_bar.empty()) work.field_bar[part].cleared = {};
+            work.sums[part].set_row(Sums::PAIRS);
+            if (!work.field_bar.empty()) work.field_bar[part].cleared = {}, work.field_bar[part].set_row(Sums::PAIRS);
         }
         forward.own_blocks([&](int, int block) {
             load(scene, block, element, scene.call.result_bar, work.bars[block]);
@@ -100,15 +101,9 @@ private:
             velocity_bars(scene, at, work.bars[index], impulse);
             sums.reserve(at.box, scene.width);
             sums.box.include(at.box);
-            scatter(scene, impulse, at, sums.nodes);
+            scatter<false>(scene, impulse, at, sums.nodes);
         });
         member.wait();
-    }
-
-    // The tape of a large scene does not fit into the caches, and its blocks are too far apart for hardware prefetching.
-    static void prefetch(const Block* block, size_t size) {
-        const char* start = reinterpret_cast<const char*>(block);
-        for (size_t line = 0; line < size; line += 64) __builtin_prefetch(start + line, 0, 2);
     }
 
     void block_adjoint(int index, const Block& state, int part) {
@@ -131,6 +126,7 @@ private:
                        values_bar);
         const auto positions = actuated ? position_adjoint<true> : position_adjoint<false>;
         positions(scene, at, velocity, p_bar, mass_bar, field, state, momentum, bar, origin_bar(part), values_bar);
+        if (body.kind == Kind::snow) drop_unresolved(body.bounds, state, bar);
         if (actuated && !work.field_bar.empty()) {
             work.field_bar[part].reserve(at.box, scene.width);
             scatter_actuation(scene, momentum, at, work.field_bar[part].nodes);
@@ -184,8 +180,9 @@ private:
                 for (const Sums& part : work.field_bar) {
                     const Box& box = part.cleared;
                     if (i + PAD < box.i0 || i + PAD > box.i1) continue;
-                    for (int j = std::max(box.j0 - PAD, 0); j <= std::min(box.j1 - PAD, n - 1); ++j)
-                        row[j] += part.nodes[4 * ((i + PAD) * width + j + PAD) + c];
+                    for (int first = box.j0 - PAD; first <= box.j1 - PAD; ++first)
+                        for (int j = std::max(first, 0); j < std::min(first + 3, n); ++j)
+                            row[j] += part.at(i + PAD, first + PAD, width)[2 * (j - first) + c];
                 }
             }
     }

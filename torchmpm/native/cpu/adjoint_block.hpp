@@ -9,7 +9,7 @@ struct alignas(64) Nodes {
 
     PASS_MEMBER void read(const Scene& scene, const Stencil& at, const Real* grid) {
         for (int k = 0; k < LANES; k += 8)
-            read_eight(at.node + k, scene.width, grid, [&](int p, const Real8(&row)[8]) {
+            read_eight(scene, at, k, grid, [&](int p, const Real8(&row)[8]) {
                 for (int n = 0; n < 6; ++n) put(row[n], &v[3 * p + n / 2][n % 2][k]);
             });
     }
@@ -199,6 +199,17 @@ PASS void position_adjoint(const Scene& scene, const Stencil& at, const Nodes& v
     }
 }
 
+// Snow that moves faster than a substep resolves passes no derivative on, see torchmpm/materials/resolved.py.
+PASS void drop_unresolved(Bounds bounds, const Block& state, Block& bar) {
+    const Real limit = square(LARGEST_STRAIN * bounds.resolved_rate);
+#pragma omp simd
+    for (int k = 0; k < LANES; ++k) {
+        const bool drop = square(state.v[C0][k]) + square(state.v[C1][k]) + square(state.v[C2][k]) +
+                              square(state.v[C3][k]) > limit;
+        for (int c = 0; c < PLANES; ++c) bar.v[c][k] = drop ? 0 : bar.v[c][k];
+    }
+}
+
 // Derivatives in the node velocities in the form of an impulse, so that the forward scatter can distribute them.
 PASS void velocity_bars(const Scene& scene, const Stencil& at, const Block& bar, Impulse& out) {
     const Real dt = scene.dt, scale = 4 * scene.inverse_h * scene.inverse_h;
@@ -216,9 +227,11 @@ PASS void velocity_bars(const Scene& scene, const Stencil& at, const Block& bar,
 PASS void scatter_actuation(const Scene& scene, const Momentum& momentum, const Stencil& at, Real* grid) {
     for (int k = 0; k < LANES; k += 8) {
         const Real8 x = eight(momentum.act_bar[0] + k), y = eight(momentum.act_bar[1] + k);
-        add_eight(at.node + k, scene.width, grid, [&](int p, int q, Real8(&out)[4]) {
-            const Real8 w = eight(at.wx[p] + k) * eight(at.wy[q] + k);
-            out[0] = w * x, out[1] = w * y;
-        });
+        const Real8 w0 = eight(at.wy[0] + k), w1 = eight(at.wy[1] + k), w2 = eight(at.wy[2] + k);
+        Real8 numbers[8] = {w0 * x, w0 * y, w1 * x, w1 * y, w2 * x, w2 * y};
+        transpose(numbers);
+#pragma GCC unroll 8
+        for (int l = 0; l < 8; ++l)
+            for (int p = 0; p < 3; ++p) add_pairs<Sums::PAIRS>(scene, at, k + l, p, grid, numbers[l]);
     }
 }

@@ -66,14 +66,23 @@ struct Span {
 
 // Add up the parts of row i into `total` (four numbers a node, from node box.j0), and clear them for the next substep.
 INLINE void collect(Sums* sums, int parts, const Box& box, int i, int width, Real* total) {
+    static constexpr Real none[Sums::TRIPLES] = {};
+    const auto four = [](const Real* from) INLINE_LAMBDA { return Real4(*reinterpret_cast<const Row4*>(from)); };
     std::fill_n(total, 4 * (box.j1 - box.j0 + 1), Real(0));
     for (int part = 0; part < parts; ++part) {
         const Box& own = sums[part].box;
         if (i < own.i0 || i > own.i1) continue;
-        Real* from = sums[part].nodes + 4 * (i * width + own.j0);
-        Real* to = total + 4 * (own.j0 - box.j0);
-        const int count = 4 * (own.j1 - own.j0 + 1);
-        for (int k = 0; k < count; ++k) to[k] += from[k], from[k] = 0;
+        const int row = sums[part].row, rows = own.j1 - own.j0 - 1;
+        Real* begin = sums[part].at(i, own.j0, width);
+        // Rows that begin at node j and at the two nodes before it.
+        const Real *first = none, *second = none, *third;
+        for (int n = 0; n < rows + 2; ++n) {
+            third = second, second = first, first = n < rows ? begin + row * n : none;
+            const Real4 pair = four(first) + four(second + 2) + four(third + 4);
+            const Real4 mass = {row == Sums::PAIRS ? 0 : first[8] + second[9] + third[10]};
+            *reinterpret_cast<Row4*>(total + 4 * (own.j0 - box.j0 + n)) += SHUFFLE(pair, mass, 0, 1, 4, 5);
+        }
+        std::fill_n(begin, row * rows, Real(0));
     }
 }
 

@@ -18,7 +18,8 @@ struct Values {
     INLINE Real hardening() const { return cosh2; }
 };
 constexpr int VALUES = 8;
-constexpr Real LARGEST_JP = Real(1e30);  // as in snow.py
+constexpr Real LARGEST_JP = Real(1e30);      // as in snow.py
+constexpr Real LARGEST_STRAIN = Real(0.03);  // as in resolved.py
 
 // Column k of a block whose particles have their own values, or the only column.
 template <bool varying> INLINE Values values_at(const Real* table, int k) {
@@ -29,7 +30,7 @@ template <bool varying> INLINE Values values_at(const Real* table, int k) {
 }
 
 struct Bounds {
-    Real hardening_low, hardening_high, shear_cutoff, stretch_floor;
+    Real hardening_low, hardening_high, shear_cutoff, resolved_rate, stretch_floor;
 };
 
 struct Sym2 {
@@ -45,14 +46,14 @@ INLINE Direction von_mises_return(const Values& m, Bounds bounds, Mat2& F) {
     const Direction R = direction(v);
     const Real large = square(v.m1) + square(v.m2), small = square(v.n1) + square(v.n2);
     const bool outside = small > m.tanh2 * large;
-    const Real total = outside ? R.total : Real(1), difference = std::sqrt(outside ? small : Real(0.25));
-    const Real major = at_least(Real(0.5) * (total + difference), bounds.stretch_floor);
-    const Real minor = at_least(Real(0.5) * (total - difference), bounds.stretch_floor);
+    const Real difference = std::sqrt(small);  // may be zero where the particle does not yield
+    const Real major = at_least(Real(0.5) * (R.total + difference), bounds.stretch_floor);
+    const Real minor = at_least(Real(0.5) * (R.total - difference), bounds.stretch_floor);
     const bool yields = outside & (major > minor * m.exp);
     const Real mean = Real(0.5) * std::sqrt(major * minor);
     const Real grow_total = mean * m.cosh2, grow_difference = mean * (m.sinh2 / difference);
     const Mat2 returned = join(
-        {grow_total * R.cos, grow_total * R.sin, grow_difference * v.n1, grow_difference * v.n2, v.proper});
+        {grow_total * R.cos, grow_total * R.sin, grow_difference * v.n1, grow_difference * v.n2, v.sign});
     F = select(yields, returned, F);
     return R;
 }
@@ -73,7 +74,7 @@ INLINE Direction snow_return(const Values& m, Bounds bounds, Mat2& F, Real& Jp) 
     const Real major = clamp(first, low, high), minor = clamp(second, low, high);
     const Real kept = (first >= low) & (first <= high) ? Real(1) : Real(0);
     const Real ratio = Real(0.5) * (round ? kept : (major - minor) / root), sum = Real(0.5) * (major + minor);
-    F = join({sum * R.cos, sum * R.sin, ratio * n1, ratio * n2, v.proper});
+    F = join({sum * R.cos, sum * R.sin, ratio * n1, ratio * n2, v.sign});
     const Real grown = Jp * (first * second / (major * minor));
     Jp = grown > LARGEST_JP ? LARGEST_JP : grown;
     return R;
@@ -96,8 +97,10 @@ template <Kind kind> INLINE Sym2 stress(const Values& m, Real hard, Mat2 F, Dire
     const Mat2 D = F + Real(-1) * orthogonal(R);
     const Real J = kind == Kind::snow ? std::abs(det(F)) : det(F);
     const Real pressure = hard * m.lam * (J * (J - 1)), mu2 = hard * m.mu2;
-    const Real xx = mu2 * (D.a * F.a + D.b * F.b) + pressure + act_x * F.a * F.a + act_y * F.b * F.b;
-    const Real xy = mu2 * (D.a * F.c + D.b * F.d) + act_x * F.a * F.c + act_y * F.b * F.d;
-    const Real yy = mu2 * (D.c * F.c + D.d * F.d) + pressure + act_x * F.c * F.c + act_y * F.d * F.d;
+    // P F^T with the first Piola-Kirchhoff stress but its pressure
+    const Mat2 P{mu2 * D.a + act_x * F.a, mu2 * D.b + act_y * F.b, mu2 * D.c + act_x * F.c, mu2 * D.d + act_y * F.d};
+    const Real xx = P.a * F.a + P.b * F.b + pressure;
+    const Real xy = P.a * F.c + P.b * F.d;
+    const Real yy = P.c * F.c + P.d * F.d + pressure;
     return {xx, xy, yy};
 }

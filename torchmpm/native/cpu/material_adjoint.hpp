@@ -10,18 +10,26 @@ struct MaterialBar {
     DirectionBar R;
 };
 
-// From the derivative in the Kirchhoff stress to those in the returned F (added to F_bar) and in all else.
+// The hardening factor in the derivative of the stress with respect to F, see torchmpm/materials/resolved.py.
+template <Kind kind> INLINE Real tangent_hardening(const Values& m, Bounds bounds, Real hard) {
+    if (kind != Kind::snow) return hard;
+    const Real limit = 4 * bounds.resolved_rate * m.mass / (-m.factor * (m.mu2 + 2 * at_least(m.lam, 0)));
+    return limit < hard ? limit : hard;
+}
+
+// From the derivative in the Kirchhoff stress to those in the returned F (added to F_bar), with the hardening factor
+// `tangent`, and in all else.
 template <Kind kind>
-INLINE void stress_adjoint(const Values& m, Real hard, Mat2 F, Direction R, Real act_x, Real act_y, Sym2 bar,
-                           Mat2& F_bar, MaterialBar& out) {
+INLINE void stress_adjoint(const Values& m, Real hard, Real tangent, Mat2 F, Direction R, Real act_x, Real act_y,
+                           Sym2 bar, Mat2& F_bar, MaterialBar& out) {
     const Mat2 D = F + Real(-1) * orthogonal(R);
-    const Real mu2 = hard * m.mu2, xx = bar.xx, xy = bar.xy, yy = bar.yy;
+    const Real mu2 = tangent * m.mu2, xx = bar.xx, xy = bar.xy, yy = bar.yy;
     const Mat2 D_bar{mu2 * (xx * F.a + xy * F.c), mu2 * (xx * F.b + xy * F.d), mu2 * yy * F.c, mu2 * yy * F.d};
-    const Parts R_bar = split(D_bar, R.proper);
+    const Parts R_bar = split(D_bar, R.sign);
     out.R = {0, -R_bar.m1, -R_bar.m2};
 
     const Real signed_J = det(F), J = kind == Kind::snow ? std::abs(signed_J) : signed_J;
-    const Real J_bar = (xx + yy) * hard * m.lam * (2 * J - 1);
+    const Real J_bar = (xx + yy) * tangent * m.lam * (2 * J - 1);
     const Real side = kind != Kind::snow ? Real(1) : signed_J > 0 ? Real(1) : signed_J < 0 ? Real(-1) : Real(0);
     const Real area = side * J_bar;
 
@@ -67,7 +75,7 @@ INLINE void von_mises_adjoint(const Values& m, Bounds bounds, Mat2 F, MaterialBa
     const Real mean = Real(0.5) * std::sqrt(major * minor);
     const Real grow_total = mean * m.cosh2, grow_difference = mean * (m.sinh2 * inverse);
 
-    const Parts v_bar = split(F_bar, v.proper);
+    const Parts v_bar = split(F_bar, v.sign);
     const Real of_total = v_bar.m1 * R.cos + v_bar.m2 * R.sin, of_difference = v_bar.n1 * v.n1 + v_bar.n2 * v.n2;
     const Real mean_bar = of_total * m.cosh2 + of_difference * m.sinh2 * inverse;
     const Real major_bar = first >= bounds.stretch_floor ? mean_bar * mean / (2 * major) : 0;
@@ -106,7 +114,7 @@ INLINE void snow_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, Materi
     Jp_bar = Jp * squeezed > LARGEST_JP ? Real(0) : Jp_bar;
     const Real squeezed_bar = Jp_bar * Jp;
 
-    const Parts v_bar = split(F_bar, v.proper);
+    const Parts v_bar = split(F_bar, v.sign);
     const Real sum_bar = v_bar.m1 * R.cos + v_bar.m2 * R.sin;
     const Real ratio_bar = round ? 0 : v_bar.n1 * n1 + v_bar.n2 * n2;
     const Real major_bar = Real(0.5) * (sum_bar + ratio_bar / root) - squeezed_bar * squeezed / major;
@@ -143,7 +151,8 @@ INLINE MaterialBar material_adjoint(const Values& m, Bounds bounds, Mat2 F, Real
     bar.values.factor = S_bar.xx * tau.xx + S_bar.xy * tau.xy + S_bar.yy * tau.yy;
     S = {m.factor * tau.xx, m.factor * tau.xy, m.factor * tau.yy};
     const Sym2 tau_bar{m.factor * S_bar.xx, m.factor * S_bar.xy, m.factor * S_bar.yy};
-    stress_adjoint<kind>(m, hard, returned, R, act_x, act_y, tau_bar, F_bar, bar);
+    const Real tangent = tangent_hardening<kind>(m, bounds, hard);
+    stress_adjoint<kind>(m, hard, tangent, returned, R, act_x, act_y, tau_bar, F_bar, bar);
     const Real Jp_hard = hardening_adjoint<kind>(m, bounds, Jp, bar);
     if (kind == Kind::elastic) elastic_adjoint(F, bar, F_bar);
     if (kind == Kind::von_mises) von_mises_adjoint(m, bounds, F, bar, F_bar);

@@ -9,7 +9,7 @@
 // Documented in torchmpm/native/tables.py.
 struct BodyTable {
     int64_t first, count, kind, muscle, varying, column;
-    double hardening_low, hardening_high, shear_cutoff;
+    double hardening_low, hardening_high, shear_cutoff, resolved_rate;
 };
 
 struct RuleTable {
@@ -88,7 +88,8 @@ struct Scene {
     }
 
     void add(const BodyTable& b, Real stretch_floor) {
-        const Bounds bounds{Real(b.hardening_low), Real(b.hardening_high), Real(b.shear_cutoff), stretch_floor};
+        const Bounds bounds{Real(b.hardening_low), Real(b.hardening_high), Real(b.shear_cutoff), Real(b.resolved_rate),
+                            stretch_floor};
         bodies.push_back({int(b.count), Kind(int(b.kind)), b.muscle != 0, b.varying != 0, int(b.column), bounds,
                           int(b.first), blocks});
         blocks += (bodies.back().count + LANES - 1) / LANES;

@@ -17,13 +17,16 @@ struct alignas(64) Actuation {
 
     PASS_MEMBER void sample(const Scene& scene, const Stencil& at, const Real* field) {
         for (int k = 0; k < LANES; k += 8) {
-            Real8 sum[2] = {};
-            read_eight(at.node + k, scene.width, field, [&](int p, const Real8(&row)[8]) {
-                for (int c = 0; c < 2; ++c)
-                    sum[c] += eight(at.wx[p] + k) * (eight(at.wy[0] + k) * row[c] + eight(at.wy[1] + k) * row[2 + c] +
-                                                     eight(at.wy[2] + k) * row[4 + c]);
-            });
-            put(sum[0], x + k), put(sum[1], y + k);
+            Real8 sum[8];
+            for (int l = 0; l < 8; ++l) {
+                const Real8 first = load_row(scene, at, k + l, 0, field), second = load_row(scene, at, k + l, 1, field);
+                const Real8 third = load_row(scene, at, k + l, 2, field);
+                sum[l] = at.wx[0][k + l] * first + at.wx[1][k + l] * second + at.wx[2][k + l] * third;
+            }
+            transpose(sum);
+            const Real8 w0 = eight(at.wy[0] + k), w1 = eight(at.wy[1] + k), w2 = eight(at.wy[2] + k);
+            put(w0 * sum[0] + w1 * sum[2] + w2 * sum[4], x + k);
+            put(w0 * sum[1] + w1 * sum[3] + w2 * sum[5], y + k);
         }
     }
 };
@@ -36,7 +39,7 @@ PASS void advance(const Scene& scene, const Real* velocity, const Stencil& at, B
         const Real8 w0 = eight(at.wy[0] + k), w1 = eight(at.wy[1] + k), w2 = eight(at.wy[2] + k);
         const Real8 d0 = w0 * -fy, d1 = w1 * (1 - fy), d2 = w2 * (2 - fy);
         Real8 v[2] = {}, slope_x[2] = {}, slope_y[2] = {};
-        read_eight(at.node + k, scene.width, velocity, [&](int p, const Real8(&row)[8]) {
+        read_eight(scene, at, k, velocity, [&](int p, const Real8(&row)[8]) {
             const Real8 w = eight(at.wx[p] + k), d = w * (Real(p) - fx);
             for (int c = 0; c < 2; ++c) {
                 const Real8 across = w0 * row[c] + w1 * row[2 + c] + w2 * row[4 + c];
@@ -109,20 +112,29 @@ INLINE void deform(const Scene& scene, const Body& body, const Real* table, cons
     table_of[int(body.kind)][body.varying](scene, table, body.bounds, at, act, block, out);
 }
 
-// Add mass and momentum to the nodes.
-PASS void scatter(const Scene& scene, const Impulse& in, const Stencil& at, Real* grid) {
+// Add mass and momentum to the nodes, or momentum alone. The row of nodes at x = p - 1 from the middle of the stencil gets
+// its weight times middle + (p - 1) tilt.
+template <bool with_mass> PASS void scatter(const Scene& scene, const Impulse& in, const Stencil& at, Real* grid) {
+    constexpr int row = with_mass ? Sums::TRIPLES : Sums::PAIRS;
     const Real h = scene.h;
     for (int k = 0; k < LANES; k += 8) {
-        const Real8 fx = eight(at.fx + k), fy = eight(at.fy + k), mass = eight(in.mass + k);
-        const Real8 vx = eight(in.vx + k), vy = eight(in.vy + k);
+        const Real8 dx = 1 - eight(at.fx + k), dy = 1 - eight(at.fy + k), mass = eight(in.mass + k);
         const Real8 xx = h * eight(in.affine[0] + k), xy = h * eight(in.affine[1] + k);
         const Real8 yx = h * eight(in.affine[2] + k), yy = h * eight(in.affine[3] + k);
-        add_eight(at.node + k, scene.width, grid, [&](int p, int q, Real8(&out)[4]) {
-            const Real8 dx = Real(p) - fx, dy = Real(q) - fy, w = eight(at.wx[p] + k) * eight(at.wy[q] + k);
-            out[0] = w * (vx + xx * dx + xy * dy);
-            out[1] = w * (vy + yx * dx + yy * dy);
-            out[2] = w * mass;
-        });
+        const Real8 x = eight(in.vx + k) + xx * dx + xy * dy, y = eight(in.vy + k) + yx * dx + yy * dy;
+        const Real8 w0 = eight(at.wy[0] + k), w1 = eight(at.wy[1] + k), w2 = eight(at.wy[2] + k);
+        Real8 middle[8] = {w0 * (x - xy), w0 * (y - yy), w1 * x, w1 * y, w2 * (x + xy), w2 * (y + yy)};
+        Real8 tilt[8] = {w0 * xx, w0 * yx, w1 * xx, w1 * yx, w2 * xx, w2 * yx};
+        Real8 masses[4] = {w0 * mass, w1 * mass, w2 * mass};
+        transpose(middle), transpose(tilt), transpose(masses);
+#pragma GCC unroll 8
+        for (int l = 0; l < 8; ++l) {
+            const Real8 rows[3] = {middle[l] - tilt[l], middle[l], middle[l] + tilt[l]};
+            for (int p = 0; p < 3; ++p) {
+                add_pairs<row>(scene, at, k + l, p, grid, rows[p]);
+                if (with_mass) add_third(scene, at, k + l, p, grid, half(masses[l % 4], l / 4));
+            }
+        }
     }
 }
 
@@ -141,6 +153,13 @@ struct Tape {
         return {velocity + 2 * node, inverse_mass + node};
     }
 };
+
+// The tape of a large scene does not fit into the caches, and its blocks are too far apart for hardware prefetching.
+// Blocks that will be written are prefetched too, or the stores would wait for them.
+INLINE void prefetch(const Block* block, size_t size) {
+    const char* start = reinterpret_cast<const char*>(block);
+    for (size_t line = 0; line < size; line += 64) __builtin_prefetch(start + line, 0, 2);
+}
 
 class Forward {
 public:
@@ -185,6 +204,7 @@ private:
             load(scene, block, element, scene.call.planes, work.state[block]);
             load_values(scene, block, element, work.values);
         });
+        for (int part = member.rank; part < scene.parts; part += member.size) work.sums[part].set_row(Sums::TRIPLES);
         if (member.rank == 0) work.rules.build(scene, scene.call.shift + 2 * element);
         if (member.rank == member.size - 1 && scene.muscles) load_field(scene, element, work.field);
         actuation.none();
@@ -196,11 +216,13 @@ private:
         for (int part = member.rank; part < scene.parts; part += member.size) work.sums[part].box = {};
         own_blocks([&](int part, int index) {
             Block& block = work.state[index];
+            Block* record = tape.states ? tape.states + substep * scene.blocks + index : nullptr;
+            if (record) prefetch(record, sizeof(Block));
             if (finishing) {
                 at.locate(scene, origin, block);
                 advance(scene, work.velocity, at, block);
             }
-            if (tape.states) record_state(block, scene.body(index), tape.states[substep * scene.blocks + index]);
+            if (record) record_state(block, scene.body(index), *record);
             if (!beginning) return;
             at.locate(scene, origin, block);
             scatter_block(index, block, work.sums[part]);
@@ -226,7 +248,7 @@ private:
         deform(scene, body, work.values_of(scene, index, element, uniform), at, actuation, block, impulse);
         sums.reserve(at.box, scene.width);
         sums.box.include(at.box);
-        scatter(scene, impulse, at, sums.nodes);
+        scatter<true>(scene, impulse, at, sums.nodes);
     }
 
     void nodes(int64_t substep) {

@@ -65,42 +65,44 @@ INLINE Real8 eight(const Real* from) { return *reinterpret_cast<const Real8*>(fr
 
 INLINE void put(Real8 value, Real* to) { *reinterpret_cast<Real8*>(to) = value; }
 
-// Read the nodes of eight particles, two numbers each: `use(p, row)` gets the nodes (p, q) as row[2 q] and row[2 q + 1]. A
-// row of three nodes is six numbers; two more are loaded and ignored. Addresses are also valid for particles that take
-// no part, but the values read there are meaningless.
-template <class Function> INLINE void read_eight(const int32_t* node, int width, const Real* grid, Function use) {
+// Row p of the nodes of particle k, two numbers each: six, and two more to ignore. The address is also valid for particles
+// that take no part, but the values read there are meaningless.
+INLINE Real8 load_row(const Scene& scene, const Stencil& at, int k, int p, const Real* grid) {
+    return *reinterpret_cast<const Row8*>(grid + 2 * (int64_t(at.node[k]) + p * int64_t(scene.width)));
+}
+
+// Read the nodes of particles k to k + 7, two numbers each: `use(p, row)` gets the nodes (p, q) as row[2 q] and
+// row[2 q + 1].
+template <class Function>
+INLINE void read_eight(const Scene& scene, const Stencil& at, int k, const Real* grid, Function use) {
     three([&](int p) INLINE_LAMBDA {
-        Real8 row[8];
-        for (int l = 0; l < 8; ++l) row[l] = *reinterpret_cast<const Row8*>(grid + 2 * (node[l] + p * width));
-        transpose(row);
+        // Particles 0 to 3 in the lower halves, 4 to 7 in the upper ones; the first four numbers apart from the last.
+        Real8 low[4], high[4];
+        for (int l = 0; l < 4; ++l) {
+            const Real8 a = load_row(scene, at, k + l, p, grid), b = load_row(scene, at, k + l + 4, p, grid);
+            low[l] = SHUFFLE(a, b, 0, 1, 2, 3, 8, 9, 10, 11), high[l] = SHUFFLE(a, b, 4, 5, 6, 7, 12, 13, 14, 15);
+        }
+        transpose(low), transpose(high);
+        const Real8 row[8] = {low[0], low[1], low[2], low[3], high[0], high[1]};
         use(p, row);
     });
 }
 
-// Add to the nodes of eight particles, numbers four by four: `value(p, q, numbers)` computes them for a node. Aligned
-// nodes never overlap partially, so a recent store is forwarded to the next load. Particles that take no part must
-// contribute zeros, which are added to some node.
-template <class Function> INLINE void add_eight(const int32_t* node, int width, Real* grid, Function value) {
-    Real4* row[8];
-    for (int l = 0; l < 8; ++l) row[l] = reinterpret_cast<Real4*>(grid) + node[l];
-    three([&](int p) INLINE_LAMBDA {
-        three([&](int q) INLINE_LAMBDA {
-            Real8 numbers[4] = {};
-            value(p, q, numbers);
-            transpose(numbers);
-            for (int l = 0; l < 4; ++l) {
-                row[l][p * width + q] += half(numbers[l], 0);
-                row[l + 4][p * width + q] += half(numbers[l], 1);
-            }
-        });
-    });
-}
-
-// A grid of nodes of four numbers that collects sums. Only nodes within `cleared` have defined values.
+// A grid that collects sums of particles. Each node holds the sums of a row of three nodes, over the particles whose
+// stencil has a row that begins there: two numbers of each of the three (six, and two unused), then a third of each where
+// there is one (three, and five unused). So a particle adds to three places instead of nine. Two particles add to the
+// same place or to separate ones, so a recent store is forwarded to the next load. Only nodes within `cleared` have
+// defined values.
 struct Sums {
+    static constexpr int PAIRS = 8, TRIPLES = 16;  // numbers of a row
     Real* nodes;
+    int row = TRIPLES;
     Box box;      // nodes added to since the last reset
     Box cleared;
+
+    void set_row(int numbers) {
+        if (row != numbers) row = numbers, cleared = {};
+    }
 
     void reserve(const Box& wanted, int width) {
         if (cleared.holds(wanted)) return;
@@ -115,7 +117,23 @@ struct Sums {
         cleared = next;
     }
 
+    Real* at(int i, int j, int width) const { return nodes + row * (int64_t(i) * width + j); }
+
     void clear(int i, int j0, int j1, int width) {
-        if (j1 >= j0) std::fill_n(nodes + 4 * (i * width + j0), 4 * (j1 - j0 + 1), Real(0));
+        if (j1 >= j0) std::fill_n(at(i, j0, width), row * (j1 - j0 + 1), Real(0));
     }
 };
+
+// Add `numbers`, two of each of the three nodes, times the weight of row p to the sums of particle k.
+template <int row>
+INLINE void add_pairs(const Scene& scene, const Stencil& at, int k, int p, Real* grid, const Real8& numbers) {
+    const Real w = at.wx[p][k];
+    Real* to = grid + row * (int64_t(at.node[k]) + p * int64_t(scene.width));
+    *reinterpret_cast<Real8*>(to) += Real8{w, w, w, w, w, w, w, w} * numbers;
+}
+
+// The third number of each node.
+INLINE void add_third(const Scene& scene, const Stencil& at, int k, int p, Real* grid, const Real4& numbers) {
+    Real* to = grid + Sums::TRIPLES * (int64_t(at.node[k]) + p * int64_t(scene.width));
+    *reinterpret_cast<Real4*>(to + 8) += at.wx[p][k] * numbers;
+}

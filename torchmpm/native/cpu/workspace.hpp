@@ -43,10 +43,10 @@ struct Workspace {
         total = arena.take<Real>(size_t(members) * row_length(scene));
         rules.code = arena.take<uint32_t>(cells);
         sums.resize(scene.parts);
-        for (Sums& part : sums) part.nodes = arena.take<Real>(4 * cells);
+        for (Sums& part : sums) part.nodes = arena.take<Real>(Sums::TRIPLES * cells);
     }
 
-    static size_t row_length(const Scene& scene) { return (4 * scene.width + 15) / 16 * 16; }
+    static size_t row_length(const Scene& scene) { return (4 * scene.width + 31) / 16 * 16; }
 
     // Values of a block's particles for values_at.
     const Real* values_of(const Scene& scene, int block, int64_t element, Real* uniform) const {

@@ -5,7 +5,7 @@ import triton.language as tl
 
 from torchmpm.native.cuda.grid import ADJOINT
 from torchmpm.native.cuda.linalg import matmul
-from torchmpm.native.cuda.material import DT, INVERSE_H, H, deform, read_values
+from torchmpm.native.cuda.material import DT, INVERSE_H, LARGEST_STRAIN, SNOW, H, deform, read_values
 from torchmpm.native.cuda.material_adjoint import material_adjoint
 from torchmpm.native.cuda.step import load_matrix, own_particles, store_matrix, values_at
 from torchmpm.native.cuda.transfer import (
@@ -119,6 +119,16 @@ def add_matrix(planes, stride, a, b, c, d, mask):
     store_matrix(planes, stride, e + a, f + b, g + c, h + d, mask)
 
 
+@triton.jit
+def drop_unresolved(bars, stride, c0, c1, c2, c3, bounds, mask, KIND: tl.constexpr):
+    """Forget the derivatives in snow that moves faster than a substep resolves, see ``torchmpm.materials.resolved``."""
+    if KIND == SNOW:
+        limit, zero = LARGEST_STRAIN * tl.load(bounds + 3), tl.zeros_like(c0)
+        drop = mask & (c0 * c0 + c1 * c1 + c2 * c2 + c3 * c3 > limit * limit)
+        for plane in tl.static_range(13):
+            tl.store(bars + plane * stride, zero, drop)
+
+
 @triton.jit(do_not_specialize=SIZES)
 def finish_adjoint(
     state, bars, values_bar, field_bar, origin_bar, answers, field, origin, values, constants, bounds,
@@ -151,7 +161,7 @@ def finish_adjoint(
         e0_bar, e1_bar, e2_bar, e3_bar, new_Jp_bar, xx, xy, yy, act_x_bar, act_y_bar,
         factor_bar, mu2_bar, lam_bar, s0_bar, s1_bar, s2_bar, s3_bar,
     ) = material_adjoint(
-        t0, t1, t2, t3, Jp, factor, mu2, lam, s0, s1, s2, s3, act_x, act_y, pxx_bar, pxy_bar + pyx_bar, pyy_bar,
+        t0, t1, t2, t3, Jp, mass, factor, mu2, lam, s0, s1, s2, s3, act_x, act_y, pxx_bar, pxy_bar + pyx_bar, pyy_bar,
         f0_bar, f1_bar, f2_bar, f3_bar, Jp_bar, constants, bounds, KIND,
     )  # fmt: skip
     d0, d1, d2, d3 = matmul(e0_bar, e1_bar, e2_bar, e3_bar, f0, f2, f1, f3)
@@ -173,6 +183,7 @@ def finish_adjoint(
     store_matrix(bars + 4 * stride, stride, d0, d1, d2, d3, on)
     store_matrix(bars + 8 * stride, stride, e0_bar, e1_bar, e2_bar, e3_bar, on)
     tl.store(bars + 12 * stride, new_Jp_bar, on)
+    drop_unresolved(bars, stride, c0, c1, c2, c3, bounds, valid, KIND)
     if MUSCLE and WANT_FIELD:
         scatter_actuation(field_bar, i, j, fx, fy, act_x_bar, act_y_bar, on, resolution)
     if WANT_VALUES:

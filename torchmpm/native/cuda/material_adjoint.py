@@ -6,7 +6,7 @@ At corners the derivative is that of the side which automatic differentiation of
 import triton
 import triton.language as tl
 
-from torchmpm.native.cuda.linalg import direction, direction_adjoint, join, join_adjoint, split
+from torchmpm.native.cuda.linalg import at_least, direction, direction_adjoint, join, join_adjoint, split
 from torchmpm.native.cuda.material import (
     LARGEST_JP,
     SNOW,
@@ -18,6 +18,15 @@ from torchmpm.native.cuda.material import (
     stress,
     von_mises_parts,
 )
+
+
+@triton.jit
+def tangent_hardening(hard, mass, factor, mu2, lam, bounds, KIND: tl.constexpr):
+    """The hardening factor in the derivative of the stress with respect to F, see ``torchmpm.materials.resolved``."""
+    if KIND == SNOW:
+        limit = 4.0 * tl.load(bounds + 3) * mass / (-factor * (mu2 + 2.0 * at_least(lam, 0.0)))
+        hard = tl.where(limit < hard, limit, hard)
+    return hard
 
 
 @triton.jit
@@ -143,7 +152,7 @@ def hardening_adjoint(Jp, hardening, hard_bar, bounds):
 
 @triton.jit
 def material_adjoint(
-    a, b, c, d, Jp, factor, mu2, lam, s0, s1, s2, s3, act_x, act_y, xx_bar, xy_bar, yy_bar,
+    a, b, c, d, Jp, mass, factor, mu2, lam, s0, s1, s2, s3, act_x, act_y, xx_bar, xy_bar, yy_bar,
     a_bar, b_bar, c_bar, d_bar, Jp_bar, constants, bounds, KIND: tl.constexpr,
 ):  # fmt: skip
     """Adjoint of return map and stress together.
@@ -160,8 +169,9 @@ def material_adjoint(
     hard = hardening_factor(Jp, s2, bounds, KIND)
     xx, xy, yy = stress(e, f, g, h, r0, r1, r2, r3, hard * mu2, hard * lam, act_x, act_y, KIND)
     factor_bar = xx_bar * xx + xy_bar * xy + yy_bar * yy
+    tangent = tangent_hardening(hard, mass, factor, mu2, lam, bounds, KIND)
     e_bar, f_bar, g_bar, h_bar, cos_bar, sin_bar, act_x_bar, act_y_bar, of_mu2, of_lam = stress_adjoint(
-        e, f, g, h, r0, r1, r2, r3, proper, hard * mu2, hard * lam, act_x, act_y,
+        e, f, g, h, r0, r1, r2, r3, proper, tangent * mu2, tangent * lam, act_x, act_y,
         factor * xx_bar, factor * xy_bar, factor * yy_bar, KIND,
     )  # fmt: skip
     a_bar, b_bar, c_bar, d_bar = a_bar + e_bar, b_bar + f_bar, c_bar + g_bar, d_bar + h_bar

@@ -18,7 +18,7 @@ class DeviceTables:
     bodies: tuple[BodyTable, ...]
     slots: int  # number of directions that have velocity rules
     #: h, 1/h, dt, margin and extent of the window, damping, mass epsilon, stretch floor, largest Jp; then for each body
-    #: the bounds of hardening and the shear cutoff, from :meth:`bounds_of`.
+    #: the bounds of hardening, the shear cutoff and the resolved rate, from :meth:`bounds_of`.
     constants: Tensor
     rules: Tensor  # (rules, 9) float64: the numbers of each rule
 
@@ -37,7 +37,7 @@ def device_tables(handle: int, dtype: torch.dtype, device: torch.device) -> Devi
     constants += [tables.stretch_floor, LARGEST_JP]
     constants += [0.0] * 3  # parts of a table begin at whole fours, as Triton compiles a kernel anew for others
     for body in bodies:
-        constants += [body.hardening_low, body.hardening_high, body.shear_cutoff, 0.0]
+        constants += [body.hardening_low, body.hardening_high, body.shear_cutoff, body.resolved_rate]
     names = ("axis", "sign", "i_low", "i_high", "j_low", "j_high", "friction", "world", "slot")
     rows = [[float(getattr(rule, name)) for name in names] for rule in rules] or [[0.0] * len(names)]
     with torch.inference_mode(False):
