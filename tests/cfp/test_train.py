@@ -3,7 +3,6 @@
 import html
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -235,10 +234,9 @@ def test_task_of_a_module_is_trained_and_evaluated_by_name(tmp_path, monkeypatch
 def test_page_shows_the_run_and_opens_from_disk(finished):
     page = (finished / "index.html").read_text()
     assert 'src="curve.png"' in page and "http" not in page and "<video" not in page  # filmed nothing
-    cells = re.findall("<td>(.*?)</td>", page)
     for row in json.loads((finished / "results.json").read_text()):
-        mean = cells[cells.index(row["policy"]) + 3]
-        assert float(mean) == pytest.approx(row["mean"], abs=0.056)  # rounded to 0.1 here and to 0.01 there
+        means = {f"<td>{row['mean'] + rounding:.1f}</td>" for rounding in (-5e-4, 5e-4)}  # the file has three digits
+        assert f"<td>{row['policy']}</td>" in page and any(mean in page for mean in means)
     assert html.escape((finished / "config.json").read_text().strip()) in page
 
 
