@@ -1,67 +1,121 @@
-"""Cost of a step by number of particles, batch size and threads, as a Markdown table.
+"""Cost of a step by number of particles and of robots: `python benchmarks/scaling.py --out docs/scaling.csv`.
 
-Run ``python benchmarks/scaling.py [--backend native] [--rounds 8]``.
+Times are minima over rounds, each of which measures every case once: a step of 100 substeps in the scene of RUN. With
+one thread they are processor time, so that other programs count less.
 """
 
 from __future__ import annotations
 
+import csv
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 import tyro
+from matplotlib import pyplot
 from test_solver import scene
 
+from torchmpm.memory import estimate_memory
+
 SUBSTEPS = 100
-SIZES = ((1, 500), (1, 2_000), (1, 8_000), (1, 22_000), (1, 88_000), (4, 2_000), (16, 2_000), (64, 2_000), (256, 2_000))
+ROBOTS = {
+    "one robot": [(1, count) for count in (500, 2_000, 8_000, 22_000, 88_000, 200_000)],
+    "robots of 2,000 particles": [(batch, 2_000) for batch in (1, 4, 16, 64, 256)],
+}
+MEASURES = {"forward": "forward", "gradient": "with gradient"}
+Row = dict[str, float]
 
 
 @dataclass(frozen=True)
 class Options:
-    """Time steps of 100 substeps in the scene of RUN; the minimum over the rounds is printed."""
+    """Measure steps, or draw the table of an earlier measurement."""
 
+    out: Path
+    """Table (CSV)."""
+    picture: Path | None = None
+    """Picture of the table; the table is not measured again if it is there."""
     backend: str = "auto"
     """Backend of the solver."""
     rounds: int = 8
-    """Timed steps of each case, after one for warming up."""
-    threads: tuple[int, ...] = tuple(sorted({1, torch.get_num_threads()}))
-    """Numbers of threads."""
+    """Times that each case is measured, after once for warming up."""
+    threads: int = 1
+    """Number of threads."""
 
 
-def seconds(run, rounds: int) -> float:
-    """Minimum time of a call in seconds, after one for warming up."""
-    run()
-    times = []
-    for _ in range(rounds):
-        start = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - start)
-    return min(times)
+def prepare(backend: str, batch: int, count: int) -> tuple[Row, dict[str, Callable[[], object]]]:
+    """The row of a case with its memory, and the two steps to measure."""
+    solver, state, actuation, origin = scene(backend, batch, count)
+    cotangent = torch.sin(40 * state.x)
+
+    def forward(actuation: torch.Tensor = actuation) -> torch.Tensor:
+        return solver.step(state, actuation, substeps=SUBSTEPS, origin=origin).x
+
+    def gradient() -> None:
+        leaf = actuation.clone().requires_grad_()
+        torch.autograd.grad(forward(leaf), leaf, cotangent)
+
+    memory = estimate_memory(solver, state, substeps=SUBSTEPS) / 2**20
+    return {"robots": batch, "particles": count, "memory (MiB)": round(memory, 1)}, {
+        "forward": forward,
+        "gradient": gradient,
+    }
+
+
+def measure(options: Options) -> list[Row]:
+    """Rows with nanoseconds a particle and substep."""
+    torch.set_num_threads(options.threads)
+    clock = time.process_time if options.threads == 1 else time.perf_counter
+    cases = dict.fromkeys(case for cases in ROBOTS.values() for case in cases)
+    prepared = [prepare(options.backend, *case) for case in cases]
+    best: dict[tuple[int, str], float] = {}
+    for number in range(options.rounds + 1):
+        for case, (_, runs) in enumerate(prepared):
+            for name, run in runs.items():
+                start = clock()
+                run()
+                seconds = clock() - start
+                if number:
+                    best[case, name] = min(seconds, best.get((case, name), seconds))
+    for case, (row, runs) in enumerate(prepared):
+        for name in runs:
+            row[f"{name} (ms/substep)"] = round(1e3 * best[case, name] / SUBSTEPS, 4)
+            row[f"{name} (ns/particle)"] = round(
+                1e9 * best[case, name] / SUBSTEPS / (row["robots"] * row["particles"]), 1
+            )
+    return [row for row, _ in prepared]
+
+
+def draw(rows: list[Row], path: Path) -> None:
+    """Draw time and memory over the number of particles of all robots."""
+    table = {(int(row["robots"]), int(row["particles"])): row for row in rows}
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
+    for (label, cases), colour in zip(ROBOTS.items(), ("tab:blue", "tab:orange"), strict=True):
+        totals = [batch * count for batch, count in cases]
+        for (name, words), line in zip(MEASURES.items(), ("o-", "s--"), strict=True):
+            costs = [table[case][f"{name} (ns/particle)"] for case in cases]
+            left.loglog(totals, costs, line, color=colour, label=f"{label}, {words}")
+        right.loglog(totals, [table[case]["memory (MiB)"] for case in cases], "s--", color=colour, label=label)
+    left.set(xlabel="particles of all robots", ylabel="ns per particle and substep", ylim=(1, None))
+    right.set(xlabel="particles of all robots", ylabel="memory of a gradient (MiB)")
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=7)
+    figure.savefig(path, dpi=150)
 
 
 def main(options: Options) -> None:
-    """Print the table."""
-    print(
-        "| simulations x particles | threads | forward, ms a substep | ns a particle | with gradient | ns a particle |"
-    )
-    print("| --- | --- | --- | --- | --- | --- |")
-    for batch, count in SIZES:
-        solver, state, actuation, origin = scene(options.backend, batch, count)
-        cotangent = torch.sin(40 * state.x)
-
-        def forward(solver=solver, state=state, actuation=actuation, origin=origin) -> torch.Tensor:
-            return solver.step(state, actuation, substeps=SUBSTEPS, origin=origin).x
-
-        def gradient(actuation=actuation, cotangent=cotangent, forward=forward) -> None:
-            with torch.enable_grad():
-                torch.autograd.grad(forward(actuation=actuation.requires_grad_()), actuation, cotangent)
-
-        for threads in options.threads:
-            torch.set_num_threads(threads)
-            with torch.no_grad():
-                costs = [seconds(run, options.rounds) / SUBSTEPS for run in (forward, gradient)]
-            cells = [f"{1e3 * cost:.3f} | {1e9 * cost / (batch * count):.1f}" for cost in costs]
-            print(f"| {batch} x {count:,} | {threads} | {' | '.join(cells)} |", flush=True)
+    """Write the table and the picture."""
+    if options.picture is None or not options.out.exists():
+        rows = measure(options)
+        with options.out.open("w", newline="") as file:
+            writer = csv.DictWriter(file, rows[0])
+            writer.writeheader()
+            writer.writerows(rows)
+    if options.picture is not None:
+        with options.out.open(newline="") as file:
+            draw([{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)], options.picture)
 
 
 if __name__ == "__main__":

@@ -12,11 +12,12 @@ from baselines.train import PROGRAM
 from cfp.envs.disturbances import Case, Disturbed
 from cfp.envs.vec_env import monitored
 from cfp.evaluate import open_policy
+from cfp.evaluation.episodes import Trial
 from cfp.evaluation.evaluate import evaluate, evaluation_seed
 from dittogym import TorchEnv, make_spec
 
 BATCH = 20
-"""Episodes side by side."""
+"""Episodes between two reports."""
 
 
 def main() -> None:
@@ -31,9 +32,8 @@ def main() -> None:
     policy, own = policies.popitem()[1], config.environment
     spec = replace(make_spec(config.task, **own.task_options()), horizon=arguments.steps)
     case = Case("noise", action_noise=arguments.noise)
-    successes = done = 0
-    while done < arguments.episodes:
-        count = min(BATCH, arguments.episodes - done)
+
+    def make_env(seed: int, count: int) -> Disturbed:
         env = TorchEnv(
             spec,
             count,
@@ -44,11 +44,21 @@ def main() -> None:
             dtype=own.dtype,
             action_layout=own.action_indexing,
         )
-        seed = evaluation_seed(config) + done
-        result = evaluate(
-            "", policy, Disturbed(monitored(env), case, seed, policy.description["resolution"]), count,
-            deterministic=policy.deterministic_by_default, seed=seed,
-        )  # fmt: skip
+        return Disturbed(monitored(env), case, seed, policy.description["resolution"])
+
+    successes = done = 0
+    while done < arguments.episodes:
+        count = min(BATCH, arguments.episodes - done)
+        trial = Trial(
+            name="",
+            resolution=policy.resolution,
+            policy=policy,
+            make_env=make_env,
+            episodes=count,
+            deterministic=policy.deterministic_by_default,
+            seed=evaluation_seed(config) + done,
+        )
+        result = evaluate([trial])[0]
         if result.success is None:
             parser.error(f"policy must be for a task that defines success, got one for {config.task}")
         done, successes = done + count, successes + round(result.success * count)

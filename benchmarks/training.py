@@ -1,7 +1,8 @@
 """Cost of a training step and its parts: `python benchmarks/training.py`.
 
-Prints seconds per update (batches of the quick and the paper preset), training steps per second of the quick preset
-with the shares of simulation, updates and the rest, and environment steps per second alone.
+Prints for each update the seconds, floating-point operations and the share of the speed of a matrix product, training
+steps per second of the quick preset with the shares of simulation, updates and the rest, and environment steps per
+second alone.
 """
 
 import argparse
@@ -10,12 +11,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from unittest import mock
 
 import gymnasium
 import numpy as np
 import torch
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from torch import Tensor
+from torch.nn import functional as F
+from torch.utils.flop_counter import FlopCounterMode
 
 import dittogym  # noqa: F401  (registers the environments)
 from cfp import CFP, CFPPolicy, Config, preset
@@ -50,24 +55,55 @@ def make_batch(size: int, resolution: int) -> ReplayBufferSamples:
 
 
 def minimum_seconds(function: Callable[[], object], repeats: int) -> float:
-    """Minimum seconds of a call."""
+    """Minimum seconds of a call: of the processor with one thread, so that other programs count less."""
+    clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
     seconds = []
     for _ in range(repeats + 2):  # two calls for warming up
-        start = time.perf_counter()
+        start = clock()
         function()
-        seconds.append(time.perf_counter() - start)
+        seconds.append(clock() - start)
     return min(seconds[2:])
 
 
+def encode_one_by_one(encoders, *images: Tensor) -> Tensor:
+    """`cfp.agent.fused.encode` without joining encoders, and without the constant coordinates."""
+    latents = []
+    for encoder in encoders:
+        weights = encoder.first.weight[:, :-2].split([image.shape[1] for image in images], dim=1)
+        parts = [F.conv2d(image, weight, stride=4) for image, weight in zip(images, weights, strict=True)]
+        latents.append(encoder.rest(sum(parts[1:], parts[0])))
+    return torch.cat(latents, dim=1)
+
+
+def count_flop(model: CFP, batch: ReplayBufferSamples) -> int:
+    """Floating-point operations of an update: convolutions and matrix products of every network on its own."""
+    plain = mock.patch.multiple(
+        "cfp.agent.fused",
+        encode=encode_one_by_one,
+        decode=lambda heads, latent: [head(latent) for head in heads],
+        multilayer_perceptrons=lambda each, values: torch.stack([one(x) for one, x in zip(each, values, strict=True)]),
+    )
+    with plain, FlopCounterMode(display=False) as counter:
+        model.update(batch)
+    return counter.get_total_flops()
+
+
 def updates(config: Config, repeats: int) -> None:
-    """Print seconds per update."""
-    print("| stage | batch | seconds |")
-    print("| --- " * 3 + "|")
+    """Print the cost of an update next to that of a matrix product."""
+    matrix = torch.randn(1024, 1024)
+    peak = 2 * 1024**3 / minimum_seconds(lambda: matrix @ matrix, repeats)
+    print(f"matrix product: {peak / 1e9:.0f} GFLOP/s")
+    print("| stage | batch | GFLOP | seconds | GFLOP/s | share of the matrix product |")
+    print("| --- " * 6 + "|")
     for stage in (1, 2):
         model = make_model(config, stage, 1)
         for size in (64, 256):
-            batch = make_batch(size, config.resolution(stage))
-            print(f"| {stage} | {size} | {minimum_seconds(partial(model.update, batch), repeats):.4f} |", flush=True)
+            batch = make_batch(size, config.action_size(stage))
+            flop = count_flop(model, batch)
+            seconds = minimum_seconds(partial(model.update, batch), repeats)
+            speed = flop / seconds
+            cells = f"{flop / 1e9:.1f} | {seconds:.4f} | {speed / 1e9:.0f} | {100 * speed / peak:.0f} %"
+            print(f"| {stage} | {size} | {cells} |", flush=True)
 
 
 @contextmanager
@@ -128,7 +164,9 @@ def main() -> None:
     print(f"torch {torch.__version__}, {torch.get_num_threads()} threads")
     config = preset("shapematch")
     if "updates" not in arguments.skip:
-        updates(config, arguments.rounds)
+        for task in ("run", "shapematch"):
+            print(f"{task}, preset paper")
+            updates(preset(task, "paper"), arguments.rounds)
     if "training" not in arguments.skip:
         training(config, arguments.steps)
     if "environments" not in arguments.skip:

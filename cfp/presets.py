@@ -59,6 +59,7 @@ class AnalyticNumbers:
         steps: Environment steps of both stages.
         handover: Step at which stage 2 begins.
         action_step: Step on the actions in stages 1 and 2.
+        gate_bias: Bias of the gate logit; a gate that is nearly closed leaves the coarse policy as it is at first.
         on_speed: Trained on speed to the right instead of the task's reward.
         num_envs: Robots side by side.
         windows_kept: Latest windows that the regression draws from.
@@ -69,7 +70,8 @@ class AnalyticNumbers:
 
     steps: int = 25_600
     handover: int = 19_200
-    action_step: tuple[float, float] = (0.1, 0.1)
+    action_step: tuple[float, float] = (0.1, 0.02)
+    gate_bias: float = -3.0
     on_speed: bool = False
     num_envs: int = 8
     windows_kept: int = 40
@@ -79,10 +81,20 @@ class AnalyticNumbers:
 
 
 ANALYTIC: dict[str, AnalyticNumbers] = {
-    "shapematch": AnalyticNumbers(4_800, 3_200, (0.3, 0.3), False, 4, 8, 24, 64, 0.98),
+    "shapematch": AnalyticNumbers(
+        steps=4_800,
+        handover=3_200,
+        action_step=(0.3, 0.3),
+        gate_bias=-2.0,
+        num_envs=4,
+        windows_kept=8,
+        minibatches=24,
+        minibatch_size=64,
+        weight_average=0.98,
+    ),
     "run": AnalyticNumbers(on_speed=True),
     "obstacle": AnalyticNumbers(on_speed=True),
-    "kick": AnalyticNumbers(action_step=(0.15, 0.15)),
+    "kick": AnalyticNumbers(action_step=(0.15, 0.02)),
 }
 """Those of the tasks that differ from the defaults of `AnalyticNumbers`."""
 
@@ -134,7 +146,7 @@ def analytic_preset(task: str, name: str = "quick") -> AnalyticConfig:
         steps=own.steps,
         handover=(own.handover,),
         resolutions=published.resolutions,
-        gate_bias=published.gate_bias,
+        gate_bias=(own.gate_bias,),
         action_step=own.action_step,
         windows_kept=own.windows_kept,
         minibatches=own.minibatches,

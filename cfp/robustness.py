@@ -6,6 +6,7 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ from matplotlib.figure import Figure
 
 from cfp.config import RunConfig
 from cfp.envs.disturbances import FRICTION, Case, disturbed_env, make_cases, reason_without_effect
+from cfp.envs.make import batch_size
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection
+from cfp.evaluation.episodes import Trial
 from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
 from cfp.evaluation.plots import write_figure
 from cfp.evaluation.tables import numbers
@@ -83,21 +86,35 @@ def choose(cases: Sequence[Case], words: Sequence[str], spec: TaskSpec, policy: 
 
 
 def report(
-    config: RunConfig, policy: Policy, cases: Sequence[Case], episodes: int, *, deterministic: bool | None = None
+    config: RunConfig,
+    policy: Policy,
+    cases: Sequence[Case],
+    episodes: int,
+    *,
+    deterministic: bool | None = None,
+    progress: bool = False,
 ) -> list[Result]:
     """Evaluate a policy in every case that changes something for it, on the same layouts with the same noise."""
     if deterministic is None:
         deterministic = policy.deterministic_by_default
     spec, seed = make_spec(config.task, **config.environment.task_options()), evaluation_seed(config)
-    grid = 0 if isinstance(policy, DisturbablePolicy) else policy.description.get("resolution", policy.resolution)
-    results = []
-    for case in cases:
-        if reason_without_effect(case, spec, policy.uses_image):
-            continue
-        env = disturbed_env(config, policy.resolution, episodes, case, seed, grid)
-        acting = policy.through(env.disturb) if isinstance(policy, DisturbablePolicy) else policy
-        results.append(evaluate(case.name, acting, env, episodes, deterministic=deterministic, seed=seed))
-    return results
+    decides = policy.description.get("resolution", policy.resolution)
+    grid = 0 if isinstance(policy, DisturbablePolicy) else decides
+    trials = [
+        Trial(
+            name=case.name,
+            resolution=decides,
+            policy=policy,
+            make_env=partial(disturbed_env, config, policy.resolution, case, grid),
+            episodes=episodes,
+            deterministic=deterministic,
+            seed=seed,
+            batch=batch_size(config, episodes),
+        )
+        for case in cases
+        if not reason_without_effect(case, spec, policy.uses_image)
+    ]
+    return evaluate(trials, spec.horizon if progress else None)
 
 
 def to_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
@@ -154,7 +171,7 @@ def run(program: Program, command: Command) -> str:
     assert folder is not None
     cases = choose(cases, command.cases, make_spec(config.task, **config.environment.task_options()), policy)
     folder.mkdir(parents=True, exist_ok=True)
-    results = report(config, policy, cases, command.episodes)
+    results = report(config, policy, cases, command.episodes, progress=True)
     rows, path = to_rows(results), folder / "robustness"
     table = to_markdown(config, rows)
     write_json(path.with_suffix(".json"), rows)

@@ -41,6 +41,8 @@ def bicubic(image: Tensor, size: int, align_corners: bool = False) -> Tensor:
     As two small matrix products, several times faster on a CPU than ``torch.nn.functional.interpolate``.
     """
     matrix = bicubic_matrix(image.shape[-1], size, align_corners, image.dtype, image.device)
+    if not torch.is_autocast_enabled(image.device.type):  # to enter the context takes longer than the products
+        return matrix @ image @ matrix.T
     with torch.autocast(image.device.type, enabled=False):  # its result is executed, so precision matters
         return matrix @ image @ matrix.T
 
@@ -66,7 +68,7 @@ def place(actuation: Tensor, centre: Tensor, nodes: int) -> Tensor:
     i, j = patch_corner(centre, patch, nodes).split(1, dim=1)
     ids = i * nodes + j + _patch_ids(patch, nodes, actuation.device)
     result = actuation.new_zeros(batch, 2, nodes * nodes)
-    return result.scatter(2, ids[:, None].expand(-1, 2, -1), actuation.flatten(2)).unflatten(2, (nodes, nodes))
+    return result.scatter(2, ids[:, None].expand(-1, 2, -1), actuation.flatten(2)).view(batch, 2, nodes, nodes)
 
 
 @functools.lru_cache(maxsize=16)

@@ -41,8 +41,11 @@ def measure(particles: ParticleState, num_robot_particles: int) -> Measurement:
     robot, other = slice(None, num_robot_particles), slice(num_robot_particles, None)
     com = x[:, robot].mean(1)
     variance = (x[:, robot] - com[:, None]).square().mean(1).sum(-1)  # several times faster than Tensor.var
-    single = variance == 0  # the square root of zero has no derivative
-    split = torch.where(single, 0.0, torch.where(single, 1.0, variance).sqrt())
+    if variance.requires_grad:  # the square root of zero has no derivative
+        single = variance == 0
+        split = torch.where(single, 0.0, torch.where(single, 1.0, variance).sqrt())
+    else:
+        split = variance.sqrt()
     if num_robot_particles == x.shape[1]:
         return Measurement(com, v[:, robot].mean(1), split)
     return Measurement(com, v[:, robot].mean(1), split, x[:, other].mean(1), v[:, other].mean(1))

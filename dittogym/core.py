@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
@@ -189,12 +190,22 @@ def _judge(model: Model, moment: Moment, actuation: Tensor, valid: Tensor) -> tu
     if weights.get("action"):
         terms["action"] = -action_cost(actuation)
     terms["alive"] = torch.ones_like(now.split)
-    values = torch.stack([weights.get(name, 0.0) * term for name, term in terms.items()])
+    terms["failure"] = torch.zeros_like(now.split)
+    factors, failed = _columns(tuple(weights.get(name, 0.0) for name in terms), now.split.dtype, now.split.device)
+    values = torch.stack(tuple(terms.values())) * factors
     _check_finite(spec.name, list(terms), values, valid)
-    values = torch.where(valid, values, 0.0)
-    failure = torch.where(valid, 0.0, FAILURE_REWARD).to(now.split)
-    weighted = {**dict(zip(terms, values.unbind(), strict=True)), "failure": failure}
-    return outcome, weighted, torch.stack(tuple(weighted.values())).sum(0)
+    values = torch.where(valid, values, failed)
+    return outcome, dict(zip(terms, values.unbind(), strict=True)), values.sum(0)
+
+
+@functools.lru_cache(maxsize=64)
+@torch.inference_mode(False)  # what is kept must serve gradients later
+def _columns(weights: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Weights of terms, and their values in a simulation that is not valid, (K, 1) each; ``failure`` comes last."""
+    rows = torch.tensor([(weight, 0.0) for weight in weights], dtype=torch.float64, device="cpu")
+    rows[-1, 1] = FAILURE_REWARD
+    factors, failed = rows.to(device, dtype)[..., None].unbind(1)
+    return factors, failed
 
 
 def _check_finite(task: str, names: list[str], values: Tensor, valid: Tensor) -> None:

@@ -1,5 +1,6 @@
 """Settings shared by all tests."""
 
+import os
 from collections.abc import Iterator
 
 import pytest
@@ -8,6 +9,9 @@ from hypothesis import settings
 
 settings.register_profile("torchmpm", deadline=None)  # the first call of an operator may compile or allocate
 settings.load_profile("torchmpm")
+
+
+os.environ["TORCHMPM_EPISODES"] = ""  # tests keep no episodes in the user's folders; programs that they start neither
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -31,11 +31,9 @@ def warn_eager(reason: str) -> None:
 
 @functools.cache
 def compiled(substep: Callable[..., Any]) -> Callable[..., Any]:
-    """A substep through ``torch.compile``.
+    """A substep through ``torch.compile``, for devices without native kernels; where there are any, they are faster.
 
     It compiles for about ten seconds for each new combination of solver and shapes in a process (less with
     TorchInductor's cache on disk). More than eight combinations in one process run eagerly again.
     """
-    # Sums over the nine nodes become one expression that computes their addresses once; addresses are clamped already.
-    options: dict[str, Any] = {"unroll_reductions_threshold": 16, "assert_indirect_indexing": False}
-    return torch.compile(substep, dynamic=False, options=options)
+    return torch.compile(substep, dynamic=False)

@@ -39,8 +39,8 @@ class Solver:
         rules: Velocity rules, see :class:`torchmpm.VelocityRule`.
         dt: Duration of a substep, s.
         backend: ``"native"`` (fused kernels, ``torchmpm.native``: C++ on the CPU, Triton on CUDA), ``"eager"``
-            (operator by operator), ``"compile"`` (the same through ``torch.compile``), or ``"auto"``: native on a CPU
-            where it works, else eager.
+            (operator by operator), ``"compile"`` (the same through ``torch.compile``, for devices without native
+            kernels), or ``"auto"``: native on a CPU where it works, else eager.
         allow_unstable: Accept a ``dt`` above :meth:`stable_dt`.
 
     Raises:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -10,6 +9,7 @@ from torch import Tensor
 
 from baselines.common.grid import GridConfig
 from baselines.common.open_loop import OpenLoop
+from cfp.evaluation.untrained import UntrainedPolicy
 from cfp.policy_protocols import Policy
 from cfp.presets import sac_preset
 from cfp.sections import ReportConfig
@@ -42,18 +42,13 @@ def reference_preset(algo: str, task: str, name: str) -> ReferenceConfig:
     )
 
 
-def _zero(config: ReferenceConfig) -> OpenLoop:
-    size = config.resolution(1)
-    return OpenLoop(torch.zeros(0, 2, size, size))
-
-
 def _scripted(config: ReferenceConfig) -> OpenLoop:
     return OpenLoop(wave(make_spec(config.task).horizon, config.resolution(1), config.environment.action_indexing))
 
 
 REFERENCE_POLICIES: dict[str, Callable[[ReferenceConfig], Policy]] = {
-    "zero": _zero,
-    "random": lambda config: RandomActions(config.resolution(1)),
+    "zero": lambda config: UntrainedPolicy("zero", config.resolution(1)),
+    "random": lambda config: UntrainedPolicy("random", config.resolution(1)),
     "scripted": _scripted,
 }
 
@@ -67,27 +62,3 @@ def wave(steps: int, size: int, layout: ActionIndexing) -> Tensor:
     t, c, x, y = np.ogrid[1 : steps + 1, 0:2, 0:size, 0:size]
     drive = np.sin(0.3 * t + 0.7 * x + 1.1 * y + 2.0 * c)
     return from_grid_indexing(torch.from_numpy(drive.astype(np.float32)), layout)
-
-
-class RandomActions:
-    """Uniform actions in [-1, 1], independent in every cell and step, from torch's generator."""
-
-    deterministic_by_default = False
-    uses_image = False
-
-    def __init__(self, resolution: int) -> None:
-        self.resolution = resolution
-        self.description: dict[str, Any] = {}
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Actions (B, 2, R, R), or (2, R, R) for one image; ``deterministic`` changes nothing."""
-        shape: tuple[int, ...] = (2, self.resolution, self.resolution)
-        if not (isinstance(observation, np.ndarray) and observation.ndim == 3):
-            shape = (len(observation), *shape)
-        return (2.0 * torch.rand(shape) - 1.0).numpy(), state

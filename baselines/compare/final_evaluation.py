@@ -14,9 +14,9 @@ from baselines.compare import paper
 from baselines.registry import load, reference_policy
 from cfp.config import RunConfig
 from cfp.envs.disturbances import Case, make_cases
-from cfp.envs.make import choose_device, make_env
+from cfp.envs.make import choose_device
 from cfp.errors import CheckpointError
-from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
+from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed, make_trial
 from cfp.files import parse_json, write_json
 from cfp.robustness import report
 from cfp.sections import Particles
@@ -125,8 +125,8 @@ def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop
     config = evaluation_config(config, protocol.tier)
 
     def play(seed: int, count: int) -> Entry:
-        env = make_env(config, policy.resolution, count)
-        return _entry(evaluate("", policy, env, count, deterministic=deterministic, seed=seed))
+        trial = make_trial(config, "", policy, policy.resolution, count, deterministic=deterministic, seed=seed)
+        return _entry(evaluate([trial])[0])
 
     def play_disturbed(first: int, count: int, case: Case) -> Entry | None:
         results = report(replace(config, seed=first), policy, [case], count, deterministic=deterministic)

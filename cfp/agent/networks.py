@@ -46,7 +46,7 @@ def normalise_image(observation: Tensor) -> Tensor:
     """Map uint8 pixels to [-1, 1] by ``s / 255 * 2 - 1``; floating-point images are returned as they are."""
     if observation.is_floating_point():
         return observation
-    return observation.float().mul_(2.0 / 255.0).sub_(1.0)
+    return fused.channels_last(observation).float().mul_(2.0 / 255.0).sub_(1.0)
 
 
 def initialise(module: nn.Module) -> nn.Module:
@@ -66,21 +66,21 @@ class Encoder(nn.Module):
     """
 
     patches: Tensor
-    """Coordinate channels in the receptive fields of the first layer, unfolded to (2 x 8 x 8, 225)."""
+    """Coordinate channels in the receptive fields of the first layer, unfolded to (225, 2 x 8 x 8)."""
 
     def __init__(self, channels: int, width: int) -> None:
         super().__init__()
         self.first = nn.Conv2d(channels + 2, width, 8, stride=4)
         self.rest = nn.Sequential(
-            nn.ELU(),
+            nn.ELU(inplace=True),
             nn.Conv2d(width, 2 * width, 4, stride=2),
-            nn.ELU(),
+            nn.ELU(inplace=True),
             nn.Conv2d(2 * width, width, 3),
-            nn.ELU(),
+            nn.ELU(inplace=True),
         )
         line = (torch.arange(IMAGE_SIZE) - IMAGE_SIZE / 2) / (IMAGE_SIZE / 2)
         grid = torch.stack(torch.meshgrid(line, line, indexing="ij"))
-        self.register_buffer("patches", F.unfold(grid[None], 8, stride=4)[0], persistent=False)
+        self.register_buffer("patches", F.unfold(grid[None], 8, stride=4)[0].T.contiguous(), persistent=False)
 
     def forward(self, *images: Tensor) -> Tensor:
         """Encode images (B, c, 64, 64) with values about [-1, 1], stacked along their channels, to (B, w, 4, 4)."""
@@ -113,7 +113,7 @@ def make_head(resolution: int) -> nn.Sequential:
     shapes, channels = _DECODERS[resolution]
     layers: list[nn.Module] = []
     for (kernel, stride, padding), (before, after) in zip(shapes, pairwise(channels), strict=True):
-        layers += [nn.ConvTranspose2d(before, after, kernel, stride, padding), nn.ELU()]
+        layers += [nn.ConvTranspose2d(before, after, kernel, stride, padding), nn.ELU(inplace=True)]
     return nn.Sequential(*layers[:-1])
 
 
@@ -121,7 +121,7 @@ def _perceptron(*sizes: int) -> nn.Sequential:
     """Linear layers of these sizes on a flattened input, with ELUs between them."""
     layers: list[nn.Module] = [nn.Flatten()]
     for before, after in pairwise(sizes):
-        layers += [nn.Linear(before, after), nn.ELU()]
+        layers += [nn.Linear(before, after), nn.ELU(inplace=True)]
     return nn.Sequential(*layers[:-1])
 
 

@@ -59,7 +59,7 @@ def reason_without_effect(case: Case, spec: TaskSpec, uses_image: bool = True) -
 
 
 def disturbed_env(
-    config: RunConfig, resolution: int, num_envs: int, case: Case, seed: int, grid: int | None = None
+    config: RunConfig, resolution: int, case: Case, grid: int | None, seed: int, num_envs: int
 ) -> Disturbed:
     """Create the environment of a run with a disturbance; a first reset sets the constants of the physics."""
     spec = make_spec(config.task, **config.environment.task_options())

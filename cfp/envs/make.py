@@ -41,3 +41,8 @@ def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = No
         return TorchEnv(config.task, resolution=resolution, **options)
     except (ValueError, TypeError, OSError) as error:
         raise ConfigError(" ".join(str(error).split())) from error
+
+
+def batch_size(config: RunConfig, episodes: int) -> int:
+    """How many of some episodes share an environment: on a CPU none, so that each runs on a core of its own."""
+    return 1 if torch.device(choose_device(config.device)).type == "cpu" else episodes

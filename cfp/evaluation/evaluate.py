@@ -3,50 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-import torch
 from scipy import stats
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import VecEnv
 
-from cfp.agent.actor_policy import Memory, Observation, Start
 from cfp.config import EVALUATION_SEED, RunConfig
-from cfp.envs.make import make_env
-from cfp.envs.vec_env import TorchVecEnv
-from cfp.policy_protocols import Policy, SeesState
+from cfp.envs.make import batch_size, make_env
+from cfp.evaluation.cache import EpisodeCache
+from cfp.evaluation.episodes import Trial, play
+from cfp.evaluation.untrained import UntrainedPolicy
+from cfp.policy_protocols import Policy
+from dittogym import make_spec
 
 Noise = Literal["default", "with", "without", "both"]
 """With action noise or without; default: as the run that trained a policy evaluates it."""
-
-
-def attached(policy: PolicyPredictor, env: VecEnv) -> PolicyPredictor:
-    """A policy for an environment of `make_env`: one that sees the state is shown it, any other stays as it is."""
-    inner = env.unwrapped
-    if isinstance(policy, SeesState) and isinstance(inner, TorchVecEnv):
-        return policy.attached(inner.torch_env)
-    return policy
-
-
-@dataclass(frozen=True)
-class SingleThreaded:
-    """A policy that acts with one thread: with several, torch adds up convolutions in another order."""
-
-    policy: PolicyPredictor
-
-    def predict(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, Memory]:
-        """Actions of the policy."""
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            return self.policy.predict(*args, **kwargs)
-        finally:
-            torch.set_num_threads(threads)
 
 
 @dataclass(frozen=True)
@@ -82,71 +56,62 @@ def evaluation_seed(config: RunConfig) -> int:
     return config.seed + 2 * EVALUATION_SEED
 
 
-@dataclass(frozen=True)
-class UntrainedPolicy:
-    """Draws actions (B, 2, R, R) by their shape, whatever it sees."""
+def make_trial(
+    config: RunConfig, name: str, policy: PolicyPredictor, size: int, episodes: int, *, deterministic: bool, seed: int
+) -> Trial:
+    """Episodes of a policy with actions (2, size, size) in the environment of a run."""
+    return Trial(
+        name=name,
+        resolution=size,
+        policy=policy,
+        make_env=lambda _, count: make_env(config, size, count),
+        episodes=episodes,
+        deterministic=deterministic,
+        seed=seed,
+        batch=batch_size(config, episodes),
+        cache=EpisodeCache.of(config, policy.kind, size) if isinstance(policy, UntrainedPolicy) else None,
+    )
 
-    resolution: int
-    draw: Callable[[tuple[int, ...]], Any]
 
-    def predict(
-        self, observation: Observation, state: Memory = None, episode_start: Start = None, deterministic: bool = False
-    ) -> tuple[np.ndarray, Memory]:
-        """Actions for a batch of observations."""
-        actions: np.ndarray = self.draw((len(observation), 2, self.resolution, self.resolution))
-        return actions.astype(np.float32), state
+def evaluate(trials: Sequence[Trial], steps: int | None = None) -> list[Result]:
+    """Evaluate policies without learning; torch's generator is left as it was.
 
+    A trial gives the same result whatever the number of threads and whatever is evaluated beside it.
 
-def evaluate(
-    name: str, policy: PolicyPredictor, env: VecEnv, episodes: int, *, deterministic: bool, seed: int
-) -> Result:
-    """Run episodes without learning, element i of the batch from layout ``seed + i``; torch's generator is not touched.
-
-    The same seed gives the same episodes; with reference parity, whose resets show what was before, in a new ``env``.
+    Args:
+        trials: Episodes, all played side by side.
+        steps: Steps of an episode at most, to show a progress bar on a terminal; None shows none.
     """
-    elements: list[int] = []
-    successes: list[bool] = []
-
-    def note(local: dict[str, Any], _: dict[str, Any]) -> None:
-        if local["done"]:
-            elements.append(local["i"])
-            if "is_success" in local["info"]:
-                successes.append(bool(local["info"]["is_success"]))
-
-    acting = SingleThreaded(attached(policy, env))
-    env.seed(seed)
-    with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
-        torch.manual_seed(seed)
-        returns, _ = evaluate_policy(
-            acting, env, episodes, deterministic=deterministic, callback=note, return_episode_rewards=True
-        )
-    assert isinstance(returns, list)
-    ordered = np.asarray(returns)[np.argsort(elements, kind="stable")]  # they come as the episodes end
-    success = float(np.mean(successes)) if successes else None
-    assert env.action_space.shape is not None
-    return Result(name, env.action_space.shape[-1], tuple(ordered.tolist()), success)
+    results = []
+    for trial, episodes in zip(trials, play(trials, steps), strict=True):
+        successes = [episode.success for episode in episodes if episode.success is not None]
+        success = float(np.mean(successes)) if successes else None
+        results.append(Result(trial.name, trial.resolution, tuple(episode.total for episode in episodes), success))
+    return results
 
 
 def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, noise: Noise = "default") -> list[Result]:
     """Evaluate policies beside zero and random action on the same layouts; one made for a single layout also there."""
     coarsest, seed = config.resolution(1), evaluation_seed(config)
-    uniform = partial(np.random.default_rng(config.seed).uniform, -1, 1)
-
-    def evaluated(name: str, policy: Policy | UntrainedPolicy, deterministic: bool) -> Result:
-        env = make_env(config, policy.resolution, episodes)
-        return evaluate(name, policy, env, episodes, deterministic=deterministic, seed=seed)
-
-    results = [
-        evaluated("zero action", UntrainedPolicy(coarsest, np.zeros), True),
-        evaluated("random action", UntrainedPolicy(coarsest, uniform), True),
+    trials = [
+        make_trial(
+            config, f"{kind} action", UntrainedPolicy(kind, coarsest), coarsest, episodes, deterministic=True, seed=seed
+        )
+        for kind in ("zero", "random")
     ]
     for name, trained in policies.items():
         deterministic = trained.deterministic_by_default if noise == "default" else noise == "without"
-        grid = trained.description.get("resolution", trained.resolution)
+        size = trained.resolution
         for quiet in (False, True) if noise == "both" else (deterministic,):
             label = f"{name}, {'mean' if quiet else 'noisy'}" if noise == "both" else name
-            results.append(replace(evaluated(label, trained, quiet), resolution=grid))
+            trial = make_trial(config, label, trained, size, episodes, deterministic=quiet, seed=seed)
+            trials.append(replace(trial, resolution=trained.description.get("resolution", size)))
         if "layout" in trained.description:
-            alone, own = make_env(config, trained.resolution, 1), trained.description["layout"]
-            results.append(evaluate("  own layout", trained, alone, 1, deterministic=deterministic, seed=own))
-    return results
+            own = trained.description["layout"]
+            trials.append(make_trial(config, "  own layout", trained, size, 1, deterministic=deterministic, seed=own))
+    return evaluate(trials, horizon(config))
+
+
+def horizon(config: RunConfig) -> int:
+    """Steps of an episode at most."""
+    return make_spec(config.task, **config.environment.task_options()).horizon

@@ -16,7 +16,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.envs.make import make_env
 from cfp.envs.vec_env import TorchVecEnv
-from cfp.evaluation.evaluate import SingleThreaded, attached
+from cfp.evaluation.episodes import SeededPolicy, attached
 from cfp.policy_protocols import Policy
 
 FRAMES_PER_SECOND = 10
@@ -43,13 +43,12 @@ def film_episode(
     """Pictures of one episode, uint8 (512, 512, 3), to be taken all at once: the start, then one per step."""
     venv = make_env(config, size, 1).venv
     assert isinstance(venv, TorchVecEnv)
-    acting = SingleThreaded(attached(policy, venv))
+    acting = SeededPolicy(attached(policy, venv), seed)
     venv.seed(seed)
     observation = venv.reset()
     yield venv.torch_env.render(0)
     done, memory, start = False, None, np.array([True])
     with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
-        torch.manual_seed(seed)
         while not done:
             with torch.no_grad():
                 action, memory = acting.predict(observation, memory, start, deterministic)

@@ -11,8 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from tqdm import tqdm
 
 from cfp.config import RunConfig
-from cfp.envs.make import make_env
-from cfp.evaluation.evaluate import evaluate
+from cfp.evaluation.evaluate import evaluate, make_trial
 from cfp.evaluation.video import film_episode, write_video
 from cfp.experiment.algorithm import Algorithm, Position
 from cfp.experiment.checkpoint import Checkpoint
@@ -181,9 +180,9 @@ class EvaluationCallback(StageCallback):
     def _act(self) -> None:
         start, stage, config = time.perf_counter(), self.stage, self.stage.config
         seed, episodes = config.evaluation(stage.number)
-        deterministic = config.report.eval_deterministic
-        env = make_env(config, config.action_size(stage.number), episodes)
-        result = evaluate("", stage.algorithm, env, episodes, deterministic=deterministic, seed=seed)
+        size, deterministic = config.action_size(stage.number), config.report.eval_deterministic
+        trial = make_trial(config, "", stage.algorithm, size, episodes, deterministic=deterministic, seed=seed)
+        result = evaluate([trial])[0]
         if result.mean > max(self.means, default=-float("inf")):
             stage.save_policy()  # before the row: a crash between the two repeats the evaluation
         self.means.append(result.mean)

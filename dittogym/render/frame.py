@@ -47,10 +47,10 @@ def frame(model: Model, state: EnvState, index: int, actuation: Tensor | None, s
         for box in obstacle.boxes:
             ground = box == Box(top=box.top)
             canvas.box(box, filled=bool(obstacle.observed_boxes) or ground)
-    x = particles.x[0].cpu().double().numpy()
+    x = particles.x[0].cpu().numpy().astype(np.float64)
     counts = [body.count for body in model.solver.bodies]
     kinds = [ROBOT, *(GROUND_BODY if isinstance(body.material, Snow) else OBJECT for body in spec.objects)]
-    colours = np.repeat(np.array(kinds), counts, axis=0)
+    colours = np.repeat(np.array(kinds, np.uint8), counts, axis=0)
     if actuation is not None:
         colours[: model.num_robot_particles] = _muscle_colours(model, state, index, actuation)
     parts = [part for _, part in slices(model.solver.bodies)]
@@ -65,7 +65,8 @@ class Canvas:
 
     def __init__(self, pixels: int, origin: np.ndarray) -> None:
         self.pixels, self.origin = pixels, origin
-        self.image = np.full((pixels, pixels, 3), GROUND, np.uint8)
+        self.image = np.empty((pixels, pixels, 3), np.uint8)
+        cv2.rectangle(self.image, (0, 0), (pixels, pixels), GROUND, cv2.FILLED)  # much faster than NumPy
 
     def marks(self) -> None:
         """Vertical lines at round world positions, so that the motion of the window is seen."""
@@ -107,21 +108,28 @@ class Canvas:
         column = (position[:, 0] - self.origin[0]) * self.pixels
         row = (1.0 - (position[:, 1] - self.origin[1])) * self.pixels
         seen = (column >= 0) & (column < self.pixels) & (row >= 0) & (row < self.pixels)
+        if not seen.any():
+            return
         column, row, colours = column[seen].astype(int), row[seen].astype(int), colours[seen]
-        for dy in range(-radius, radius + 1):
-            half = int(np.sqrt(radius**2 - dy**2))
-            for dx in range(-half, half + 1):
-                r, c = row + dy, column + dx
-                ok = (r >= 0) & (r < self.pixels) & (c >= 0) & (c < self.pixels)
-                self.image[r[ok], c[ok]] = colours[ok]
+        top, left = max(0, row.min() - radius), max(0, column.min() - radius)
+        part = self.image[top : row.max() + radius + 1, left : column.max() + radius + 1]
+        numbers = np.zeros(part.shape[:2], np.float32)  # of the particles, from 1 on; float32 counts to 16 million
+        numbers[row - top, column - left] = np.arange(1, len(row) + 1)
+        reach = np.arange(-radius, radius + 1)
+        disc = np.add.outer(reach**2, reach**2) <= radius**2
+        last = cv2.dilate(numbers, disc.astype(np.uint8)).astype(np.int32)  # the particle on top in each pixel
+        palette = np.zeros((len(row) + 1, 4), np.uint8)  # four bytes, which are looked up as one number
+        palette[1:, :3] = colours
+        drawn = palette.view(np.uint32)[:, 0][last].view(np.uint8).reshape(*last.shape, 4)
+        cv2.copyTo(drawn[..., :3], (last > 0).astype(np.uint8), part)
 
 
 def _muscle_colours(model: Model, state: EnvState, index: int, actuation: Tensor) -> np.ndarray:
     spec, one = model.spec, slice(index, index + 1)
     centre = centre_in_window(spec.reach, state.centre[one], state.origin[one])
-    nodes = place(actuation[one], centre, NODES)[0].sum(0).cpu().double().numpy()
-    robot_x = state.particles.x[index, : model.num_robot_particles] - state.origin[index]
-    relative = robot_x.detach().cpu().double().numpy()
+    nodes = place(actuation[one], centre, NODES)[0].cpu().numpy().sum(0, dtype=np.float64)
+    robot_x, origin = state.particles.x[index, : model.num_robot_particles], state.origin[index]
+    relative = robot_x.detach().cpu().numpy().astype(np.float64) - origin.detach().cpu().numpy()
     finite = np.isfinite(relative).all(1, keepdims=True)
     at = np.clip(np.where(finite, relative, 0.0) * len(nodes), 0, len(nodes) - 1).astype(int)
     strength = float(state.physics["max_actuation"][index]) if "max_actuation" in state.physics else spec.max_actuation

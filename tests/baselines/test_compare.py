@@ -168,9 +168,9 @@ def test_all_policies_are_evaluated_with_the_same_noise(finished, monkeypatch):
     """Whatever the run that trained a policy does by default."""
     used = []
 
-    def evaluate(*arguments, deterministic, **options):
-        used.append(deterministic)
-        return result
+    def evaluate(trials):
+        used.extend(trial.deterministic for trial in trials)
+        return [result]
 
     result = evaluations.Result("", 8, (1.0,))
     monkeypatch.setattr(evaluations, "evaluate", evaluate)

@@ -65,6 +65,12 @@ TINY = {
         60,
         ["stage 1"],
     ),
+    "analytic": (
+        "--train-particles 100 --num-envs 2 --steps 96 --handover 48 --window 6 --resolutions 4 8 --minibatches 2 "
+        "--minibatch-size 8 --critic-updates 2 --eval-every 48 --checkpoint-every 12 --log-every 24",
+        60,
+        ["stage 1", "stage 2"],
+    ),
     "gnn-16": (MODULAR, 44, ["stage 1"]),
     "gnn-64": (MODULAR, 44, ["stage 1"]),
     "transformer-16": (MODULAR, 44, ["stage 1"]),
@@ -72,7 +78,7 @@ TINY = {
 }
 PATCHES = {algo: 64 for algo in TINY if "-" in algo}
 """Action grids that are not 8."""
-LEVELS = ("cfp", "coarse", "distill", "fine")
+LEVELS = ("analytic", "cfp", "coarse", "distill", "fine")
 """Algorithms whose policies are those of `cfp`."""
 
 
@@ -209,7 +215,7 @@ def test_new_particles_are_refused_where_the_seed_says_them(algo):
 def test_polish_is_evaluated_on_the_layout_it_is_made_for(finished):
     algo, folder = finished
     rows = [row for row in read_table(folder / "evaluations.csv") if row["stage"] == "2"]
-    wanted = {"cfp": {"2"}, "distill": {"2"}, "gradient": {"1"}}
+    wanted = {"analytic": {"2"}, "cfp": {"2"}, "distill": {"2"}, "gradient": {"1"}}
     assert {row["episodes"] for row in rows} == wanted.get(algo, set())
     if algo == "gradient":
         own = json.loads((folder / "results.json").read_text())[-1]

@@ -19,7 +19,8 @@ from cfp.analytic.reward import RewardConfig
 from cfp.analytic.window import Window, short_horizon_loss, td_lambda_targets
 from cfp.envs.make import make_env
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
-from cfp.evaluation.evaluate import attached, evaluate
+from cfp.evaluation.episodes import attached
+from cfp.evaluation.evaluate import evaluate, make_trial
 from cfp.evaluation.video import film
 from cfp.sections import EnvironmentConfig
 from cfp.weights import describe, describe_run, save_policy
@@ -271,7 +272,8 @@ def test_policy_goes_through_its_file(sees, tmp_path):
     images = env.reset()
     actions = [attached(each, env).predict(images, deterministic=True)[0] for each in (algorithm, policy)]
     assert np.array_equal(*actions) and np.abs(actions[0]).max() > 0
-    results = [evaluate("", each, env, 2, deterministic=False, seed=3) for each in (algorithm, policy)]
+    options = {"deterministic": False, "seed": 3}
+    results = evaluate([make_trial(algorithm.config, "", each, 8, 2, **options) for each in (algorithm, policy)])
     assert results[0] == results[1]
     assert sum(1 for _ in film(algorithm.config, policy)) == 31
 

@@ -131,7 +131,7 @@ def test_one_update_equals_the_float64_computation(kind, monkeypatch):
     generator = torch.Generator().manual_seed(5)
     noises = [torch.randn(6, 2, r, r, generator=generator, dtype=torch.float64) for r in sizes]
     queue = iter(noises)
-    monkeypatch.setattr("cfp.agent.actor.torch.randn_like", lambda like: next(queue).to(like))
+    monkeypatch.setattr(torch.Tensor, "normal_", lambda noise, generator=None: noise.copy_(next(queue)))
 
     weights, values, targets = doubles(actor, True), doubles(critic, True), doubles(target, False)
     obs, next_obs = (image.double() / 255 * 2 - 1 for image in (batch.observations, batch.next_observations))

@@ -1,4 +1,7 @@
-"""Evaluations."""
+"""Evaluations: the same digits however episodes are spread over threads, and baselines that are played once."""
+
+import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,32 +11,159 @@ from fakes import FakeEnv
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection
-from cfp.evaluation.evaluate import evaluate
+from cfp.evaluation.cache import VARIABLE
+from cfp.evaluation.episodes import Trial
+from cfp.evaluation.evaluate import compare, evaluate, make_trial
+from cfp.evaluation.untrained import UntrainedPolicy
+from cfp.presets import preset
 from cfp.train import PROGRAM
+from dittogym import TorchEnv
 
 
 class LinearPolicy:
-    """Actions are a linear function of the pixels; torch sums them in parts, one for each thread."""
+    """Actions are a linear function of the pixels, with noise; torch sums them in parts, one for each thread."""
 
     def __init__(self):
-        torch.manual_seed(0)
-        self.weights, self.actions = torch.randn(3 * 64 * 64, 2 * 8 * 8), []
+        self.weights = torch.randn(3 * 64 * 64, 2 * 8 * 8, generator=torch.Generator().manual_seed(0))
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
         pixels = torch.as_tensor(observation).flatten(1).float() / 255
-        self.actions.append((pixels @ self.weights).tanh().view(-1, 2, 8, 8).numpy())
-        return self.actions[-1], state
+        noise = 0.0 if deterministic else torch.randn(len(pixels), 2 * 8 * 8)
+        return (pixels @ self.weights + noise).tanh().view(-1, 2, 8, 8).numpy(), state
 
 
-@pytest.mark.parametrize("threads", [2, 3, 4])
-def test_evaluation_does_not_depend_on_the_number_of_threads(threads):
-    policies = LinearPolicy(), LinearPolicy()
-    for policy, count in zip(policies, (1, threads), strict=True):
-        torch.set_num_threads(count)
-        evaluate("", policy, monitored(FakeEnv(num_envs=16)), 16, deterministic=True, seed=0)
-        assert torch.get_num_threads() == count
-    for one, other in zip(*(policy.actions for policy in policies), strict=True):
-        assert np.array_equal(one, other)
+class Counting:
+    """Counts the steps in which it acts, and fails after some of them if asked to."""
+
+    def __init__(self, fails_after=None):
+        self.steps, self.fails_after = 0, fails_after
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        self.steps += len(observation)
+        if self.steps == self.fails_after:
+            raise RuntimeError("it has had enough")
+        return np.zeros((len(observation), 2, 8, 8), np.float32), state
+
+
+def tiny(task="run", **environment):
+    config = preset(task)
+    options = {"particles": 200, "substeps": 2} | environment
+    return replace(config, device="cpu", environment=replace(config.environment, **options))
+
+
+def fake_trial(policy, episodes, batch=1, **options):
+    def make_env(first, count):
+        return monitored(FakeEnv(count, **{"start": 0.09 * first, "horizon": 4} | options))
+
+    return Trial("", 8, policy, make_env, episodes, deterministic=False, seed=0, batch=batch)
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Episodes of every task that last a few steps."""
+    monkeypatch.setattr(TorchEnv, "step", _ending(TorchEnv.step))
+
+
+def _ending(step):
+    def shortened(self, action, **options):
+        observation, reward, terminated, truncated, info = step(self, action, **options)
+        return observation, reward, terminated, truncated | (self.env_state.steps >= 6), info
+
+    return shortened
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_evaluation_does_not_depend_on_threads_and_on_what_else_is_evaluated(short, threads):
+    config, before = tiny(), torch.get_num_threads()
+    options = {"deterministic": False, "seed": 5}
+    trial = make_trial(config, "", LinearPolicy(), 8, 4, **options)
+    state = torch.get_rng_state()
+    try:
+        torch.set_num_threads(1)
+        alone = evaluate([trial])[0]
+        torch.set_num_threads(threads)
+        _, together = evaluate([make_trial(config, "", UntrainedPolicy("random", 8), 8, 3, **options), trial])
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert together.returns == alone.returns and len(set(alone.returns)) == 4
+    first, third = (make_trial(config, "", LinearPolicy(), 8, 1, deterministic=False, seed=s) for s in (5, 7))
+    assert [result.returns[0] for result in evaluate([first, third])] == [alone.returns[0], alone.returns[2]]
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_noise_differs_between_layouts_and_steps():
+    class Recorder(LinearPolicy):
+        def __init__(self):
+            super().__init__()
+            self.drawn = []
+
+        def predict(self, *arguments, **options):
+            self.drawn.append(torch.randn(3))
+            return super().predict(*arguments, **options)
+
+    policy = Recorder()
+    evaluate([fake_trial(policy, 3)])
+    assert len(policy.drawn) == 12 and len(torch.stack(policy.drawn).unique(dim=0)) == 12
+
+
+@pytest.mark.parametrize("batch", [1, 2, 6])
+def test_returns_are_in_the_order_of_layouts(batch):
+    # The later three are too high and end at once, which costs no steps where each has an environment of its own.
+    policy = Counting()
+    result = evaluate([fake_trial(policy, 6, batch, end_above=0.25)])[0]
+    assert result.returns == pytest.approx([2.0, 2.4, 2.8, 0.8, 0.9, 1.0])
+    assert result.success == pytest.approx(0.0 + 1 / 6)
+    if batch == 1:
+        assert policy.steps == 3 * 4 + 3
+
+
+def test_an_episode_that_fails_ends_the_others():
+    before, policies = threading.active_count(), (Counting(), Counting(fails_after=3))
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        with pytest.raises(RuntimeError, match="had enough"):
+            evaluate([fake_trial(policy, 1, horizon=10**6 if k == 0 else 10) for k, policy in enumerate(policies)])
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+    assert threading.active_count() == before and policies[0].steps < 10**6
+
+
+def test_baselines_are_played_once_for_the_same_conditions(short, tmp_path, monkeypatch):
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    seen = []
+    step = TorchEnv.step
+
+    def counted(self, action, **options):
+        seen.append(0)
+        return step(self, action, **options)
+
+    monkeypatch.setattr(TorchEnv, "step", counted)
+
+    def steps_of(config, episodes=2):
+        seen.clear()
+        results = compare(config, {}, episodes)
+        return len(seen), results
+
+    count, results = steps_of(tiny())
+    assert count == 2 * 2 * 6
+    assert steps_of(tiny()) == (0, results)
+    assert steps_of(replace(tiny(), environment=replace(tiny().environment, num_envs=7))) == (0, results)
+    assert steps_of(tiny(), 3)[0] == 2 * 6  # a further layout each
+    assert steps_of(replace(tiny(), seed=1))[0] == 0  # which are among those
+    for other in (tiny("kick"), tiny(particles=300), tiny(substeps=3), tiny(parity="reference")):
+        assert steps_of(other)[0] == 24
+    for file in tmp_path.glob("*.json"):
+        file.write_text("{")
+    assert steps_of(tiny()) == (24, results) and steps_of(tiny()) == (0, results)  # what is damaged is played again
+    monkeypatch.setattr("cfp.evaluation.cache._sources", lambda: "other sources")
+    assert steps_of(tiny())[0] == 24
+    monkeypatch.setenv(VARIABLE, "")
+    assert steps_of(tiny()) == (24, results)
+    monkeypatch.setenv(VARIABLE, __file__)  # no folder
+    assert steps_of(tiny()) == (24, results)
 
 
 def test_a_policy_can_be_evaluated_with_other_substeps():

@@ -97,7 +97,7 @@ def test_damaged_file_is_replaced(quick_compiler: None, monkeypatch: pytest.Monk
 
 def test_another_source_is_another_file(quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     library.load(torch.float32)
-    for name, value in (("_processor", lambda: "another processor"), ("_FLAGS", ("-O0",))):
+    for name, value in (("processor", lambda: "another processor"), ("_FLAGS", ("-O0",))):
         monkeypatch.setattr(library, name, value)
         forget()
         library.load(torch.float32)

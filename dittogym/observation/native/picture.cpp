@@ -119,12 +119,13 @@ template <class Real> struct Drawing {
                 if (between(Real(float(RASTER - row - r) / RASTER) + bottom, box + 2, box[4] != 0))
                     for (int w = 0; w < WORDS; ++w) covered[r * WORDS + w] |= across[w];
         }
-        const uint8_t* bytes = reinterpret_cast<const uint8_t*>(covered.data());
-        for (int r = 0; r < SIZE; ++r)
-            for (int c = 0; c < SIZE; ++c) {
-                int set = 0;
-                for (int k = 0; k < BLOCK; ++k) set += __builtin_popcount(bytes[(r * BLOCK + k) * SIZE + c]);
-                fraction[r * SIZE + c] = Real(set) / (BLOCK * BLOCK);
+        std::fill(fraction.begin(), fraction.end(), Real(0));
+        for (int r = 0; r < FINE; ++r)
+            for (int w = 0; w < WORDS; ++w) {
+                const uint64_t word = covered[r * WORDS + w];
+                for (int c = 0; word && c < 64 / BLOCK; ++c)  // most words are empty
+                    fraction[r / BLOCK * SIZE + w * (64 / BLOCK) + c] +=
+                        Real(__builtin_popcount(word >> (c * BLOCK) & ((1u << BLOCK) - 1))) / (BLOCK * BLOCK);
             }
     }
 
@@ -230,7 +231,9 @@ template <class Real> struct Drawing {
 template <class Real> int draw(const Picture* picture) {
     try {
         const int threads = int(std::max<int64_t>(1, std::min(picture->threads, picture->batch)));
-        std::vector<Drawing<Real>> drawings(threads, Drawing<Real>(*picture));
+        std::vector<Drawing<Real>> drawings;
+        drawings.reserve(threads);
+        for (int rank = 0; rank < threads; ++rank) drawings.emplace_back(*picture);
         std::atomic<int64_t> next{0};
         const auto work = [&](int rank) {
             for (int64_t element; (element = next.fetch_add(1)) < picture->batch;) drawings[rank].run(element);

@@ -9,6 +9,7 @@ import platform
 import shlex
 import shutil
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -60,8 +61,9 @@ def find_compiler() -> tuple[str, ...] | None:
 
 
 def cache_folder() -> str:
-    """Where compiled kernels are kept: ``$XDG_CACHE_HOME/torchmpm``, by default ``~/.cache/torchmpm``."""
-    return os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "torchmpm")
+    """Where compiled kernels are kept: ``$XDG_CACHE_HOME/torchmpm``, else in the system's folder for caches."""
+    usual = {"darwin": "~/Library/Caches", "win32": "~/AppData/Local"}.get(sys.platform, "~/.cache")
+    return os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser(usual), "torchmpm")
 
 
 def load(dtype: torch.dtype) -> ctypes.CDLL:
@@ -120,14 +122,14 @@ def _load(source: Path, options: tuple[str, ...], folder: str, *_: str | None) -
 def _key(command: list[str], folder: Path) -> str:
     """Hash of the sources, the command, the compiler and the processor it compiles for."""
     compiler = Path(shutil.which(command[0]) or command[0])
-    facts = [*command[:-2], f"{compiler.resolve()} {compiler.stat().st_mtime_ns}", _processor()]
+    facts = [*command[:-2], f"{compiler.resolve()} {compiler.stat().st_mtime_ns}", processor()]
     digest = hashlib.sha256("\n".join(facts).encode())
     for source in sorted(file for place in {folder, _SOURCES} for file in place.glob("*.[ch]pp")):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:24]
 
 
-def _processor() -> str:
+def processor() -> str:
     """Model and instruction sets, because kernels compiled for one processor may not run on another."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
