@@ -72,7 +72,7 @@ class TaskSpec:
             is a ``split_limit``), ``action`` (norm of the actuation field) and ``alive`` (every step).
         objects: Bodies besides the robot, at most one.
         gravity: (x, y), m/s^2.
-        damping: Factor on node velocities in every :data:`DT`.
+        damping: Factor on node velocities in every 1e-4 s.
         window: Fixed or moving window.
         view: Centre of the observed half-window.
         reach: Centre of the patch of nodes on which actions act.
