@@ -145,16 +145,7 @@ class Shac(Stateful, Algorithm):
             assert isinstance(self.actor, ImageActor) and isinstance(start, ActorPolicy)
             self.actor.actor.load_state_dict(start.actor.state_dict())
             self.actor.actor.fix_std()
-        self.critic = Critic(
-            critic,
-            target,
-            gamma=config.gamma,
-            td_lambda=config.td_lambda,
-            learning_rate=config.learning_rate,
-            updates=config.critic_updates,
-            tau=config.tau,
-            max_grad_norm=config.max_grad_norm,
-        )
+        self.critic = Critic(critic, target, config)
         trained = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
         self.actor_adam = torch.optim.Adam(trained, config.learning_rate, BETAS)
         self.skipped, self.skipped_in_a_row = 0, 0

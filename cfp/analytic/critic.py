@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
@@ -27,58 +29,58 @@ def mlp(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(*layers, last)
 
 
+class CriticOptions(Protocol):
+    """The options of a run that concern its critic, see `cfp.analytic.config.AnalyticConfig`."""
+
+    @property
+    def gamma(self) -> float: ...  # noqa: D102
+    @property
+    def td_lambda(self) -> float: ...  # noqa: D102
+    @property
+    def learning_rate(self) -> float: ...  # noqa: D102
+    @property
+    def critic_updates(self) -> int: ...  # noqa: D102
+    @property
+    def tau(self) -> float: ...  # noqa: D102
+    @property
+    def max_grad_norm(self) -> float: ...  # noqa: D102
+
+
 class Critic(Stateful):
     """A value network, its slowly following target, and their training on TD(lambda) targets.
 
     Args:
         network: Maps observations (B, ...) to (B, 1).
         target: A network of the same structure.
-        gamma: Discount factor.
-        td_lambda: Lambda of the targets: 0 for single steps, 1 for the whole window.
-        updates: Steps of Adam for each window.
-        tau: Fraction of the network that goes into its target after each window.
-        max_grad_norm: Largest norm of a gradient.
+        options: Of the run.
     """
 
     parts = ("network", "target", "adam")
 
-    def __init__(
-        self,
-        network: nn.Module,
-        target: nn.Module,
-        *,
-        gamma: float,
-        td_lambda: float,
-        learning_rate: float,
-        updates: int,
-        tau: float,
-        max_grad_norm: float,
-    ) -> None:
-        self.network, self.target = network, target
+    def __init__(self, network: nn.Module, target: nn.Module, options: CriticOptions) -> None:
+        self.network, self.target, self.options = network, target, options
         target.load_state_dict(network.state_dict())
         target.requires_grad_(False)
-        self.adam = torch.optim.Adam(network.parameters(), learning_rate, BETAS)
-        self.gamma, self.td_lambda, self.updates, self.tau = gamma, td_lambda, updates, tau
-        self.max_grad_norm = max_grad_norm
+        self.adam = torch.optim.Adam(network.parameters(), options.learning_rate, BETAS)
 
     def __call__(self, observations: Tensor) -> Tensor:
         """Values (B,) of the target network."""
         return self._value(self.target, observations)
 
     def _value(self, network: nn.Module, observations: Tensor) -> Tensor:
-        value: Tensor = network(observations)[..., 0] / max(1.0 - self.gamma, 1e-2)
+        value: Tensor = network(observations)[..., 0] / max(1.0 - self.options.gamma, 1e-2)
         return value
 
     def update(self, window: Window, learning_rate: float) -> float:
         """Learn the values of a window's states; returns the last mean squared error."""
         self.adam.param_groups[0]["lr"] = learning_rate
-        targets = td_lambda_targets(window, self.gamma, self.td_lambda).flatten()
+        targets = td_lambda_targets(window, self.options.gamma, self.options.td_lambda).flatten()
         observations, loss = window.observations.flatten(0, 1), torch.zeros(())
-        for _ in range(self.updates):
+        for _ in range(self.options.critic_updates):
             self.adam.zero_grad()
             loss = (self._value(self.network, observations) - targets).square().mean()
             loss.backward()
-            nn.utils.clip_grad_norm_(self.network.parameters(), self.max_grad_norm)
+            nn.utils.clip_grad_norm_(self.network.parameters(), self.options.max_grad_norm)
             self.adam.step()
-        get_ema_multi_avg_fn(1 - self.tau)(list(self.target.parameters()), list(self.network.parameters()), 1)
+        get_ema_multi_avg_fn(1 - self.options.tau)(list(self.target.parameters()), list(self.network.parameters()), 1)
         return float(loss.detach())

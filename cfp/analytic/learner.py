@@ -73,16 +73,8 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         size = features.size(len(self.env.spec.bodies) - 1)
         with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             torch.manual_seed(config.seed)
-            networks = [mlp(size, 1).to(self.env.device) for _ in range(2)]
-        self.critic = Critic(
-            *networks,
-            gamma=config.gamma,
-            td_lambda=config.td_lambda,
-            learning_rate=config.learning_rate,
-            updates=config.critic_updates,
-            tau=config.tau,
-            max_grad_norm=config.max_grad_norm,
-        )
+            critic, target = (mlp(size, 1).to(self.env.device) for _ in range(2))
+        self.critic = Critic(critic, target, config)
         episodes = Episodes(self.env, config.seed, config.max_episode_steps, config.num_layouts)
         self.collector = WindowCollector(episodes, lambda: features(self.env).float(), config.reward, config.window)
         self.action_step = ActionStep()
