@@ -6,19 +6,16 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from dittogym.action import place
-from dittogym.geometry import NODES, Box
+from dittogym.geometry import Box
 from dittogym.model import EnvState, Model
-from dittogym.window import centre_in_window
-from torchmpm import Snow, checks
+from dittogym.render.colours import body_colours, particle_colours
+from torchmpm import checks
 from torchmpm.materials.body import slices
 
 GROUND = (248, 246, 240)
 SOLID = (112, 119, 130)
 GRID = (226, 224, 217)
 TARGET = (247, 198, 98)
-ROBOT, OBJECT, GROUND_BODY = (38, 121, 140), (222, 122, 60), (150, 118, 86)
-CONTRACT, RELAX, EXPAND = np.array((206, 60, 52)), np.array((190, 190, 190)), np.array((52, 92, 200))
 #: Distance of the marks on the ground that show how far the window has moved, m.
 MARK = 0.1
 #: Radius of a dot at full size, just large enough to close a body at its initial density, m.
@@ -48,11 +45,10 @@ def frame(model: Model, state: EnvState, index: int, actuation: Tensor | None, s
             ground = box == Box(top=box.top)
             canvas.box(box, filled=bool(obstacle.observed_boxes) or ground)
     x = particles.x[0].cpu().numpy().astype(np.float64)
-    counts = [body.count for body in model.solver.bodies]
-    kinds = [ROBOT, *(GROUND_BODY if isinstance(body.material, Snow) else OBJECT for body in spec.objects)]
-    colours = np.repeat(np.array(kinds, np.uint8), counts, axis=0)
-    if actuation is not None:
-        colours[: model.num_robot_particles] = _muscle_colours(model, state, index, actuation)
+    if actuation is None:
+        colours = body_colours(model)
+    else:
+        colours = particle_colours(model, state, index, actuation, "muscle")
     parts = [part for _, part in slices(model.solver.bodies)]
     for part, weight in reversed(list(zip(parts, model.camera.particle_weight, strict=True))):  # the robot last, on top
         radius = max(1, round(FULL_SIZE_RADIUS * np.sqrt(weight) * canvas.pixels))
@@ -122,16 +118,3 @@ class Canvas:
         palette[1:, :3] = colours
         drawn = palette.view(np.uint32)[:, 0][last].view(np.uint8).reshape(*last.shape, 4)
         cv2.copyTo(drawn[..., :3], (last > 0).astype(np.uint8), part)
-
-
-def _muscle_colours(model: Model, state: EnvState, index: int, actuation: Tensor) -> np.ndarray:
-    spec, one = model.spec, slice(index, index + 1)
-    centre = centre_in_window(spec.reach, state.centre[one], state.origin[one])
-    nodes = place(actuation[one], centre, NODES)[0].cpu().numpy().sum(0, dtype=np.float64)
-    robot_x, origin = state.particles.x[index, : model.num_robot_particles], state.origin[index]
-    relative = robot_x.detach().cpu().numpy().astype(np.float64) - origin.detach().cpu().numpy()
-    finite = np.isfinite(relative).all(1, keepdims=True)
-    at = np.clip(np.where(finite, relative, 0.0) * len(nodes), 0, len(nodes) - 1).astype(int)
-    strength = float(state.physics["max_actuation"][index]) if "max_actuation" in state.physics else spec.max_actuation
-    pull = np.clip(nodes[at[:, 0], at[:, 1]] / (2 * strength), -1, 1)[:, None]
-    return RELAX + np.abs(pull) * (np.where(pull > 0, CONTRACT, EXPAND) - RELAX)

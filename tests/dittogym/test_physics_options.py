@@ -12,7 +12,7 @@ from tiny import SMALL, TASKS, actions, assert_same_bits, everything, make_vec, 
 import dittogym
 from dittogym import TorchEnv
 from dittogym.physics import NAMES
-from dittogym.render.frame import CONTRACT
+from dittogym.render.colours import CONTRACT
 
 DT = 1e-4
 OWN = {name: getattr(dittogym.make_spec("kick"), name) for name in NAMES if name != "mass"} | {"mass": 1.0}

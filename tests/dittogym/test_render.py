@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from dittogym import TorchEnv
-from dittogym.render.frame import CONTRACT, GROUND, ROBOT, SOLID, TARGET, Canvas
+from dittogym.render.colours import CONTRACT, EXPAND, OBJECT, RELAX, ROBOT, SCALES, particle_colours, particle_values
+from dittogym.render.frame import GROUND, SOLID, TARGET, Canvas
 
 
 def near(image: np.ndarray, colour) -> np.ndarray:
@@ -40,6 +41,23 @@ def test_muscles_target_and_size() -> None:
         env.render(2)
     with pytest.raises(ValueError, match="size must be at least 16"):
         env.render(size=3)
+
+
+def test_scales() -> None:
+    """The quantities in their units, and colours at the ends of a scale, beyond them, and without a value."""
+    env = TorchEnv("kick", 1, particles=100, dtype="float64")
+    env.reset(seed=0)
+    stretch = 1.03
+    env.state.F[0, 0] = torch.tensor([[0.0, -stretch], [1 / stretch, 0.0]])  # stretched along y, and turned
+    env.state.v[0, -1] = torch.tensor([0.3, -0.4])
+    model, state = env.model, env.env_state
+    strain, speed = (particle_values(model, state, 0, None, by) for by in ("deformation", "speed"))
+    assert strain[0] == pytest.approx(np.sqrt(2) * np.log(stretch)) and not strain[1:].any()
+    assert speed[-1] == pytest.approx(0.5) and not speed[:-1].any()
+    muscle = SCALES["muscle"].colours(np.array([-9.0, 0.0, 1.0, np.nan]))
+    assert muscle.tolist() == [list(EXPAND), list(RELAX), list(CONTRACT), list(RELAX)]
+    colours = particle_colours(model, state, 0, None, "muscle")
+    assert tuple(colours[0]) == RELAX and tuple(colours[-1]) == OBJECT
 
 
 @pytest.mark.parametrize("task", ["shapematch", "slot"])

@@ -1,0 +1,118 @@
+"""Colours of particles by muscle, deformation or speed; one definition for pictures, films and pages."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dittogym.action import place
+from dittogym.geometry import NODES
+from dittogym.model import EnvState, Model
+from dittogym.window import centre_in_window
+from torchmpm import Snow
+
+ROBOT, OBJECT, GROUND_BODY = (38, 121, 140), (222, 122, 60), (150, 118, 86)
+EXPAND, RELAX, CONTRACT = (52, 92, 200), (190, 190, 190), (206, 60, 52)
+
+
+class ColourScale(NamedTuple):
+    """Colours of a quantity.
+
+    Attributes:
+        label: What it is, with its unit.
+        low: Value of the first colour.
+        high: Value of the last one; larger values have the same colour.
+        stops: RGB colours at equal distances from ``low`` to ``high``, between which colours are interpolated.
+        robot_only: Whether other bodies do not have it; they have colours of their own, see :func:`body_colours`.
+    """
+
+    label: str
+    low: float
+    high: float
+    stops: tuple[tuple[int, int, int], ...]
+    robot_only: bool = False
+
+    def colours(self, values: np.ndarray) -> np.ndarray:
+        """RGB colours (N, 3) of values (N,), as floating point numbers from 0 to 255; grey where they are NaN."""
+        at = np.clip((values - self.low) / (self.high - self.low), 0.0, 1.0)
+        stops = np.array(self.stops, np.float64)
+        mixed = [np.interp(at, np.linspace(0.0, 1.0, len(stops)), column) for column in stops.T]
+        return np.where(np.isnan(at)[:, None], 190.0, np.stack(mixed, axis=1))
+
+
+SCALES = {
+    "muscle": ColourScale("expansion to contraction", -1.0, 1.0, (EXPAND, RELAX, CONTRACT), True),
+    "deformation": ColourScale(
+        "shear strain", 0.0, 0.1, ((38, 70, 83), (42, 157, 143), (233, 196, 106), (231, 111, 81))
+    ),
+    "speed": ColourScale("speed, m/s", 0.0, 1.5, ((49, 54, 110), (78, 121, 190), (120, 200, 190), (253, 231, 130))),
+}
+
+
+def body_colours(model: Model) -> np.ndarray:
+    """The colours of the bodies, by which particles of different bodies can be told apart, (N, 3) uint8."""
+    kinds = [ROBOT, *(GROUND_BODY if isinstance(body.material, Snow) else OBJECT for body in model.spec.objects)]
+    return np.repeat(np.array(kinds, np.uint8), [body.count for body in model.solver.bodies], axis=0)
+
+
+def muscle_activity(model: Model, state: EnvState, index: int, actuation: Tensor) -> np.ndarray:
+    """Mean actuation of the muscles at each particle of the robot, as a fraction of their limit, (n,) in [-1, 1].
+
+    Args:
+        model: The task.
+        state: Its present state.
+        index: Which element of the batch.
+        actuation: (B, 2, P, P) on the patch, Pa.
+    """
+    spec, one = model.spec, slice(index, index + 1)
+    centre = centre_in_window(spec.reach, state.centre[one], state.origin[one])
+    nodes = place(actuation[one], centre, NODES)[0].cpu().numpy().sum(0, dtype=np.float64)
+    robot_x, origin = state.particles.x[index, : model.num_robot_particles], state.origin[index]
+    relative = robot_x.detach().cpu().numpy().astype(np.float64) - origin.detach().cpu().numpy()
+    finite = np.isfinite(relative).all(1, keepdims=True)
+    at = np.clip(np.where(finite, relative, 0.0) * len(nodes), 0, len(nodes) - 1).astype(int)
+    strength = float(state.physics["max_actuation"][index]) if "max_actuation" in state.physics else spec.max_actuation
+    # Without muscles there is nothing to pull.
+    return np.clip(nodes[at[:, 0], at[:, 1]] / (2 * strength), -1, 1) if strength else np.zeros(len(at))
+
+
+def shear_strain(model: Model, state: EnvState, index: int) -> np.ndarray:
+    """Norm of the deviator of the logarithmic elastic strain of each particle, (N,).
+
+    Where it would exceed ``yield_stress / (2 mu)``, a robot flows.
+    """
+    a, b, c, d = state.particles.F[index].detach().flatten(1).double().cpu().unbind(1)
+    total, difference = torch.hypot(a + d, b - c), torch.hypot(a - d, b + c)  # of the principal stretches
+    return (math.sqrt(2.0) * torch.atanh((difference / total).clamp_max(1.0 - 1e-9))).numpy()
+
+
+def speed(model: Model, state: EnvState, index: int) -> np.ndarray:
+    """Speed of each particle (N,), m/s."""
+    return state.particles.v[index].detach().norm(dim=-1).cpu().numpy()
+
+
+#: The quantities of :data:`SCALES` but ``"muscle"``, which needs the actuation.
+QUANTITIES: dict[str, Callable[[Model, EnvState, int], np.ndarray]] = {"deformation": shear_strain, "speed": speed}
+
+
+def particle_values(model: Model, state: EnvState, index: int, actuation: Tensor | None, by: str) -> np.ndarray:
+    """The quantity ``by``, a key of :data:`SCALES`, of each particle that has it: (N,), of the muscles (n,).
+
+    Without an actuation, (B, 2, P, P) in Pa, the muscles are at rest.
+    """
+    if by != "muscle":
+        return QUANTITIES[by](model, state, index)
+    return np.zeros(model.num_robot_particles) if actuation is None else muscle_activity(model, state, index, actuation)
+
+
+def particle_colours(model: Model, state: EnvState, index: int, actuation: Tensor | None, by: str) -> np.ndarray:
+    """RGB colours (N, 3) uint8 of all particles by the quantity ``by``, a key of :data:`SCALES`."""
+    colours = body_colours(model)
+    values = particle_values(model, state, index, actuation, by)
+    colours[: len(values)] = SCALES[by].colours(values)
+    return colours
