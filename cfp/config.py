@@ -149,6 +149,8 @@ class StagedConfig(RunConfig):
             self.network.gate_scale,
             self.network.interpolation,
             None if self.network.interpolation == "aligned" else make_spec(self.task).patch,
+            self.network.encoder,
+            self.network.initial_std,
         )
 
     def with_derived(self, base: RunConfig, given: Collection[str]) -> RunConfig:

@@ -188,22 +188,35 @@ def _paper(task: str, numbers: TaskNumbers) -> Config:
 
 
 def _quick(task: str, numbers: TaskNumbers) -> Config:
-    """Minutes instead of days: many small robots, small batches, a shorter horizon of credit."""
+    """Minutes instead of days: many small robots, small networks, and what later publications found."""
     paper = _paper(task, numbers)
     return replace(
         paper,
         preset="quick",
         seed=0,
-        steps=4_800,
-        handover=(3_200,),
-        random_steps=(480, 100),
-        alpha=(0.5 * numbers.alpha[0], numbers.alpha[1]),
-        environment=EnvironmentConfig(),
-        network=replace(paper.network, interpolation="half_pixel"),
+        steps=96_000,
+        handover=(64_000,),
+        random_steps=(0, 0),
+        alpha=(0.01, 0.01),
+        environment=EnvironmentConfig(num_envs=32),
+        network=replace(paper.network, interpolation="half_pixel", encoder="lean", initial_std=0.15),
         learning=LearningConfig(
-            batch_size=64, learning_rate=1e-3, gamma=0.9, tau=0.01, buffer_size=20_000, gradient_steps=4
+            learning_rate=1e-3,
+            gamma=0.97,
+            tau=0.01,
+            buffer_size=50_000,
+            gradient_steps=2,
+            update_start=1_024,
+            critic="categorical",
+            reward_scale="return",
+            target_std=0.15,
+            noise_cells=4,
+            n_steps=3,
+            actor_every=3,
+            final_rate=0.1,
+            overlap=True,
         ),
-        report=ReportConfig(eval_every=480, checkpoint_every=480, log_every=160),
+        report=replace(paper.report, eval_every=9_600, checkpoint_every=9_600, log_every=960),
     )
 
 
