@@ -44,18 +44,22 @@ def as_tensor(action: Any, env: TorchEnv, single: bool = False) -> torch.Tensor:
     return torch.from_numpy(array).to(env.device)
 
 
-def as_numpy(value: Any) -> Any:
+def flat(info: dict[str, Any]) -> dict[str, torch.Tensor]:
+    """An ``info`` without nesting: reward terms have keys such as ``reward_terms/velocity``."""
+    terms = {f"reward_terms/{name}": value for name, value in info.get("reward_terms", {}).items()}
+    return {name: value for name, value in info.items() if name != "reward_terms"} | terms
+
+
+def as_numpy(value: torch.Tensor | dict[str, Any]) -> Any:
     """Copies of a tensor, or of all in an ``info``, as arrays, which the user may write to."""
     if isinstance(value, dict):
-        return {name: as_numpy(entry) for name, entry in value.items()}
+        return {name: as_numpy(entry) for name, entry in flat(value).items()}
     return value.detach().cpu().numpy().copy()
 
 
 def first(value: Any) -> Any:
-    """The first element of an array, or of all in an ``info``; numbers come out as Python numbers."""
-    if isinstance(value, dict):
-        return {name: first(entry) for name, entry in value.items()}
-    return value[0].item() if value[0].ndim == 0 else value[0]
+    """The first element of an array, or of all in an ``info``; numbers come out as NumPy scalars."""
+    return {name: entry[0] for name, entry in value.items()} if isinstance(value, dict) else value[0]
 
 
 class Env(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -127,7 +131,8 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
             action: (2, R, R) in [-1, 1].
 
         Returns:
-            Observation (3, 64, 64) uint8, reward, terminated, truncated, ``info``.
+            Observation (3, 64, 64) uint8, reward, terminated, truncated, and ``info`` with arrays and NumPy scalars;
+            the reward terms have keys such as ``"reward_terms/velocity"``.
         """
         with torch.no_grad():
             batch = as_tensor(action, self.torch_env, single=True)
