@@ -250,6 +250,8 @@ class Config(CoarseToFineConfig):
             raise ConfigError(f"alpha must be positive with target_std, got {self.alpha}")
         if self.learning.warm_critic and self.start_from is not None:
             raise ConfigError("warm_critic must be False with start_from, got True (a policy file has no critics)")
+        if self.learning.warm_critic and self.network.encoder == "lean":
+            raise ConfigError("warm_critic must be False with encoder lean, got True (each stage has its own encoder)")
 
 
 def check_training_layouts(name: str, count: int, before: int = 0) -> None:

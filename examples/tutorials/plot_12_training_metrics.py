@@ -60,7 +60,7 @@ def series(name: str) -> tuple[list[int], list[float]]:
 #   explore; if it never decreases, the critics do not distinguish actions.
 # - ``train/gate`` exists from the second stage on: 0 keeps the coarse action, and 1 replaces it.
 
-shown = ("rollout/return", "train/critic_loss", "train/q", "train/entropy", "train/reward_std", "train/gate")
+shown = ("rollout/return", "train/critic_loss", "train/q", "train/entropy", "train/reward_scale", "train/gate")
 figure, axes = plt.subplots(2, 3, figsize=(11, 5.4))
 for axis, name in zip(axes.flat, shown, strict=True):
     axis.plot(*series(name))
