@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
@@ -17,6 +16,7 @@ from dittogym.physics import Physics
 from dittogym.reward_ops import EXACT, SMOOTH, RewardOps, action_cost
 from dittogym.window import centre_in_window, contains
 from torchmpm import ParticleState, diagnostics, tree
+from torchmpm.backends import cached_tensors, transforming
 
 #: Reward of a step of an element whose state is no longer valid; its episode ends.
 FAILURE_REWARD = -16.0
@@ -107,7 +107,7 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
 
     guarded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tree.leaves((state, action)))
     if guarded:
-        state, action = tree.map(guard, (state, action))
+        state, action = tree.map(guard, tree.without_inference((state, action)))
     spec, solver = model.spec, model.solver_for(state.physics)
     actuation = patch_field(action, spec.patch, state.physics.get("max_actuation", spec.max_actuation))
     on_nodes = place(actuation, centre_in_window(spec.reach, state.centre, state.origin), solver.grid.resolution)
@@ -198,8 +198,7 @@ def _judge(model: Model, moment: Moment, actuation: Tensor, valid: Tensor) -> tu
     return outcome, dict(zip(terms, values.unbind(), strict=True)), values.sum(0)
 
 
-@functools.lru_cache(maxsize=64)
-@torch.inference_mode(False)  # what is kept must serve gradients later
+@cached_tensors
 def _columns(weights: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """Weights of terms, and their values in a simulation that is not valid, (K, 1) each; ``failure`` comes last."""
     rows = torch.tensor([(weight, 0.0) for weight in weights], dtype=torch.float64, device="cpu")
@@ -210,6 +209,8 @@ def _columns(weights: tuple[float, ...], dtype: torch.dtype, device: torch.devic
 
 def _check_finite(task: str, names: list[str], values: Tensor, valid: Tensor) -> None:
     """Refuse terms (K, B) that are not finite where the simulations (B,) are valid."""
+    if transforming():  # nothing can depend on the numbers that a batch of torch.func.vmap holds
+        return
     wrong = ~torch.isfinite(values.detach()) & valid
     if bool(wrong.any()):
         term, element = wrong.nonzero()[0].tolist()
