@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import gymnasium
@@ -9,6 +10,9 @@ import numpy as np
 import torch
 
 from dittogym.model import Snapshot
+from dittogym.render.frame import frame, pace
+from dittogym.render.recording import Recording, as_function, film
+from dittogym.render.scene import describe
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
 from dittogym.torch_env import TorchEnv
@@ -65,7 +69,8 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Args:
         task: Task name or specification.
-        render_mode: ``None``, ``"rgb_array"`` or ``"human"`` (a window; needs pygame).
+        render_mode: ``None``, ``"rgb_array"`` or ``"human"``: a window, which needs pygame. Space pauses, the
+            right arrow takes a single step, q or Escape closes the window; the simulation then goes on without it.
         render_muscles: Colour the robot by its muscles in pictures.
         options: All arguments of :class:`dittogym.TorchEnv` but ``num_envs``.
 
@@ -78,7 +83,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": RENDER_FPS}
 
     def __init__(
-        self, task: str | TaskSpec, *, render_mode: str | None = None, render_muscles: bool = False, **options: Any
+        self, task: str | TaskSpec, *, render_mode: str | None = None, render_muscles: bool = True, **options: Any
     ) -> None:
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be None or one of {RENDER_MODES}, got {render_mode!r}")
@@ -89,7 +94,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         self._own_limit = self.torch_env.spec.horizon != make_spec(task).horizon
         self.observation_space, self.action_space = spaces(self.torch_env)
         self.render_mode, self.render_muscles = render_mode, render_muscles
-        self._screen = None
+        self._screen, self._return = None, 0.0
         if render_mode == "human":
             from dittogym.render.screen import Screen  # pygame is an extra
 
@@ -115,6 +120,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         with torch.no_grad():
             observation, info = self.torch_env.reset(seed=seed, options=options)
+        self._return = 0.0
         self._show()
         return first(as_numpy(observation)), first(as_numpy(info))
 
@@ -131,6 +137,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         with torch.no_grad():
             batch = as_tensor(action, self.torch_env, single=True)
             observation, reward, terminated, truncated, info = self.torch_env.step(batch)
+        self._return += float(reward[0])
         self._show()
         limit = bool(truncated[0]) and (self.spec is None or self._own_limit)  # else Gymnasium's TimeLimit truncates
         return first(as_numpy(observation)), float(reward[0]), bool(terminated[0]), limit, first(as_numpy(info))
@@ -147,6 +154,36 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         """The picture (512, 512, 3) uint8 in mode ``"rgb_array"``, else nothing."""
         return self.torch_env.render(muscles=self.render_muscles) if self.render_mode == "rgb_array" else None
 
+    def film(
+        self, policy: Any, path: str | os.PathLike[str] | None = None, *, seed: int = 0, **options: Any
+    ) -> Recording:
+        """Reset, play an episode and record it; see :meth:`dittogym.TorchEnv.film`.
+
+        Wrappers have no part in it: an environment of ``gymnasium.make`` is filmed with ``env.unwrapped.film``.
+
+        Args:
+            policy: A function from an observation (3, 64, 64) to an action (2, R, R), or an object with such a method
+                ``predict``, as :func:`cfp.load` and stable-baselines3 return it.
+            path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
+            seed: Of the reset.
+            options: Such as ``size``, ``speed`` and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
+
+        Returns:
+            The recording, from which further films can be saved. A notebook shows it.
+        """
+        act = as_function(policy)
+        return film(
+            self.torch_env, lambda images: as_tensor(act(images[0]), self.torch_env, True), path, seed, 0, options
+        )
+
+    def _repr_png_(self) -> bytes | None:
+        return self.torch_env._repr_png_()
+
+    @property
+    def window_open(self) -> bool:
+        """Whether there is a window: in mode ``"human"``, until it is closed."""
+        return self._screen is not None
+
     def close(self) -> None:
         """Close the window, if there is one."""
         if self._screen is not None:
@@ -154,5 +191,13 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
             self._screen = None
 
     def _show(self) -> None:
-        if self._screen is not None:
-            self._screen.show(self.torch_env.render(muscles=self.render_muscles))
+        if self._screen is None:
+            return
+        shown, torch_env = self.torch_env.shot(), self.torch_env
+        scene = describe(torch_env.model)
+        caption = (
+            f"{scene.task}   {shown.step * scene.dt:.2f} s   return {self._return:.1f}",
+            pace(RENDER_FPS * scene.dt),
+        )
+        if not self._screen.show(frame(scene, shown, muscles=self.render_muscles, caption=caption)):
+            self.close()

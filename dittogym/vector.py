@@ -73,7 +73,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
-        render_muscles: bool = False,
+        render_muscles: bool = True,
         max_episode_steps: int | None = None,
         **options: Any,
     ) -> None:
