@@ -30,6 +30,7 @@ from dittogym.core import observe
 from dittogym.spec import DT
 
 LONG = 2 * DT
+TASKS = list(dittogym.TASKS)
 LAYOUTS, PLANNED_LAYOUTS = 6, 4
 WAVE_STEPS, PLANNED_STEPS = 100, 64
 WINDOW, WARMUP, ACTION_RANGE = 16, 8, 0.3
@@ -165,7 +166,15 @@ def gradients(task: str) -> dict[str, object]:
 
 
 def write(path: Path, rows: Sequence[dict[str, object]]) -> None:
-    """Write a table."""
+    """Write rows into a table in the order of the tasks; rows of other tasks that it has already stay."""
+    old: list[dict[str, object]] = []
+    if path.exists():
+        with path.open(newline="") as file:
+            old = [*csv.DictReader(file)]
+    written = {row["task"] for row in rows}
+    rows = sorted(
+        [*(row for row in old if row["task"] not in written), *rows], key=lambda row: TASKS.index(row["task"])
+    )
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
@@ -175,7 +184,7 @@ def write(path: Path, rows: Sequence[dict[str, object]]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, help="folder of the two tables")
-    parser.add_argument("--tasks", nargs="+", default=list(dittogym.TASKS), choices=list(dittogym.TASKS))
+    parser.add_argument("--tasks", nargs="+", default=TASKS, choices=TASKS)
     arguments = parser.parse_args()
     returns, slopes = [], []
     for task in arguments.tasks:

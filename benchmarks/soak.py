@@ -74,7 +74,7 @@ def main(options: Options) -> None:
             action = draw.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
             _, rewards, terminated, truncated, info = env.step(action)
             episodes += 0 if options.endless else int((terminated | truncated).sum())
-            failed += int(np.count_nonzero(info["reward_terms"]["failure"]))
+            failed += int(np.count_nonzero(info["reward_terms/failure"]))
             broken += int(np.count_nonzero(~np.isfinite(rewards)) + (~diagnostics.finite(env.unwrapped.state)).sum())
         seconds = time.process_time() - start
         row = {

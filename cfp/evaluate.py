@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import tyro
@@ -15,9 +15,9 @@ from cfp.envs.make import choose_device
 from cfp.errors import CheckpointError, ConfigError
 from cfp.evaluation.evaluate import Noise, compare
 from cfp.evaluation.tables import format_table, to_rows
+from cfp.evaluation.video import check_files, record_policy, save_media
 from cfp.experiment.cli import program_name, run_command
 from cfp.experiment.folder import policy_files, read_config
-from cfp.experiment.run import make_video
 from cfp.experiment.training import Program
 from cfp.from_dict import update_from_dict
 from cfp.policy_protocols import Policy
@@ -64,6 +64,20 @@ class Selection:
 
 
 @dataclass(frozen=True)
+class FilmOptions:
+    """How the video looks."""
+
+    size: int = 512
+    """Pixels per side of the video."""
+    rate: float = 30.0
+    """Pictures per second of the video."""
+    speed: float | None = None
+    """Playback speed, 1 is real time; None: real time, or slower for episodes of less than four seconds."""
+    zoom: float | None = None
+    """The video shows 1/zoom metres; None: 0.56 m."""
+
+
+@dataclass(frozen=True)
 class Command(Selection):
     """Evaluate the policies of a run, or a single one, beside zero and random action, on the same particle layouts."""
 
@@ -72,7 +86,10 @@ class Command(Selection):
     json: bool = False
     """Print JSON instead of a table."""
     video: Path | None = None
-    """Also film one episode of the newest policy into this MP4 file."""
+    """Also film one episode of the newest policy: a file .mp4, .gif or .webp, or .png for a row of pictures."""
+    replay: Path | None = None
+    """Also write one episode of it as a page (.html) that plays in any browser."""
+    film: tyro.conf.OmitArgPrefixes[FilmOptions] = field(default_factory=FilmOptions)
 
 
 def open_run(
@@ -115,10 +132,13 @@ def open_policy(program: Program, path: str, device: str, seed: int | None) -> t
 
 def run(program: Program, command: Command) -> str:
     """Evaluate, film if asked to, and return the table."""
+    files, options = {"video": command.video, "replay": command.replay}, vars(command.film)
+    check_files(files, options)
     config, policies = command.open(program)
     results = compare(config, policies, command.episodes, command.noise)
-    if command.video is not None:
-        make_video(config, list(policies.values())[-1], command.video, to_stderr=command.json)
+    if any(files.values()):
+        recording = record_policy(config, list(policies.values())[-1])
+        save_media(recording, files, sys.stderr if command.json else None, **options)
     return json.dumps(to_rows(results), indent=2) if command.json else format_table(config, results)
 
 

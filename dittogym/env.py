@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import gymnasium
@@ -9,6 +10,9 @@ import numpy as np
 import torch
 
 from dittogym.model import Snapshot
+from dittogym.render.frame import frame, pace
+from dittogym.render.recording import Recording, as_function, film
+from dittogym.render.scene import describe
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
 from dittogym.torch_env import TorchEnv
@@ -40,18 +44,22 @@ def as_tensor(action: Any, env: TorchEnv, single: bool = False) -> torch.Tensor:
     return torch.from_numpy(array).to(env.device)
 
 
-def as_numpy(value: Any) -> Any:
+def flat(info: dict[str, Any]) -> dict[str, torch.Tensor]:
+    """An ``info`` without nesting: reward terms have keys such as ``reward_terms/velocity``."""
+    terms = {f"reward_terms/{name}": value for name, value in info.get("reward_terms", {}).items()}
+    return {name: value for name, value in info.items() if name != "reward_terms"} | terms
+
+
+def as_numpy(value: torch.Tensor | dict[str, Any]) -> Any:
     """Copies of a tensor, or of all in an ``info``, as arrays, which the user may write to."""
     if isinstance(value, dict):
-        return {name: as_numpy(entry) for name, entry in value.items()}
+        return {name: as_numpy(entry) for name, entry in flat(value).items()}
     return value.detach().cpu().numpy().copy()
 
 
 def first(value: Any) -> Any:
-    """The first element of an array, or of all in an ``info``; numbers come out as Python numbers."""
-    if isinstance(value, dict):
-        return {name: first(entry) for name, entry in value.items()}
-    return value[0].item() if value[0].ndim == 0 else value[0]
+    """The first element of an array, or of all in an ``info``; numbers come out as NumPy scalars."""
+    return {name: entry[0] for name, entry in value.items()} if isinstance(value, dict) else value[0]
 
 
 class Env(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -61,7 +69,8 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Args:
         task: Task name or specification.
-        render_mode: ``None``, ``"rgb_array"`` or ``"human"`` (a window; needs pygame).
+        render_mode: ``None``, ``"rgb_array"`` or ``"human"``: a window, which needs pygame. Space pauses, the
+            right arrow takes a single step, q or Escape closes the window; the simulation then goes on without it.
         render_muscles: Colour the robot by its muscles in pictures.
         options: All arguments of :class:`dittogym.TorchEnv` but ``num_envs``.
 
@@ -74,7 +83,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": RENDER_FPS}
 
     def __init__(
-        self, task: str | TaskSpec, *, render_mode: str | None = None, render_muscles: bool = False, **options: Any
+        self, task: str | TaskSpec, *, render_mode: str | None = None, render_muscles: bool = True, **options: Any
     ) -> None:
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be None or one of {RENDER_MODES}, got {render_mode!r}")
@@ -85,7 +94,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         self._own_limit = self.torch_env.spec.horizon != make_spec(task).horizon
         self.observation_space, self.action_space = spaces(self.torch_env)
         self.render_mode, self.render_muscles = render_mode, render_muscles
-        self._screen = None
+        self._screen, self._return = None, 0.0
         if render_mode == "human":
             from dittogym.render.screen import Screen  # pygame is an extra
 
@@ -111,6 +120,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         with torch.no_grad():
             observation, info = self.torch_env.reset(seed=seed, options=options)
+        self._return = 0.0
         self._show()
         return first(as_numpy(observation)), first(as_numpy(info))
 
@@ -121,11 +131,13 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
             action: (2, R, R) in [-1, 1].
 
         Returns:
-            Observation (3, 64, 64) uint8, reward, terminated, truncated, ``info``.
+            Observation (3, 64, 64) uint8, reward, terminated, truncated, and ``info`` with arrays and NumPy scalars;
+            the reward terms have keys such as ``"reward_terms/velocity"``.
         """
         with torch.no_grad():
             batch = as_tensor(action, self.torch_env, single=True)
             observation, reward, terminated, truncated, info = self.torch_env.step(batch)
+        self._return += float(reward[0])
         self._show()
         limit = bool(truncated[0]) and (self.spec is None or self._own_limit)  # else Gymnasium's TimeLimit truncates
         return first(as_numpy(observation)), float(reward[0]), bool(terminated[0]), limit, first(as_numpy(info))
@@ -142,6 +154,36 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
         """The picture (512, 512, 3) uint8 in mode ``"rgb_array"``, else nothing."""
         return self.torch_env.render(muscles=self.render_muscles) if self.render_mode == "rgb_array" else None
 
+    def film(
+        self, policy: Any, path: str | os.PathLike[str] | None = None, *, seed: int = 0, **options: Any
+    ) -> Recording:
+        """Reset, play an episode and record it; see :meth:`dittogym.TorchEnv.film`.
+
+        Wrappers have no part in it: an environment of ``gymnasium.make`` is filmed with ``env.unwrapped.film``.
+
+        Args:
+            policy: A function from an observation (3, 64, 64) to an action (2, R, R), or an object with such a method
+                ``predict``, as :func:`cfp.load` and stable-baselines3 return it.
+            path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
+            seed: Of the reset.
+            options: Such as ``size``, ``speed`` and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
+
+        Returns:
+            The recording, from which further films can be saved. A notebook shows it.
+        """
+        act = as_function(policy)
+        return film(
+            self.torch_env, lambda images: as_tensor(act(images[0]), self.torch_env, True), path, seed, 0, options
+        )
+
+    def _repr_png_(self) -> bytes | None:
+        return self.torch_env._repr_png_()
+
+    @property
+    def window_open(self) -> bool:
+        """Whether there is a window: in mode ``"human"``, until it is closed."""
+        return self._screen is not None
+
     def close(self) -> None:
         """Close the window, if there is one."""
         if self._screen is not None:
@@ -149,5 +191,13 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
             self._screen = None
 
     def _show(self) -> None:
-        if self._screen is not None:
-            self._screen.show(self.torch_env.render(muscles=self.render_muscles))
+        if self._screen is None:
+            return
+        shown, torch_env = self.torch_env.shot(), self.torch_env
+        scene = describe(torch_env.model)
+        caption = (
+            f"{scene.task}   {shown.step * scene.dt:.2f} s   return {self._return:.1f}",
+            pace(RENDER_FPS * scene.dt),
+        )
+        if not self._screen.show(frame(scene, shown, muscles=self.render_muscles, caption=caption)):
+            self.close()

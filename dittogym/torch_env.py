@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -27,7 +28,9 @@ from dittogym.contract import measure
 from dittogym.model import EnvState, Parity, Snapshot, check_stability, make_model
 from dittogym.observation.image import SHAPE
 from dittogym.physics import Physics, merged, physics_values
-from dittogym.render.frame import frame
+from dittogym.render.frame import frame, png
+from dittogym.render.recording import Recording, as_function, film
+from dittogym.render.scene import Shot, describe, take
 from dittogym.spec import DT, TaskSpec
 from dittogym.tasks import make_spec
 from torchmpm import ParticleState, checks, tree
@@ -305,12 +308,44 @@ class TorchEnv:
         """The present image (B, 3, 64, 64) as a smooth function; see :func:`dittogym.core.soft_observation`."""
         return core.soft_observation(self.model, self.env_state)
 
-    def render(self, index: int = 0, *, muscles: bool = False, size: int = 512) -> np.ndarray:
+    def shot(self, index: int = 0) -> Shot:
+        """What pictures show of the present moment of one simulation, ``index``."""
+        return take(self.model, self.env_state, index, self._actuation)
+
+    def render(self, index: int = 0, *, muscles: bool = True, size: int = 512, zoom: float | None = None) -> np.ndarray:
         """Picture (S, S, 3) uint8 of one simulation in RGB.
 
         Args:
             index: Which element of the batch.
             muscles: Colour the robot by the actuation of the last step: contraction red, expansion blue.
             size: S, pixels per side.
+            zoom: The picture shows 1 / zoom metres, 1 is the whole window; ``None``: 0.56 m, a little more than the
+                robot observes.
         """
-        return frame(self.model, self.env_state, index, self._actuation if muscles else None, size)
+        return frame(describe(self.model), self.shot(index), size, zoom, muscles)
+
+    def film(
+        self, policy: Any, path: str | os.PathLike[str] | None = None, *, seed: Seed = 0, index: int = 0, **options: Any
+    ) -> Recording:
+        """Reset, play an episode, and record one of the simulations until its episode ends.
+
+        Args:
+            policy: A function from observations (B, 3, 64, 64) uint8, NumPy, to actions (B, 2, R, R), or an object with
+                such a method ``predict``, as :func:`cfp.load` returns it.
+            path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
+            seed: Of the reset.
+            index: Which element of the batch.
+            options: Such as ``size``, ``speed`` and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
+
+        Returns:
+            The recording, from which further films can be saved. A notebook shows it.
+
+        Raises:
+            ValueError: An option is out of range.
+            TypeError: The policy is neither a function nor has a method ``predict``.
+        """
+        return film(self, as_function(policy), path, seed, index, options)
+
+    def _repr_png_(self) -> bytes | None:
+        """What a notebook shows: the first simulation, once there is a state."""
+        return None if self._env_state is None else png(self.render())

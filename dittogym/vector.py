@@ -52,9 +52,9 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     Args:
         task: Task name or specification.
         num_envs: Number of simulations.
-        autoreset_mode: ``SAME_STEP`` (an ended episode is reset in the same call; ``info["final_obs"]`` and
-            ``info["final_info"]`` are the last ones), ``NEXT_STEP`` (in the next call, whose action it ignores), or
-            ``DISABLED``.
+        autoreset_mode: ``NEXT_STEP`` (an ended episode is reset in the next call, whose action it ignores; what
+            Gymnasium's vector wrappers need), ``SAME_STEP`` (in the same call; ``info["final_obs"]`` and
+            ``info["final_info"]`` are the last ones), or ``DISABLED``.
         render_mode: ``None`` or ``"rgb_array"``.
         render_muscles: Colour the robots by their muscles in pictures.
         max_episode_steps: Horizon instead of the task's; -1 for none.
@@ -71,9 +71,9 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         task: str | TaskSpec,
         num_envs: int = 1,
         *,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
-        render_muscles: bool = False,
+        render_muscles: bool = True,
         max_episode_steps: int | None = None,
         **options: Any,
     ) -> None:
@@ -128,7 +128,8 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             actions: (B, 2, R, R) in [-1, 1].
 
         Returns:
-            Observations (B, 3, 64, 64) uint8, rewards (B,) float64, terminated and truncated (B,) bool, ``info``.
+            Observations (B, 3, 64, 64) uint8, rewards (B,) float64, terminated and truncated (B,) bool, and ``info``
+            with arrays; the reward terms have keys such as ``"reward_terms/velocity"``.
         """
         action = as_tensor(actions, self.torch_env)
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
@@ -201,6 +202,5 @@ def _with_masks(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
     """Info in Gymnasium's form: for each entry, ``_name`` says for which elements it holds."""
     result: dict[str, Any] = {}
     for name, value in info.items():
-        result[name] = _with_masks(value, mask) if isinstance(value, dict) else value
-        result["_" + name] = mask.copy()
+        result[name], result["_" + name] = value, mask.copy()
     return result

@@ -151,7 +151,7 @@ class Shac(Stateful, Algorithm):
         self.skipped, self.skipped_in_a_row = 0, 0
         self.generator = torch.Generator().manual_seed(config.seed)
         episodes = Episodes(self.env, config.seed, config.max_episode_steps, config.num_layouts)
-        self.collector = WindowCollector(episodes, self.observe, config.reward, config.window)
+        self.collector = WindowCollector(episodes, self.observe, config.reward, config.window, config.gamma)
 
     def _make_networks(self) -> tuple[StateActor | ImageActor, nn.Module, nn.Module]:
         size, device = self.features.size(len(self.env.spec.bodies) - 1), self.env.device

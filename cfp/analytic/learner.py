@@ -76,7 +76,9 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
             critic, target = (mlp(size, 1).to(self.env.device) for _ in range(2))
         self.critic = Critic(critic, target, config)
         episodes = Episodes(self.env, config.seed, config.max_episode_steps, config.num_layouts)
-        self.collector = WindowCollector(episodes, lambda: features(self.env).float(), config.reward, config.window)
+        self.collector = WindowCollector(
+            episodes, lambda: features(self.env).float(), config.reward, config.window, config.gamma
+        )
         self.action_step = ActionStep()
         self.generator = torch.Generator(self.env.device).manual_seed(config.seed)
         image = self._image()

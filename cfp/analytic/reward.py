@@ -35,14 +35,21 @@ class RewardConfig:
     integrity_weight: float = 300.0
     """Cost of particles that were close when the window, or the episode within it, began and drift apart; see
     `Neighbours`."""
+    success_reward: float = 0.0
+    """Reward for every step that an episode would have gone on after it ended in success; 0 as in the task, where an
+    episode that ends early earns no more."""
     scale: float = 0.05
     """Factor of the whole, so that values are not far from one."""
 
     def check(self) -> None:
         """Check what the types do not express."""
         check_at_least(0, split_weight=self.split_weight, split_margin=self.split_margin)
-        check_at_least(0, integrity_weight=self.integrity_weight)
+        check_at_least(0, integrity_weight=self.integrity_weight, success_reward=self.success_reward)
         check_positive(scale=self.scale)
+
+    def success_value(self, gamma: float) -> float:
+        """Value of the end of an episode that ended in success."""
+        return self.scale * self.success_reward / max(1.0 - gamma, 1e-2)
 
 
 @tree.register

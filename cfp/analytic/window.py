@@ -20,7 +20,7 @@ class Window(NamedTuple):
 
     observations: Tensor  # (T, B, ...) inputs of the critic, detached
     rewards: Tensor  # (T, B) training rewards
-    next_values: Tensor  # (T, B) values of the states after each step; 0 where the task has ended the episode
+    next_values: Tensor  # (T, B) values of the states after each step, or of the end of the episode
     done: Tensor  # (T, B) bool, whether the episode was over after the step
     true_reward: float  # mean of the task's own rewards
 
@@ -35,13 +35,16 @@ class WindowCollector(Stateful):
         observe: Inputs (B, ...) of the critic in the present state.
         reward: The training reward.
         steps: T, control steps of a window.
+        gamma: Discount factor.
     """
 
     parts = ("episodes",)
 
-    def __init__(self, episodes: Episodes, observe: Callable[[], Tensor], reward: RewardConfig, steps: int) -> None:
+    def __init__(
+        self, episodes: Episodes, observe: Callable[[], Tensor], reward: RewardConfig, steps: int, gamma: float
+    ) -> None:
         self.env, self.episodes, self.observe = episodes.env, episodes, observe
-        self.reward, self.steps = reward, steps
+        self.reward, self.steps, self.success_value = reward, steps, reward.success_value(gamma)
         self.episodes.counts["dropped"] = 0
 
     def collect(self, act: Callable[[Tensor], Tensor], value: Callable[[Tensor], Tensor]) -> Window:
@@ -62,7 +65,9 @@ class WindowCollector(Stateful):
             _, smooth_reward, terminated, _, info = env.step(self._guarded(act(observation)), soft=True)
             reward = training_reward(self.reward, env, centre, smooth_reward, info, neighbours).float()
             next_observation = self.observe()
-            next_value = torch.where(terminated, 0.0, value(next_observation))
+            success = info.get("is_success", terminated.new_zeros(()))
+            final_value = torch.where(success, self.success_value, 0.0)
+            next_value = torch.where(terminated, final_value, value(next_observation))
             true_reward += float(info["true_reward"].detach().mean())
             is_over = self.episodes.record(info["true_reward"].detach(), terminated)
             steps.append((observation.detach(), reward, next_value, is_over))

@@ -83,12 +83,8 @@ class TorchVecEnv(VecEnv):
 
     def _split_info(self, info: dict[str, Any]) -> list[dict[str, Any]]:
         """Turn one dictionary of tensors with leading B into B dictionaries of numbers."""
-        columns = {key: value.tolist() for key, value in info.items() if isinstance(value, Tensor)}
-        infos = [{key: value[index] for key, value in columns.items()} for index in range(self.num_envs)]
-        if terms := info.get("reward_terms"):
-            for element, reward_terms in zip(infos, self._split_info(terms), strict=True):
-                element["reward_terms"] = reward_terms
-        return infos
+        columns = {key: value.tolist() for key, value in dittogym_env.flat(info).items()}
+        return [{key: value[index] for key, value in columns.items()} for index in range(self.num_envs)]
 
     def state_dict(self) -> list[Tensor]:
         """Tensors of the episodes in progress, with a leading B; see `load_state_dict`."""

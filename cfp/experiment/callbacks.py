@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from cfp.config import RunConfig
 from cfp.evaluation.evaluate import evaluate, make_trial
-from cfp.evaluation.video import film_episode, write_video
+from cfp.evaluation.video import record_episode
 from cfp.experiment.algorithm import Algorithm, Position
 from cfp.experiment.checkpoint import Checkpoint
 from cfp.experiment.folder import policy_path
@@ -215,7 +215,7 @@ class FilmCallback(StageCallback):
         stage, config = self.stage, self.stage.config
         path = stage.folder / "videos" / f"step{stage.step:09d}.mp4"
         size, (seed, _) = config.action_size(stage.number), config.evaluation(stage.number)
-        write_video(path, film_episode(config, stage.algorithm, size, config.report.eval_deterministic, seed))
+        record_episode(config, stage.algorithm, size, config.report.eval_deterministic, seed).save(path)
         self.tracker.film(stage.step, path)
 
 

@@ -14,9 +14,9 @@ from torch.utils.tensorboard import SummaryWriter
 
 from cfp.config import RunConfig, to_json
 from cfp.errors import ConfigError
-from cfp.evaluation.video import available
 from cfp.files import write_text
 from cfp.tables import Table
+from dittogym.render.film import available
 
 EVALUATION_METRICS: dict[str, str] = {
     "eval/return": "mean undiscounted return of an evaluation's episodes (the column mean of evaluations.csv)",

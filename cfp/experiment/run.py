@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from cfp.evaluation.evaluate import Result, compare
 from cfp.evaluation.page import write_page
 from cfp.evaluation.plots import plot_curve
 from cfp.evaluation.tables import format_table, to_rows
-from cfp.evaluation.video import VideoUnavailable, film, write_video
+from cfp.evaluation.video import record_policy, save_media
 from cfp.experiment.algorithm import Algorithm, Position
 from cfp.experiment.callbacks import (
     CheckpointCallback,
@@ -35,7 +34,6 @@ from cfp.experiment.folder import copy_policy, holds_run, policy_files, policy_p
 from cfp.experiment.loggers import ProgressTable, Tracker, check_trackers
 from cfp.experiment.process import StopSignals
 from cfp.files import write_json
-from cfp.policy_protocols import Policy
 from cfp.tables import Table
 from cfp.weights import is_of_another_task, read_policy
 
@@ -165,18 +163,8 @@ class Run:
         untrained = {result.name: result.mean for result in results[:2]}
         print(f"learning curve: {plot_curve(self.folder, self.config, untrained)}")
         if self.config.report.video:
-            make_video(self.config, list(policies.values())[-1], self.folder / "video.mp4")
+            recording = record_policy(self.config, list(policies.values())[-1])
+            save_media(recording, {"video": self.folder / "video.mp4", "replay": self.folder / "replay.html"})
         print(f"all of it on one page: {write_page(self.folder, self.config, results)}")
         print(format_table(self.config, results))
         return results
-
-
-def make_video(config: RunConfig, policy: Policy, path: Path, to_stderr: bool = False) -> None:
-    """Film one episode of a policy; without the optional packages, print how to install them."""
-    output = sys.stderr if to_stderr else sys.stdout
-    try:
-        write_video(path, film(config, policy))
-    except VideoUnavailable as error:
-        print(error, file=output)
-    else:
-        print(f"video: {path}", file=output)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -13,8 +13,12 @@ from torch import Tensor
 from dittogym.action import place
 from dittogym.geometry import NODES
 from dittogym.model import EnvState, Model
+from dittogym.spec import BodySpec
 from dittogym.window import centre_in_window
 from torchmpm import Snow
+
+#: Red, green and blue, 0 to 255.
+Colour: TypeAlias = tuple[int, int, int]
 
 ROBOT, OBJECT, GROUND_BODY = (38, 121, 140), (222, 122, 60), (150, 118, 86)
 EXPAND, RELAX, CONTRACT = (52, 92, 200), (190, 190, 190), (206, 60, 52)
@@ -34,7 +38,7 @@ class ColourScale(NamedTuple):
     label: str
     low: float
     high: float
-    stops: tuple[tuple[int, int, int], ...]
+    stops: tuple[Colour, ...]
     robot_only: bool = False
 
     def colours(self, values: np.ndarray) -> np.ndarray:
@@ -43,6 +47,15 @@ class ColourScale(NamedTuple):
         stops = np.array(self.stops, np.float64)
         mixed = [np.interp(at, np.linspace(0.0, 1.0, len(stops)), column) for column in stops.T]
         return np.where(np.isnan(at)[:, None], 190.0, np.stack(mixed, axis=1))
+
+    def codes(self, values: np.ndarray) -> np.ndarray:
+        """Values (N,) as uint8, from 0 for ``low`` to 254 for ``high``; the middle where they are NaN."""
+        at = np.clip((values - self.low) / (self.high - self.low), 0.0, 1.0)
+        return np.where(np.isnan(at), 127.0, 254.0 * at).round().astype(np.uint8)
+
+    def palette(self) -> np.ndarray:
+        """The colour of each code, (255, 3) uint8."""
+        return self.colours(np.linspace(self.low, self.high, 255)).round().astype(np.uint8)
 
 
 SCALES = {
@@ -54,10 +67,15 @@ SCALES = {
 }
 
 
+def body_colour(body: BodySpec | None) -> Colour:
+    """The colour of an object, or of the robot, ``None``."""
+    return ROBOT if body is None else GROUND_BODY if isinstance(body.material, Snow) else OBJECT
+
+
 def body_colours(model: Model) -> np.ndarray:
     """The colours of the bodies, by which particles of different bodies can be told apart, (N, 3) uint8."""
-    kinds = [ROBOT, *(GROUND_BODY if isinstance(body.material, Snow) else OBJECT for body in model.spec.objects)]
-    return np.repeat(np.array(kinds, np.uint8), [body.count for body in model.solver.bodies], axis=0)
+    kinds = [body_colour(body) for body in (None, *model.spec.objects)]
+    return np.repeat(np.array(kinds, np.uint8), model.camera.counts, axis=0)
 
 
 def muscle_activity(model: Model, state: EnvState, index: int, actuation: Tensor) -> np.ndarray:

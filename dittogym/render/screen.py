@@ -10,6 +10,10 @@ except ImportError as error:
     raise ImportError("render_mode='human' needs pygame: pip install 'torchmpm[human]'") from error
 
 
+#: Keys that pause and go on, take one step, and close the window.
+PAUSE, STEP, QUIT = pygame.K_SPACE, pygame.K_RIGHT, (pygame.K_q, pygame.K_ESCAPE)
+
+
 class Screen:
     """A window that shows at most ``fps`` pictures per second."""
 
@@ -18,16 +22,30 @@ class Screen:
         self._title, self._fps = title, fps
         self._clock = pygame.time.Clock()
         self._surface: pygame.Surface | None = None
+        self._paused = False
 
-    def show(self, picture: np.ndarray) -> None:
-        """Show an RGB picture (H, W, 3) uint8."""
+    def show(self, picture: np.ndarray) -> bool:
+        """Show an RGB picture (H, W, 3) uint8, and wait while paused; returns whether the window is to stay open."""
         if self._surface is None:
             self._surface = pygame.display.set_mode(picture.shape[1::-1])
             pygame.display.set_caption(self._title)
         pygame.surfarray.blit_array(self._surface, picture.transpose(1, 0, 2))
-        pygame.event.pump()
         pygame.display.flip()
         self._clock.tick(self._fps)
+        while True:
+            event = pygame.event.poll()
+            key = event.key if event.type == pygame.KEYDOWN else None
+            if event.type == pygame.QUIT or key in QUIT:
+                return False
+            if key == STEP:
+                self._paused = True
+                return True
+            if key == PAUSE:
+                self._paused = not self._paused
+            if event.type == pygame.NOEVENT:
+                if not self._paused:
+                    return True
+                self._clock.tick(self._fps)
 
     def close(self) -> None:
         """Close the window."""

@@ -82,7 +82,11 @@ def make_spec(
     """
     if isinstance(task, TaskSpec):
         if options:
-            raise TypeError(f"a TaskSpec takes no options but body and obstacles, got {sorted(options)}")
+            name = next(iter(options))
+            raise TypeError(
+                f"task {task.name!r} got an unexpected keyword argument {name!r}; a TaskSpec takes body and "
+                "obstacles alone"
+            )
         spec = task
     else:
         if (allowed := allowed_instead(task)) is not None:
@@ -90,8 +94,9 @@ def make_spec(
         make = TASKS[task_name(task)]
         known = list(inspect.signature(make).parameters)
         if unknown := [name for name in options if name not in known]:
-            names = f"besides the arguments of TorchEnv it has: {', '.join(('body', 'obstacles', *known))}"
-            raise TypeError(f"task {task!r} has no option {unknown[0]!r}; {names}")
+            # The words are Python's own, which programs that try out options look for.
+            names = f"it takes the arguments of TorchEnv, and {', '.join(('body', 'obstacles', *known))}"
+            raise TypeError(f"task {task!r} got an unexpected keyword argument {unknown[0]!r}; {names}")
         spec = make(**options)
     if obstacles is not None:
         checks.instances("obstacles", obstacles, Obstacle)

@@ -137,7 +137,11 @@ ENVIRONMENT = table(
     ]
 ) + table(
     [
-        ("unknown option", lambda: env(colour="red"), ("task 'run' has no option 'colour'", "body, obstacles")),
+        (
+            "unknown option",
+            lambda: env(colour="red"),
+            ("'run' got an unexpected keyword argument 'colour'; it takes", "body, obstacles"),
+        ),
         ("single environment of three", lambda: single(num_envs=3), ("num_envs must not be given", "make_vec")),
         ("reward of nothing", lambda: rewarded(lambda moment, spec: None), "must return an Outcome, got NoneType"),
     ],

@@ -66,7 +66,7 @@ TRAIN = [
     training("an anchor to nothing", "--anchor 3", "anchor requires refine"),
     training("an unknown backend", "--backend warp", "backend must be one of ('auto', 'eager'", "got 'warp'"),
     training("a target that is not there", "--target none.png", "target must be 'star'", "no such file: 'none.png'"),
-    training("a variant of another task", "--variant published", "task 'shapematch' has no option 'variant'"),
+    training("a variant of another task", "--variant published", "task 'shapematch' got an unexpected", "'variant'"),
     training("a policy that is not there", "--start-from none", "none.safetensors: there is no policy"),
     training("a policy of another task", "--start-from run", "start_from must be a policy for shapematch, got one"),
     training("an algorithm of baselines", "--algo shac", "algo must be 'cfp', got 'shac'; python -m baselines.train"),

@@ -21,7 +21,7 @@ from cfp.envs.make import make_env
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
 from cfp.evaluation.episodes import attached
 from cfp.evaluation.evaluate import evaluate, make_trial
-from cfp.evaluation.video import film
+from cfp.evaluation.video import record_policy
 from cfp.sections import EnvironmentConfig
 from cfp.weights import describe, describe_run, save_policy
 from dittogym import TorchEnv
@@ -275,7 +275,7 @@ def test_policy_goes_through_its_file(sees, tmp_path):
     options = {"deterministic": False, "seed": 3}
     results = evaluate([make_trial(algorithm.config, "", each, 8, 2, **options) for each in (algorithm, policy)])
     assert results[0] == results[1]
-    assert sum(1 for _ in film(algorithm.config, policy)) == 31
+    assert len(record_policy(algorithm.config, policy).shots) == 31
 
 
 def test_actor_on_the_image_begins_with_a_policy_of_any_algorithm(tmp_path):

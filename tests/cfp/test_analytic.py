@@ -9,16 +9,21 @@ import torch
 from tiny_runs import assert_same_run, at_step
 
 import cfp
+import dittogym
 from cfp import train
 from cfp.agent.actor import build_actor
 from cfp.agent.spec import ActorSpec
 from cfp.analytic.action_step import ActionStep
+from cfp.analytic.episodes import Episodes
 from cfp.analytic.learner import METRICS, AnalyticLearner
 from cfp.analytic.regression import ImageMemory, Regression
+from cfp.analytic.reward import RewardConfig
+from cfp.analytic.window import WindowCollector
 from cfp.errors import ConfigError
 from cfp.experiment.folder import policy_path
 from cfp.sections import EnvironmentConfig
 from cfp.weights import describe_run
+from dittogym.contract import Outcome
 
 TINY = (
     "--task run --learner analytic --particles 300 --train-particles 300 --substeps 4 --num-envs 2 --resolutions 4 8 "
@@ -179,3 +184,18 @@ def test_run_of_two_stages_and_the_same_run_with_an_interruption(tmp_path):
     policies = [cfp.load(folder) for folder in (whole, parts)]
     assert torch.equal(parameters(policies[0]), parameters(policies[1]))
     assert policies[0].spec.resolutions == (4, 8) and policies[0].description["trained_by"] == "analytic"
+
+
+@pytest.mark.parametrize(("success", "expected"), [(True, 1.0), (False, 0.0)])
+def test_an_episode_that_ends_in_success_has_the_value_of_the_option(success, expected):
+    def ends_at_once(moment, spec):
+        over = torch.ones_like(moment.now.com[:, 0], dtype=torch.bool)
+        return Outcome(terms={}, terminated=over, success=over & success)
+
+    spec = replace(dittogym.make_spec("run"), reward_fn=ends_at_once, weights={"alive": 1.0})
+    env = dittogym.TorchEnv(spec, 2, particles=300, substeps=4)
+    episodes = Episodes(env, seed=0, max_episode_steps=10, num_layouts=2)
+    reward = RewardConfig(success_reward=2.0)  # times the scale 0.05, for 1 / (1 - gamma) = 10 steps
+    collector = WindowCollector(episodes, lambda: torch.zeros(2, 1), reward, steps=1, gamma=0.9)
+    window = collector.collect(lambda _: torch.zeros(2, *env.action_shape), lambda seen: seen[:, 0] + 7.0)
+    assert window.next_values.tolist() == [[pytest.approx(expected)] * 2]

@@ -144,7 +144,7 @@ def test_an_element_fails_alone(task: str, how: str) -> None:
 
 
 def test_a_failed_element_of_a_vector_environment_starts_anew() -> None:
-    env = BatchEnv("grow", 3, **SMALL)
+    env = BatchEnv("grow", 3, autoreset_mode="SameStep", **SMALL)
     env.reset(seed=0)
     env.state.v[1] = torch.nan
     _, rewards, terminated, _, info = env.step(np.zeros(env.action_space.shape, np.float32))

@@ -84,7 +84,7 @@ def test_through_gymnasium() -> None:
     assert env.unwrapped.torch_env.env_state.physics["mu"].tolist() == [100.0]
     vector = make_vec(max_episode_steps=2)
     vector.reset(seed=0, options={"physics": {"mu": np.array([100.0, 200.0])}})
-    for _ in range(3):  # through an autoreset
+    for _ in range(4):  # through an autoreset
         vector.step(np.zeros(vector.action_space.shape, np.float32))
     assert vector.unwrapped.torch_env.env_state.steps.tolist() == [1, 1]
     assert vector.unwrapped.torch_env.env_state.physics["mu"].tolist() == [100.0, 200.0]

@@ -1,12 +1,15 @@
 """Pictures."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from dittogym import TorchEnv
+from dittogym import TorchEnv, make_spec
+from dittogym.render.canvas import GROUND, SOLID, TARGET, Canvas
 from dittogym.render.colours import CONTRACT, EXPAND, OBJECT, RELAX, ROBOT, SCALES, particle_colours, particle_values
-from dittogym.render.frame import GROUND, SOLID, TARGET, Canvas
+from dittogym.render.scene import describe
 
 
 def near(image: np.ndarray, colour) -> np.ndarray:
@@ -17,7 +20,7 @@ def near(image: np.ndarray, colour) -> np.ndarray:
 def test_body_and_floor_are_where_they_should_be(particles: str) -> None:
     env = TorchEnv("run", 1, particles=particles)
     env.reset(seed=0)
-    image = env.render()
+    image = env.render(zoom=1)
     assert image.shape == (512, 512, 3) and image.dtype == np.uint8
     rows, columns = near(image, ROBOT)
     area = np.pi * (0.09 * 512) ** 2
@@ -80,9 +83,10 @@ def test_particles_that_are_not_finite_are_left_out() -> None:
 
 def test_holes_of_a_target_stay_empty() -> None:
     """A ring with a disc in it."""
-    canvas = Canvas(256, np.zeros(2))
     y, x = np.mgrid[:64, :64] - 31.5
     radius = np.hypot(x, y)
-    canvas.target((radius < 8) | ((radius > 16) & (radius < 28)), np.array((0.5, 0.5)))
+    spec = replace(make_spec("shapematch"), target=(radius < 8) | ((radius > 16) & (radius < 28)))
+    canvas = Canvas(256, np.zeros(2))
+    canvas.target(describe(TorchEnv(spec, particles=100).model).target, np.array((0.5, 0.5)))
     for distance, colour in ((0, TARGET), (24, GROUND), (44, TARGET), (62, GROUND)):  # pixels of the picture
         assert tuple(canvas.image[128, 128 + distance]) == colour == tuple(canvas.image[128 - distance, 128])

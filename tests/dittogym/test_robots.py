@@ -13,7 +13,7 @@ import dittogym
 from dittogym.bodies import positions as layout
 from dittogym.bodies.shapes import Disc, Figure, Lattice, Rectangle
 from dittogym.geometry import ceiling, floor, solid
-from dittogym.render.frame import SOLID
+from dittogym.render.canvas import SOLID
 from dittogym.spec import BodySpec
 from torchmpm import sampling
 
@@ -183,11 +183,12 @@ def test_a_custom_obstacle_is_felt_seen_and_drawn(make) -> None:
     column, row = round(35 - 11.52 + 32), round(35.84 + 32 - 50)
     assert seen["wall"][row, column] == 255 and seen["glass"][row, column] == 0 == seen["none"][row, column]
     assert np.array_equal(seen["glass"], seen["none"])
-    x, y = round((35 / 128 - 0.09 + 0.4) * 512), round((1 - 50 / 128) * 512)
+    # The picture shows 0.56 m around the robot's centre, 0.09 m, and from the lower end of the window on.
+    x, y = round((35 / 128 - 0.09 + 0.28) / 0.56 * 512), round((1 - 50 / 128 / 0.56) * 512)
     assert np.abs(drawn["wall"][y, x].astype(int) - SOLID).max() < 12
     assert np.abs(drawn["none"][y, x].astype(int) - SOLID).max() > 60
-    edge = drawn["glass"][y, x - 14 : x + 15].astype(int)
-    assert np.abs(edge - SOLID).max(-1).min() < 40 and np.abs(edge[14] - SOLID).max() > 60  # an outline only
+    edge = drawn["glass"][y, x - 24 : x + 25].astype(int)
+    assert np.abs(edge - SOLID).max(-1).min() < 40 and np.abs(edge[24] - SOLID).max() > 60  # an outline only
 
 
 def test_obstacles_of_the_task_are_gone_when_others_are_given() -> None:

@@ -77,7 +77,7 @@ def test_what_a_batch_in_torch_returns_is_written_to() -> None:
 
 
 def test_an_action_that_is_ignored_stays_as_it_was() -> None:
-    env = BatchEnv("run", 2, autoreset_mode="NextStep", max_episode_steps=1, **SMALL)
+    env = BatchEnv("run", 2, max_episode_steps=1, **SMALL)
     env.reset(seed=0)
     action = np.full(env.action_space.shape, 0.5, np.float32)
     env.step(action)

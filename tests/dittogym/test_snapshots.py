@@ -66,7 +66,7 @@ def test_through_gymnasium(task: str, mode: str | None) -> None:
 
 def test_an_ended_element_goes_on_from_a_loaded_moment() -> None:
     """Its reset, due in the next call, is off; the step count of the moment is back."""
-    env = make_vec(max_episode_steps=3, autoreset_mode="NextStep")
+    env = make_vec(max_episode_steps=3)
     env.reset(seed=0)
     action = np.ones(env.action_space.shape, np.float32)
     env.step(action)
@@ -77,7 +77,7 @@ def test_an_ended_element_goes_on_from_a_loaded_moment() -> None:
     env.unwrapped.load(moment, np.array([True, False]))
     observations, rewards, _, truncated, info = env.step(action)
     assert np.array_equal(observations[0], wanted[0][0]) and rewards[0] == wanted[1][0]
-    assert truncated.tolist() == [True, False] and info["_reward_terms"].tolist() == [True, False]
+    assert truncated.tolist() == [True, False] and info["_reward_terms/alive"].tolist() == [True, False]
     assert env.unwrapped.torch_env.env_state.steps.tolist() == [3, 0]
 
 

@@ -117,20 +117,46 @@ def test_gymnasiums_own_vector_environments() -> None:
     assert set(results[4]) == set(theirs[4])
 
 
-def test_the_window_on_the_screen_shows_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def pygame(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # pygame's own imports
-        pygame = pytest.importorskip("pygame")
+        return pytest.importorskip("pygame")
+
+
+def test_the_window_on_the_screen_shows_the_picture(pygame) -> None:
     env = single(render_mode="human")
     env.reset(seed=0)
     for _ in range(2):
         shown = pygame.surfarray.array3d(pygame.display.get_surface()).transpose(1, 0, 2)
-        assert np.array_equal(shown, env.unwrapped.torch_env.render())
+        assert np.array_equal(shown[30:], env.unwrapped.torch_env.render()[30:])  # below the caption
         env.step(np.ones((2, 8, 8), np.float32))
-    assert pygame.display.get_caption()[0] == "dittogym: run"
+    assert pygame.display.get_caption()[0] == "dittogym: run" and env.unwrapped.window_open
     env.close()
-    assert not pygame.display.get_init()
+    assert not pygame.display.get_init() and not env.unwrapped.window_open
+
+
+def test_the_window_pauses_steps_and_closes(pygame) -> None:
+    def press(*keys: int) -> None:
+        for key in keys:
+            pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=key))
+
+    env, action = single(render_mode="human"), np.ones((2, 8, 8), np.float32)
+    env.reset(seed=0)
+    press(pygame.K_SPACE, pygame.K_RIGHT, pygame.K_RIGHT, pygame.K_SPACE)
+    for left in (2, 1, 0):  # paused, two single steps, and on
+        env.step(action)
+        waiting = pygame.event.get(pygame.KEYDOWN)
+        assert len(waiting) == left
+        press(*(event.key for event in waiting))
+    for closing in (pygame.event.Event(pygame.KEYDOWN, key=pygame.K_q), pygame.event.Event(pygame.QUIT)):
+        env = single(render_mode="human")
+        env.reset(seed=0)
+        pygame.event.post(closing)
+        env.step(action)
+        assert not env.unwrapped.window_open and not pygame.display.get_init()
+        env.step(action)  # the simulation goes on
 
 
 def test_a_real_video(tmp_path: Path) -> None:

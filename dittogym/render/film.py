@@ -1,0 +1,78 @@
+"""Film files: MP4 (H.264, which every browser plays), GIF and WebP."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+#: The unit in which a format counts the time of a picture, s; a film has the nearest rate that is possible.
+UNITS = {".gif": 0.01, ".webp": 0.001, ".mp4": None}
+
+
+class VideoUnavailable(ImportError):
+    """The optional packages that write MP4 files are not installed."""
+
+
+def available() -> bool:
+    """Whether the optional packages that write MP4 files are installed."""
+    return bool(find_spec("imageio") and find_spec("imageio_ffmpeg"))
+
+
+def possible_rate(suffix: str, rate: float) -> float:
+    """The number of pictures per second that comes nearest to a rate in a format."""
+    unit = UNITS[suffix]
+    return rate if unit is None else 1.0 / (unit * max(1, round(1.0 / (unit * rate))))
+
+
+def write_film(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
+    """Write one or more pictures, (H, W, 3) uint8, of which the last is shown a second longer.
+
+    Args:
+        path: The file, which is replaced only when all of it is written; its suffix is one of :data:`UNITS`.
+        frames: The pictures.
+        rate: Pictures per second, see :func:`possible_rate`.
+
+    Raises:
+        VideoUnavailable: MP4 without imageio and its ffmpeg.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        if path.suffix == ".mp4":
+            _write_mp4(aside, frames, rate)
+        else:
+            pictures = (Image.fromarray(frame) for frame in _held(frames, round(rate)))
+            quality: Any = {"quality": 75, "method": 3} if path.suffix == ".webp" else {}
+            first, duration = next(pictures), round(1000 / rate)
+            first.save(aside, save_all=True, append_images=pictures, duration=duration, loop=0, **quality)
+        os.replace(aside, path)
+    except BaseException:  # a simulation that fails, a second Ctrl-C
+        aside.unlink(missing_ok=True)
+        raise
+
+
+def _held(frames: Iterable[np.ndarray], times: int) -> Iterator[np.ndarray]:
+    """The pictures, and the last one some more times."""
+    for frame in frames:
+        yield frame
+    yield from itertools.repeat(frame, times)
+
+
+def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
+    if not available():
+        raise VideoUnavailable("MP4 needs imageio with ffmpeg: pip install 'torchmpm[video]'")
+    import imageio.v2 as imageio
+
+    options: dict[str, Any] = {"codec": "libx264", "pixelformat": "yuv420p", "macro_block_size": 2, "quality": 8}
+    writer: Any = imageio.get_writer(path, format="FFMPEG", fps=rate, **options)
+    with closing(writer):  # its own `with` leaves ffmpeg running where there is an error
+        for frame in _held(frames, round(rate)):
+            writer.append_data(frame)

@@ -1,0 +1,243 @@
+"""An episode as data, from which films, filmstrips and replays are made."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from PIL import Image
+
+from dittogym.render.film import UNITS, possible_rate, write_film
+from dittogym.render.frame import frame, pace
+from dittogym.render.replay import replay_page
+from dittogym.render.scene import Scene, Shot, check_view, describe
+from torchmpm import checks
+
+#: Chooses actions (B, 2, R, R) from observations (B, 3, 64, 64).
+Act: TypeAlias = Callable[[np.ndarray], Any]
+SUFFIXES = (*UNITS, ".png", ".html")
+#: Playback speeds, as a fraction of real time, and the shortest film for which one of them is chosen, s.
+SPEEDS = tuple(mantissa / 10**exponent for exponent in range(6) for mantissa in (1.0, 0.5, 0.2))
+SHORTEST = 4.0
+
+
+@dataclass(eq=False)
+class Recording:
+    """One episode of one simulation, as :meth:`dittogym.TorchEnv.film` returns it. A notebook shows its replay.
+
+    Attributes:
+        scene: What does not move.
+        shots: The start, then one moment after each step.
+        rewards: Of the steps.
+        observation: (3, 64, 64) uint8, the last one.
+        success: Whether the last step counts as success; ``None`` where the task does not define it.
+    """
+
+    scene: Scene
+    shots: list[Shot]
+    rewards: list[float] = field(default_factory=list)
+    observation: np.ndarray | None = None
+    success: bool | None = None
+
+    @property
+    def duration(self) -> float:
+        """Simulated time, s."""
+        return len(self.rewards) * self.scene.dt
+
+    @property
+    def default_speed(self) -> float:
+        """Real time, or the next of 0.5, 0.2, 0.1, ... at which the film takes at least four seconds."""
+        return next((speed for speed in SPEEDS if self.duration / speed >= SHORTEST), SPEEDS[-1])
+
+    def picture(
+        self,
+        time: float,
+        *,
+        size: int = 512,
+        zoom: float | None = None,
+        muscles: bool = True,
+        caption: tuple[str, str] | None = None,
+    ) -> np.ndarray:
+        """The picture (size, size, 3) uint8 of a moment; between two steps, particles move on straight lines.
+
+        Args:
+            time: s.
+            size: Pixels per side.
+            zoom: As in :meth:`dittogym.TorchEnv.render`.
+            muscles: Colour the robot by its muscles.
+            caption: What to write into the upper corners.
+        """
+        at = float(np.clip(time / self.scene.dt, 0, len(self.shots) - 1))
+        before, after = self.shots[int(at)], self.shots[min(int(at) + 1, len(self.shots) - 1)]
+        if (part := np.float32(at - int(at))) > 1e-6:
+            names = ("x", "origin", "view", "centre")
+            moved = {n: (1 - part) * getattr(before, n) + part * getattr(after, n) for n in names}
+            before = after._replace(**moved)
+        return frame(self.scene, before, size, zoom, muscles, caption)
+
+    def frames(
+        self,
+        *,
+        size: int = 512,
+        rate: float = 30.0,
+        speed: float | None = None,
+        zoom: float | None = None,
+        muscles: bool = True,
+    ) -> Iterator[np.ndarray]:
+        """The pictures of a film with task, time, return and playback speed; for the arguments see :meth:`save`."""
+        speed = self.default_speed if speed is None else speed
+        returns = np.cumsum([0.0, *self.rewards])
+        for number in range(round(self.duration / speed * rate) + 1):
+            time = min(number * speed / rate, self.duration)
+            total = returns[min(round(time / self.scene.dt), len(self.rewards))]
+            caption = f"{self.scene.task}   {time:.{self._digits}f} s", f"return {total:.1f}   {pace(speed)}"
+            yield self.picture(time, size=size, zoom=zoom, muscles=muscles, caption=caption)
+
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        size: int = 512,
+        rate: float = 30.0,
+        speed: float | None = None,
+        zoom: float | None = None,
+        muscles: bool = True,
+        pictures: int = 6,
+    ) -> Path:
+        """Write a film, a filmstrip or a replay, and return its path.
+
+        Args:
+            path: ``.mp4``, ``.gif`` or ``.webp``: a film; ``.png``: some pictures beside each other; ``.html``: a page
+                that plays the episode in any browser, also without a network.
+            size: Pixels per side of a picture.
+            rate: Pictures per second.
+            speed: 1: real time. ``None``: :attr:`default_speed`.
+            zoom: The picture shows 1 / zoom metres; ``None``: 0.56 m, a little more than the robot observes.
+            muscles: Colour the robot by its muscles: contraction red, expansion blue.
+            pictures: Number of pictures of a filmstrip, from the start to the end at equal intervals.
+
+        Raises:
+            ValueError: The suffix is another, or a number is out of range.
+            dittogym.render.film.VideoUnavailable: MP4 without the extra ``video``.
+        """
+        path = check_film(path, size, rate, speed, zoom, muscles, pictures)
+        if path.suffix == ".html":
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(self.page(speed))
+        elif path.suffix == ".png":
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(self._strip(size, zoom, muscles, pictures)).save(path)
+        else:
+            rate = possible_rate(path.suffix, rate)
+            write_film(path, self.frames(size=size, rate=rate, speed=speed, zoom=zoom, muscles=muscles), rate)
+        return path
+
+    def page(self, speed: float | None = None) -> str:
+        """The replay as an HTML page, which begins to play at a ``speed``; 1: real time."""
+        speed = self.default_speed if speed is None else speed
+        return replay_page(self.scene, self.shots, self.rewards, self.success, speed)
+
+    @property
+    def _digits(self) -> int:
+        """Digits behind the point of times, so that steps can be told apart."""
+        return max(2, int(np.ceil(-np.log10(self.scene.dt) - 1e-9)))
+
+    def _strip(self, size: int, zoom: float | None, muscles: bool, pictures: int) -> np.ndarray:
+        shown = []
+        for time in np.linspace(0, self.duration, pictures):
+            caption = f"{time:.{self._digits}f} s", ""
+            shown += [self.picture(time, size=size, zoom=zoom, muscles=muscles, caption=caption)]
+            shown += [np.full((size, max(1, size // 64), 3), 255, np.uint8)]
+        return np.concatenate(shown[:-1], axis=1)
+
+    def _repr_html_(self) -> str:
+        page = escape(self.page())
+        return f'<iframe srcdoc="{page}" width="600" height="760" style="border:0"></iframe>'
+
+
+def check_film(
+    path: str | os.PathLike[str],
+    size: int = 512,
+    rate: float = 30.0,
+    speed: float | None = None,
+    zoom: float | None = None,
+    muscles: bool = True,
+    pictures: int = 6,
+) -> Path:
+    """Check the arguments of :meth:`Recording.save`, and return the path."""
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise ValueError(f"path must end in one of {', '.join(SUFFIXES)}, got {str(path)!r}")
+    check_view(size, zoom)
+    checks.number("rate", rate, above=0.0)
+    if speed is not None:
+        checks.number("speed", speed, above=0.0)
+    checks.flag("muscles", muscles)
+    checks.whole("pictures", pictures, 1)
+    return path
+
+
+def film(env: Any, act: Act, path: Any, seed: Any, index: int, options: dict[str, Any]) -> Recording:
+    """Record an episode, see :func:`record`, and save it if a ``path`` is given, see :meth:`Recording.save`."""
+    if path is not None:
+        check_film(path, **options)  # before the episode
+    elif options:
+        raise TypeError(f"path must be given with {', '.join(options)}, got None")
+    recording = record(env, act, seed, index)
+    if path is not None:
+        recording.save(path, **options)
+    return recording
+
+
+def record(env: Any, act: Act, seed: Any = 0, index: int = 0) -> Recording:
+    """Play an episode.
+
+    Args:
+        env: A :class:`dittogym.TorchEnv`, which is reset.
+        act: Chooses the actions.
+        seed: Of the reset.
+        index: Which element of the batch is recorded, until its episode ends.
+    """
+    with torch.no_grad():
+        observation, _ = env.reset(seed=seed)
+        recording, ended = Recording(describe(env.model), [env.shot(index)]), False
+        info: dict[str, Any] = {}
+        while not ended:
+            action = torch.as_tensor(act(observation.cpu().numpy()), device=env.device)
+            observation, reward, terminated, truncated, info = env.step(action)
+            recording.shots.append(env.shot(index))
+            recording.rewards.append(float(reward[index]))
+            ended = bool(terminated[index] | truncated[index])
+    recording.observation = observation[index].cpu().numpy()
+    recording.success = bool(info["is_success"][index]) if "is_success" in info else None
+    return recording
+
+
+def as_function(policy: Any) -> Act:
+    """A policy as a function of observations.
+
+    Args:
+        policy: A function, or an object with ``predict(observation, state)`` as stable-baselines3's, which returns
+            actions and the next state.
+
+    Raises:
+        TypeError: It is neither.
+    """
+    if not hasattr(policy, "predict"):
+        if not callable(policy):
+            raise TypeError(f"policy must be a function or have a method predict, got {type(policy).__name__}")
+        return policy
+    memory: Any = None
+
+    def act(observation: np.ndarray) -> Any:
+        nonlocal memory
+        action, memory = policy.predict(observation, memory)
+        return action
+
+    return act

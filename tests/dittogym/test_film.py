@@ -1,0 +1,206 @@
+"""Films, filmstrips and replays of an episode."""
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+import zlib
+from dataclasses import replace
+
+import cv2
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tiny import SMALL
+
+import dittogym
+from dittogym.render.film import write_film
+from dittogym.render.frame import pace
+from dittogym.render.recording import Recording, as_function
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+def wave(observation: np.ndarray) -> np.ndarray:
+    """Contraction on the left, expansion on the right, of one robot or a batch."""
+    across = np.linspace(1, -1, 8, dtype=np.float32)
+    return np.broadcast_to(across, (*observation.shape[:-3], 2, 8, 8)).copy()
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    """Twenty steps of KICK that take 0.2 s; one particle is lost on the way."""
+    env = dittogym.TorchEnv(replace(dittogym.make_spec("kick"), horizon=20), 2, **SMALL | {"substeps": 100})
+    film = env.film(wave, index=1, seed=3)
+    film.shots[-1].x[5] = np.nan
+    return film
+
+
+def test_a_recording_is_the_episode(recording: Recording) -> None:
+    env = dittogym.TorchEnv(replace(dittogym.make_spec("kick"), horizon=20), **SMALL | {"substeps": 100})
+    observation, _ = env.reset(seed=4)  # element 1 of a batch of seed 3
+    rewards = []
+    for shot in recording.shots[:-1]:
+        np.testing.assert_allclose(shot.x, env.state.x[0], atol=1e-6)
+        observation, reward, *_ = env.step(torch.from_numpy(wave(observation.numpy())))
+        rewards.append(float(reward))
+    assert recording.rewards == pytest.approx(rewards, abs=1e-3) and recording.duration == pytest.approx(0.2)
+    assert recording.success is False and np.array_equal(recording.observation, observation[0])
+    assert recording.default_speed == 0.05  # 4 s
+
+
+@pytest.mark.parametrize("suffix", ["gif", "webp", "mp4"])
+def test_films(recording: Recording, tmp_path, suffix: str) -> None:
+    if suffix == "mp4":
+        pytest.importorskip("imageio_ffmpeg")
+    path = recording.save(tmp_path / "new" / f"film.{suffix}", size=64, rate=10, speed=0.2)
+    if suffix == "mp4":
+        film = cv2.VideoCapture(str(path))
+        count, shape = int(film.get(cv2.CAP_PROP_FRAME_COUNT)), film.read()[1].shape[:2]
+        seconds = count / film.get(cv2.CAP_PROP_FPS)
+        assert count == 21  # from 0 to 1 s, and the last picture a second longer
+    else:
+        with Image.open(path) as film:
+            durations = []
+            for number in range(film.n_frames):
+                film.seek(number)
+                film.load()
+                durations.append(film.info["duration"])
+            shape, seconds = film.size, sum(durations) / 1000
+    assert shape == (64, 64) and seconds == pytest.approx(2.1)
+    assert [each.name for each in path.parent.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("suffix", ["webp", "mp4"])
+def test_a_film_that_fails_leaves_the_old_file(tmp_path, suffix: str) -> None:
+    def frames():
+        yield from np.zeros((3, 32, 32, 3), np.uint8)
+        raise ValueError("the robot is gone")
+
+    path = tmp_path / f"film.{suffix}"
+    path.write_bytes(b"old")
+    with pytest.raises(ValueError, match="the robot is gone"):
+        write_film(path, frames(), 10)
+    assert [each.name for each in tmp_path.iterdir()] == [path.name] and path.read_bytes() == b"old"
+
+
+def test_pictures_of_a_film(recording: Recording) -> None:
+    """Muscles are shown unless one does not want them, and a moment between two steps lies between them."""
+    red, plain = (recording.picture(0.1, muscles=muscles, size=128).astype(int) for muscles in (True, False))
+    assert (red[..., 0] - red[..., 2] > 100).sum() > 50 > (plain[..., 0] - plain[..., 1] > 100)[:, :64].sum()
+    first, second = recording.shots[10].x, recording.shots[11].x
+    near = recording.picture(0.105)
+    moved = recording.shots[10]._replace(x=(first + second) / 2)
+    middle = replace(recording, shots=[moved]).picture(0.0)
+    assert (np.abs(near.astype(int) - middle).max(-1) > 60).mean() < 0.01
+    assert [pace(speed) for speed in (1, 0.05, 0.3, 2)] == [
+        "real time", "20 times slower", "3.3 times slower", "2 times faster",
+    ]  # fmt: skip
+
+
+def test_filmstrip(recording: Recording, tmp_path) -> None:
+    strip = np.asarray(Image.open(recording.save(tmp_path / "strip.png", size=64, pictures=3, zoom=1)))
+    assert strip.shape == (64, 3 * 64 + 2, 3) and (strip[:, 64] == 255).all()
+    assert np.array_equal(strip[16:, -64:], recording.picture(0.2, size=64, zoom=1)[16:])
+
+
+def test_environments_of_gymnasium_film_too(tmp_path) -> None:
+    env = gymnasium.make("dittogym/shapematch-coarse-v0", resolution=8, **SMALL).unwrapped
+    assert env._repr_png_() is None
+    recorded = env.film(wave, tmp_path / "film.html", seed=1)
+    assert (tmp_path / "film.html").stat().st_size > 1000 and len(recorded.rewards) == 30
+    assert "<iframe" in recorded._repr_html_() and env._repr_png_().startswith(b"\x89PNG")
+
+
+def test_policies_are_functions_or_predict() -> None:
+    class Counting:
+        def predict(self, observation, state=None):
+            return wave(observation), (state or 0) + 1
+
+    act = as_function(Counting())
+    for _ in range(2):
+        assert act(np.zeros((1, 3, 64, 64), np.uint8)).shape == (1, 2, 8, 8)
+    with pytest.raises(TypeError, match="policy must be a function or have a method predict, got int"):
+        as_function(3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"path": "film.avi"}, "path must end in one of .gif, .webp, .mp4, .png, .html, got 'film.avi'"),
+        ({"path": "film.mp4", "size": 3}, "size must be at least 16, got 3"),
+        ({"path": "film.mp4", "rate": 0}, "rate must be positive, got 0"),
+        ({"path": "film.mp4", "speed": -1}, "speed must be positive, got -1"),
+        ({"path": "film.mp4", "zoom": 0}, "zoom must be positive, got 0"),
+        ({"path": "film.png", "pictures": 0}, "pictures must be at least 1, got 0"),
+        ({"size": 64}, "path must be given with size"),
+    ],
+)
+def test_options_are_checked_before_the_episode(options: dict, message: str) -> None:
+    env = dittogym.TorchEnv("run", **SMALL)
+    with pytest.raises((ValueError, TypeError), match=re.escape(message)):
+        env.film(wave, **options)
+    with pytest.raises(RuntimeError, match="reset"):
+        _ = env.state
+
+
+def decode(page: str) -> tuple[dict, np.ndarray, dict[str, np.ndarray]]:
+    """The description, the positions (T, 2, N) and the values (T, N) that a replay holds."""
+    header = json.loads(re.search(r'type="application/json">(.*?)</script>', page, re.S)[1])
+    data = zlib.decompress(base64.b64decode(re.search(r'type="text/plain">(.*?)</script>', page, re.S)[1]))
+    moments, counts = len(header["steps"]), [body["count"] for body in header["bodies"]]
+    size = moments * 2 * sum(counts)
+    codes = np.frombuffer(data, np.uint8)
+    alternating = codes[:size].astype(int) + 256 * codes[size : 2 * size].astype(int)
+    second = np.where(alternating % 2, -(alternating + 1) // 2, alternating // 2).reshape(moments, 2, -1)
+    quanta = np.cumsum(np.cumsum(second, 0), 0).astype(np.int16)
+    positions = np.array(header["centre"])[:, :, None] + quanta * header["quantum"]
+    values, start = {}, 2 * size
+    for name, count in (("muscle", counts[0]), ("deformation", sum(counts))):
+        part = codes[start : start + moments * count].reshape(moments, count)
+        values[name] = np.cumsum(part, 0, dtype=np.uint8)
+        start += part.size
+    assert start == len(codes)
+    return header, np.where(quanta == -(2**15), np.nan, positions), values
+
+
+def test_a_replay_holds_the_episode(recording: Recording, monkeypatch) -> None:
+    header, positions, values = decode(recording.page())
+    assert header["steps"] == list(range(21)) and header["particles"] == positions.shape[2]
+    for moment, shot in enumerate(recording.shots):
+        distance = np.linalg.norm(positions[moment].T[:, None] - shot.x[None], axis=-1)
+        known = np.isfinite(positions[moment]).all(0)
+        assert known.sum() == np.isfinite(shot.x).all(1).sum()
+        assert np.nanmin(distance[known], axis=1).max() < header["quantum"]  # each is one of them
+    assert values["muscle"][0].tolist() == [127 // 16] * header["bodies"][0]["count"]  # at rest
+    assert values["muscle"][1].min() < 5 and values["muscle"][1].max() > 9 and values["deformation"].max() > 0
+    monkeypatch.setattr("dittogym.render.replay.MOST_MOMENTS", 7)
+    monkeypatch.setattr("dittogym.render.replay.MOST_PARTICLES", 50)
+    header, positions, _ = decode(recording.page())
+    assert header["steps"] == [0, 3, 6, 9, 12, 15, 18, 20] and header["stride"] == 3
+    assert positions.shape[2] == 50 and header["particles"] > 100
+    assert "http" not in recording.page().replace("http-equiv", "")  # nothing comes from elsewhere
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium or Chrome")
+def test_a_replay_plays_in_a_browser(recording: Recording, tmp_path) -> None:
+    """The page unpacks its data, draws, and says what it holds."""
+    path = recording.save(tmp_path / "replay.html")
+    probe = """<script>
+    addEventListener("load", () => setTimeout(() => {
+      setPlaying(false); seek(0.1);
+      const shot = () => document.getElementById("scene").toDataURL();
+      const colours = ["muscle", "deformation", "speed"].map((name) => {
+        document.getElementById("colour").value = name; draw(); return shot();
+      });
+      document.title = [new Set(colours).size, positions.length, time, document.getElementById("about").textContent];
+    }, 500));
+    </script></body>"""
+    path.write_text(path.read_text().replace("</body>", probe))
+    options = "--headless --no-sandbox --disable-gpu --virtual-time-budget=3000 --dump-dom".split()
+    page = subprocess.run([BROWSER, *options, path.as_uri()], capture_output=True, text=True, timeout=120).stdout
+    numbers = 21 * 2 * len(recording.shots[0].x)
+    assert f"<title>3,{numbers},0.1,20 steps of 10 ms, return {sum(recording.rewards):.1f}." in page
