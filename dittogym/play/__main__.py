@@ -6,18 +6,15 @@ import pkgutil
 import secrets
 import sys
 import webbrowser
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 import tyro
 
-from dittogym.play.session import Policy, Session
 from dittogym.tasks import allowed_instead
 
-MISSING = "playing needs a web server, which is not installed: pip install torchmpm[play]"
 #: Options of its training that a policy plays with, too, unless the command line says otherwise.
 FROM_POLICY = ("dt", "substeps", "dtype", "parity", "target", "variant")
 
@@ -37,7 +34,7 @@ class Command:
     """Rows and columns of the action image; policies bring their own."""
     target: str | None = None
     """Target shape of SHAPE MATCH: a name or the path of an image."""
-    body: Path | None = None
+    body: str | None = None
     """Robot: the path of an image. Bright pixels belong to it."""
     seed: int = 0
     """Seed of the particles."""
@@ -47,45 +44,42 @@ class Command:
     """Open the page in a browser."""
 
 
-def load_policy(path: str) -> Policy:
+def load_policy(path: str) -> Any:
     """A policy of any kind. The packages that load them depend on this one, so they are looked up by name."""
     kind = pkgutil.resolve_name("cfp.weights:read_policy")(path)[1]["kind"]
-    policy: Policy = pkgutil.resolve_name("cfp:load" if kind == "cfp" else "baselines:load")(path)
-    return policy
+    return pkgutil.resolve_name("cfp:load" if kind == "cfp" else "baselines:load")(path)
 
 
-def make_session(command: Command) -> Callable[[], Session]:
-    """What makes the simulation of a page.
-
-    Raises:
-        ValueError: An option is wrong.
-        TypeError: The task has no such option.
-    """
+def options(command: Command) -> dict[str, Any]:
+    """Arguments of :class:`dittogym.play.session.Session`."""
     weights = pkgutil.resolve_name("cfp.weights")
-    options: dict[str, Any] = {}
-    described = {name: weights.read_policy(name)[1] for name in weights.shipped()}
+    known = {name: weights.read_policy(name)[1] for name in weights.shipped()}
+    chosen: dict[str, Any] = {}
     if command.policy is not None:
-        described[command.policy] = weights.read_policy(command.policy)[1]
-        told = described[command.policy]["environment"]
-        options = {name: told[name] for name in FROM_POLICY if told.get(name) is not None}
-    task = command.task or (described[command.policy]["task"] if command.policy else "run")
+        known[command.policy] = weights.read_policy(command.policy)[1]
+        told = known[command.policy]["environment"]
+        chosen = {name: told[name] for name in FROM_POLICY if told.get(name) is not None}
+    task = command.task or (known[command.policy]["task"] if command.policy else "run")
     if (allowed := allowed_instead(task)) is not None:
         raise ValueError(f"task must be one of {allowed}, got {task!r}")
-    given = {"target": command.target, "body": command.body}
-    options |= {name: value for name, value in given.items() if value is not None}
-    options |= {"particles": command.particles, "resolution": command.resolution}
-    names = [name for name, about in described.items() if about["task"] == task or name == command.policy]
-    policies = {name: partial(load_policy, name) for name in names}
-    return partial(Session, task, policies, command.policy, command.seed, **options)
+    names = [name for name, about in known.items() if about["task"] == task or name == command.policy]
+    given = {name: getattr(command, name) for name in ("particles", "resolution", "seed", "policy", "target", "body")}
+    chosen |= {name: value for name, value in given.items() if value is not None}
+    return chosen | {"task": task, "policies": {name: partial(load_policy, name) for name in names}}
 
 
-def serve(new_session: Callable[[], Session], port: int, browser: bool) -> None:
+def play(command: Command) -> None:
     """Serve the page until Ctrl-C."""
-    from dittogym.play.server import Server  # what it needs is an extra
-
-    server = Server(new_session, secrets.token_urlsafe(16), port)
+    try:
+        from dittogym.play.server import Server
+        from dittogym.play.session import Session
+    except ModuleNotFoundError as error:
+        raise OSError(f"the page needs a web server: pip install torchmpm[play] ({error})") from error
+    new_session = partial(Session, **options(command))
+    new_session()  # what is wrong with the options shows before a page is opened
+    server = Server(new_session, secrets.token_urlsafe(16), command.port)
     print(f"Play at {server.address}\nCtrl-C stops the program.", flush=True)
-    if browser:
+    if command.browser:
         webbrowser.open(server.address)
     server.run()
 
@@ -94,13 +88,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
     command = tyro.cli(Command, prog="python -m dittogym.play", args=arguments)
     try:
-        new_session = make_session(command)
-        new_session()  # what is wrong with the options shows before a page is opened
-        serve(new_session, command.port, command.browser)
-    except ModuleNotFoundError as error:
-        print(f"error: {MISSING} ({error})", file=sys.stderr)
-        return 2
-    except (ValueError, TypeError, OSError, pkgutil.resolve_name("cfp.errors:CFPError")) as error:
+        play(command)
+    except KeyboardInterrupt:
+        return 0
+    except (ValueError, TypeError, OSError, pkgutil.resolve_name("cfp:CFPError")) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from torchmpm import ParticleState
@@ -25,7 +24,7 @@ WAVE_SPEED, WAVE_NUMBER = 0.3, 2.0
 
 @dataclass(frozen=True)
 class Grip:
-    """Particles that are pulled at: their indices (n,), weights (n, 1) from 0 to 1, and where they are held, m."""
+    """Particles that are pulled at: their indices (n,), weights (n, 1) from 0 to 1, and where they are held (2,), m."""
 
     indices: Tensor
     weights: Tensor
@@ -43,7 +42,7 @@ class Grip:
         return cls(indices, weights, point - (weights * x[indices]).sum(0) / weights.sum())
 
     def pull(self, state: ParticleState, point: Tensor) -> ParticleState:
-        """Give the particles a velocity towards a point (2,), m, where the place they are held at goes."""
+        """Give the particles a velocity with which the place they are held at goes to a point (2,), m."""
         held = (self.weights * state.x[0, self.indices]).sum(0) / self.weights.sum() + self.offset
         velocity = HASTE * (point - held)
         velocity = velocity * (LARGEST_SPEED / velocity.norm().clamp_min(LARGEST_SPEED))
@@ -74,8 +73,3 @@ def wave(direction: Literal["left", "right", "up", "down"], step: int, size: int
     position = {"right": along, "left": -along, "up": -along[:, None], "down": along[:, None]}[direction]
     phase = 2 * np.pi * WAVE_NUMBER * np.broadcast_to(position, (size, size)) - WAVE_SPEED * step
     return np.sin(phase - 2.0 * np.arange(2)[:, None, None])
-
-
-def tensor_point(x: float, y: float, like: Tensor) -> Tensor:
-    """A point (2,) of the world, m."""
-    return torch.tensor((x, y), dtype=like.dtype, device=like.device)

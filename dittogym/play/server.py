@@ -9,6 +9,7 @@ import socket
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +25,14 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from dittogym.play import protocol
-from dittogym.play.session import Session, timed_steps
+from dittogym.play.session import Answers, Session
 
 PAGE = Path(__file__).parent / "page"
 HOSTS = ["127.0.0.1", "localhost"]
 #: Frames a second, and frames that may be on their way to a page.
 FRAMES_PER_SECOND, IN_FLIGHT = 60, 3
+#: Seconds after which no further control step is begun for a frame.
+BUDGET = 1 / 30
 #: Pages that may be open at once; each has a simulation of its own.
 LARGEST_NUMBER = 4
 #: Seconds over which the achieved speed is averaged.
@@ -160,7 +163,7 @@ class Connection:
                     raise ValueError("message must be text, got bytes")
                 message = protocol.parse(content["text"])
             except ValueError as error:
-                await self.tell("error", str(error))
+                await self.websocket.send_json({"type": "error", "message": str(error)})
                 continue
             if isinstance(message, protocol.Seen):
                 self.seen = min(message.frame, self.sent)
@@ -198,10 +201,6 @@ class Connection:
             if not playing:
                 pace.restart()
 
-    async def tell(self, kind: str, message: str) -> None:
-        """Send a text for people to read."""
-        await self.websocket.send_json({"type": kind, "message": message})
-
 
 class Pace:
     """Turns passing time into control steps that are due."""
@@ -237,18 +236,23 @@ class Pace:
         return max(0.0, self._tick - time.perf_counter())
 
 
-def work(session: Session, messages: list[protocol.Message], due: int) -> tuple[list[dict[str, Any]], int]:
-    """Apply messages and take the control steps that are due; returns answers and the number of steps."""
-    answers: list[dict[str, Any]] = []
-    before = session.num_steps
+def work(session: Session, messages: list[protocol.Message], due: int) -> tuple[Answers, int]:
+    """Apply messages and take the control steps that are due, as far as time allows; returns answers and steps."""
+    answers: Answers = []
+    before, end = session.num_steps, time.perf_counter() + BUDGET
     for message in messages:
-        try:
-            answers += session.apply(message)
-        except Exception as error:  # the page asked for it, or a task or a policy of the user's is wrong
-            answers.append({"type": "error", "message": f"{error}" or type(error).__name__})
-    try:
-        timed_steps(session, due, 2 / FRAMES_PER_SECOND)
-    except Exception as error:
-        log.exception("a step has failed")
-        answers.append({"type": "error", "message": f"the step has failed: {type(error).__name__}: {error}"})
+        answers += attempt(partial(session.apply, message))
+    while session.playing and session.num_steps - before < due and time.perf_counter() < end:
+        answers += attempt(session.advance)
     return answers, session.num_steps - before
+
+
+def attempt(action: Callable[[], Answers | None]) -> Answers:
+    """Answers of an action, or the error for the page: it asked for something impossible, or a user's task failed."""
+    try:
+        return action() or []
+    except ValueError as error:
+        return [{"type": "error", "message": str(error)}]
+    except Exception as error:
+        log.exception("the simulation has raised an error")
+        return [{"type": "error", "message": f"{type(error).__name__}: {error}"}]

@@ -3,6 +3,7 @@
 import contextlib
 import gc
 import json
+import re
 import socket
 import sys
 import threading
@@ -14,6 +15,7 @@ from functools import partial
 from typing import Any
 
 import pytest
+import tyro
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
@@ -33,7 +35,7 @@ MALFORMED = [
     '{"type": "hand", "tool": "pull", "x": NaN, "y": 0}',
     '{"type": "paint", "muscles": "both", "value": 1, "cells": [[0, 999]]}',
     '{"type": "policy", "name": "../../etc/passwd"}',
-    '{"type": "draw", "what": "body", "size": 8, "pixels": "AAAA"}',
+    '{"type": "draw", "what": "body", "pixels": "AAAA"}',
 ]
 
 
@@ -123,7 +125,7 @@ def test_malformed_messages_are_answered_and_survived(server: Server) -> None:
 
 def test_time_stops_and_goes_on_in_single_steps(server: Server) -> None:
     with open_page(server) as page:
-        assert receive(page, "hello")["control_step"] == pytest.approx(1e-3)
+        assert receive(page, "hello")["dt"] == pytest.approx(1e-3)
         while receive(page, "frame") < 5:
             pass
         tell(page, "play", playing=False)
@@ -193,35 +195,37 @@ def test_pace(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_command_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    served: list[Any] = []
-    monkeypatch.setattr(
-        program, "serve", lambda new_session, port, browser: served.append((new_session(), port, browser))
+    opened: list[str] = []
+    monkeypatch.setattr(Server, "run", lambda self: self._socket.close())
+    monkeypatch.setattr(program.webbrowser, "open", opened.append)
+    arguments = "--policy shapematch --particles 200 --target T --port 0"
+    assert program.main(arguments.split()) == 0
+    (address,) = opened
+    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{22}", address)
+    assert address in capsys.readouterr().out
+    played = Session(**program.options(tyro.cli(program.Command, args=arguments.split())))
+    assert (played.env.spec.name, played.policy_name, list(played.policies)) == (
+        "shapematch",
+        "shapematch",
+        ["shapematch"],
     )
-    assert program.main("--policy shapematch --particles 200 --target T --no-browser --port 99".split()) == 0
-    played, port, browser = served.pop()
-    assert (played.env.spec.name, played.policy_name, port, browser) == ("shapematch", "shapematch", 99, False)
-    assert list(played.policies) == ["shapematch"] and not played.env.spec.target[40, 20]
-    for arguments, message in (
-        ("fly", "task must be one of"),
-        ("run --target star", "task 'run' has no option 'target'"),
-        ("run --policy nowhere", "there is no policy"),
-        ("run --particles 0", "particles must be at least 1"),
-        ("run --body nowhere.png", "no such file"),
-    ):
-        assert program.main(arguments.split()) == 2
-        error = capsys.readouterr().err
-        assert error.startswith("error: ") and message in error and error.count("\n") == 1
+    assert not played.env.spec.target[40, 20] and played.env.action_resolution == 32
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        for arguments, message in (
+            ("fly", "task must be one of"),
+            ("run --target star", "unexpected keyword argument 'target'"),
+            ("run --policy nowhere", "there is no policy"),
+            ("run --particles 0", "particles must be at least 1"),
+            ("run --body nowhere.png", "no such file"),
+            (f"run --particles 200 --port {other.getsockname()[1]}", "in use"),
+        ):
+            assert program.main(arguments.split()) == 2
+            error = capsys.readouterr().err
+            assert error.startswith("error: ") and message in error and error.count("\n") == 1
 
 
-def test_a_port_that_is_taken_and_a_server_that_is_missing(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with socket.socket() as other:
-        other.bind(("127.0.0.1", 0))
-        other.listen()
-        assert program.main(f"run --particles 200 --no-browser --port {other.getsockname()[1]}".split()) == 2
-    assert "in use" in capsys.readouterr().err
+def test_without_the_extra(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.delitem(sys.modules, "dittogym.play.server")
     monkeypatch.setitem(sys.modules, "uvicorn", None)
-    assert program.main(["run", "--particles", "200", "--no-browser"]) == 2
+    assert program.main(["run"]) == 2
     assert "pip install torchmpm[play]" in capsys.readouterr().err

@@ -73,7 +73,7 @@ def test_every_task_can_be_played(task: str) -> None:
     played = session(task)
     about = json.loads(json.dumps(played.describe(), allow_nan=False))
     assert about["task"] == task and sum(body["count"] for body in about["bodies"]) == played.env.num_particles
-    assert ("target" in about["draws"]) == (task == "shapematch") == (about["target"] is not None)
+    assert ("target" in about["draws"]) == (task == "shapematch") == bool(about["target"])
     for _ in range(2):
         played.advance()
     frame, state = shown(played), played.env.env_state
@@ -138,7 +138,7 @@ def test_paint_waves_and_policy_add_up() -> None:
     with pytest.raises(ValueError, match="name must be one of constant, got '/etc/passwd'"):
         played.apply(protocol.Policy("/etc/passwd"))
     played.apply(protocol.Policy(None))
-    assert played.env.action_resolution == make_spec("run").fine
+    assert played.env.action_resolution == make_spec("run").coarse
     before = played.env.state.x.clone()
     played.apply(protocol.Policy("constant"))
     assert torch.equal(before, played.env.state.x) and played.layout()["resolution"] == 4
@@ -187,6 +187,8 @@ def test_saved_actions_repeat_an_episode() -> None:
     played.apply(Wave("right"))
     for _ in range(4):
         played.advance()
+    (replay,) = played.apply(Save("replay"))
+    assert replay["name"] == "run-4.html" and b'"rewards":[' in base64.b64decode(replay["content"])
     (answer,) = played.apply(Save("actions"))
     saved = np.load(io.BytesIO(base64.b64decode(answer["content"])))
     assert (
@@ -216,7 +218,7 @@ def test_moments() -> None:
 
 
 def drawing(mask: np.ndarray, what: str) -> Draw:
-    return Draw(what, len(mask), base64.b64encode(mask.astype(np.uint8) * 255).decode())
+    return Draw(what, (mask.astype(np.uint8) * 255).tobytes())
 
 
 def test_drawings() -> None:
@@ -284,37 +286,30 @@ GOOD = [
     '{"type": "paint", "muscles": "both", "value": 1, "cells": [[0, 3]]}',
 ]
 BAD = {
-    "": "message must be JSON",
-    "[" * 100_000: "message must be JSON",
-    "[1]": "message must be a JSON object",
-    "{}": "type must be one of",
-    '{"type": ["play"]}': "type must be one of",
-    '{"type": "__class__"}': "type must be one of",
-    '{"type": "play"}': "play must hold playing",
-    '{"type": "play", "playing": 1}': "playing must be True or False, got 1",
-    '{"type": "step", "count": 9}': "step may hold nothing, got",
-    '{"type": "speed", "factor": 1e99}': "factor must be at most 16",
-    '{"type": "speed", "factor": NaN}': "NaN is not JSON",
-    '{"type": "speed", "factor": 1e999}': "factor must be finite, got inf",
-    '{"type": "hand", "tool": "bite"}': "tool must be one of 'pull', 'contract', 'expand', None, got 'bite'",
-    '{"type": "hand", "tool": "pull", "x": "0"}': "x must be a number, got '0'",
-    '{"type": "hand", "tool": "pull", "x": 1e999}': "x must be finite",
-    '{"type": "hand", "tool": "pull", "id": -1}': "id must not be negative",
-    '{"type": "reset", "seed": 1.5}': "seed must be a whole number",
-    '{"type": "paint", "muscles": "all", "value": 1, "cells": [[0, 0]]}': "muscles must be one of",
-    '{"type": "paint", "muscles": "both", "value": 1, "cells": []}': "cells must be 1 to 4096 pairs",
-    '{"type": "paint", "muscles": "both", "value": 1, "cells": [[0]]}': "cells must be pairs",
-    '{"type": "paint", "muscles": "both", "value": 1, "cells": [[-1, 0]]}': "row must not be negative",
-    '{"type": "paint", "muscles": "both", "value": 2, "cells": [[0, 0]]}': "value must be at most 1",
-    '{"type": "wave", "direction": "north"}': "direction must be one of",
-    '{"type": "policy", "name": 3}': "name must be the name of a policy or null",
-    '{"type": "matter", "stiffness": 0, "yield_stress": 1, "gravity": 9}': "stiffness must be positive",
-    '{"type": "matter", "stiffness": 1, "yield_stress": 1, "gravity": 1e9}': "gravity must be between",
-    '{"type": "save", "what": "../../x"}': "what must be one of",
-    '{"type": "draw", "what": "body", "size": 8, "pixels": "!"}': "pixels must be base64",
-    '{"type": "draw", "what": "body", "size": 8, "pixels": "AAAA"}': "pixels must be 64 bytes, got 3",
-    '{"type": "draw", "what": "body", "size": 100000, "pixels": ""}': "size must be at most 256",
-    '{"type": "seen", "frame": true}': "frame must be a whole number",
+    "": "truncated",
+    "[" * 100_000: "Expected `object`, got `array`",
+    "{}": "missing required field `type`",
+    '{"type": ["play"]}': "Expected `str` - at `$.type`",
+    '{"type": "message"}': "Invalid value 'message' - at `$.type`",
+    '{"type": "play"}': "missing required field `playing`",
+    '{"type": "play", "playing": 1}': "Expected `bool`, got `int` - at `$.playing`",
+    '{"type": "step", "count": 9}': "unknown field `count`",
+    '{"type": "speed", "factor": 1e99}': "Expected `float` <= 16.0 - at `$.factor`",
+    '{"type": "speed", "factor": NaN}': "invalid character",
+    '{"type": "hand", "tool": "bite"}': "Invalid enum value 'bite' - at `$.tool`",
+    '{"type": "hand", "tool": "pull", "x": "0"}': "Expected `float`, got `str` - at `$.x`",
+    '{"type": "hand", "tool": "pull", "x": 1e999}': "Number out of range - at `$.x`",
+    '{"type": "hand", "tool": "pull", "id": -1}': "Expected `int` >= 0 - at `$.id`",
+    '{"type": "reset", "seed": 1.5}': "Expected `int | null`, got `float` - at `$.seed`",
+    '{"type": "paint", "muscles": "both", "value": 1, "cells": []}': "length >= 1 - at `$.cells`",
+    '{"type": "paint", "muscles": "both", "value": 1, "cells": [[0]]}': "length 2 - at `$.cells[0]`",
+    '{"type": "paint", "muscles": "both", "value": 1, "cells": [[-1, 0]]}': "`int` >= 0 - at `$.cells[0][0]`",
+    '{"type": "policy", "name": 3}': "Expected `str | null`, got `int`",
+    '{"type": "matter", "stiffness": 0, "yield_stress": 1, "gravity": 9}': "Expected `float` > 0.0 - at `$.stiffness`",
+    '{"type": "save", "what": "../../x"}': "Invalid enum value '../../x' - at `$.what`",
+    '{"type": "draw", "what": "body", "pixels": "!"}': "Invalid base64 encoded string - at `$.pixels`",
+    '{"type": "draw", "what": "body", "pixels": "AAAA"}': "Expected `bytes` of length >= 64 - at `$.pixels`",
+    '{"type": "seen", "frame": true}': "Expected `int`, got `bool` - at `$.frame`",
 }
 
 
@@ -322,7 +317,8 @@ BAD = {
 def test_messages(text: str) -> None:
     message = parse(text)
     for name, value in json.loads(text).items():
-        assert name == "type" or getattr(message, name) == value
+        told = type(message).__name__.lower() if name == "type" else getattr(message, name)
+        assert told == value or [list(cell) for cell in told] == value
 
 
 @pytest.mark.parametrize("text", BAD, ids=range(len(BAD)))

@@ -44,10 +44,10 @@ export class Discs {
 export const packed = ([r, g, b]) => (255 << 24 | b << 16 | g << 8 | r) >>> 0;
 
 // RGB at a place from 0 to 1 between stops at equal distances.
-export function ramp(stops, at) {
+function ramp(stops, at) {
   const place = Math.min(Math.max(at, 0), 1) * (stops.length - 1), k = Math.min(Math.floor(place), stops.length - 2);
   return stops[k].map((from, i) => Math.round(from + (place - k) * (stops[k + 1][i] - from)));
 }
 
-// The same at 256 places.
-export const table = (stops) => Array.from({ length: 256 }, (_, k) => ramp(stops, k / 255));
+// The same at 255 places, for codes from 0 to 254.
+export const table = (stops) => Array.from({ length: 255 }, (_, k) => ramp(stops, k / 254));

@@ -76,12 +76,12 @@ function show() {
   verdict();
   if (stats.frames % 3 && frame.playing) return;  // pictures for people to read need no more than 20 a second
   plot.draw();
-  observation.draw(frame.observation, 64, (value, channel) => channel ? shades.muscle[value] : shades.grey[value]);
+  observation.draw(frame.observation, 64, (value, channel) => (channel ? shades.muscle : shades.grey)[Math.round(value * 254 / 255)]);
   const size = Math.sqrt(frame.action.length / 2), gate = Math.sqrt(frame.gate.length / 2);
-  actions.draw(frame.action, size, (value) => shades.muscle[Math.round((value + 127) * 255 / 254)]);
+  actions.draw(frame.action, size, (value) => shades.muscle[value + 127]);
   $("size").textContent = `2 × ${size} × ${size}`;
   for (const canvas of gates.canvases) canvas.parentElement.hidden = !gate;
-  if (gate) gates.draw(frame.gate, gate, (value) => shades.gate[value]);
+  if (gate) gates.draw(frame.gate, gate, (value) => shades.gate[Math.min(value, 254)]);
 }
 requestAnimationFrame(show);
 scene.redraw = () => { fresh = Boolean(frame); };
@@ -220,6 +220,7 @@ $("policy").onchange = () => setPolicy($("policy").value);
 $("colour").onchange = () => { chosen = true; setColour($("colour").value); };
 $("moment").onclick = () => link.send("save", { what: "moment" });
 $("actions").onclick = () => link.send("save", { what: "actions" });
+$("replay").onclick = () => link.send("save", { what: "replay" });
 $("back").onclick = () => link.send("back");
 $("draw").onclick = () => pad.open();
 $("help").onclick = () => $("about").showModal();

@@ -40,7 +40,7 @@ export class Pad {
     this.context.fillStyle = "#14171a";
     this.context.fillRect(0, 0, 256, 256);
     if ($("what").value === "target") {  // half a metre wide
-      const [left, right] = this.task.bodies[0].box;
+      const [left, , right] = this.task.boxes[0];
       this.context.fillStyle = "#3a4247";
       this.context.beginPath();
       this.context.arc(128, 128, (right - left) * 256, 0, 7);
@@ -66,6 +66,6 @@ export class Pad {
     const { data } = this.ink.getImageData(0, 0, 256, 256);
     let bytes = "";
     for (let k = 3; k < data.length; k += 4) bytes += data[k] > 127 ? "\xff" : "\0";
-    return { what: $("what").value, size: 256, pixels: btoa(bytes) };
+    return { what: $("what").value, pixels: btoa(bytes) };
   }
 }

@@ -20,12 +20,11 @@ export class Scene {
 
   setTask(task) {
     this.task = task;
-    const finite = task.boxes.filter((box) => box.solid).map((box) => box.edges);
-    const boxes = [...task.bodies.map((body) => body.box), ...finite.filter((edges) => !edges.includes(null) && !task.follow)];
-    if (task.goal) boxes.push([task.goal[0], task.goal[0], task.goal[1], task.goal[1]]);
-    const side = (index, pick) => pick(...boxes.map((box) => box[index]));
-    this.bounds = [side(0, Math.min), side(1, Math.max), side(2, Math.min), side(3, Math.max)];
-    this.target = task.target ? targetImage(task.target) : null;
+    this.floor = task.solids.find(([left, right, bottom]) => left === null && right === null && bottom === null)?.[3];
+    const goal = task.goal ? [[...task.goal, ...task.goal]] : [];
+    const solids = task.follow ? [] : task.solids.filter((solid) => solid[4] && !solid.includes(null));
+    const boxes = [...task.boxes, ...goal, ...solids.map(([left, right, bottom, top]) => [left, bottom, right, top])];
+    this.bounds = [0, 1, 2, 3].map((side) => Math[side < 2 ? "min" : "max"](...boxes.map((box) => box[side])));
     this.camera = null;
     this.zoom = 1;
   }
@@ -41,7 +40,7 @@ export class Scene {
 
   // Look at the whole scene where it has a fixed window, else at the robot.
   aim(frame) {
-    const { task, bounds: [left, right, bottom, top], canvas } = this;
+    const { task, bounds: [left, bottom, right, top], canvas } = this;
     const aspect = canvas.width / canvas.height;
     const width = task.follow ? 0.55 : right - left + 0.16, height = top - bottom + (task.follow ? 0.2 : 0.22);
     const span = Math.max(height, width / aspect, 0.46) / this.zoom;
@@ -75,9 +74,9 @@ export class Scene {
     context.fillStyle = this.colour("sky");
     context.fillRect(0, 0, canvas.width, canvas.height);
     this.drawMetres(false);
-    if (this.target) this.drawTarget(frame);
+    this.drawTarget(frame);
     if (this.task.goal) this.drawGoal(this.task.goal);
-    for (const box of this.task.boxes) this.drawBox(box);
+    for (const solid of this.task.solids) this.drawSolid(solid);
     this.drawMetres(true);
     this.drawParticles(frame, ui.colour);
     if (ui.brush) this.drawCells(frame);
@@ -86,9 +85,8 @@ export class Scene {
 
   drawMetres(labels) {
     const { context, canvas, ratio } = this;
-    const floor = this.task.boxes.find(({ edges }) => edges[0] === null && edges[1] === null && edges[2] === null);
-    const [, surface] = floor ? this.toPixel(0, floor.edges[3]) : [0, canvas.height];
-    const [left] = this.toWorldPixels(0), [right] = this.toWorldPixels(canvas.width);
+    const surface = this.floor === undefined ? canvas.height : this.toPixel(0, this.floor)[1];
+    const half = canvas.width / 2 / this.scale, left = this.camera.x - half, right = this.camera.x + half;
     context.font = `${11 * ratio}px system-ui, sans-serif`;
     context.textAlign = "center";
     for (let k = Math.ceil(left * 10); k <= right * 10; k++) {
@@ -107,16 +105,14 @@ export class Scene {
     }
   }
 
-  toWorldPixels(column) { return [(column - this.canvas.width / 2) / this.scale + this.camera.x]; }
-
-  drawBox({ edges: [left, right, bottom, top], solid }) {
+  drawSolid([left, right, bottom, top, filled]) {
     const { context, canvas, ratio } = this, far = 20 * ratio;
     const [x0, y0] = this.toPixel(left ?? -1e4, top ?? 1e4), [x1, y1] = this.toPixel(right ?? 1e4, bottom ?? -1e4);
     const clip = (value, high) => Math.min(Math.max(value, -far), high + far);
     const a = clip(x0, canvas.width), b = clip(y0, canvas.height), c = clip(x1, canvas.width), d = clip(y1, canvas.height);
     context.beginPath();
     context.roundRect(a, b, c - a, d - b, (left === null || right === null ? 0 : 3) * ratio);
-    if (solid) {
+    if (filled) {
       context.fillStyle = this.colour("ground");
       context.fill();
     } else {
@@ -138,11 +134,15 @@ export class Scene {
     }
   }
 
-  drawTarget(frame) {
-    const [column, row] = this.toPixel(frame.centre[0] - 0.25, frame.centre[1] + 0.25), size = 0.5 * this.scale;
-    this.context.globalAlpha = 0.75;
-    this.context.drawImage(this.target, column, row, size, size);
-    this.context.globalAlpha = 1;
+  drawTarget({ centre: [x, y] }) {
+    const { context } = this;
+    context.beginPath();
+    for (const outline of this.task.target) {
+      outline.forEach(([dx, dy], k) => context[k ? "lineTo" : "moveTo"](...this.toPixel(x + dx, y + dy)));
+      context.closePath();
+    }
+    context.fillStyle = this.colour("mark");
+    context.fill("evenodd");
   }
 
   drawParticles({ positions, colours, origin }, scale) {
@@ -152,7 +152,7 @@ export class Scene {
     let end = bodies.reduce((sum, body) => sum + body.count, 0);
     for (let index = bodies.length - 1; index >= 0; index--) {  // the robot last, on top
       const body = bodies[index], first = end - body.count, plain = robot_only && index > 0 && packed(body.colour);
-      const radius = Math.max(1.05 * body.radius * this.scale, 1.2 * this.ratio);
+      const radius = Math.max(body.radius * this.scale, 1.2 * this.ratio);
       for (const [reach, shade] of [[radius + 1.3 * this.ratio, outline], [radius, null]]) {
         for (let i = first; i < end; i++) {
           const [x, y] = this.toPixel(world(positions[2 * i], origin[0]), world(positions[2 * i + 1], origin[1]));
@@ -194,11 +194,4 @@ export class Scene {
     context.lineWidth = 1.5 * ratio;
     context.stroke();
   }
-}
-
-function targetImage(base64) {
-  const image = new OffscreenCanvas(64, 64), context = image.getContext("2d"), pixels = context.createImageData(64, 64);
-  [...atob(base64)].forEach((byte, k) => pixels.data.set(byte.charCodeAt(0) ? [247, 198, 98, 255] : [0, 0, 0, 0], 4 * k));
-  context.putImageData(pixels, 0, 0);
-  return image;
 }
