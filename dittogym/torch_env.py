@@ -161,11 +161,6 @@ class TorchEnv:
         """The particles of all simulations."""
         return self.env_state.particles
 
-    @property
-    def actuation(self) -> Tensor | None:
-        """Actuation of the last step on the patch, (B, 2, P, P), Pa; ``None`` if the state is not that of a step."""
-        return self._actuation
-
     def _present_observation(self) -> Tensor:
         """The last observation, computed again if the state was assigned."""
         if self._observation is None:
