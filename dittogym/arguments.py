@@ -97,6 +97,9 @@ def check_action(action: Tensor, shape: tuple[int, ...]) -> Tensor:
     if not isinstance(action, Tensor) or not action.is_floating_point():
         kind = action.dtype if isinstance(action, Tensor) else type(action).__name__
         raise ValueError(f"action must be a floating point tensor, got {kind}")
+    checks.tensor("action", action)
+    if action.is_meta:
+        raise ValueError("action must hold numbers, got a tensor on the device meta")
     if tuple(action.shape) != shape:
         raise ValueError(f"action must have shape {shape}, got {tuple(action.shape)}")
     # A sum that is finite spares the test of every entry; one of finite entries may overflow.

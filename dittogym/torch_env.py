@@ -26,7 +26,7 @@ from dittogym.arguments import (
 )
 from dittogym.bodies.positions import InitialPositions, Particles, Seed, get_state, particle_counts, set_state
 from dittogym.contract import measure
-from dittogym.model import EnvState, Parity, Snapshot, check_stability, make_model
+from dittogym.model import EnvState, Parity, Snapshot, check_snapshot, check_stability, make_model
 from dittogym.observation.image import SHAPE
 from dittogym.physics import Physics, merged, physics_values
 from dittogym.render.frame import frame, png
@@ -177,7 +177,9 @@ class TorchEnv:
     def save(self) -> Snapshot:
         """A copy of the present moment, to which :meth:`load` returns; keeps the autograd graph."""
         state, observation = tree.map(Tensor.clone, (self.env_state, self._present_observation()))
-        return Snapshot(self.spec.name, self.model.camera.counts, self.model.camera.particle_weight, state, observation)
+        camera = self.model.camera
+        kind = self.spec.name, camera.counts, camera.particle_weight
+        return Snapshot(*kind, state, observation, self.model.constants)
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Continue from a saved moment, to the last bit as if nothing had happened since.
@@ -192,19 +194,13 @@ class TorchEnv:
             The observation (B, 3, 64, 64) uint8.
 
         Raises:
-            ValueError: The snapshot is of another task, other numbers of particles, another type, device or batch size.
+            ValueError: The snapshot is of another task or variant, other numbers of particles, other substeps, another
+                type, device or batch size.
         """
         checks.instance("snapshot", snapshot, Snapshot)
         chosen = find_mask("mask", mask, self.num_envs, self.device)
-        x, size = snapshot.state.particles.x, len(snapshot.state.steps)
-        own = self.spec.name, self.model.camera.counts, self.model.camera.particle_weight, self.dtype, self.device
-        kind = snapshot.task, snapshot.counts, snapshot.particle_weight, x.dtype, x.device
-        if kind != own or size not in (1, self.num_envs):
-            raise ValueError(
-                f"snapshot must hold 1 or {self.num_envs} simulations of {own}, got {size} of {kind} "
-                "(task, particles, what each stands for, dtype, device)"
-            )
-        index = torch.arange(self.num_envs, device=self.device) % size
+        check_snapshot(self.model, snapshot, self._like)
+        index = torch.arange(self.num_envs, device=self.device) % len(snapshot.state.steps)
         state, observation = tree.map(lambda t: t[index], (snapshot.state, snapshot.observation))
         if not bool(chosen.all()):
             mine = self.env_state
