@@ -101,12 +101,9 @@ class Session:
             "flags": FLAGS,
             "speed": self.speed,
             "colour": self.colour,
+            "terms": list(self.terms),
         }
-        return describe(self.env.model).as_json() | about | self.layout()
-
-    def layout(self) -> dict[str, Any]:
-        """What the sizes of a frame's arrays depend on."""
-        return {"resolution": self.env.action_resolution, "gate": self.gate.shape[-1], "terms": list(self.terms)}
+        return describe(self.env.model).as_json() | about
 
     def apply(self, message: protocol.Message) -> Answers:
         """Do what a message says, and return what to answer, as JSON values.
@@ -158,7 +155,7 @@ class Session:
             (127 * self.action).round().astype(np.int8),
             (255 * np.clip(self.gate, 0, 1)).round().astype(np.uint8),
         )
-        rows = np.array(self.rows, np.float32)
+        rows = np.array(self.rows, np.float32).reshape(len(self.rows), 1 + len(self.terms))
         self.rows.clear()
         numbers = (*shot.origin, *shot.centre, *self._corner(), self.total, rate)
         counters = self.num_frames, shot.step, self.hand.id, flags
