@@ -106,7 +106,7 @@ def _fitted(picture: np.ndarray) -> np.ndarray:
     scale = FINE * min(np.sqrt(ROBOT_AREA / len(pixels)), (SIZE / 2 - MARGIN) / reach)
     move = np.array([[scale, 0, 0], [0, scale, 0]])
     move[:, 2] = FINE * SIZE / 2 - 0.5 - scale * centre
-    drawn = picture.astype(np.float32)
+    drawn: np.ndarray = picture.astype(np.float32)
     if scale < 0.5:  # else thin lines would fall between the pixels that are looked at
         drawn = cv2.blur(drawn, (round(1 / scale),) * 2)
     return _reduced(cv2.warpAffine(drawn, move, (FINE * SIZE,) * 2, flags=cv2.INTER_LINEAR))
