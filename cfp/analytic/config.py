@@ -27,8 +27,10 @@ class AnalyticConfig(CoarseToFineConfig):
     """Control steps that a gradient reaches back."""
     gamma: float = 0.98
     """Discount factor."""
+    iterations: int = 1
+    """Gradient steps on the actions of a window; for each one the window is simulated anew, and its steps count."""
     action_step: tuple[float, ...]
-    """Root mean square of the step on the actions of a window, for each stage."""
+    """Root mean square of each step on the actions of a window, for each stage."""
     final_step: float = 0.4
     """Fraction of action_step at the end of a stage; it falls linearly."""
     minibatches: int = 48
@@ -65,6 +67,7 @@ class AnalyticConfig(CoarseToFineConfig):
         check_at_least(
             1,
             window=self.window,
+            iterations=self.iterations,
             minibatches=self.minibatches,
             minibatch_size=self.minibatch_size,
             windows_kept=self.windows_kept,

@@ -35,7 +35,7 @@ class Episodes(Stateful):
 
     def record(self, reward: Tensor, terminated: Tensor) -> Tensor:
         """Add the rewards (B,) of a step to the returns; tell which episodes are over, (B,) bool."""
-        self.returns += reward
+        self.returns = self.returns + reward  # not in place: a saved state may hold it
         return terminated | (self.env.env_state.steps >= self.limit)
 
     def restart(self, done: Tensor, terminated: Tensor, finite: Tensor) -> None:

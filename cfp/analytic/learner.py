@@ -22,7 +22,7 @@ from cfp.analytic.episodes import Episodes
 from cfp.analytic.features import StateFeatures
 from cfp.analytic.regression import ImageMemory, Regression
 from cfp.analytic.stateful import Stateful
-from cfp.analytic.window import WindowCollector, short_horizon_loss
+from cfp.analytic.window import Window, WindowCollector, short_horizon_loss
 from cfp.envs.make import choose_device, make_torch_env
 from cfp.evaluation.pictures import policy_pictures
 from cfp.experiment.algorithm import Scalars
@@ -33,8 +33,9 @@ from dittogym import core
 
 METRICS: dict[str, str] = {
     "rollout/return": "mean undiscounted true return of the episodes that ended since the last row, None for none",
-    "train/reward": "mean training reward of a step, before its scale",
-    "train/true_reward": "mean true reward of a step, at the particle count of training",
+    "train/reward": "mean training reward of a step of the actor, before its scale",
+    "train/improved_reward": "the same in the last simulation of the window, with improved actions",
+    "train/true_reward": "mean true reward of a step in the last simulation, at the particle count of training",
     "train/value": "mean value that the target critic gives to the window's states",
     "train/critic_loss": "mean squared error of the critic in the last of its updates",
     "train/regression_loss": "mean squared error of the actor's actions in the last step of the regression",
@@ -113,29 +114,23 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         config, progress = self.config, stage_progress(self.config, self.stage, self.num_timesteps)
         learning_rate = config.learning_rate * linear_decay(progress)
         step_size = config.action_step[self.stage - 1] * linear_decay(progress, config.final_step)
-        images: list[Tensor] = []
-        locations: list[Tensor] = []
-
-        def act(_: Tensor) -> Tensor:
-            images.append(self._image())
-            with torch.no_grad():
-                outputs = self.actor.outputs(images[-1], generator=self.generator)
-                locations.append(outputs.location.clamp(-BOUND, BOUND))
-            return self.actor.act(outputs.at(locations[-1].requires_grad_()), generator=self.generator).action
-
-        window = self.collector.collect(act, self.critic)
-        gradients = torch.autograd.grad(short_horizon_loss(window, config.gamma), locations)
-        self.env.detach()
-        improved = self.action_step(torch.stack(locations).detach(), torch.stack(gradients), step_size)
-        self.memory.add(torch.cat(images), improved.flatten(0, 1))
+        start, noise = self.collector.state_dict(), self.generator.get_state()
+        images, improved, window = self._improve(step_size, None)
+        own_reward = float(window.rewards.detach().mean())
+        for _ in range(1, config.iterations):
+            self.collector.load_state_dict(start)
+            self.generator.set_state(noise)
+            images, improved, window = self._improve(step_size, improved)
+        self.memory.add(images, improved.flatten(0, 1))
         regression_loss = torch.zeros(())
         for _ in range(config.minibatches):
             batch = self.memory.sample(config.minibatch_size, self.generator)
             regression_loss = self.regression.update(*batch, learning_rate)
         critic_loss = self.critic.update(window, learning_rate)
-        self.num_timesteps += config.window * self.env.num_envs
+        self.num_timesteps += config.iterations * config.window * self.env.num_envs
         return self.collector.episodes.scalars() | {
-            "train/reward": float(window.rewards.detach().mean()) / config.reward.scale,
+            "train/reward": own_reward / config.reward.scale,
+            "train/improved_reward": float(window.rewards.detach().mean()) / config.reward.scale,
             "train/true_reward": window.true_reward,
             "train/value": float(window.next_values.detach().mean()),
             "train/critic_loss": critic_loss,
@@ -144,6 +139,33 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
             "train/learning_rate": learning_rate,
             "train/limited": float(self.action_step.limited),
         }
+
+    def _improve(self, step_size: float, locations: Tensor | None) -> tuple[Tensor, Tensor, Window]:
+        """Simulate a window and take a gradient step on its actions.
+
+        Args:
+            step_size: Root mean square of the step.
+            locations: Of the actions (T, B, C, R, R); None for the actor's own.
+
+        Returns:
+            Images (T B, 3, 64, 64), improved locations (T, B, C, R, R), and the window before the step.
+        """
+        images: list[Tensor] = []
+        leaves: list[Tensor] = []
+
+        def act(_: Tensor) -> Tensor:
+            images.append(self._image())
+            with torch.no_grad():
+                outputs = self.actor.outputs(images[-1], generator=self.generator)
+                location = outputs.location if locations is None else locations[len(leaves)]
+                leaves.append(location.clamp(-BOUND, BOUND))
+            return self.actor.act(outputs.at(leaves[-1].requires_grad_()), generator=self.generator).action
+
+        window = self.collector.collect(act, self.critic)
+        gradients = torch.autograd.grad(short_horizon_loss(window, self.config.gamma), leaves)
+        self.env.detach()
+        improved = self.action_step(torch.stack(leaves).detach(), torch.stack(gradients), step_size)
+        return torch.cat(images), improved, window
 
     def row(self) -> Scalars:
         """Scalars of the last update, with the mean return of the episodes that ended since the last row."""
