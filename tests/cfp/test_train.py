@@ -286,15 +286,16 @@ def with_tuples(values):
     return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
 
 
-def test_a_run_that_failed_before_its_first_checkpoint_does_not_block_its_folder(finished, tmp_path, capsys):
+def test_a_run_that_failed_before_its_first_checkpoint_does_not_block_its_folder(tmp_path, capsys):
     def fail():
         raise OSError("no space left on device")
 
+    options = "--steps 40 --handover 20 --eval-every 0 --eval-episodes 1".split()
     with at_step(14, fail):
-        assert run(tmp_path / "run") == 1
-    assert (tmp_path / "run" / "progress.csv").exists()
-    assert run(tmp_path / "run") == 0
+        assert run(tmp_path / "run", *options) == 1
+    assert [row["step"] for row in read_table(tmp_path / "run" / "progress.csv")] == ["10"]
+    assert run(tmp_path / "run", *options) == 0
     assert "holds no checkpoint: starting from the beginning" in capsys.readouterr().out
-    assert_same_run(tmp_path / "run", finished)
-    assert run(tmp_path / "run") == 2
+    assert [row["step"] for row in read_table(tmp_path / "run" / "progress.csv")] == ["10", "20", "30", "40"]
+    assert run(tmp_path / "run", *options) == 2
     assert "already holds a run" in capsys.readouterr().err
