@@ -5,7 +5,9 @@ from typing import Literal
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, pad
+
+from torchmpm.backends import transforming
 
 #: How an action array is indexed: as the observation (row from the top, column), or as the grid (x, y).
 ActionIndexing = Literal["image", "grid"]
@@ -65,7 +67,11 @@ def patch_corner(centre: Tensor, patch: int, nodes: int) -> Tensor:
 def place(actuation: Tensor, centre: Tensor, nodes: int) -> Tensor:
     """Put the actuation (B, 2, P, P) of patches around ``centre`` (B, 2) on all nodes of the window, (B, 2, G, G)."""
     batch, _, patch, _ = actuation.shape
-    i, j = patch_corner(centre, patch, nodes).split(1, dim=1)
+    corner = patch_corner(centre, patch, nodes)
+    if batch == 1 and corner.device.type == "cpu" and not transforming():  # a third of the time of the general case
+        i, j = corner[0].tolist()
+        return pad(actuation, (j, nodes - patch - j, i, nodes - patch - i))
+    i, j = corner.split(1, dim=1)
     ids = i * nodes + j + _patch_ids(patch, nodes, actuation.device)
     result = actuation.new_zeros(batch, 2, nodes * nodes)
     return result.scatter(2, ids[:, None].expand(-1, 2, -1), actuation.flatten(2)).view(batch, 2, nodes, nodes)

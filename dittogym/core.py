@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
@@ -15,7 +16,8 @@ from dittogym.contract import Measurement, Moment, Outcome, check_memory, check_
 from dittogym.model import EnvState, Model
 from dittogym.physics import Physics
 from dittogym.reward_ops import EXACT, SMOOTH, RewardOps, action_cost
-from dittogym.window import centre_in_window, contains
+from dittogym.validity import find_valid
+from dittogym.window import centre_in_window
 from torchmpm import ParticleState, diagnostics, tree
 
 #: Reward of a step of an element whose state is no longer valid; its episode ends.
@@ -171,8 +173,7 @@ def measured_info(model: Model, state: EnvState, now: Measurement) -> dict[str, 
 
 def is_valid(model: Model, state: EnvState) -> Tensor:
     """Which simulations can go on, (B,) bool: all numbers are finite and some of the robot is in the window."""
-    robot = state.particles.x[:, : model.num_robot_particles].detach()
-    return diagnostics.finite(state.particles) & contains(robot, state.origin).any(1)
+    return find_valid(state.particles, model.num_robot_particles, state.origin, model.camera.native)
 
 
 def _moment(model: Model, state: EnvState, now: Measurement, observation: Tensor, ops: RewardOps) -> Moment:
@@ -193,9 +194,11 @@ def _judge(model: Model, moment: Moment, actuation: Tensor, valid: Tensor) -> tu
     terms["failure"] = torch.zeros_like(now.split)
     factors, failed = _columns(tuple(weights.get(name, 0.0) for name in terms), now.split.dtype, now.split.device)
     values = torch.stack(tuple(terms.values())) * factors
-    _check_finite(spec.name, list(terms), values, valid)
-    values = torch.where(valid, values, failed)
-    return outcome, dict(zip(terms, values.unbind(), strict=True)), values.sum(0)
+    counted = torch.where(valid, values, failed)
+    reward = counted.sum(0)
+    if not math.isfinite(reward.detach().sum()):  # seldom, so that the names are not looked for in every step
+        _check_finite(spec.name, list(terms), values, valid)
+    return outcome, dict(zip(terms, counted.unbind(), strict=True)), reward
 
 
 @functools.lru_cache(maxsize=64)
