@@ -72,6 +72,7 @@ def grid_frames(recordings: dict[str, Recording]) -> list[np.ndarray]:
 
 
 def main(tasks: list[str]) -> None:
+    """Make the films of some tasks, or of all, and the grid."""
     sources = json.loads(SOURCES.read_text()) if SOURCES.exists() else {}
     recordings = {task: record_task(task) for task in dittogym.TASKS}
     for task in tasks or dittogym.TASKS:
