@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dittogym.spec import CONTROL_STEP, TaskSpec
 from torchmpm import checks
+from torchmpm.backends import transforming
 
 Value = TypeVar("Value")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -80,6 +81,15 @@ def reset_options(options: Any) -> dict[str, Any]:
     if unknown := options.keys() - set(RESET_OPTIONS):
         raise ValueError(f"options may hold {', '.join(RESET_OPTIONS)}, got {', '.join(map(repr, unknown))}")
     return dict(options)
+
+
+def refuse_transforms(name: str) -> None:
+    """Refuse to keep tensors that end with the transform of ``torch.func`` that they were made in."""
+    if transforming():
+        raise RuntimeError(
+            f"{name} must not be used under a transform of torch.func, whose tensors the environment would keep: use "
+            "dittogym.core.reset and dittogym.core.step with its model, which keep nothing"
+        )
 
 
 def check_action(action: Tensor, shape: tuple[int, ...]) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -43,6 +43,11 @@ class EnvState:
     memory: Mapping[str, Tensor]
     physics: Physics
     steps: Tensor
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields, for pickles and deep copies, which cannot hold an autograd graph."""
+        tree.refuse_graph("the state of a TorchEnv", self)
+        return vars(self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ from dittogym.arguments import (
     find_mask,
     find_resolution,
     find_substeps,
+    refuse_transforms,
     reset_options,
 )
 from dittogym.bodies.positions import InitialPositions, Particles, Seed, get_state, particle_counts, set_state
@@ -135,6 +136,7 @@ class TorchEnv:
 
     @env_state.setter
     def env_state(self, value: EnvState) -> None:
+        refuse_transforms("TorchEnv.env_state")
         checks.instance("env_state", value, EnvState)
         theirs = value.particles
         kind = theirs.batch_size, theirs.num_particles, theirs.dtype, theirs.device
@@ -231,6 +233,7 @@ class TorchEnv:
             ValueError: An option is unknown, has the wrong shape, puts particles outside the window, or makes matter
                 too stiff for the substeps.
         """
+        refuse_transforms("TorchEnv.reset")
         options = reset_options(options)
         mask = find_mask("reset_mask", options.get("reset_mask"), self.num_envs, self.device)
         if self._env_state is None and not bool(mask.all()):
@@ -288,6 +291,7 @@ class TorchEnv:
         Raises:
             ValueError: The action has the wrong shape or type or is not finite.
         """
+        refuse_transforms("TorchEnv.step")
         action = check_action(action, (self.num_envs, *self.action_shape)).to(self.device, self.dtype)
         action = to_grid_indexing(action, self.action_layout)
         result = core.step(self.model, self.env_state, action, soft=soft)

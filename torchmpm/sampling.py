@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchmpm import checks
+from torchmpm.backends import transforming
 
 Points = NDArray[np.float64]
 
@@ -30,8 +31,14 @@ def sobol(count: int, seed: int) -> Points:
 
     Args:
         count: N, at least 1.
-        seed: Of the scrambling.
+        seed: Of the scrambling, a whole number from 0 to 2**63 - 1.
+
+    Raises:
+        RuntimeError: Under a transform of ``torch.func``, which has no such random numbers.
     """
+    checks.whole("seed", seed, 0, 2**63 - 1)
+    if transforming():
+        raise RuntimeError("sobol must not be called under a transform of torch.func: draw the points before it")
     engine = torch.quasirandom.SobolEngine(2, scramble=True, seed=seed)
     return engine.draw(checks.whole("count", count, 1), dtype=torch.float64).numpy()
 

@@ -170,6 +170,8 @@ class Solver:
             TypeError: The state, the actuation or the origin has another type.
             RuntimeError: In the backward pass: one of these tensors was changed in place before it is read again.
         """
+        if self.backend != "eager" and torch.compiler.is_compiling():  # with fullgraph=True; else it runs as it is
+            raise ValueError(f"backend {self.backend!r} cannot be traced by torch.compile, use 'eager'")
         checks.instance("state", state, ParticleState)
         substeps, segment = check_repetition(substeps, segment, "substeps")
         origin = self._check_arguments(state, actuation, origin)
@@ -179,7 +181,7 @@ class Solver:
             return self.kernels.step(state, actuation, origin, self.gravity, substeps, segment)
         function: Any = compiled(type(self).substep) if self.backend == "compile" else type(self).substep
         run = partial(function, self, self.scene(state, actuation, origin))
-        reads = {"origin": origin} | self.constants
+        reads = {} if torch.compiler.is_compiling() else {"origin": origin} | self.constants
         return ParticleState.from_planes(repeated(run, state.planes(), substeps, segment=segment, reads=reads))
 
     def substep(self, scene: Scene, planes: Planes) -> Planes:
