@@ -111,10 +111,7 @@ class Session:
         Raises:
             ValueError: It cannot be done, and nothing has changed.
         """
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            answers = getattr(self, f"_apply_{type(message).__name__.lower()}")(message) or []
-        return [*answers, *({"type": "notice", "message": str(warning.message)} for warning in caught)]
+        return getattr(self, f"_apply_{type(message).__name__.lower()}")(message) or []
 
     def advance(self) -> None:
         """Take one control step, unless the state is no longer valid.
@@ -328,12 +325,15 @@ class Session:
         picture = np.frombuffer(message.pixels, np.uint8).reshape(size, size)
         old = self.env, self.options
         self.options = {**self.options, message.what: picture}
-        try:
-            self.env = TorchEnv(self.task, 1, **{**self.options, "resolution": self.env.action_resolution})
-            self._reset(self.seed)
-        except ValueError:
-            self.env, self.options = old
-            raise
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            try:
+                self.env = TorchEnv(self.task, 1, **{**self.options, "resolution": self.env.action_resolution})
+                self._reset(self.seed)
+            except ValueError:
+                self.env, self.options = old
+                raise
         self.moment = None
         self._apply_policy(protocol.Policy(self.policy_name))
-        return [{"type": "hello", **self.describe()}, {"type": "reset"}]
+        notices = ({"type": "notice", "message": str(warning.message)} for warning in caught)
+        return [{"type": "hello", **self.describe()}, {"type": "reset"}, *notices]

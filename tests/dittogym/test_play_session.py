@@ -228,13 +228,13 @@ def test_drawings() -> None:
     width, height = np.ptp(played.env.state.x[0].numpy(), axis=0)
     assert width / height == pytest.approx(2.0, rel=0.1) and played.env.spec.target[32, 32]
     before = played.env
-    with pytest.raises(ValueError, match="body must have pixels"):
+    with pytest.raises(ValueError, match="body must be a picture"):
         played.apply(drawing(np.zeros((64, 64)), "body"))
     with pytest.raises(ValueError, match="body must lie inside the window"):
         session().apply(drawing(abs(y) < 2, "body"))
     assert played.env is before
-    answers = played.apply(drawing(np.hypot(x - 30, y) < 20, "target"))
-    assert answers[-1]["type"] == "notice" and "off the middle" in answers[-1]["message"]
+    answers = played.apply(drawing(np.hypot(abs(x) - 30, y) < 20, "target"))  # two discs
+    assert answers[-1]["type"] == "notice" and "no robot can be expected" in answers[-1]["message"]
 
 
 def test_the_end_of_an_episode_is_told_and_failure_stops_time() -> None:
