@@ -25,10 +25,12 @@ from dittogym.render.recording import Recording
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #282c34; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
 img, video { max-width: 100%; } .film { width: 32rem; border-radius: 6px; }
-figure { display: inline-block; margin: 0 1rem 1rem 0; } figure img { width: 12rem; image-rendering: pixelated; }
+figure { display: inline-block; margin: 0 1rem 1rem 0; }
+figure img { width: min(12rem, 25vw); image-rendering: pixelated; }
 .wide { overflow-x: auto; } table { border-collapse: collapse; }
 th, td { padding: 0.2rem 0.8rem; text-align: right; border-bottom: 1px solid #ccc; }
-th:first-child, td:first-child { text-align: left; } pre { background: #f4f4f4; padding: 1rem; overflow-x: auto; }
+th:first-child, td:first-child { text-align: left; }
+pre { background: #f4f4f4; padding: 1rem; overflow-x: auto; white-space: pre-wrap; }
 """
 HEADER = ("policy", "action", "episodes", "mean return", "95 % interval", "std", "success")
 #: When the picture that a film shows before it plays was taken, as a share of the episode.
@@ -77,6 +79,7 @@ def write_page(
 def changed_options(config: RunConfig, preset: RunConfig) -> dict[str, tuple[Any, Any]]:
     """Options, by their dotted names, that differ from the preset: their value, and that of the preset."""
     own, usual = flatten(to_json(config)), flatten(to_json(preset))
+    own.pop("algo")  # each algorithm has presets of its own, CFP one for each learner
     return {name: (value, usual.get(name)) for name, value in own.items() if value != usual.get(name)}
 
 

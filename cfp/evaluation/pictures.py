@@ -54,11 +54,15 @@ def match_pictures(target: np.ndarray, observation: np.ndarray) -> tuple[dict[st
         observation: (3, 64, 64) uint8.
     """
     robot = silhouette(torch.from_numpy(observation)[None])[0].numpy()
-    layers = {"target": (target, target & False), "result": (robot & False, robot), "overlap": (target, robot)}
+    layers = {
+        "target": [(target, TARGET)],
+        "result": [(robot, ROBOT)],
+        "overlap": [(target, TARGET), (robot, MISPLACED), (robot & target, ROBOT)],
+    }
     pictures = {}
-    for name, (wanted, covered) in layers.items():
+    for name, painted in layers.items():
         pictures[name] = np.full((*target.shape, 3), GROUND, np.uint8)
-        for mask, colour in ((wanted, TARGET), (covered, MISPLACED), (covered & target, ROBOT)):
+        for mask, colour in painted:
             pictures[name][mask] = colour
     return pictures, float((robot & target).sum() / (robot | target).sum())
 
