@@ -52,6 +52,11 @@ def holds_run(folder: Path) -> bool:
     return any((folder / name).exists() for name in marks)
 
 
+def holds_progress(folder: Path) -> bool:
+    """Whether a run in a folder has got so far that there is something to lose: a checkpoint or a policy."""
+    return (folder / "checkpoint" / "state.pt").exists() or policy_path(folder).exists()
+
+
 def read_config(folder: Path, configure: Callable[[dict[str, Any]], RunConfig]) -> RunConfig:
     """Options of the run in a folder; `CheckpointError` where there is none or they cannot be read."""
     path = folder / "config.json"

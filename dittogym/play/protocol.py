@@ -17,7 +17,7 @@ LOW, HIGH = -0.5, 1.5
 #: Stands for a particle that is elsewhere.
 HIDDEN = 65535
 #: The head of a frame: whole numbers, then floating point ones; see :func:`pack_frame`.
-HEAD = struct.Struct("<5I8f")
+HEAD = struct.Struct("<9I8f")
 
 Count: TypeAlias = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 Pixels: TypeAlias = Annotated[bytes, Meta(min_length=64, max_length=2**16)]
@@ -144,15 +144,15 @@ def quantise(positions: np.ndarray, origin: np.ndarray) -> np.ndarray:
 def pack_frame(
     counters: tuple[int, int, int, int], numbers: Sequence[float], rows: np.ndarray, arrays: Sequence[np.ndarray]
 ) -> bytes:
-    """A frame for the page, little-endian.
+    """A frame for the page, little-endian; its head begins with the counters and the sizes S, K, N, R and G.
 
     Args:
         counters: Number of the frame, control steps of the episode, id of the last :class:`Hand`, and flags.
         numbers: Origin (x, y) of the window, centre of the robot, lower left corner of the action image, m; return;
             simulated seconds per second.
-        rows: Return and the terms of the reward after each step since the last frame, (S, 1 + K) float32.
+        rows: Return and the terms of the reward after each step since the last frame, (S, K) float32.
         arrays: Positions (N, 2) uint16; colour codes (N,) uint8; observation (3, 64, 64) uint8; action (2, R, R) int8;
             gate (2, G, G) uint8, or empty.
     """
-    head = HEAD.pack(*counters, len(rows), *numbers)
-    return b"".join((head, rows.astype("<f4").tobytes(), *(array.tobytes() for array in arrays)))
+    sizes = (*rows.shape, len(arrays[0]), arrays[3].shape[-1], arrays[4].shape[-1])
+    return b"".join((HEAD.pack(*counters, *sizes, *numbers), rows.tobytes(), *(array.tobytes() for array in arrays)))

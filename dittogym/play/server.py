@@ -176,7 +176,7 @@ class Connection:
         loop = asyncio.get_running_loop()
         session = await loop.run_in_executor(executor, new_session)
         await self.websocket.send_json({"type": "hello", **session.describe()})
-        layout, pace, fresh = session.layout(), Pace(session.control_step), True
+        terms, pace, fresh = list(session.terms), Pace(session.control_step), True
         while True:
             messages, self.inbox = self.inbox, []
             due = pace.due(session.speed if session.playing else 0.0)
@@ -184,8 +184,8 @@ class Connection:
             pace.count(taken)
             for answer in answers:
                 await self.websocket.send_json(answer)
-            if layout != (layout := session.layout()):
-                await self.websocket.send_json({"type": "layout", **layout})
+            if terms != (terms := list(session.terms)):
+                await self.websocket.send_json({"type": "terms", "names": terms})
             if taken or messages or fresh:
                 fresh = False
                 await self.websocket.send_bytes(session.frame(pace.rate))

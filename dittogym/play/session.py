@@ -101,12 +101,9 @@ class Session:
             "flags": FLAGS,
             "speed": self.speed,
             "colour": self.colour,
+            "terms": list(self.terms),
         }
-        return describe(self.env.model).as_json() | about | self.layout()
-
-    def layout(self) -> dict[str, Any]:
-        """What the sizes of a frame's arrays depend on."""
-        return {"resolution": self.env.action_resolution, "gate": self.gate.shape[-1], "terms": list(self.terms)}
+        return describe(self.env.model).as_json() | about
 
     def apply(self, message: protocol.Message) -> Answers:
         """Do what a message says, and return what to answer, as JSON values.
@@ -114,10 +111,7 @@ class Session:
         Raises:
             ValueError: It cannot be done, and nothing has changed.
         """
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            answers = getattr(self, f"_apply_{type(message).__name__.lower()}")(message) or []
-        return [*answers, *({"type": "notice", "message": str(warning.message)} for warning in caught)]
+        return getattr(self, f"_apply_{type(message).__name__.lower()}")(message) or []
 
     def advance(self) -> None:
         """Take one control step, unless the state is no longer valid.
@@ -158,7 +152,7 @@ class Session:
             (127 * self.action).round().astype(np.int8),
             (255 * np.clip(self.gate, 0, 1)).round().astype(np.uint8),
         )
-        rows = np.array(self.rows, np.float32)
+        rows = np.array(self.rows, np.float32).reshape(len(self.rows), 1 + len(self.terms))
         self.rows.clear()
         numbers = (*shot.origin, *shot.centre, *self._corner(), self.total, rate)
         counters = self.num_frames, shot.step, self.hand.id, flags
@@ -331,12 +325,15 @@ class Session:
         picture = np.frombuffer(message.pixels, np.uint8).reshape(size, size)
         old = self.env, self.options
         self.options = {**self.options, message.what: picture}
-        try:
-            self.env = TorchEnv(self.task, 1, **{**self.options, "resolution": self.env.action_resolution})
-            self._reset(self.seed)
-        except ValueError:
-            self.env, self.options = old
-            raise
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            try:
+                self.env = TorchEnv(self.task, 1, **{**self.options, "resolution": self.env.action_resolution})
+                self._reset(self.seed)
+            except ValueError:
+                self.env, self.options = old
+                raise
         self.moment = None
         self._apply_policy(protocol.Policy(self.policy_name))
-        return [{"type": "hello", **self.describe()}, {"type": "reset"}]
+        notices = ({"type": "notice", "message": str(warning.message)} for warning in caught)
+        return [{"type": "hello", **self.describe()}, {"type": "reset"}, *notices]

@@ -162,7 +162,7 @@ def test_a_drawn_robot(played: Played) -> None:
     assert width > 1.8 * height
     page.click("#draw")
     page.click("#use")  # nothing was drawn
-    played.until(lambda: "body must have pixels" in page.inner_text("#toasts"))
+    played.until(lambda: "body must be a picture" in page.inner_text("#toasts"))
 
 
 def test_small_screens_and_the_end_of_the_program(browser: Any) -> None:

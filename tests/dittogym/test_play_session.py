@@ -41,31 +41,27 @@ def session(task: str = "run", **arguments: Any) -> Session:
     return Session(task, **(SMALL | arguments))
 
 
-def unpack(frame: bytes, layout: dict[str, Any], count: int) -> SimpleNamespace:
-    """A frame as the page reads it."""
-    number, step, echo, flags, rows, *numbers = HEAD.unpack_from(frame)
-    at = HEAD.size
+def shown(played: Session) -> SimpleNamespace:
+    """The next frame as the page reads it."""
+    frame = played.frame(1.0)
+    number, step, echo, flags, rows, width, count, resolution, gate, *numbers = HEAD.unpack_from(frame)
     result = SimpleNamespace(number=number, step=step, echo=echo, numbers=numbers)
     result.flags = {name for bit, name in enumerate(FLAGS) if flags >> bit & 1}
-    resolution, gate = layout["resolution"], layout["gate"]
     shapes = {
-        "rows": ("<f4", (rows, 1 + len(layout["terms"]) if rows else 0)),
+        "rows": ("<f4", (rows, width)),
         "positions": ("<u2", (count, 2)),
         "colours": ("u1", (count,)),
         "observation": ("u1", (3, 64, 64)),
         "action": ("i1", (2, resolution, resolution)),
         "gate": ("u1", (2, gate, gate)),
     }
+    at = HEAD.size
     for name, (kind, shape) in shapes.items():
         array = np.frombuffer(frame, kind, int(np.prod(shape)), at).reshape(shape)
         setattr(result, name, array)
         at += array.nbytes
     assert at == len(frame)
     return result
-
-
-def shown(played: Session) -> SimpleNamespace:
-    return unpack(played.frame(1.0), played.layout(), played.env.num_particles)
 
 
 @pytest.mark.parametrize("task", sorted(TASKS))
@@ -141,7 +137,7 @@ def test_paint_waves_and_policy_add_up() -> None:
     assert played.env.action_resolution == make_spec("run").coarse
     before = played.env.state.x.clone()
     played.apply(protocol.Policy("constant"))
-    assert torch.equal(before, played.env.state.x) and played.layout()["resolution"] == 4
+    assert torch.equal(before, played.env.state.x) and shown(played).action.shape == (2, 4, 4)
 
 
 def test_waves_travel() -> None:
@@ -232,13 +228,13 @@ def test_drawings() -> None:
     width, height = np.ptp(played.env.state.x[0].numpy(), axis=0)
     assert width / height == pytest.approx(2.0, rel=0.1) and played.env.spec.target[32, 32]
     before = played.env
-    with pytest.raises(ValueError, match="body must have pixels"):
+    with pytest.raises(ValueError, match="body must be a picture"):
         played.apply(drawing(np.zeros((64, 64)), "body"))
     with pytest.raises(ValueError, match="body must lie inside the window"):
         session().apply(drawing(abs(y) < 2, "body"))
     assert played.env is before
-    answers = played.apply(drawing(np.hypot(x - 30, y) < 20, "target"))
-    assert answers[-1]["type"] == "notice" and "off the middle" in answers[-1]["message"]
+    answers = played.apply(drawing(np.hypot(abs(x) - 30, y) < 20, "target"))  # two discs
+    assert answers[-1]["type"] == "notice" and "no robot can be expected" in answers[-1]["message"]
 
 
 def test_the_end_of_an_episode_is_told_and_failure_stops_time() -> None:

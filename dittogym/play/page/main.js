@@ -34,7 +34,7 @@ const link = new Link({
     legend();
     if (!matterSet()) setMatter();
   },
-  layout(message) { plot.setTerms(message.terms); },
+  terms({ names }) { plot.setTerms(names); },
   policy(message) { $("policy").value = message.name ?? ""; policy = message.name ?? policy; },
   reset() { plot.reset(); },
   notice(message) { toast(message.message); },
@@ -77,7 +77,7 @@ function show() {
   if (stats.frames % 3 && frame.playing) return;  // pictures for people to read need no more than 20 a second
   plot.draw();
   observation.draw(frame.observation, 64, (value, channel) => (channel ? shades.muscle : shades.grey)[Math.round(value * 254 / 255)]);
-  const size = Math.sqrt(frame.action.length / 2), gate = Math.sqrt(frame.gate.length / 2);
+  const size = frame.resolution, gate = Math.sqrt(frame.gate.length / 2);
   actions.draw(frame.action, size, (value) => shades.muscle[value + 127]);
   $("size").textContent = `2 × ${size} × ${size}`;
   for (const canvas of gates.canvases) canvas.parentElement.hidden = !gate;
@@ -154,7 +154,7 @@ function hand(event) {
 }
 
 function paintWorld(x, y) {
-  const size = Math.sqrt(frame.action.length / 2), step = task.patch / size;
+  const size = frame.resolution, step = task.patch / size;
   const column = Math.floor((x - frame.corner[0]) / step), row = size - 1 - Math.floor((y - frame.corner[1]) / step);
   paint($("muscles").value, row, column, size);
 }

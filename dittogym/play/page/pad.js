@@ -3,7 +3,7 @@
 const $ = (id) => document.getElementById(id);
 const HINTS = {
   body: "The drawing gets the area of the task's robot and stands where it stood.",
-  target: "The target stays centred on the robot, whose first shape is shown in grey.",
+  target: "The drawing gets the area of the robot, and its centre stays on the robot's.",
 };
 
 export class Pad {
@@ -21,7 +21,6 @@ export class Pad {
   }
 
   setTask(task) {
-    this.task = task;
     $("what").replaceChildren(...task.draws.map((kind) => new Option(kind === "body" ? "a robot" : "a target", kind)));
   }
 
@@ -39,13 +38,6 @@ export class Pad {
   show() {
     this.context.fillStyle = "#14171a";
     this.context.fillRect(0, 0, 256, 256);
-    if ($("what").value === "target") {  // half a metre wide
-      const [left, , right] = this.task.boxes[0];
-      this.context.fillStyle = "#3a4247";
-      this.context.beginPath();
-      this.context.arc(128, 128, (right - left) * 256, 0, 7);
-      this.context.fill();
-    }
     this.context.drawImage(this.ink.canvas, 0, 0);
   }
 

@@ -148,12 +148,14 @@ export class Scene {
   drawParticles({ positions, colours, origin }, scale) {
     const { bodies } = this.task, { canvas, discs } = this, { robot_only, stops } = this.task.scales[scale];
     discs.begin(canvas.width, canvas.height);
-    const outline = packed(this.outline), shades = table(stops).map(packed);
+    const shades = table(stops).map(packed);
     let end = bodies.reduce((sum, body) => sum + body.count, 0);
     for (let index = bodies.length - 1; index >= 0; index--) {  // the robot last, on top
       const body = bodies[index], first = end - body.count, plain = robot_only && index > 0 && packed(body.colour);
       const radius = Math.max(body.radius * this.scale, 1.2 * this.ratio);
-      for (const [reach, shade] of [[radius + 1.3 * this.ratio, outline], [radius, null]]) {
+      const outline = packed(index && !robot_only ? body.colour : this.outline), passes = [[radius, null]];
+      if (body.count <= 3000) passes.unshift([radius + 1.3 * this.ratio, outline]);
+      for (const [reach, shade] of passes) {
         for (let i = first; i < end; i++) {
           const [x, y] = this.toPixel(world(positions[2 * i], origin[0]), world(positions[2 * i + 1], origin[1]));
           if (x > -reach && x < canvas.width + reach) discs.disc(x, y, reach, shade ?? (plain || shades[colours[i]]));
@@ -164,8 +166,8 @@ export class Scene {
     this.context.drawImage(discs.end(), 0, 0);
   }
 
-  drawCells({ corner: [x, y], action }) {
-    const { context, ratio } = this, size = Math.sqrt(action.length / 2), step = this.task.patch / size;
+  drawCells({ corner: [x, y], action, resolution: size }) {
+    const { context, ratio } = this, step = this.task.patch / size;
     const [left, top] = this.toPixel(x, y + this.task.patch), width = step * this.scale;
     context.strokeStyle = this.colour("faint");
     context.lineWidth = ratio;
