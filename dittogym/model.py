@@ -126,9 +126,10 @@ def _as_text(value: Any) -> str:
         return f"[{', '.join(map(_as_text, value))}]"
     if isinstance(value, np.ndarray | Tensor):
         return f"{tuple(value.shape)} {hashlib.sha256(np.asarray(value).tobytes()).hexdigest()}"
-    if callable(value):  # an address in its text would differ in another process
+    if callable(value):
         return str(getattr(value, "__qualname__", type(value).__name__))
-    return repr(value) if type(value).__repr__ is not object.__repr__ else type(value).__name__
+    text = repr(value)
+    return type(value).__name__ if " at 0x" in text else text  # an address differs in another process
 
 
 def make_model(
