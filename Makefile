@@ -26,7 +26,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "Installing PyTorch (a large download the first time) ..."
 	@$(PIP) torch==2.13.0
 	@echo "Installing torchmpm and its tools ..."
-	@$(PIP) -e ".[dev,video]"
+	@$(PIP) -e ".[dev,play,video]"
 	@touch $@
 
 $(DOCS_STAMP): $(STAMP)
@@ -62,7 +62,7 @@ test-gpu-kernels: $(TRITON_STAMP)  ## tests of the CUDA kernels: on a GPU, else 
 # In an environment of its own: .venv holds the newest versions. Old versions use what new ones of others deprecate.
 test-oldest:  ## fast tests with the oldest versions of all dependencies but torch
 	@test -x .venv-oldest/bin/python || $(PYTHON) -m venv .venv-oldest
-	@.venv-oldest/bin/python -m pip install -qq --disable-pip-version-check -c constraints-oldest.txt $(PIP_FLAGS) -e ".[dev,video]"
+	@.venv-oldest/bin/python -m pip install -qq --disable-pip-version-check -c constraints-oldest.txt $(PIP_FLAGS) -e ".[dev,play,video]"
 	.venv-oldest/bin/python $(PYTEST) -W ignore::DeprecationWarning -W ignore::pytest.PytestUnraisableExceptionWarning
 
 coverage: install  ## fast tests, and which lines and branches of the four packages they miss

@@ -67,6 +67,9 @@ class AnalyticNumbers:
         minibatches: Steps of the regression after each window.
         minibatch_size: Images in each.
         weight_average: Decay of the average of the actor's weights.
+        warmup: Windows at the beginning of stage 2 in which only the critic learns.
+        max_episode_steps: Steps after which a training episode is truncated; where a contact at the beginning decides
+            about the rest, short episodes show more beginnings.
     """
 
     steps: int = 25_600
@@ -79,6 +82,8 @@ class AnalyticNumbers:
     minibatches: int = 48
     minibatch_size: int = 128
     weight_average: float = 0.995
+    warmup: int = 15
+    max_episode_steps: int = 10_000
 
 
 ANALYTIC: dict[str, AnalyticNumbers] = {
@@ -92,10 +97,11 @@ ANALYTIC: dict[str, AnalyticNumbers] = {
         minibatches=24,
         minibatch_size=64,
         weight_average=0.98,
+        warmup=0,
     ),
     "run": AnalyticNumbers(on_speed=True),
     "obstacle": AnalyticNumbers(on_speed=True),
-    "kick": AnalyticNumbers(action_step=(0.15, 0.02)),
+    "kick": AnalyticNumbers(action_step=(0.15, 0.02), max_episode_steps=400),
 }
 """Those of the tasks that differ from the defaults of `AnalyticNumbers`."""
 
@@ -156,6 +162,8 @@ def analytic_preset(task: str, name: str = "quick") -> AnalyticConfig:
         minibatches=own.minibatches,
         minibatch_size=own.minibatch_size,
         weight_average=own.weight_average,
+        warmup=own.warmup,
+        max_episode_steps=own.max_episode_steps,
         displacement=not own.on_speed,
         reward=RewardConfig("speed" if own.on_speed else "task"),
         environment=EnvironmentConfig(num_envs=own.num_envs),

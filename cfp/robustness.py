@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import tyro
@@ -23,6 +22,7 @@ from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
 from cfp.evaluation.plots import write_figure
 from cfp.evaluation.tables import numbers
 from cfp.experiment.cli import program_name, run_command
+from cfp.experiment.folder import Folder, make_folder
 from cfp.experiment.training import Program
 from cfp.files import write_json, write_text
 from cfp.policy_protocols import DisturbablePolicy, Policy
@@ -42,7 +42,7 @@ class Command(Selection):
     Writes robustness.md, .csv, .json and .png.
     """
 
-    out: Path | None = None
+    out: Folder | None = None
     """Folder to write into; the run's own if not given."""
     dropout: float = 0.2
     """Share of action entries, and of observation entries, set to zero in every step."""
@@ -170,7 +170,7 @@ def run(program: Program, command: Command) -> str:
     policy, folder = list(policies.values())[-1], command.out or command.folder
     assert folder is not None
     cases = choose(cases, command.cases, make_spec(config.task, **config.environment.task_options()), policy)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     results = report(config, policy, cases, command.episodes, progress=True)
     rows, path = to_rows(results), folder / "robustness"
     table = to_markdown(config, rows)

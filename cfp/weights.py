@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -93,6 +94,8 @@ def shipped() -> list[str]:
 
 def policy_file(path: str | Path) -> Path:
     """The ``.safetensors`` file of a policy; see `load` for what ``path`` may be."""
+    if not isinstance(path, str | os.PathLike):
+        raise CheckpointError(f"path must be a folder, a file or the name of a policy, got {path!r}")
     file = Path(path)
     if not file.exists() and str(path) in shipped():
         file = SHIPPED / str(path)

@@ -1,13 +1,12 @@
 """From an action image to an actuation field on the nodes of the window."""
 
-import functools
 from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
-from torchmpm.backends import transforming
+from torchmpm.backends import cached_tensors, transforming
 
 #: How an action array is indexed: as the observation (row from the top, column), or as the grid (x, y).
 ActionIndexing = Literal["image", "grid"]
@@ -49,8 +48,7 @@ def bicubic(image: Tensor, size: int, align_corners: bool = False) -> Tensor:
         return matrix @ image @ matrix.T
 
 
-@functools.lru_cache(maxsize=64)
-@torch.inference_mode(False)  # what is kept must serve gradients later
+@cached_tensors
 def bicubic_matrix(before: int, after: int, align_corners: bool, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Matrix (after, before) of one-dimensional interpolation, from ``interpolate`` of unit vectors."""
     basis = torch.eye(before, dtype=torch.float64, device="cpu")[:, None, :, None].expand(-1, -1, -1, before)
@@ -77,8 +75,7 @@ def place(actuation: Tensor, centre: Tensor, nodes: int) -> Tensor:
     return result.scatter(2, ids[:, None].expand(-1, 2, -1), actuation.flatten(2)).view(batch, 2, nodes, nodes)
 
 
-@functools.lru_cache(maxsize=16)
-@torch.inference_mode(False)
+@cached_tensors
 def _patch_ids(patch: int, nodes: int, device: torch.device) -> Tensor:
     """Indices (P P) among all nodes of a patch in the corner of the window."""
     along = torch.arange(patch, device=device)

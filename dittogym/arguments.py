@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dittogym.spec import CONTROL_STEP, TaskSpec
 from torchmpm import checks
+from torchmpm.backends import transforming
 
 Value = TypeVar("Value")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -82,11 +83,23 @@ def reset_options(options: Any) -> dict[str, Any]:
     return dict(options)
 
 
+def refuse_transforms(name: str) -> None:
+    """Refuse to keep tensors that end with the transform of ``torch.func`` that they were made in."""
+    if transforming():
+        raise RuntimeError(
+            f"{name} must not be used under a transform of torch.func, whose tensors the environment would keep: use "
+            "dittogym.core.reset and dittogym.core.step with its model, which keep nothing"
+        )
+
+
 def check_action(action: Tensor, shape: tuple[int, ...]) -> Tensor:
     """The action, if it is a finite floating point tensor of this shape."""
     if not isinstance(action, Tensor) or not action.is_floating_point():
         kind = action.dtype if isinstance(action, Tensor) else type(action).__name__
         raise ValueError(f"action must be a floating point tensor, got {kind}")
+    checks.tensor("action", action)
+    if action.is_meta:
+        raise ValueError("action must hold numbers, got a tensor on the device meta")
     if tuple(action.shape) != shape:
         raise ValueError(f"action must have shape {shape}, got {tuple(action.shape)}")
     # A sum that is finite spares the test of every entry; one of finite entries may overflow.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,6 +18,7 @@ from dittogym.reward_ops import EXACT, SMOOTH, RewardOps, action_cost
 from dittogym.validity import find_valid
 from dittogym.window import centre_in_window
 from torchmpm import ParticleState, diagnostics, tree
+from torchmpm.backends import cached_tensors, transforming
 
 #: Reward of a step of an element whose state is no longer valid; its episode ends.
 FAILURE_REWARD = -16.0
@@ -109,7 +109,7 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
 
     guarded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tree.leaves((state, action)))
     if guarded:
-        state, action = tree.map(guard, (state, action))
+        state, action = tree.map(guard, tree.without_inference((state, action)))
     spec, solver = model.spec, model.solver_for(state.physics)
     actuation = patch_field(action, spec.patch, state.physics.get("max_actuation", spec.max_actuation))
     on_nodes = place(actuation, centre_in_window(spec.reach, state.centre, state.origin), solver.grid.resolution)
@@ -196,13 +196,13 @@ def _judge(model: Model, moment: Moment, actuation: Tensor, valid: Tensor) -> tu
     values = torch.stack(tuple(terms.values())) * factors
     counted = torch.where(valid, values, failed)
     reward = counted.sum(0)
-    if not math.isfinite(reward.detach().sum()):  # seldom, so that the names are not looked for in every step
+    # Seldom, so that the names are not looked for in every step. Nothing can depend on numbers under torch.func.vmap.
+    if not transforming() and not math.isfinite(reward.detach().sum()):
         _check_finite(spec.name, list(terms), values, valid)
     return outcome, dict(zip(terms, counted.unbind(), strict=True)), reward
 
 
-@functools.lru_cache(maxsize=64)
-@torch.inference_mode(False)  # what is kept must serve gradients later
+@cached_tensors
 def _columns(weights: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """Weights of terms, and their values in a simulation that is not valid, (K, 1) each; ``failure`` comes last."""
     rows = torch.tensor([(weight, 0.0) for weight in weights], dtype=torch.float64, device="cpu")

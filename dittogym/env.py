@@ -16,7 +16,7 @@ from dittogym.render.scene import describe
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
 from dittogym.torch_env import TorchEnv
-from torchmpm import ParticleState
+from torchmpm import ParticleState, checks
 
 RENDER_MODES = ("rgb_array", "human")
 #: Pictures per second of a video; a control step is 0.01 s, so motion is shown three times slower.
@@ -31,6 +31,8 @@ def spaces(env: TorchEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
 
 def as_tensor(action: Any, env: TorchEnv, single: bool = False) -> torch.Tensor:
     """An array of actions as a tensor; ``single``: one action, which becomes a batch of one."""
+    if np.ma.is_masked(action):
+        raise ValueError(f"action must be numbers, got a masked array with {np.ma.count_masked(action)} masked entries")
     try:
         array = np.asarray(action)
     except ValueError:  # rows of different lengths
@@ -87,6 +89,7 @@ class Env(gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> None:
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be None or one of {RENDER_MODES}, got {render_mode!r}")
+        checks.flag("render_muscles", render_muscles)
         if "num_envs" in options:
             batch = "gymnasium.make_vec(..., vectorization_mode='vector_entry_point') or dittogym.TorchEnv"
             raise TypeError(f"num_envs must not be given, got {options['num_envs']!r}; for a batch use {batch}")

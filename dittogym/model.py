@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -44,6 +47,11 @@ class EnvState:
     physics: Physics
     steps: Tensor
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields, for pickles and deep copies, which cannot hold an autograd graph."""
+        tree.refuse_graph("the state of a TorchEnv", self)
+        return vars(self)
+
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
@@ -55,6 +63,7 @@ class Snapshot:
         particle_weight: By body, the full-size particles that one particle stands for.
         state: Everything that moves.
         observation: (B, 3, 64, 64) uint8.
+        constants: What else the environment that loads it must share, see :attr:`Model.constants`.
     """
 
     task: str
@@ -62,6 +71,7 @@ class Snapshot:
     particle_weight: tuple[float, ...]
     state: EnvState
     observation: Tensor
+    constants: Mapping[str, str]
 
 
 torch.serialization.add_safe_globals([Snapshot, EnvState, Measurement])  # tensors, numbers and a name
@@ -92,12 +102,34 @@ class Model:
         """The robot's particles come first."""
         return self.solver.bodies[0].count
 
+    @functools.cached_property
+    def constants(self) -> dict[str, str]:
+        """By name what determines an episode besides its state, as texts that are equal for equal values."""
+        names = [each.name for each in fields(self.spec) if each.name not in ("coarse", "fine")]
+        spec = {name: _as_text(getattr(self.spec, name)) for name in names}
+        return {**spec, "substeps": str(self.substeps), "dt": str(self.solver.dt)}
+
     def solver_for(self, physics: Physics) -> Solver:
         """The solver with the constants of :func:`dittogym.physics.physics_values` in place of the task's own."""
         if not physics:
             return self.solver
         bodies = _bodies(self.spec, self.camera.counts, self.camera.particle_weight, physics)
         return self.solver.with_constants(bodies, physics.get("gravity", self.spec.gravity))
+
+
+def _as_text(value: Any) -> str:
+    if is_dataclass(value) and not isinstance(value, type):
+        return _as_text([type(value).__name__, *(getattr(value, each.name) for each in fields(value))])
+    if isinstance(value, Mapping):
+        return _as_text(sorted(value.items()))
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(map(_as_text, value))}]"
+    if isinstance(value, np.ndarray | Tensor):
+        return f"{tuple(value.shape)} {hashlib.sha256(np.asarray(value).tobytes()).hexdigest()}"
+    if callable(value):
+        return str(getattr(value, "__qualname__", type(value).__name__))
+    text = repr(value)
+    return type(value).__name__ if " at 0x" in text else text  # an address differs in another process
 
 
 def make_model(
@@ -151,6 +183,20 @@ def check_stability(model: Model, physics: Physics) -> None:
     if solver.dt > limit:
         matter = "matter of these mu, lam, max_actuation and mass"
         raise ValueError(f"dt must be at most {limit} s to be stable with {matter}, got {solver.dt}")
+
+
+def check_snapshot(model: Model, snapshot: Snapshot, like: Tensor) -> None:
+    """Refuse a snapshot that does not fit the model and B simulations of dtype and device of ``like`` (B,)."""
+    x, size = snapshot.state.particles.x, len(snapshot.state.steps)
+    own = model.spec.name, model.camera.counts, model.camera.particle_weight, like.dtype, like.device
+    kind = snapshot.task, snapshot.counts, snapshot.particle_weight, x.dtype, x.device
+    if kind != own or size not in (1, len(like)):
+        raise ValueError(
+            f"snapshot must hold 1 or {len(like)} simulations of {own}, got {size} of {kind} "
+            "(task, particles, what each stands for, dtype, device)"
+        )
+    if others := [name for name, text in model.constants.items() if snapshot.constants.get(name) != text]:
+        raise ValueError(f"snapshot must be of an environment with the same {', '.join(others)}, got another")
 
 
 def _bodies(spec: TaskSpec, counts: tuple[int, ...], weight: tuple[float, ...], physics: Physics) -> tuple[Body, ...]:

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from dittogym.bodies.shapes import Shape, check_pair
+from dittogym.bodies.shapes import Shape
 from dittogym.contract import Memory, Moment, Outcome
 from dittogym.geometry import NODES, Box, Obstacle, mark
 from dittogym.observation.image import SIZE
@@ -143,12 +143,12 @@ class TaskSpec:
         checks.whole("patch", self.patch, 4, NODES)
         for name in ("coarse", "fine"):
             checks.whole(name, getattr(self, name), 1, self.patch)
-        check_pair("gravity", self.gravity)
+        checks.pair("gravity", self.gravity)
         if self.goal is not None:
-            check_pair("goal", self.goal)
+            checks.pair("goal", self.goal)
         for name in ("view", "reach"):
             centre: Centre = getattr(self, name)
-            check_pair(name, tuple(0.0 if c is None else c for c in centre))  # None follows the robot
+            checks.pair(name, tuple(0.0 if c is None else c for c in centre))  # None follows the robot
 
     @property
     def bodies(self) -> tuple[BodySpec, ...]:

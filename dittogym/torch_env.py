@@ -21,11 +21,12 @@ from dittogym.arguments import (
     find_mask,
     find_resolution,
     find_substeps,
+    refuse_transforms,
     reset_options,
 )
 from dittogym.bodies.positions import InitialPositions, Particles, Seed, get_state, particle_counts, set_state
 from dittogym.contract import measure
-from dittogym.model import EnvState, Parity, Snapshot, check_stability, make_model
+from dittogym.model import EnvState, Parity, Snapshot, check_snapshot, check_stability, make_model
 from dittogym.observation.image import SHAPE
 from dittogym.physics import Physics, merged, physics_values
 from dittogym.render.frame import frame, png
@@ -135,6 +136,7 @@ class TorchEnv:
 
     @env_state.setter
     def env_state(self, value: EnvState) -> None:
+        refuse_transforms("TorchEnv.env_state")
         checks.instance("env_state", value, EnvState)
         theirs = value.particles
         kind = theirs.batch_size, theirs.num_particles, theirs.dtype, theirs.device
@@ -175,7 +177,9 @@ class TorchEnv:
     def save(self) -> Snapshot:
         """A copy of the present moment, to which :meth:`load` returns; keeps the autograd graph."""
         state, observation = tree.map(Tensor.clone, (self.env_state, self._present_observation()))
-        return Snapshot(self.spec.name, self.model.camera.counts, self.model.camera.particle_weight, state, observation)
+        camera = self.model.camera
+        kind = self.spec.name, camera.counts, camera.particle_weight
+        return Snapshot(*kind, state, observation, self.model.constants)
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Continue from a saved moment, to the last bit as if nothing had happened since.
@@ -190,19 +194,13 @@ class TorchEnv:
             The observation (B, 3, 64, 64) uint8.
 
         Raises:
-            ValueError: The snapshot is of another task, other numbers of particles, another type, device or batch size.
+            ValueError: The snapshot is of another task or variant, other numbers of particles, other substeps, another
+                type, device or batch size.
         """
         checks.instance("snapshot", snapshot, Snapshot)
         chosen = find_mask("mask", mask, self.num_envs, self.device)
-        x, size = snapshot.state.particles.x, len(snapshot.state.steps)
-        own = self.spec.name, self.model.camera.counts, self.model.camera.particle_weight, self.dtype, self.device
-        kind = snapshot.task, snapshot.counts, snapshot.particle_weight, x.dtype, x.device
-        if kind != own or size not in (1, self.num_envs):
-            raise ValueError(
-                f"snapshot must hold 1 or {self.num_envs} simulations of {own}, got {size} of {kind} "
-                "(task, particles, what each stands for, dtype, device)"
-            )
-        index = torch.arange(self.num_envs, device=self.device) % size
+        check_snapshot(self.model, snapshot, self._like)
+        index = torch.arange(self.num_envs, device=self.device) % len(snapshot.state.steps)
         state, observation = tree.map(lambda t: t[index], (snapshot.state, snapshot.observation))
         if not bool(chosen.all()):
             mine = self.env_state
@@ -231,6 +229,7 @@ class TorchEnv:
             ValueError: An option is unknown, has the wrong shape, puts particles outside the window, or makes matter
                 too stiff for the substeps.
         """
+        refuse_transforms("TorchEnv.reset")
         options = reset_options(options)
         mask = find_mask("reset_mask", options.get("reset_mask"), self.num_envs, self.device)
         if self._env_state is None and not bool(mask.all()):
@@ -288,6 +287,7 @@ class TorchEnv:
         Raises:
             ValueError: The action has the wrong shape or type or is not finite.
         """
+        refuse_transforms("TorchEnv.step")
         action = check_action(action, (self.num_envs, *self.action_shape)).to(self.device, self.dtype)
         action = to_grid_indexing(action, self.action_layout)
         result = core.step(self.model, self.env_state, action, soft=soft)

@@ -79,6 +79,7 @@ class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> None:
         if render_mode not in (None, RENDER_MODES[0]):
             raise ValueError(f"render_mode must be None or {RENDER_MODES[0]!r} for a batch, got {render_mode!r}")
+        checks.flag("render_muscles", render_muscles)
         if max_episode_steps not in (None, -1):
             checks.whole("max_episode_steps", max_episode_steps, 1)
         try:

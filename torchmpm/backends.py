@@ -3,12 +3,14 @@
 import functools
 import logging
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 
 from torchmpm.native.cpu.library import find_compiler
 
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
 BACKENDS = ("auto", "eager", "compile", "native")
 _logger = logging.getLogger(__name__)
 
@@ -21,6 +23,20 @@ def compiler_found() -> bool:
 def transforming() -> bool:
     """Whether a transform of ``torch.func`` is active."""
     return bool(torch._C._are_functorch_transforms_active())  # torch.func has no public query for this
+
+
+def cached_tensors(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Keep the tensors that a function of hashable arguments returns, for as long as they serve all later calls.
+
+    Those made in inference mode could not serve gradients; those made under a transform of ``torch.func`` end with it.
+    """
+    cached = functools.lru_cache(maxsize=64)(torch.inference_mode(False)(function))
+
+    @functools.wraps(cached)
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        return function(*args, **kwargs) if transforming() else cached(*args, **kwargs)  # type: ignore[arg-type]
+
+    return call
 
 
 @functools.cache

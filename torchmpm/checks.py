@@ -5,7 +5,11 @@ from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import Any
 
+import numpy as np
+import torch
 from torch import Tensor
+
+from torchmpm.backends import transforming
 
 
 def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
@@ -33,12 +37,53 @@ def number(name: str, value: Any, *, least: float | None = None, above: float | 
 
 
 def value(name: str, given: Any, *, least: float | None = None, above: float | None = None) -> None:
-    """As :func:`number`, or a tensor; what it holds is left to :meth:`torchmpm.Solver.stable_dt`."""
+    """As :func:`number`, or a tensor, whose numbers are left to :func:`entries`."""
     if isinstance(given, Tensor):
+        tensor(name, given)
+        if given.is_complex() or not given.numel():
+            raise ValueError(f"{name} must be real and not empty, got {given.dtype} of shape {tuple(given.shape)}")
         return
     if not isinstance(given, Real):
         raise ValueError(f"{name} must be a number or a tensor, got {given!r}")
     number(name, given, least=least, above=above)
+
+
+def entries(name: str, given: Any, *, above: float | None = None, below: float | None = None) -> None:
+    """Raise a ValueError unless all numbers of a tensor, or a number, are finite, above ``above`` and below ``below``.
+
+    Under the transforms of ``torch.func``, where nothing can depend on them, they are not looked at.
+    """
+    if isinstance(given, Tensor):
+        if not transforming() and not given.is_meta:
+            for extreme in torch.aminmax(given.detach()):  # NaN if one is among them
+                entries(name, extreme.item(), above=above, below=below)
+        return
+    number(name, given, above=above)
+    if below is not None and not given < below:
+        raise ValueError(f"{name} must be below {below}, got {given}")
+
+
+def tensor(name: str, given: Any) -> None:
+    """Raise a TypeError unless this is a dense tensor."""
+    instance(name, given, Tensor)
+    if given.layout is not torch.strided:
+        raise TypeError(f"{name} must be a dense Tensor, got one of layout {given.layout}")
+
+
+def points(name: str, given: Any) -> None:
+    """Raise a ValueError unless these are points (N, 2) of the unit square."""
+    shape, kind = getattr(given, "shape", None), getattr(getattr(given, "dtype", None), "kind", "")
+    if shape is None or shape[1:] != (2,) or kind not in "fiu" or not ((given >= 0) & (given <= 1)).all():
+        found = f"an array of shape {shape}" if isinstance(given, np.ndarray) else _brief(given)
+        raise ValueError(f"{name} must be an array (N, 2) of numbers from 0 to 1, got {found}")
+
+
+def pair(name: str, given: Any, *, above: float | None = None) -> None:
+    """Raise a ValueError unless these are two finite numbers, x and y, above ``above``."""
+    if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str) or len(given) != 2:
+        raise ValueError(f"{name} must be two numbers (x, y), got {given!r}")
+    for axis, each in zip("xy", given, strict=True):
+        number(f"{name} {axis}", each, above=above)
 
 
 def instance(name: str, given: Any, kind: type) -> None:

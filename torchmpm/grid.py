@@ -10,6 +10,9 @@ from torchmpm import checks
 #: to nodes outside the window are dropped.
 PAD = 3
 
+#: Nodes per axis: with more, velocities and masses of a single grid take more than 12 GiB.
+LARGEST = 2**15
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -23,8 +26,8 @@ class Grid:
         margin: Particles closer than this to the left or right end of the window (m) take no part.
 
     Raises:
-        ValueError: ``resolution`` is not a whole number of at least 4, ``spacing`` is not positive, or ``margin`` does
-            not leave any of the window.
+        ValueError: ``resolution`` is not a whole number from 4 to 32,768, ``spacing`` is not positive, or ``margin``
+            does not leave any of the window.
     """
 
     resolution: int = 128
@@ -32,7 +35,7 @@ class Grid:
     margin: float = 1e-5
 
     def __post_init__(self) -> None:
-        checks.whole("resolution", self.resolution, 4)
+        checks.whole("resolution", self.resolution, 4, LARGEST)
         if self.spacing is not None:
             checks.number("spacing", self.spacing, above=0.0)
         checks.number("margin", self.margin, least=0.0)

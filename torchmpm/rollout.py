@@ -37,7 +37,7 @@ def _checkpointed(function: Callable[[State], State], state: State, reads: Mappi
     ``torch.utils.checkpoint`` does not notice when a tensor is changed in place before the replay, which would give a
     wrong gradient; this raises an error. The transforms of ``torch.func`` do not support checkpoints.
     """
-    if not torch.is_grad_enabled() or transforming():
+    if not torch.is_grad_enabled() or transforming() or torch.compiler.is_compiling():
         return function(state)
 
     def versions(state: State) -> dict[str, list[int]]:

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchmpm import checks
+from torchmpm.backends import transforming
 
 Points = NDArray[np.float64]
 
@@ -30,8 +31,14 @@ def sobol(count: int, seed: int) -> Points:
 
     Args:
         count: N, at least 1.
-        seed: Of the scrambling.
+        seed: Of the scrambling, a whole number from 0 to 2**63 - 1.
+
+    Raises:
+        RuntimeError: Under a transform of ``torch.func``, which has no such random numbers.
     """
+    checks.whole("seed", seed, 0, 2**63 - 1)
+    if transforming():
+        raise RuntimeError("sobol must not be called under a transform of torch.func: draw the points before it")
     engine = torch.quasirandom.SobolEngine(2, scramble=True, seed=seed)
     return engine.draw(checks.whole("count", count, 1), dtype=torch.float64).numpy()
 
@@ -44,6 +51,9 @@ def box(numbers: Points, corner: tuple[float, float], size: tuple[float, float])
         corner: Lower left corner, m.
         size: Width and height, m.
     """
+    checks.points("numbers", numbers)
+    checks.pair("corner", corner)
+    checks.pair("size", size, above=0.0)
     return np.asarray(corner) + numbers * np.asarray(size)
 
 
@@ -55,7 +65,7 @@ def disc(numbers: Points, centre: tuple[float, float], radius: float) -> Points:
         centre: Centre, m.
         radius: Radius, m.
     """
-    checks.number("radius", radius, above=0.0)
+    _check_round(numbers, centre, radius)
     distance, angle = radius * np.sqrt(numbers[:, 0]), 2.0 * math.pi * numbers[:, 1]
     return np.asarray(centre) + np.stack((distance * np.cos(angle), distance * np.sin(angle)), axis=1)
 
@@ -70,10 +80,16 @@ def chord_disc(numbers: Points, centre: tuple[float, float], radius: float) -> P
         centre: Centre, m.
         radius: Radius, m.
     """
-    checks.number("radius", radius, above=0.0)
+    _check_round(numbers, centre, radius)
     across, along = 2.0 * numbers[:, 0] - 1.0, 2.0 * numbers[:, 1] - 1.0
     chord = np.sqrt(radius**2 - (radius * across) ** 2)
     return np.stack((centre[0] + radius * across, centre[1] + along * chord), axis=1)
+
+
+def _check_round(numbers: Points, centre: tuple[float, float], radius: float) -> None:
+    checks.points("numbers", numbers)
+    checks.pair("centre", centre)
+    checks.number("radius", radius, above=0.0)
 
 
 def lattice(cells: tuple[int, int], corner: tuple[float, float], size: tuple[float, float]) -> Points:
@@ -103,9 +119,12 @@ def image(numbers: Points, mask: NDArray[np.bool_], corner: tuple[float, float],
         size: Width and height of the whole image, m.
 
     Raises:
-        ValueError: The mask has no pixel set.
+        ValueError: The mask has no pixel set, or another shape.
     """
-    pixels = np.flipud(np.asarray(mask, dtype=bool)).T  # (column, row from below)
+    checks.points("numbers", numbers)
+    if not isinstance(mask, np.ndarray) or mask.ndim != 2:
+        raise ValueError(f"mask must be an array (H, W), got {type(mask).__name__} of shape {np.shape(mask)}")
+    pixels = np.flipud(mask.astype(bool)).T  # (column, row from below)
     counts = pixels.sum(1)
     if not counts.any():
         raise ValueError("mask must have at least one pixel set, got none")

@@ -44,8 +44,8 @@ class Solver:
         allow_unstable: Accept a ``dt`` above :meth:`stable_dt`.
 
     Raises:
-        ValueError: No bodies, ``dt`` not positive or above :meth:`stable_dt`, ``damping`` negative, gravity not two
-            numbers, or an unknown or unavailable backend.
+        ValueError: No bodies, ``dt`` not positive or above :meth:`stable_dt`, ``damping`` not from 0 to 1, gravity not
+            two numbers, a tensor that is not finite, or an unknown or unavailable backend.
         TypeError: ``grid``, a body or a rule has another type.
     """
 
@@ -72,6 +72,9 @@ class Solver:
             for component, value in zip("xy", self.gravity, strict=True):
                 checks.number(f"gravity {component}", value)
         checks.number("damping", self.damping, least=0.0)
+        if self.damping > 1:
+            raise ValueError(f"damping must be at most 1, got {self.damping}")
+        checks.flag("allow_unstable", self.allow_unstable)
         checks.number("dt", self.dt, above=0.0)
         if self.backend not in BACKENDS:
             raise ValueError(f"backend must be one of {BACKENDS}, got {self.backend!r}")
@@ -79,6 +82,8 @@ class Solver:
             raise ValueError(f"backend {self.backend!r} {NO_COMPILER}")
         if not self.allow_unstable:
             self._check_stability()
+        for name, tensor in self.constants.items():
+            checks.entries(name, tensor, above=0.0 if name.endswith(("mass", "volume")) else None)
 
     def _check_stability(self) -> None:
         try:
@@ -170,6 +175,8 @@ class Solver:
             TypeError: The state, the actuation or the origin has another type.
             RuntimeError: In the backward pass: one of these tensors was changed in place before it is read again.
         """
+        if self.backend != "eager" and torch.compiler.is_compiling():  # with fullgraph=True; else it runs as it is
+            raise ValueError(f"backend {self.backend!r} cannot be traced by torch.compile, use 'eager'")
         checks.instance("state", state, ParticleState)
         substeps, segment = check_repetition(substeps, segment, "substeps")
         origin = self._check_arguments(state, actuation, origin)
@@ -179,7 +186,7 @@ class Solver:
             return self.kernels.step(state, actuation, origin, self.gravity, substeps, segment)
         function: Any = compiled(type(self).substep) if self.backend == "compile" else type(self).substep
         run = partial(function, self, self.scene(state, actuation, origin))
-        reads = {"origin": origin} | self.constants
+        reads = {} if torch.compiler.is_compiling() else {"origin": origin} | self.constants
         return ParticleState.from_planes(repeated(run, state.planes(), substeps, segment=segment, reads=reads))
 
     def substep(self, scene: Scene, planes: Planes) -> Planes:
@@ -259,7 +266,7 @@ class Solver:
         for name, value, shape in (("actuation", actuation, field_shape), ("origin", origin, (batch, 2))):
             if value is None:
                 continue
-            checks.instance(name, value, Tensor)
+            checks.tensor(name, value)
             if (tuple(value.shape), value.dtype, value.device) != (shape, state.dtype, state.device):
                 raise ValueError(
                     f"{name} must be {state.dtype} on {state.device} of shape {shape}, "

@@ -116,6 +116,7 @@ class ParticleState:
 
     def __reduce__(self) -> tuple[type[ParticleState], tuple[Tensor, ...]]:
         """Pickle the fields alone: copies would not share memory with a copy of :meth:`stack`."""
+        tree.refuse_graph("a ParticleState", self)
         return ParticleState, tuple(getattr(self, f.name) for f in fields(self))
 
     def __getitem__(self, index: Any) -> ParticleState:

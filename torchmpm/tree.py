@@ -68,6 +68,25 @@ def detach(tree: Tree) -> Tree:
     return map(Tensor.detach, tree)
 
 
+def refuse_graph(name: str, tree: Any) -> None:
+    """Refuse to pickle or deeply copy a tree whose tensors belong to an autograd graph.
+
+    Args:
+        name: What the tree is, for the message.
+        tree: The tree.
+
+    Raises:
+        RuntimeError: A tensor has a graph.
+    """
+    if any(leaf.grad_fn is not None for leaf in leaves(tree)):
+        raise RuntimeError(f"{name} cannot be pickled or copied with its autograd graph: call its detach() first")
+
+
+def without_inference(tree: Tree) -> Tree:
+    """The same tree with copies of the tensors that were made in inference mode, which autograd could not save."""
+    return map(lambda t: t.clone() if t.is_inference() else t, tree)
+
+
 def where(mask: Tensor, tree: Tree, other: Tree) -> Tree:
     """Select whole batch elements: those of ``tree`` where the mask holds, those of ``other`` elsewhere.
 

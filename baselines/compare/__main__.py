@@ -20,6 +20,7 @@ from baselines.registry import ALGORITHMS
 from cfp.config import Preset, RunConfig
 from cfp.errors import ConfigError
 from cfp.experiment.cli import program_name, run_command
+from cfp.experiment.folder import Folder, make_folder
 from cfp.experiment.process import Stopped, StopSignals
 from cfp.sections import Particles
 from cfp.validation import check_at_least
@@ -42,7 +43,7 @@ class Command:
     """Algorithms, or variants that the plan names; zero is a resting robot, from which sample efficiency counts."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the runs; the reference policies zero, random and scripted have one run, with the first seed."""
-    out: Path = Path("runs/compare")
+    out: Folder = Path("runs/compare")
     """Folder of the report, with the run folders in runs/."""
     plan: Path | None = None
     """JSON file with options of runs, under common, tasks and algos."""
@@ -140,6 +141,7 @@ def compare(command: Command) -> int:
     if command.report_only:
         return 0 if all(run.state == "finished" for run in _report(command, jobs)) else 1
     chosen = jobs if command.only is None else [jobs[command.only]]
+    make_folder(command.out)
     with StopSignals() as signals:
         outcomes = _carry_out(command, chosen, signals)
     if command.only is None:

@@ -17,6 +17,7 @@ from baselines.gradlab.report import write
 from cfp.envs.make import choose_device
 from cfp.errors import ConfigError
 from cfp.experiment.cli import run_command
+from cfp.experiment.folder import Folder, make_folder
 from cfp.validation import check_at_least
 from dittogym import TorchEnv
 from dittogym.spec import DT
@@ -37,7 +38,7 @@ class GradLabConfig:
 
     task: str = "run"
     """Which task."""
-    out: Path | None = None
+    out: Folder | None = None
     """Folder of the results; runs/gradlab-TASK if not given."""
     quick: bool = False
     """Start from other defaults: a tiny robot and short horizons, which take seconds."""
@@ -99,7 +100,7 @@ def run(config: GradLabConfig) -> str:
     """Measure, write the folder, and return the text to print."""
     assert config.out is not None
     env = make_env(config)
-    config.out.mkdir(parents=True, exist_ok=True)  # before the long measurement, not after it
+    make_folder(config.out)  # before the long measurement, not after it
     horizons = [horizon for horizon in config.horizons if horizon <= env.spec.horizon - config.warmup]
     generator = torch.Generator().manual_seed(config.seed)
     shape = (horizons[-1], *env.action_shape)

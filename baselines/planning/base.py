@@ -45,6 +45,7 @@ class PlannerConfig:
         Raises:
             ConfigError: An option is out of range.
         """
+        check_at_least(1, horizon=self.horizon)
         if not 1 <= self.commit <= self.horizon:
             raise ConfigError(f"commit must be between 1 and the horizon, {self.horizon}, got {self.commit}")
         check_at_least(0, noise=self.noise, termination_steps=self.termination_steps, split_weight=self.split_weight)

@@ -81,10 +81,28 @@ class ActorPolicy(nn.Module):
         """
         check_images(observation)
         assert isinstance(observation, np.ndarray)
-        batch = torch.as_tensor(observation, device=next(self.parameters()).device)
-        action: np.ndarray = self(batch.reshape(-1, *IMAGE_SHAPE), deterministic).cpu().numpy()
-        action = (action + 1) - 1  # rounds as stable-baselines3 does when it maps [-1, 1] to the bounds of the space
+        action, _ = self.predict_with_gate(observation.reshape(-1, *IMAGE_SHAPE), deterministic)
         return action if observation.ndim == 4 else action[0], state
+
+    @torch.no_grad()
+    def predict_with_gate(
+        self, observation: np.ndarray, deterministic: bool = False
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Choose actions, and tell where they replace those of the coarser stages.
+
+        Args:
+            observation: (B, 3, 64, 64) uint8.
+            deterministic: Act without noise.
+
+        Returns:
+            Actions (B, 2, R, R) float32, and the gate of the last stage (B, 2, R, R), 0 where the coarser action is
+            kept; ``None`` for a policy of one stage.
+        """
+        batch = torch.as_tensor(observation, device=next(self.parameters()).device)
+        sample = self.actor.sample(batch, deterministic)
+        # This rounds as stable-baselines3 does when it maps [-1, 1] to the bounds of the space.
+        action: np.ndarray = (sample.action.cpu().numpy() + 1) - 1
+        return action, None if sample.gate is None else sample.gate.cpu().numpy()
 
 
 def image_policy(spec: ActorSpec, actor: nn.Module, deterministic: bool) -> ActorPolicy:

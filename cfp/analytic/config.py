@@ -43,6 +43,8 @@ class AnalyticConfig(CoarseToFineConfig):
     """Decay of the average of the actor's weights, which is the policy; 0: the actor itself."""
     learning_rate: float = 1e-3
     """Adam's step size for actor and critic at the beginning of a stage; it falls to a tenth."""
+    warmup: int = 15
+    """Windows at the beginning of a stage that starts from a trained policy, in which only the critic learns."""
     td_lambda: float = 0.95
     """Lambda of the critic's TD(lambda) targets: 0 for single steps, 1 for the whole window."""
     critic_updates: int = 16
@@ -64,6 +66,7 @@ class AnalyticConfig(CoarseToFineConfig):
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
+        check_at_least(0, warmup=self.warmup)
         check_at_least(
             1,
             window=self.window,

@@ -35,7 +35,7 @@ METRICS: dict[str, str] = {
     "rollout/return": "mean undiscounted true return of the episodes that ended since the last row, None for none",
     "train/reward": "mean training reward of a step of the actor, before its scale",
     "train/improved_reward": "the same in the last simulation of the window, with improved actions",
-    "train/true_reward": "mean true reward of a step in the last simulation, at the particle count of training",
+    "train/true_reward": "mean true reward of a step of the actor, at the particle count of training",
     "train/value": "mean value that the target critic gives to the window's states",
     "train/critic_loss": "mean squared error of the critic in the last of its updates",
     "train/regression_loss": "mean squared error of the actor's actions in the last step of the regression",
@@ -115,23 +115,28 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         config, progress = self.config, stage_progress(self.config, self.stage, self.num_timesteps)
         learning_rate = config.learning_rate * linear_decay(progress)
         step_size = config.action_step[self.stage - 1] * linear_decay(progress, config.final_step)
+        iterations, minibatches = config.iterations, config.minibatches
+        if self.starts_trained and self.memory.count < config.warmup * config.window * self.env.num_envs:
+            # steps towards the values of an untrained critic, fitted to a few windows, would spoil the policy
+            step_size, iterations, minibatches = 0.0, 1, 0
         start, noise = self.collector.state_dict(), self.generator.get_state()
         images, improved, window = self._improve(step_size, None)
-        own_reward = float(window.rewards.detach().mean())
-        for _ in range(1, config.iterations):
+        end, better = self.collector.state_dict(), window
+        for _ in range(1, iterations):
             self.collector.load_state_dict(start)
             self.generator.set_state(noise)
-            images, improved, window = self._improve(step_size, improved)
+            images, improved, better = self._improve(step_size, improved)
+        self.collector.load_state_dict(end)  # episodes go on as the actor leads them
         self.memory.add(images, improved.flatten(0, 1))
         regression_loss = torch.zeros(())
-        for _ in range(config.minibatches):
+        for _ in range(minibatches):
             batch = self.memory.sample(config.minibatch_size, self.generator)
             regression_loss = self.regression.update(*batch, learning_rate)
         critic_loss = self.critic.update(window, learning_rate)
-        self.num_timesteps += config.iterations * config.window * self.env.num_envs
+        self.num_timesteps += iterations * config.window * self.env.num_envs
         return self.collector.episodes.scalars() | {
-            "train/reward": own_reward / config.reward.scale,
-            "train/improved_reward": float(window.rewards.detach().mean()) / config.reward.scale,
+            "train/reward": float(window.rewards.detach().mean()) / config.reward.scale,
+            "train/improved_reward": float(better.rewards.detach().mean()) / config.reward.scale,
             "train/true_reward": window.true_reward,
             "train/value": float(window.next_values.detach().mean()),
             "train/critic_loss": critic_loss,

@@ -1,44 +1,138 @@
-"""A page about a run that opens from disk: curve, final table, video, options; nothing is fetched from elsewhere."""
+"""A page about a run that opens from disk: film, final table, curve, what was trained; nothing is fetched."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import shlex
+from base64 import b64encode
+from collections.abc import Iterable, Sequence
+from datetime import timedelta
 from html import escape
 from pathlib import Path
+from typing import Any
 
+import torchmpm
 from cfp.config import RunConfig, to_json
 from cfp.evaluation.evaluate import Result
-from cfp.files import write_text
+from cfp.evaluation.pictures import match_pictures
+from cfp.files import write_atomically, write_text
+from cfp.from_dict import flatten
+from cfp.tables import read_table
+from dittogym import make_spec
+from dittogym.render.frame import png
+from dittogym.render.recording import Recording
 
 STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
-img, video { max-width: 100%; } video { width: 32rem; }
-table { border-collapse: collapse; }
+body { font: 16px/1.5 system-ui, sans-serif; color: #282c34; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
+img, video { max-width: 100%; } .film { width: 32rem; border-radius: 6px; }
+figure { display: inline-block; margin: 0 1rem 1rem 0; }
+figure img { width: min(12rem, 25vw); image-rendering: pixelated; }
+.wide { overflow-x: auto; } table { border-collapse: collapse; }
 th, td { padding: 0.2rem 0.8rem; text-align: right; border-bottom: 1px solid #ccc; }
-th:first-child, td:first-child { text-align: left; } pre { background: #f4f4f4; padding: 1rem; overflow-x: auto; }
+th:first-child, td:first-child { text-align: left; }
+pre { background: #f4f4f4; padding: 1rem; overflow-x: auto; white-space: pre-wrap; }
 """
 HEADER = ("policy", "action", "episodes", "mean return", "95 % interval", "std", "success")
+#: When the picture that a film shows before it plays was taken, as a share of the episode.
+POSTER_TIME = 0.6
 
 
-def write_page(folder: Path, config: RunConfig, results: Sequence[Result]) -> Path:
-    """Write ``index.html`` beside the files of a finished run that it shows; returns its path."""
+def write_page(
+    folder: Path,
+    config: RunConfig,
+    preset: RunConfig,
+    results: Sequence[Result],
+    recording: Recording | None = None,
+    seconds: float = 0.0,
+) -> Path:
+    """Write ``index.html`` beside the files of a finished run that it shows; returns its path.
+
+    Args:
+        folder: Of the run.
+        config: Its options.
+        preset: Those that its preset has for the task.
+        results: The final evaluation.
+        recording: An episode of its last policy, if one was recorded.
+        seconds: Wall time of the training, s.
+    """
     title = escape(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed}")
-    video = (folder / "video.mp4").exists()
     parts = [
         "<!doctype html>",
-        f'<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style></head><body>',
+        '<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">',
+        f"<title>{title}</title><style>{STYLE}</style></head><body>",
         f"<h1>{title}</h1>",
-        '<h2>Learning curve</h2><img src="curve.png" alt="Return over environment steps">',
-        f"<h2>Final evaluation</h2>{_table(results)}",
-        '<h2>Video</h2><video src="video.mp4" controls loop muted></video>' if video else "",
+        _film(folder, recording) if recording else "",
+        _match(config, recording) if recording else "",
+        f"<h2>Final evaluation</h2>{_table(HEADER, map(_cells, results))}",
+        f'<h2>Learning curve</h2><img src="curve.png" alt="Return over environment steps"><p>{_training(folder)}</p>',
         _films(folder),
-        f"<h2>Options</h2><pre>{escape(json.dumps(to_json(config), indent=2))}</pre>",
+        f"<h2>This run</h2><p>{_about(seconds)}</p><pre>{escape(command_line(config, preset))}</pre>",
+        _changes(config, preset),
+        f"<details><summary>All options</summary><pre>{escape(json.dumps(to_json(config), indent=2))}</pre></details>",
         "</body></html>",
     ]
     path = folder / "index.html"
     write_text(path, "\n".join(part for part in parts if part) + "\n")
     return path
+
+
+def changed_options(config: RunConfig, preset: RunConfig) -> dict[str, tuple[Any, Any]]:
+    """Options, by their dotted names, that differ from the preset: their value, and that of the preset."""
+    own, usual = flatten(to_json(config)), flatten(to_json(preset))
+    own.pop("algo")  # each algorithm has presets of its own, CFP one for each learner
+    return {name: (value, usual.get(name)) for name, value in own.items() if value != usual.get(name)}
+
+
+def command_line(config: RunConfig, preset: RunConfig) -> str:
+    """The command that trains with these options."""
+    decisive = {"algo": config.algo, "learner": getattr(config, "learner", None)}
+    package = "cfp" if config.algo == "cfp" else "baselines"
+    given = {name: value for name, value in decisive.items() if value and (name, value) != ("algo", "cfp")}
+    given |= {"task": config.task, "preset": config.preset, "seed": config.seed}
+    changed = {name.rpartition(".")[2]: value for name, (value, _) in changed_options(config, preset).items()}
+    words = ["python", "-m", f"{package}.train"]
+    for name, value in (given | changed).items():
+        option = name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{option}" if value else f"--no-{option}")
+        else:
+            words += [f"--{option}", *map(str, value if isinstance(value, tuple | list) else [value])]
+    return shlex.join(words)
+
+
+def _film(folder: Path, recording: Recording) -> str:
+    """The film, or a picture where it could not be written, and the replay."""
+    poster = png(recording.picture(POSTER_TIME * recording.duration))
+    write_atomically(folder / "poster.png", lambda file: file.write(poster))
+    video = '<video class="film" src="video.mp4" poster="poster.png" controls loop muted></video>'
+    shown = video if (folder / "video.mp4").exists() else '<img class="film" src="poster.png" alt="The robot">'
+    link = '<a href="replay.html">Replay of this episode</a>, to step through, with other speeds and colours'
+    return f"{shown}<p>{link}</p>"
+
+
+def _match(config: RunConfig, recording: Recording) -> str:
+    """Target, result and overlap, in a task that has a target."""
+    target = make_spec(config.task, **config.environment.task_options()).target
+    if target is None or recording.observation is None:
+        return ""
+    pictures, iou = match_pictures(target, recording.observation)
+    figures = [
+        f'<figure><img src="data:image/png;base64,{b64encode(png(picture)).decode()}" alt="{name}">'
+        f"<figcaption>{name}</figcaption></figure>"
+        for name, picture in pictures.items()
+    ]
+    return f"<h2>Match</h2><p>Intersection over union at the end of this episode: {iou:.2f}</p>{''.join(figures)}"
+
+
+def _training(folder: Path) -> str:
+    """The best evaluation while training; where there was none, the return of training episodes."""
+    evaluations = read_table(folder / "evaluations.csv", ("step", "mean"))
+    if evaluations:
+        best = max(evaluations, key=lambda row: float(row["mean"]))
+        return f"Best evaluation while training: {float(best['mean']):.1f} at step {best['step']}."
+    returns = [row["rollout/return"] for row in read_table(folder / "progress.csv") if row.get("rollout/return")]
+    last = f"; the last training episodes had a mean return of {float(returns[-1]):.1f}" if returns else ""
+    return f"No evaluation was made while training{last}."
 
 
 def _films(folder: Path) -> str:
@@ -48,17 +142,32 @@ def _films(folder: Path) -> str:
     return f"<h2>While training</h2><ul>{items}</ul>" if items else ""
 
 
-def _table(results: Sequence[Result]) -> str:
-    rows = ["<tr>" + "".join(f"<th>{escape(name)}</th>" for name in HEADER) + "</tr>"]
-    for result in results:
-        cells = (
-            result.name,
-            f"{result.resolution} × {result.resolution}",
-            str(len(result.returns)),
-            f"{result.mean:.1f}",
-            "–" if result.interval is None else f"± {result.interval:.1f}",
-            f"{result.std:.1f}",
-            "–" if result.success is None else f"{result.success:.0%}",
-        )
-        rows.append("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>")
-    return "<table>" + "".join(rows) + "</table>"
+def _about(seconds: float) -> str:
+    time = f"Trained in {timedelta(seconds=round(seconds))} (hours:minutes:seconds), " if seconds else ""
+    return f"{time}{'with' if time else 'With'} torchmpm {torchmpm.__version__}. The command that repeats it:"
+
+
+def _changes(config: RunConfig, preset: RunConfig) -> str:
+    changes = changed_options(config, preset)
+    if not changes:
+        return "<p>All options are those of the preset.</p>"
+    rows = [(name, str(value), str(usual)) for name, (value, usual) in changes.items()]
+    return f"<p>Options that differ from the preset:</p>{_table(('option', 'this run', 'preset'), rows)}"
+
+
+def _cells(result: Result) -> tuple[str, ...]:
+    return (
+        result.name,
+        f"{result.resolution} × {result.resolution}",
+        str(len(result.returns)),
+        f"{result.mean:.1f}",
+        "–" if result.interval is None else f"± {result.interval:.1f}",
+        f"{result.std:.1f}",
+        "–" if result.success is None else f"{result.success:.0%}",
+    )
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = ["<tr>" + "".join(f"<th>{escape(name)}</th>" for name in header) + "</tr>"]
+    lines += ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
+    return '<div class="wide"><table>' + "".join(lines) + "</table></div>"

@@ -8,6 +8,9 @@ import torch
 from torch import Tensor
 
 from cfp.agent.actor import Actor
+from dittogym.observation.image import silhouette
+from dittogym.render.canvas import GROUND, TARGET
+from dittogym.render.colours import ROBOT
 
 PICTURES: dict[str, str] = {
     "picture/observation": "what the first training robot shows: red occupancy, green and blue velocity in x and y",
@@ -16,6 +19,8 @@ PICTURES: dict[str, str] = {
 }
 """Pictures of every evaluation (TensorBoard only), and what they show."""
 
+MISPLACED = (206, 60, 52)
+"""Colour of the robot's pixels outside the target."""
 SIZE = 192  # rows of a picture, pixels
 
 
@@ -39,6 +44,27 @@ def muscles(image: Tensor) -> np.ndarray:
     colours = np.stack([np.where(values < 0, fading, 1), fading, np.where(values > 0, fading, 1)], axis=-1)
     left, right = (_enlarged((255 * colour).round().astype(np.uint8)) for colour in colours)
     return np.concatenate([left, np.zeros((SIZE, 2, 3), np.uint8), right], axis=1)
+
+
+def match_pictures(target: np.ndarray, observation: np.ndarray) -> tuple[dict[str, np.ndarray], float]:
+    """How well the robot matches a target (64, 64): pictures by name, and the intersection over union.
+
+    Args:
+        target: Bool.
+        observation: (3, 64, 64) uint8.
+    """
+    robot = silhouette(torch.from_numpy(observation)[None])[0].numpy()
+    layers = {
+        "target": [(target, TARGET)],
+        "result": [(robot, ROBOT)],
+        "overlap": [(target, TARGET), (robot, MISPLACED), (robot & target, ROBOT)],
+    }
+    pictures = {}
+    for name, painted in layers.items():
+        pictures[name] = np.full((*target.shape, 3), GROUND, np.uint8)
+        for mask, colour in painted:
+            pictures[name][mask] = colour
+    return pictures, float((robot & target).sum() / (robot | target).sum())
 
 
 def _enlarged(pixels: np.ndarray) -> np.ndarray:

@@ -25,7 +25,8 @@ def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Pat
     steps, means = _column(evaluations, "mean")
     _, stds = _column(evaluations, "std")
     how = "without noise" if config.report.eval_deterministic else "with noise"
-    axes.plot(steps, means, "o-", color="tab:blue", markersize=3, label=f"evaluation ({how}), mean ± std")
+    if steps:
+        axes.plot(steps, means, "o-", color="tab:blue", markersize=3, label=f"evaluation ({how}), mean ± std")
     low, high = np.subtract(means, stds), np.add(means, stds)
     axes.fill_between(steps, low, high, color="tab:blue", alpha=0.2, linewidth=0)
     for (name, value), style in zip(baselines.items(), ("--", ":", "-."), strict=False):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import time
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,12 @@ class Checkpoint:
     def __init__(self, folder: Path) -> None:
         self.path = folder / "state.pt"
         self.archive = ReplayArchive(folder / "replay", 1)
+        self._before, self._start = 0.0, time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Wall time since this object was made, and of the sessions that led to the checkpoint that was read."""
+        return self._before + time.perf_counter() - self._start
 
     def save(self, algorithm: Algorithm, config: RunConfig, position: Position) -> None:
         """Replace the checkpoint."""
@@ -38,6 +45,7 @@ class Checkpoint:
             "stage": position.stage,
             "offset": position.offset,
             "num_timesteps": algorithm.num_timesteps,
+            "seconds": self.seconds,
             "algorithm": algorithm.state_dict(),
         }
         if (buffer := algorithm.replay_buffer) is not None:
@@ -63,6 +71,7 @@ class Checkpoint:
             parse_json(state["config"])
             if min(state["stage"] - 1, state["offset"], state["num_timesteps"]) < 0:
                 raise ValueError("a count is negative")
+            self._before = float(state.get("seconds", 0.0))  # the first runs did not record it
         except (KeyError, TypeError, ValueError) as error:
             raise self.does_not_fit(error) from error
         return state

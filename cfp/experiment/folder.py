@@ -4,18 +4,57 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from tyro.constructors import PrimitiveConstructorSpec
 
 from cfp.config import RunConfig
-from cfp.errors import CheckpointError
+from cfp.errors import CheckpointError, ConfigError
 from cfp.files import copy_atomically, read_json
 from cfp.weights import read_policy
+
+
+def _parse_folder(words: list[str]) -> Path:
+    word = words[0]
+    if not word:  # a shell's variable that is not set; it would stand for the current folder
+        raise ValueError("it must name a folder, got ''")
+    try:
+        word.encode()
+    except UnicodeEncodeError as error:
+        raise ValueError(f"it must be text in UTF-8, got {word!r}") from error
+    return Path(word)
+
+
+#: A folder to write into, as an option of a command line.
+Folder = Annotated[
+    Path,
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="PATH",
+        instance_from_str=_parse_folder,
+        is_instance=lambda value: isinstance(value, Path),
+        str_from_instance=lambda folder: [str(folder)],
+    ),
+]
+
+
+def make_folder(folder: Path) -> None:
+    """Create the folder of the option ``out`` where there is none; `ConfigError` if that cannot be done."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"out: {folder} cannot be created as a folder ({error.strerror})") from error
 
 
 def holds_run(folder: Path) -> bool:
     """Whether a folder holds a run, finished or not."""
     marks = ("config.json", "checkpoint", "progress.csv", "evaluations.csv", "policy.safetensors")
     return any((folder / name).exists() for name in marks)
+
+
+def holds_progress(folder: Path) -> bool:
+    """Whether a run in a folder has got so far that there is something to lose: a checkpoint or a policy."""
+    return (folder / "checkpoint" / "state.pt").exists() or policy_path(folder).exists()
 
 
 def read_config(folder: Path, configure: Callable[[dict[str, Any]], RunConfig]) -> RunConfig:

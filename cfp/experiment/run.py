@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
 from tqdm import tqdm
@@ -30,12 +31,14 @@ from cfp.experiment.callbacks import (
     StopCallback,
 )
 from cfp.experiment.checkpoint import Checkpoint, check_same
-from cfp.experiment.folder import copy_policy, holds_run, policy_files, policy_path
+from cfp.experiment.folder import copy_policy, holds_progress, holds_run, policy_files, policy_path
 from cfp.experiment.loggers import ProgressTable, Tracker, check_trackers
 from cfp.experiment.process import StopSignals
-from cfp.files import write_json
+from cfp.files import write_atomically, write_json
 from cfp.tables import Table
 from cfp.weights import is_of_another_task, read_policy
+from dittogym import make_spec
+from dittogym.render.frame import png
 
 
 def check_options(config: RunConfig) -> None:
@@ -57,25 +60,37 @@ class Run:
         self, algorithm: type[Algorithm], config: RunConfig, folder: Path, resume: bool, signals: StopSignals
     ) -> None:
         check_options(config)
-        if holds_run(folder) and not resume:
+        if holds_progress(folder) and not resume:
             raise ConfigError(f"out: {folder} already holds a run; continue it with --resume, or name another folder")
         self.algorithm, self.config, self.folder, self.signals = algorithm, config, folder, signals
         self.stages = len(config.ends())
         self.evaluation_seconds = 0.0  # in this session
+        self.seconds = 0.0  # wall time of all sessions, known after training
         self.checkpoint = Checkpoint(folder / "checkpoint")
         self.state: dict[str, Any] | None = None
         if resume and self.checkpoint.path.exists():
             self._read_checkpoint()
         else:
-            if resume:
+            if holds_run(folder):
                 print(f"{folder} holds no checkpoint: starting from the beginning")
             self.position = algorithm.initialize(config, folder)
             self.step = self.position.offset
         write_json(folder / "config.json", to_json(config))
+        self._save_target()
         self.evaluations = Table(folder / "evaluations.csv", self.step, ("step", "stage", "mean"))
         self.tracker = Tracker(config, folder, self.step)
         progress = ProgressTable(Table(folder / "progress.csv", self.step))
         self.logger = Logger(str(folder), [progress, *self.tracker.writers])
+
+    def _save_target(self) -> None:
+        """Show the target that the user has chosen as it is used."""
+        target, path = self.config.environment.target, self.folder / "target.png"
+        spec = make_spec(self.config.task, **self.config.environment.task_options())
+        if target is not None and spec.target is not None:
+            pixels = np.where(spec.target, 0, 255).astype(np.uint8).repeat(8, 0).repeat(8, 1)
+            picture = png(np.dstack([pixels] * 3))
+            write_atomically(path, lambda file: file.write(picture))
+            print(f"target: {path}")
 
     def _read_checkpoint(self) -> None:
         """Set state, position and step from the checkpoint."""
@@ -107,6 +122,7 @@ class Run:
                 self.position = Position(number, self.position.offset + algorithm.num_timesteps)
                 previous = algorithm
         finally:
+            self.seconds = self.checkpoint.seconds
             self.logger.close()
 
     def _create(self, previous: Algorithm | None) -> Algorithm:
@@ -162,9 +178,12 @@ class Run:
         write_json(self.folder / "results.json", to_rows(results))
         untrained = {result.name: result.mean for result in results[:2]}
         print(f"learning curve: {plot_curve(self.folder, self.config, untrained)}")
+        recording = None
         if self.config.report.video:
             recording = record_policy(self.config, list(policies.values())[-1])
             save_media(recording, {"video": self.folder / "video.mp4", "replay": self.folder / "replay.html"})
-        print(f"all of it on one page: {write_page(self.folder, self.config, results)}")
+        preset = self.algorithm.preset(self.config.task, self.config.preset)
+        page = write_page(self.folder, self.config, preset, results, recording, self.seconds)
+        print(f"all of it on one page: {page}")
         print(format_table(self.config, results))
         return results

@@ -11,6 +11,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from cfp.errors import CFPError
+from cfp.experiment.folder import make_folder
 
 
 class FolderInUse(CFPError):
@@ -21,7 +22,7 @@ class FolderInUse(CFPError):
 def run_lock(folder: Path, timeout: float = 0.0) -> Iterator[None]:
     """Hold the folder of a run, which is created if need be; the system releases it however the process ends."""
     is_new = not folder.exists()
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     path = folder / ".lock"
     try:
         lock = FileLock(path).acquire(timeout=timeout)

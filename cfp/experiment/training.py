@@ -16,7 +16,7 @@ from cfp.config import RunConfig, to_json
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm
 from cfp.experiment.cli import program_name, run_command
-from cfp.experiment.folder import holds_run, read_config
+from cfp.experiment.folder import Folder, holds_run, read_config
 from cfp.experiment.process import Stopped, StopSignals
 from cfp.experiment.run import Run, check_options
 from cfp.experiment.run_lock import run_lock
@@ -44,7 +44,7 @@ class Command:
     """
 
     run: RunConfig
-    out: Path | None = None
+    out: Folder | None = None
     """Folder of the run; in runs/, named by algorithm, task, preset and seed, if not given."""
     resume: bool = False
     """Continue the run in the folder; in an empty or missing folder, start a new run."""
@@ -66,7 +66,7 @@ class _Choice:
     preset: str | None = None
     learner: str | None = None
     start_from: str | None = None
-    out: Path | None = None
+    out: Folder | None = None
     resume: bool = False
     config: Path | None = None
 

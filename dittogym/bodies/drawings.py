@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeAlias
@@ -13,7 +12,7 @@ import cv2
 import numpy as np
 import torch
 
-from dittogym.bodies.images import PictureLike, read_grey
+from dittogym.bodies.images import PictureLike, read_mask
 from dittogym.bodies.shapes import Figure, Shape
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.window import contains
@@ -22,8 +21,6 @@ from torchmpm import sampling
 #: A path or an array (picture), (K, 2) corners (outline), a shape, or a body.
 BodyLike: TypeAlias = "PictureLike | Sequence[tuple[float, float]] | Shape | BodySpec"
 
-#: Grey values above this belong to the robot.
-THRESHOLD = 127
 #: Pixels along the longer side of an outline.
 OUTLINE_PIXELS = 512
 #: Points with which the spread of a shape is measured.
@@ -38,8 +35,9 @@ def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
 
     Args:
         spec: The task.
-        body: The path of an image or an array (H, W), (H, W, 3), (H, W, 4), bright pixels belong to the robot; corners
-            (K, 2) of an outline with x to the right and y upwards, in any unit; a shape of
+        body: The path of an image or an array (H, W), (H, W, 3), (H, W, 4), read by
+            :func:`dittogym.bodies.images.read_mask`; corners (K, 2) of an outline with x to the right and y upwards, in
+            any unit; a shape of
             :mod:`dittogym.bodies.shapes` in world coordinates; or a :class:`dittogym.spec.BodySpec`.
 
     Raises:
@@ -74,13 +72,9 @@ def _mask(body: PictureLike | Sequence[tuple[float, float]]) -> np.ndarray:
             raise ValueError(f"body must be a path, an array, a Shape or a BodySpec, got {body!r}") from error
         if body.shape[1:] == (2,) and body.dtype.kind in "fiu":
             return _filled(body.astype(np.float64))
-    grey = read_grey(body, "body", others="an outline (K, 2), ")
-    mask: np.ndarray = grey > THRESHOLD
+    mask = read_mask(body, "body", others="an outline (K, 2), ")
     if not mask.any():
-        raise ValueError(f"body must have pixels brighter than {THRESHOLD}, got none")
-    corners = mask[[0, 0, -1, -1], [0, -1, 0, -1]]
-    if corners.all() and not mask.all():
-        warnings.warn("all corners of the body's picture belong to it: bright pixels are the robot", stacklevel=2)
+        raise ValueError("body must be a picture in which something is drawn, got an empty one")
     return mask
 
 

@@ -1,4 +1,4 @@
-"""Pictures from files and arrays as grey values."""
+"""What is drawn in pictures from files and arrays."""
 
 from __future__ import annotations
 
@@ -12,19 +12,43 @@ from PIL import Image
 
 #: Pixels of the largest picture that is read from a file, 2048 x 2048: a body drawn in one may take 240 bytes for each.
 LARGEST = 2**22
+#: Pixels from this alpha or brightness on belong to a drawing.
+OPAQUE = 128
+#: Pictures whose brightness varies less than this have no drawing, all belongs to it or nothing.
+CONTRAST = 32
 #: The path of an image file, or an array.
 PictureLike: TypeAlias = "str | os.PathLike[str] | np.ndarray"
 
 
-def read_grey(picture: PictureLike, name: str, others: str) -> np.ndarray:
-    """A picture as grey values (H, W) uint8, row 0 at the top; what is transparent is black."""
+def read_mask(picture: PictureLike, name: str, others: str) -> np.ndarray:
+    """What is drawn in a picture, (H, W) bool, row 0 at the top.
+
+    In a picture with transparent pixels it is what is not transparent; else what is bright, or, where all four corners
+    are bright, what is dark. Bool arrays are taken as they are.
+    """
+    image = _read(picture, name, others)
+    if image.ndim == 3 and image.shape[2] == 4 and (image[..., 3] < OPAQUE).any():
+        return np.asarray(image[..., 3] >= OPAQUE)
+    grey = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_BGR2GRAY)
+    threshold = OPAQUE - 1.0
+    if int(grey.max()) - int(grey.min()) >= CONTRAST:
+        threshold, _ = cv2.threshold(grey, 0, 255, cv2.THRESH_OTSU)
+    mask = np.asarray(grey > threshold)
+    on_bright = mask[[0, 0, -1, -1], [0, -1, 0, -1]].all() and not mask.all()
+    return ~mask if on_bright and np.asarray(picture).dtype != bool else mask
+
+
+def _read(picture: PictureLike, name: str, others: str) -> np.ndarray:
+    """A picture as uint8 (H, W), (H, W, 3) or (H, W, 4)."""
     if isinstance(picture, np.ndarray):
-        return _grey(picture, name)
+        return _as_bytes(picture, name)
     if not isinstance(picture, (str, os.PathLike)):
         raise ValueError(f"{name} must be {others}an array or a path, got {type(picture).__name__}")
     path = os.fspath(picture)
     if not os.path.isfile(path):
         raise ValueError(f"{name} must be {others}an array or the path of an image; no such file: {path!r}")
+    if path.lower().endswith((".svg", ".svgz")):
+        raise ValueError(f"{name} must be made of pixels, got the vector drawing {path!r}; export it as PNG")
     try:
         width, height = _claimed_size(path)
         small = width * height <= LARGEST
@@ -35,7 +59,7 @@ def read_grey(picture: PictureLike, name: str, others: str) -> np.ndarray:
         raise ValueError(f"{name} {path!r} must have at most {LARGEST} pixels, got {width} x {height}")
     if image is None:
         raise ValueError(f"{name} {path!r} cannot be read as an image")
-    return _grey(image, name)
+    return _as_bytes(image, name)
 
 
 def _claimed_size(path: str) -> tuple[int, int]:
@@ -48,7 +72,7 @@ def _claimed_size(path: str) -> tuple[int, int]:
             return size
 
 
-def _grey(image: np.ndarray, name: str) -> np.ndarray:
+def _as_bytes(image: np.ndarray, name: str) -> np.ndarray:
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (3, 4)) or 0 in image.shape:
         raise ValueError(f"{name} array must have shape (H, W), (H, W, 3) or (H, W, 4), got {image.shape}")
     if image.dtype == bool:
@@ -61,7 +85,4 @@ def _grey(image: np.ndarray, name: str) -> np.ndarray:
         image = (image // 257).astype(np.uint8)
     elif image.dtype != np.uint8:
         raise ValueError(f"{name} array must be bool, uint8, uint16 or floating point, got {image.dtype}")
-    if image.ndim == 2:
-        return image
-    grey = cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_BGR2GRAY)
-    return grey if image.shape[2] == 3 else (grey.astype(np.uint16) * image[..., 3] // 255).astype(np.uint8)
+    return image

@@ -50,7 +50,7 @@ class Disc:
     draws: int = 4
 
     def __post_init__(self) -> None:
-        check_pair("corner", self.corner)
+        checks.pair("corner", self.corner)
         checks.number("diameter", self.diameter, above=0.0)
 
     @property
@@ -83,8 +83,8 @@ class Rectangle:
     draws: int = 4
 
     def __post_init__(self) -> None:
-        check_pair("corner", self.corner)
-        check_pair("size", self.size, above=0.0)
+        checks.pair("corner", self.corner)
+        checks.pair("size", self.size, above=0.0)
 
     @property
     def area(self) -> float:
@@ -132,7 +132,7 @@ class Figure:
     draws: int = 2
 
     def __post_init__(self) -> None:
-        check_pair("corner", self.corner)
+        checks.pair("corner", self.corner)
         checks.number("pixel", self.pixel, above=0.0)
         if not isinstance(self.mask, np.ndarray) or self.mask.ndim != 2 or not self.mask.any():
             raise ValueError(f"mask must be an array (rows, columns) with a pixel set, got {np.shape(self.mask)}")
@@ -150,11 +150,3 @@ class Figure:
     def positions(self, numbers: Points) -> Points:
         """World positions (N, 2) in m."""
         return sampling.image(numbers, self.mask, self.corner, self.size)
-
-
-def check_pair(name: str, given: tuple[float, ...], above: float | None = None) -> None:
-    """Refuse what is not two numbers, x and y."""
-    if not isinstance(given, tuple | list) or len(given) != 2:
-        raise ValueError(f"{name} must be two numbers (x, y), got {given!r}")
-    for axis, number in zip("xy", given, strict=True):
-        checks.number(f"{name} {axis}", number, above=above)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import torch
@@ -13,7 +12,7 @@ from dittogym.observation import native, raster
 from dittogym.observation.image import CLIP, encode
 from dittogym.observation.raster import RasterInput
 from dittogym.window import GRID, Centre, Window, centre_in_window
-from torchmpm.backends import transforming, warn_eager
+from torchmpm.backends import cached_tensors, transforming, warn_eager
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +87,7 @@ class Camera:
         )
 
 
-@functools.lru_cache(maxsize=64)
-@torch.inference_mode(False)  # what is kept must serve gradients later
+@cached_tensors
 def per_particle(
     counts: tuple[int, ...], values: tuple[float, ...], dtype: torch.dtype, device: torch.device
 ) -> Tensor:

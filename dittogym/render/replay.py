@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from dittogym.render.colours import SCALES
 from dittogym.render.scene import VIEW_WIDTH, Scene, Shot
 
 PLAYER = Path(__file__).parent / "replay.html"
@@ -62,9 +61,7 @@ def encode(scene: Scene, shots: Sequence[Shot]) -> tuple[dict[str, Any], bytes]:
         rest = np.full(len(shots[0].x), 127, np.uint8)
         values = np.stack([shot.values.get(name, rest)[particles] for shot in kept]) // VALUE_STEP
         arrays.append(np.diff(values, axis=0, prepend=np.uint8(0)).tobytes())
-    header = {
-        "task": scene.task,
-        "dt": scene.dt,
+    header = scene.as_json() | {
         "quantum": QUANTUM,
         "valueStep": VALUE_STEP,
         "particles": len(shots[0].x),
@@ -77,10 +74,6 @@ def encode(scene: Scene, shots: Sequence[Shot]) -> tuple[dict[str, Any], bytes]:
             {"count": count, "radius": body.radius * math.sqrt(body.count / count), "colour": body.colour}
             for body, count in zip(scene.bodies, counts, strict=True)
         ],
-        "solids": [[*(None if math.isinf(side) else side for side in box[:4]), box.filled] for box in scene.solids],
-        "goal": scene.goal,
-        "target": [np.round(outline, 5).tolist() for outline in scene.target],
-        "scales": {name: scale._asdict() for name, scale in SCALES.items()},
     }
     return header, zlib.compress(b"".join(arrays))
 

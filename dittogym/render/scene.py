@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -66,6 +66,18 @@ class Scene:
     solids: tuple[Solid, ...]
     goal: tuple[float, float] | None
     target: tuple[np.ndarray, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """The scene as JSON values, with the scales of colours; ``None`` stands for an open side."""
+        return {
+            "task": self.task,
+            "dt": self.dt,
+            "bodies": [vars(body) for body in self.bodies],
+            "solids": [[*(None if math.isinf(side) else side for side in box[:4]), box.filled] for box in self.solids],
+            "goal": self.goal,
+            "target": [np.round(outline, 5).tolist() for outline in self.target],
+            "scales": {name: scale._asdict() for name, scale in SCALES.items()},
+        }
 
 
 class Shot(NamedTuple):

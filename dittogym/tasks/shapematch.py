@@ -22,11 +22,12 @@ def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
     return Outcome(terms={"mismatch": -differing}, success=iou >= MATCH, info={"iou": iou})
 
 
-def shapematch(target: TargetLike = "star") -> TaskSpec:
+def shapematch(target: TargetLike = "star", fit: bool = True) -> TaskSpec:
     """The task SHAPE MATCH.
 
     Args:
         target: See :func:`dittogym.tasks.targets.load_target`.
+        fit: Whether a drawing is scaled and moved to fit the robot, see there.
     """
     return TaskSpec(
         name="shapematch",
@@ -40,5 +41,5 @@ def shapematch(target: TargetLike = "star") -> TaskSpec:
         fine=64,
         reward_fn=reward_fn,
         weights={"mismatch": 0.1, "alive": 23.0},
-        target=load_target(target),
+        target=load_target(target, fit),
     )

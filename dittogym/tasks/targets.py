@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from typing import TypeAlias
 
 import cv2
 import numpy as np
 
-from dittogym.bodies.images import PictureLike, read_grey
+from dittogym.bodies.images import PictureLike, read_mask
 from dittogym.observation.image import SIZE
+from torchmpm import checks
 
 #: The name of a drawn target, the path of an image file, or an array.
 TargetLike: TypeAlias = PictureLike
 
-#: Grey values from this on belong to the shape.
-THRESHOLD = 125
-#: A centroid further than this from the middle is worth a warning, pixels.
+#: Pixels that the robot of SHAPE MATCH covers at the start.
+ROBOT_AREA = round(math.pi * 0.085**2 * (2 * SIZE) ** 2)
+#: Areas of targets that a robot can take, as shares of that one: matter flows, but is neither made nor lost.
+AREAS = (0.7, 1.3)
+#: A centroid further than this from the middle is out of the robot's reach, pixels.
 OFF_CENTRE = 3.0
+#: Fitted drawings stay so many pixels away from the edge, and are drawn so many times larger first.
+MARGIN, FINE = 3, 8
+#: Parts of a target that count as parts, pixels; the largest share of thin lines without a warning.
+SMALLEST_PART, LARGEST_THIN_SHARE = 8, 0.5
 
 # Corners (column, row) of filled polygons, several for a shape that is a union.
 # fmt: off
@@ -41,30 +49,81 @@ _OUTLINES: dict[str, list[list[tuple[int, int]]]] = {
 # fmt: on
 
 
-def load_target(target: TargetLike) -> np.ndarray:
+def load_target(target: TargetLike, fit: bool = True) -> np.ndarray:
     """A target as a (64, 64) bool array, row 0 at the top.
 
     Args:
         target: ``"star"``, ``"I"``, ``"M"``, ``"T"``, the path of an image, or an array (H, W), (H, W, 3) or (H, W, 4):
-            bool, uint8 0..255, or floating point 0..1. Pictures of another size are resized to 64 x 64 by area; grey
-            values from 125 of 255 belong to the shape.
+            bool, uint8 0..255, or floating point 0..1. What is drawn in it is found by
+            :func:`dittogym.bodies.images.read_mask`.
+        fit: Whether a drawing of another size or in another place is scaled to the robot's area, and moved to its
+            centre, which is always in the middle of the observation. Without, the picture is resized as a whole.
 
     Raises:
         ValueError: Neither a name nor a readable image, an array of another kind, or a picture without any pixel set or
             unset.
     """
+    checks.flag("fit", fit)
     if isinstance(target, str) and target in _OUTLINES:
-        grey: np.ndarray = np.zeros((SIZE, SIZE), np.uint8)
+        drawn: np.ndarray = np.zeros((SIZE, SIZE), np.uint8)
         for outline in _OUTLINES[target]:
-            cv2.fillPoly(grey, [np.array(outline)], 255)
-    else:
-        grey = read_grey(target, "target", others="".join(f"{name!r}, " for name in _OUTLINES))
-        grey = cv2.resize(grey, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
-    mask = grey >= THRESHOLD
+            cv2.fillPoly(drawn, [np.array(outline)], 1)
+        return drawn.astype(bool)
+    picture = read_mask(target, "target", others="".join(f"{name!r}, " for name in _OUTLINES))
+    mask = _reduced(picture)
+    if fit and picture.any() and not picture.all() and not _fits(picture, mask):
+        mask = _fitted(picture)
     if not mask.any() or mask.all():
         raise ValueError(f"target must have pixels of the shape and of the ground, got {mask.sum()} of {mask.size}")
-    offset = np.argwhere(mask).mean(0) - (SIZE - 1) / 2
-    if np.abs(offset).max() > OFF_CENTRE:
-        where = f"{offset[0]:+.1f} rows and {offset[1]:+.1f} columns off the middle"
-        warnings.warn(f"the target's centroid is {where}, where the robot's centre always is", stacklevel=2)
+    if reasons := _obstacles(mask):
+        warnings.warn(f"no robot can be expected to match the target: {'; '.join(reasons)}", stacklevel=2)
     return mask
+
+
+def _reduced(mask: np.ndarray) -> np.ndarray:
+    """A mask in (64, 64), where half of a pixel's area decides."""
+    return np.asarray(cv2.resize(mask.astype(np.float32), (SIZE, SIZE), interpolation=cv2.INTER_AREA) >= 0.5)
+
+
+def _offset(mask: np.ndarray) -> np.ndarray:
+    """Rows and columns (2,) from the middle of a picture to the centre of what is drawn."""
+    return np.asarray(np.argwhere(mask).mean(0) - (np.array(mask.shape) - 1) / 2)
+
+
+def _fits(picture: np.ndarray, mask: np.ndarray) -> bool:
+    """Whether a picture can stay as it is, with the result that a fitted one stays the same when it is loaded again."""
+    if picture.shape[0] != picture.shape[1] or not mask.any():
+        return False
+    low, high = (share * ROBOT_AREA for share in AREAS)
+    return bool(low <= mask.sum() <= high and np.abs(_offset(mask)).max() <= OFF_CENTRE)
+
+
+def _fitted(picture: np.ndarray) -> np.ndarray:
+    """A drawing scaled to the robot's area, as far as it stays inside, around the middle of (64, 64) pixels."""
+    pixels = np.argwhere(picture)[:, ::-1]
+    centre = pixels.mean(0)
+    reach = np.abs(pixels - centre).max() + 0.5
+    scale = FINE * min(np.sqrt(ROBOT_AREA / len(pixels)), (SIZE / 2 - MARGIN) / reach)
+    move = np.array([[scale, 0, 0], [0, scale, 0]])
+    move[:, 2] = FINE * SIZE / 2 - 0.5 - scale * centre
+    drawn: np.ndarray = picture.astype(np.float32)
+    if scale < 0.5:  # else thin lines would fall between the pixels that are looked at
+        drawn = cv2.blur(drawn, (round(1 / scale),) * 2)
+    return _reduced(cv2.warpAffine(drawn, move, (FINE * SIZE,) * 2, flags=cv2.INTER_LINEAR))
+
+
+def _obstacles(mask: np.ndarray) -> list[str]:
+    """Why a robot is unlikely to take this shape."""
+    reasons, area = [], int(mask.sum())
+    low, high = (round(share * ROBOT_AREA) for share in AREAS)
+    if not low <= area <= high:
+        reasons.append(f"it has {area} pixels, and a robot that is whole covers {low} to {high}")
+    if np.abs(offset := _offset(mask)).max() > OFF_CENTRE:
+        reasons.append(f"its centre is {offset[0]:+.1f} rows and {offset[1]:+.1f} columns off the middle")
+    _, _, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    if (parts := int((statistics[1:, cv2.CC_STAT_AREA] >= SMALLEST_PART).sum())) > 1:
+        reasons.append(f"it has {parts} separate parts")
+    thick = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    if (thin := 1 - thick.sum() / area) > LARGEST_THIN_SHARE:
+        reasons.append(f"{thin:.0%} of it are lines thinner than 3 pixels")
+    return reasons

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import shlex
 import shutil
 import warnings
 from collections.abc import Callable
@@ -31,6 +32,11 @@ class Desk:
     def file(self, name: str, content: bytes | str) -> None:
         """Write a file."""
         (self.folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+        self.before = snapshot(self.folder)
+
+    def link(self, name: str) -> None:
+        """Make a symbolic link to itself."""
+        (self.folder / name).symlink_to(name)
         self.before = snapshot(self.folder)
 
     def run(self, change: Callable[[Path], object] = lambda folder: None) -> None:
@@ -79,7 +85,7 @@ def command(main: Callable[[list[str]], int], arguments: str, exit_code: int = 2
         printed = io.StringIO()
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(printed):
             try:
-                code = main([word.format(folder=desk.folder) for word in arguments.split()])
+                code = main([word.format(folder=desk.folder) for word in shlex.split(arguments)])
             except SystemExit as error:
                 code = error.code
         if code:

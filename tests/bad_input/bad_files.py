@@ -92,6 +92,15 @@ POLICIES = [
         ("nobody.safetensors", "(catch, grow, run, "),
         CheckpointError,
     ),
+    *(
+        Case(
+            f"policy {path!r}",
+            lambda desk, path=path: cfp.load(path),
+            ("path must be a folder, a file or the name of a policy", repr(path)),
+            CheckpointError,
+        )
+        for path in (None, 5, b"run")
+    ),
     policy("of text", "damaged", content="hello, I am a policy"),
     policy("cut short", "damaged", content=SHIPPED[: len(SHIPPED) // 2]),
     policy("with a header of terabytes", "damaged", content=struct.pack("<Q", 2**42) + b"{}"),

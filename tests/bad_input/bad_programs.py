@@ -92,10 +92,20 @@ TRAIN = [
     ),
     Case(
         "train under a file",
-        prepared(lambda desk: desk.file("new", "mine"), command(cfp.train.main, TINY + " --out {folder}/new/run", 1)),
-        ("Not a directory", "new/run"),
+        prepared(lambda desk: desk.file("new", "mine"), command(cfp.train.main, TINY + " --out {folder}/new/run")),
+        ("out: new/run cannot be created as a folder (Not a directory)",),
         Refused,
     ),
+    training("a folder under /proc", "--out /proc/run", "out: /proc/run cannot be created as a folder (No such file"),
+    Case(
+        "train into a link in a loop",
+        prepared(lambda desk: desk.link("loop"), command(cfp.train.main, TINY + " --out {folder}/loop")),
+        ("out: loop cannot be created as a folder (File exists)",),
+        Refused,
+    ),
+    training("a folder that is not text", "--out run\udcff", "out", "text in UTF-8", "'run\\udcff'"),
+    training("an unset variable as its folder", "--out ''", "--out", "must name a folder, got ''"),
+    training("a variable that is not set", "--out=", "--out", "must name a folder, got ''"),
 ]
 
 OTHERS = [
@@ -106,6 +116,7 @@ OTHERS = [
     learning("gradient", "no iterations", "--iterations 0", "iterations must be at least 1, got 0"),
     learning("gradient", "a grid of 99", "--grid 99", "resolution must be 'coarse', 'fine' or 1 to 64, got 99"),
     learning("mpc", "two robots", "--num-envs 2", "num_envs", "got 2"),
+    learning("mpc", "no horizon", "--horizon 0", "horizon must be at least 1, got 0"),
     learning("mpc", "a horizon before its end", "--horizon 2 --commit 3", "commit", "got 3"),
     learning("cem", "one elite", "--elites 1", "elites", "got 1"),
     learning("shac", "an endless discount", "--gamma nan", "gamma must be finite, got nan"),
@@ -137,6 +148,8 @@ OTHERS = [
     evaluating("under noise of NaN", "{folder} --noise nan", "noise must be positive", main=ROBUSTNESS),
     evaluating("on ice that pushes", "{folder} --friction -1", "friction must be at least 0", main=ROBUSTNESS),
     evaluating("disturbed, nowhere", "--policy run", "out must be given with a single policy", main=ROBUSTNESS),
+    Case("compare into an unset variable", command(compare.main, "--out ''"), ("must name a folder, got ''",), Refused),
+    evaluating("disturbed, into an unset variable", "--policy run --out ''", "must name a folder", main=ROBUSTNESS),
     comparing("unknown tasks", "--tasks swim", "task must be catch"),
     comparing("unknown algorithms", "--algos alchemy", "algo must be one of cfp"),
     comparing("a seed twice", "--seeds 1 1", "seeds must be one or more different values, got 1 1"),

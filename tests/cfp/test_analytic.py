@@ -197,6 +197,19 @@ def test_several_steps_on_the_actions_of_a_window_improve_them_and_count():
     assert int(learner.env.env_state.steps.max()) == config.window  # every one began where the first did
 
 
+def test_a_trained_policy_is_kept_until_the_critic_has_learned():
+    config = make(warmup=2)
+    learner = AnalyticLearner(config, 1, build_actor(config.actor_spec(1)))
+    learner.starts_trained = True
+    before, critic = parameters(learner.actor), parameters(learner.critic.network)
+    for _ in range(2):
+        learner.update()
+    assert torch.equal(parameters(learner.actor), before)
+    assert not torch.equal(parameters(learner.critic.network), critic)
+    learner.update()
+    assert not torch.equal(parameters(learner.actor), before)
+
+
 @pytest.mark.parametrize(("success", "expected"), [(True, 1.0), (False, 0.0)])
 def test_an_episode_that_ends_in_success_has_the_value_of_the_option(success, expected):
     def ends_at_once(moment, spec):

@@ -3,6 +3,8 @@
 import html
 import json
 import os
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -15,16 +17,21 @@ from tiny_runs import TINY, assert_same_run, at_step, run
 
 import cfp
 import dittogym
+import torchmpm
 from cfp import evaluate, train
 from cfp.agent.actor import build_actor
 from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.spec import ActorSpec
+from cfp.config import to_json
 from cfp.evaluation.evaluate import compare
 from cfp.experiment.cli import program_name
+from cfp.experiment.training import parse
 from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
 from cfp.tables import read_table
 from cfp.weights import describe, policy_file, save_policy, shipped
+from dittogym.render.frame import png
+from dittogym.tasks.targets import load_target
 
 
 def test_run_trains_both_stages_and_leaves_its_files(finished):
@@ -252,3 +259,43 @@ def test_page_shows_the_run_and_opens_from_disk(finished):
         means = {f"<td>{row['mean'] + rounding:.1f}</td>" for rounding in (-5e-4, 5e-4)}  # the file has three digits
         assert f"<td>{row['policy']}</td>" in page and any(mean in page for mean in means)
     assert html.escape((finished / "config.json").read_text().strip()) in page
+
+
+def test_page_of_a_run_with_a_film_and_a_target(tmp_path, capsys):
+    folder, drawing = tmp_path / "run", tmp_path / "bar & box.png"
+    pixels = np.full((90, 200, 3), 255, np.uint8)
+    pixels[30:60, 20:120] = 0
+    drawing.write_bytes(png(pixels))
+    options = ["--video", "--target", str(drawing), "--eval-every", "0", "--eval-episodes", "1", "--seed", "3"]
+    assert run(folder, *options, "--steps", "40", "--handover", "20") == 0
+    assert f"target: {folder / 'target.png'}" in capsys.readouterr().out
+    target = load_target(drawing)
+    assert np.array_equal(load_target(folder / "target.png"), target) and np.ptp(np.argwhere(target), 0)[1] > 30
+    page = (folder / "index.html").read_text()
+    for part in ('poster="poster.png"', 'href="replay.html"', "Intersection over union", "No evaluation was made"):
+        assert part in page
+    assert page.count("data:image/png") == 3 and "<td>environment.particles</td><td>100</td><td>lite</td>" in page
+    assert "environment.dtype</td>" not in page and f"torchmpm {torchmpm.__version__}" in page
+    assert (folder / "poster.png").stat().st_size > 1000 and (folder / "replay.html").stat().st_size > 10_000
+    command = html.unescape(re.search(r"<pre>(python .*)</pre>", page)[1])
+    again = parse(train.PROGRAM, shlex.split(command)[3:]).run
+    assert to_json(again) == json.loads((folder / "config.json").read_text(), object_hook=with_tuples)
+
+
+def with_tuples(values):
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+
+
+def test_a_run_that_failed_before_its_first_checkpoint_does_not_block_its_folder(tmp_path, capsys):
+    def fail():
+        raise OSError("no space left on device")
+
+    options = "--steps 40 --handover 20 --eval-every 0 --eval-episodes 1".split()
+    with at_step(14, fail):
+        assert run(tmp_path / "run", *options) == 1
+    assert [row["step"] for row in read_table(tmp_path / "run" / "progress.csv")] == ["10"]
+    assert run(tmp_path / "run", *options) == 0
+    assert "holds no checkpoint: starting from the beginning" in capsys.readouterr().out
+    assert [row["step"] for row in read_table(tmp_path / "run" / "progress.csv")] == ["10", "20", "30", "40"]
+    assert run(tmp_path / "run", *options) == 2
+    assert "already holds a run" in capsys.readouterr().err

@@ -184,6 +184,10 @@ def test_physics_travels_with_a_moment() -> None:
         ({"particles": 119}, "snapshot must hold 1 or 2 simulations"),
         ({"dtype": "float32"}, "torch.float32"),
         ({"num_envs": 3}, "snapshot must hold 1 or 2 simulations .* got 3 of"),
+        ({"substeps": 3}, "snapshot must be of an environment with the same substeps, got another"),
+        ({"dt": 5e-5}, "an environment with the same dt, got another"),
+        ({"obstacles": ()}, "an environment with the same obstacles, got another"),
+        ({"body": np.ones((9, 5), bool)}, "an environment with the same robot, got another"),
     ],
 )
 @torch.no_grad()

@@ -121,7 +121,7 @@ def test_defaults_of_torch_change_nothing() -> None:
     """Neither of dtype, nor of the device, nor autocast."""
     rewards = []
     for context in (nullcontext(), torch.device("meta"), torch.autocast("cpu", torch.bfloat16), float64()):
-        per_particle.cache_clear()
+        per_particle.__wrapped__.cache_clear()
         with context:
             env = small(dtype="float32", particles=60, backend="auto")
             env.reset(seed=0)

@@ -238,3 +238,19 @@ def test_cuda_equals_cpu() -> None:
     on_cuda = solver.step(state.to("cuda"), field.to("cuda"), substeps=20)
     assert on_cuda.device.type == "cuda"
     assert_close(on_cuda.to("cpu"), on_cpu, 1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning")  # torch's own about what it cannot trace
+def test_a_compiled_function_holds_an_eager_step_whole_and_runs_around_other_backends() -> None:
+    state, drive = lively(5), normal(1, 2, 16, 16, seed=1)
+
+    def moved(backend: str, **options: bool) -> Tensor:
+        solver = robot(5, backend=backend)
+        return torch.compile(lambda d: solver.step(state, d).x, backend="eager", **options)(drive)
+
+    expected = robot(5).step(state, drive).x
+    assert torch.equal(moved("eager", fullgraph=True), expected)
+    with pytest.raises(Exception, match=r"backend 'auto' cannot be traced by torch.compile, use 'eager'"):
+        moved("auto", fullgraph=True)
+    torch.testing.assert_close(moved("auto"), expected, rtol=1e-12, atol=1e-12)

@@ -45,12 +45,11 @@ def lame(young: Value, poisson: Value) -> tuple[Value, Value]:
         (mu, lam) in Pa, numbers or tensors of the arguments' shape.
 
     Raises:
-        ValueError: A number is out of range.
+        ValueError: A number is out of range, or one of a tensor.
     """
     checks.value("young", young, least=0.0)
     checks.value("poisson", poisson)
-    if not isinstance(poisson, Tensor) and not -1 < poisson < 0.5:
-        raise ValueError(f"poisson must be above -1 and below 0.5, got {poisson}")
+    checks.entries("poisson", poisson, above=-1.0, below=0.5)
     return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 

@@ -22,7 +22,7 @@ class Body:
         muscle: Whether the actuation field acts on it.
 
     Raises:
-        ValueError: ``count`` is below 1, or ``mass`` or ``volume`` is not positive.
+        ValueError: ``count`` is below 1, ``mass`` or ``volume`` is not positive, or ``muscle`` not True or False.
         TypeError: The material is not a :class:`torchmpm.Material`.
     """
 
@@ -37,6 +37,7 @@ class Body:
         checks.instance("material", self.material, Material)
         for name in ("mass", "volume"):
             checks.value(name, getattr(self, name), above=0.0)
+        checks.flag("muscle", self.muscle)
 
     def constants(self) -> dict[str, Value]:
         """Constants of the body and its material by name, such as ``material.mu``; numbers, (), (B,) or (B, count)."""

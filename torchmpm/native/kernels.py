@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from torchmpm import tree
 from torchmpm.boundary import VelocityRule, node_shift
 from torchmpm.grid import Grid
 from torchmpm.materials.body import Body
@@ -100,6 +101,9 @@ class Kernels:
         gravity = given.to(state.Jp).expand(state.batch_size, 2).contiguous()
         values, shift = self.values(state.Jp), node_shift(self.grid, origin)
         planes = state.stack()
+        if torch.is_grad_enabled():
+            tensors = planes, actuation, origin, gravity, values, shift
+            planes, actuation, origin, gravity, values, shift = tree.without_inference(tensors)
         # With gradients a call keeps its start and needs a tape of all its substeps later, whose size must be bounded.
         limit = self.tape_limit(planes, segment) if torch.is_grad_enabled() else substeps
         for start in range(0, substeps, limit):

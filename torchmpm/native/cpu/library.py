@@ -54,7 +54,10 @@ if hasattr(os, "register_at_fork"):  # not on Windows
 def find_compiler() -> tuple[str, ...] | None:
     """The C++ compiler as a command: ``$CXX`` or else g++, and clang++ where that is not installed."""
     for command in (os.environ.get("CXX") or "g++", "clang++"):
-        words = tuple(shlex.split(command))
+        try:
+            words = tuple(shlex.split(command))
+        except ValueError:  # a quotation that does not end
+            continue
         if words and shutil.which(words[0]) is not None:
             return words
     return None

@@ -1,0 +1,48 @@
+// The connection to the program: JSON both ways, binary frames from it.
+
+const LOW = -0.5, SPAN = 2, HIDDEN = 65535;
+
+export class Link {
+  constructor(handlers) {
+    this.handlers = handlers;
+    this.flags = [];
+    this.socket = new WebSocket(`ws://${location.host}/ws${location.search}`);
+    this.socket.binaryType = "arraybuffer";
+    this.socket.onmessage = (event) => this.receive(event.data);
+    this.socket.onclose = (event) => handlers.closed(event);
+  }
+
+  send(type, fields = {}) {
+    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({ type, ...fields }));
+  }
+
+  receive(data) {
+    if (data instanceof ArrayBuffer) return this.handlers.frame(decode(data, this.flags));
+    const message = JSON.parse(data);
+    this.flags = message.flags ?? this.flags;
+    this.handlers[message.type]?.(message);
+  }
+}
+
+function decode(buffer, flags) {
+  let at = 0;
+  const take = (type, length) => {
+    const array = new type(buffer, at, length);
+    at += array.byteLength;
+    return array;
+  };
+  const [number, step, echo, bits, rows, width, count, resolution, gate] = take(Uint32Array, 9);
+  const [originX, originY, x, y, cornerX, cornerY, total, rate] = take(Float32Array, 8);
+  const frame = { number, step, echo, resolution, origin: [originX, originY], centre: [x, y], corner: [cornerX, cornerY], total, rate };
+  flags.forEach((name, bit) => { frame[name] = Boolean(bits >> bit & 1); });
+  frame.rewards = Array.from({ length: rows }, () => take(Float32Array, width));
+  frame.positions = take(Uint16Array, 2 * count);
+  frame.colours = take(Uint8Array, count);
+  frame.observation = take(Uint8Array, 3 * 64 * 64);
+  frame.action = take(Int8Array, 2 * resolution ** 2);
+  frame.gate = take(Uint8Array, 2 * gate ** 2);
+  return frame;
+}
+
+// Where a coordinate that was sent lies in the world, m; NaN for a particle that is elsewhere.
+export const world = (value, origin) => value === HIDDEN ? NaN : origin + LOW + value / (HIDDEN - 1) * SPAN;

@@ -1,0 +1,158 @@
+"""What page and server tell each other: JSON messages from the page, and binary frames to it."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import Annotated, Literal, TypeAlias
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+#: Largest size of a message from the page, bytes.
+LARGEST_MESSAGE = 2**18
+#: Positions are sent as 16 bits per coordinate, within this range around the window's origin, m.
+LOW, HIGH = -0.5, 1.5
+#: Stands for a particle that is elsewhere.
+HIDDEN = 65535
+#: The head of a frame: whole numbers, then floating point ones; see :func:`pack_frame`.
+HEAD = struct.Struct("<9I8f")
+
+Count: TypeAlias = Annotated[int, Meta(ge=0, le=2**32 - 1)]
+Pixels: TypeAlias = Annotated[bytes, Meta(min_length=64, max_length=2**16)]
+
+
+class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="type", tag=str.lower):
+    """Base class of what the page may send; its name in lower case is the ``type``."""
+
+
+class Play(Message, frozen=True):
+    """Let time pass, or stop it."""
+
+    playing: bool
+
+
+class Speed(Message, frozen=True):
+    """Simulated seconds per second."""
+
+    factor: Annotated[float, Meta(ge=0.01, le=16)]
+
+
+class Step(Message, frozen=True):
+    """Stop, and take one control step."""
+
+
+class Reset(Message, frozen=True):
+    """Start a new episode; with a seed the particles are drawn anew."""
+
+    seed: Count | None = None
+
+
+class Hand(Message, frozen=True):
+    """What the pointer does at a point of the world, m; without a tool it lets go. Frames echo the last ``id``."""
+
+    tool: Literal["pull", "contract", "expand", None]
+    x: float = 0.0
+    y: float = 0.0
+    id: Count = 0
+
+
+class Paint(Message, frozen=True):
+    """Set cells (row, column) of the painted action image, of the muscles in both directions or in one."""
+
+    muscles: Literal["both", "horizontal", "vertical"]
+    value: Annotated[float, Meta(ge=-1, le=1)]
+    cells: Annotated[list[tuple[Count, Count]], Meta(min_length=1, max_length=4096)]
+
+
+class Clear(Message, frozen=True):
+    """Wipe the painted action image."""
+
+
+class Wave(Message, frozen=True):
+    """Let waves of contraction travel through the robot, or stop them."""
+
+    direction: Literal["left", "right", "up", "down", None]
+
+
+class Policy(Message, frozen=True):
+    """Hand the muscles over to a policy by its name, or take them back."""
+
+    name: str | None
+
+
+class Colour(Message, frozen=True):
+    """Colour the particles by a quantity."""
+
+    by: Literal["muscle", "deformation", "speed"]
+
+
+class Matter(Message, frozen=True):
+    """Factors on the task's own stiffness and yield stress, and gravity downwards, m/s^2."""
+
+    stiffness: Annotated[float, Meta(gt=0)]
+    yield_stress: Annotated[float, Meta(ge=0)]
+    gravity: Annotated[float, Meta(ge=-100, le=100)]
+
+
+class Save(Message, frozen=True):
+    """Send the present state, the actions since the reset, or a replay of them as a file."""
+
+    what: Literal["moment", "actions", "replay"]
+
+
+class Back(Message, frozen=True):
+    """Go back to the moment that was saved last."""
+
+
+class Draw(Message, frozen=True):
+    """A drawn robot or target: a square picture, one byte per pixel, row 0 at the top."""
+
+    what: Literal["body", "target"]
+    pixels: Pixels
+
+
+class Seen(Message, frozen=True):
+    """The page has drawn a frame; no more than a few are on their way to it."""
+
+    frame: Count
+
+
+_DECODER = msgspec.json.Decoder(
+    Play | Speed | Step | Reset | Hand | Paint | Clear | Wave | Policy | Colour | Matter | Save | Back | Draw | Seen
+)
+
+
+def parse(text: str) -> Message:
+    """The message that a text holds.
+
+    Raises:
+        ValueError: It is not JSON, or not a message with exactly its fields, in their ranges.
+    """
+    message: Message = _DECODER.decode(text)
+    return message
+
+
+def quantise(positions: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Positions (N, 2), m, as 16-bit whole numbers relative to the window's ``origin`` (2,), m."""
+    relative = (positions - origin - LOW) / (HIGH - LOW) * (HIDDEN - 1)
+    near = ((relative >= 0) & (relative <= HIDDEN - 1)).all(1, keepdims=True)  # false for NaN
+    return np.where(near, relative, HIDDEN).round().astype(np.uint16)
+
+
+def pack_frame(
+    counters: tuple[int, int, int, int], numbers: Sequence[float], rows: np.ndarray, arrays: Sequence[np.ndarray]
+) -> bytes:
+    """A frame for the page, little-endian; its head begins with the counters and the sizes S, K, N, R and G.
+
+    Args:
+        counters: Number of the frame, control steps of the episode, id of the last :class:`Hand`, and flags.
+        numbers: Origin (x, y) of the window, centre of the robot, lower left corner of the action image, m; return;
+            simulated seconds per second.
+        rows: Return and the terms of the reward after each step since the last frame, (S, K) float32.
+        arrays: Positions (N, 2) uint16; colour codes (N,) uint8; observation (3, 64, 64) uint8; action (2, R, R) int8;
+            gate (2, G, G) uint8, or empty.
+    """
+    sizes = (*rows.shape, len(arrays[0]), arrays[3].shape[-1], arrays[4].shape[-1])
+    return b"".join((HEAD.pack(*counters, *sizes, *numbers), rows.tobytes(), *(array.tobytes() for array in arrays)))

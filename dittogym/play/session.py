@@ -1,0 +1,339 @@
+"""A simulation that is played with, and what messages from the page do to it."""
+
+from __future__ import annotations
+
+import base64
+import inspect
+import io
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dittogym.action import bicubic, from_grid_indexing, patch_corner, to_grid_indexing
+from dittogym.geometry import NODES
+from dittogym.model import Snapshot, check_stability
+from dittogym.physics import physics_values
+from dittogym.play import protocol
+from dittogym.play.hand import Grip, press, wave
+from dittogym.render.recording import Recording
+from dittogym.render.scene import Shot, describe
+from dittogym.tasks import TASKS, task_name
+from dittogym.torch_env import TorchEnv
+from dittogym.window import centre_in_window
+
+#: Names of the bits of a frame's flags.
+FLAGS = ("playing", "terminated", "truncated", "success", "invalid")
+#: Episodes that are shorter than this start in slow motion, s.
+SHORT = 2.0
+#: Control steps that are kept for files, the first ones after a reset.
+LONGEST = 3000
+#: Channels of an action image, by the name of their muscles.
+CHANNELS = {"both": slice(0, 2), "horizontal": slice(0, 1), "vertical": slice(1, 2)}
+#: Loads a policy with ``predict(observation, memory, episode_start, deterministic)``, as stable-baselines3 has it.
+LoadPolicy = Callable[[], Any]
+Answers = list[dict[str, Any]]
+
+
+class Session:
+    """One robot to play with.
+
+    Args:
+        task: A task name or ``"MODULE:NAME"``.
+        policies: What loads the policies, by the names they have on the page.
+        policy: Name of the one that acts at first.
+        seed: Of the particles.
+        options: All arguments of :class:`dittogym.TorchEnv` but ``num_envs``.
+
+    Raises:
+        ValueError: An option is out of range.
+        TypeError: The task has no such option.
+    """
+
+    invalid: bool
+    terminated: bool
+    truncated: bool
+    total: float
+    shot: Shot
+    grip: Grip | None
+    terms: Mapping[str, Tensor]
+
+    def __init__(
+        self,
+        task: str,
+        policies: Mapping[str, LoadPolicy] | None = None,
+        policy: str | None = None,
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
+        self.task, self.policies, self.seed, self.options = task, dict(policies or {}), seed, options
+        self.env = TorchEnv(task, 1, **options)
+        self.own_resolution = self.env.action_resolution
+        self.control_step = self.env.model.substeps * self.env.model.solver.dt
+        self.playing, self.speed = True, 0.1 if self.env.spec.horizon * self.control_step < SHORT else 1.0
+        self.colour = "deformation" if policy is None else "muscle"
+        self.policy: Any = None
+        self.policy_name: str | None = None
+        self.hand, self.direction = protocol.Hand(None), protocol.Wave(None).direction
+        self.physics: dict[str, Any] = {}
+        self.moment: Snapshot | None = None
+        self.num_frames = self.num_steps = 0
+        self._reset(seed)
+        self._apply_policy(protocol.Policy(policy))
+
+    def describe(self) -> dict[str, Any]:
+        """What the page needs to know about the task, as JSON values."""
+        spec, known = self.env.spec, inspect.signature(TASKS[task_name(self.task)]).parameters
+        boxes = [(*body.shape.corner, *np.add(body.shape.corner, body.shape.size).tolist()) for body in spec.bodies]
+        about = {
+            "horizon": spec.horizon,
+            "follow": spec.window.moves,
+            "boxes": boxes,
+            "patch": spec.patch / NODES,
+            "matter": {"mu": spec.mu, "yield_stress": spec.yield_stress, "gravity": -spec.gravity[1]},
+            "draws": ["body", *(["target"] if "target" in known else [])],
+            "policies": list(self.policies),
+            "policy": self.policy_name,
+            "flags": FLAGS,
+            "speed": self.speed,
+            "colour": self.colour,
+            "terms": list(self.terms),
+        }
+        return describe(self.env.model).as_json() | about
+
+    def apply(self, message: protocol.Message) -> Answers:
+        """Do what a message says, and return what to answer, as JSON values.
+
+        Raises:
+            ValueError: It cannot be done, and nothing has changed.
+        """
+        return getattr(self, f"_apply_{type(message).__name__.lower()}")(message) or []
+
+    def advance(self) -> None:
+        """Take one control step, unless the state is no longer valid.
+
+        Raises:
+            Exception: What a task or a policy of the user's does wrong; time is stopped.
+        """
+        if self.invalid:
+            return
+        playing, self.playing = self.playing, False  # until it has worked
+        self.action = self._next_action()
+        self._pull()
+        with torch.no_grad():
+            self.observation, reward, terminated, truncated, info = self.env.step(torch.from_numpy(self.action)[None])
+        self.num_steps, self.terms = self.num_steps + 1, info["reward_terms"]
+        if not (self.terminated or self.truncated):
+            self.total += float(reward[0])
+        self.rows.append([self.total, *(float(term[0]) for term in self.terms.values())])
+        self.terminated, self.truncated = self.terminated or bool(terminated[0]), self.truncated or bool(truncated[0])
+        self.success = "is_success" in info and bool(info["is_success"][0])
+        self.invalid = not bool(info["finite"][0])
+        self.playing, self.shot = playing and not self.invalid, self.env.shot()
+        if len(self.actions) == LONGEST:
+            return self._note(f"only the first {LONGEST} steps are kept")
+        self.actions.append(self.action)
+        self.recording.shots.append(self.shot)
+        self.recording.rewards.append(float(reward[0]))
+
+    def frame(self, rate: float) -> bytes:
+        """The present moment for the page, at ``rate`` simulated seconds per second; see `protocol.pack_frame`."""
+        self.num_frames, shot = self.num_frames + 1, self.shot
+        flags = sum(getattr(self, name) << bit for bit, name in enumerate(FLAGS))
+        codes = np.full(len(shot.x), 127, np.uint8)
+        own = shot.values.get(self.colour, codes)
+        codes[: len(own)] = own
+        images = (
+            self.observation[0].cpu().numpy(),
+            (127 * self.action).round().astype(np.int8),
+            (255 * np.clip(self.gate, 0, 1)).round().astype(np.uint8),
+        )
+        rows = np.array(self.rows, np.float32).reshape(len(self.rows), 1 + len(self.terms))
+        self.rows.clear()
+        numbers = (*shot.origin, *shot.centre, *self._corner(), self.total, rate)
+        counters = self.num_frames, shot.step, self.hand.id, flags
+        return protocol.pack_frame(counters, numbers, rows, (protocol.quantise(shot.x, shot.origin), codes, *images))
+
+    def _reset(self, seed: int | None) -> None:
+        self.observation, _ = self.env.reset(seed=seed, options={"physics": self.physics})
+        self.seed = self.seed if seed is None else seed
+        self.terminated = self.truncated = self.success = self.invalid = False
+        self.total, self.grip, self.memory, self.terms = 0.0, None, None, {}
+        self.rows: list[list[float]] = []
+        self.actions: list[np.ndarray] = []
+        self.touched: list[str] = []
+        self.painted = self.action = np.zeros(self.env.action_shape, np.float32)
+        self.gate = np.zeros((2, 0, 0), np.float32)
+        self.shot = self.env.shot()
+        self.recording = Recording(describe(self.env.model), [self.shot])
+
+    def _next_action(self) -> np.ndarray:
+        """What policy, paint, waves and hand add up to, float32 (2, R, R) in [-1, 1]."""
+        size, action = self.env.action_resolution, np.asarray(self.painted)
+        if self.policy is not None:
+            action = action + self._decide()
+        if self.direction is not None:
+            action = action + wave(self.direction, int(self.env.env_state.steps[0]), size)
+        if self.hand.tool in ("contract", "expand"):
+            point, sign = np.array((self.hand.x, self.hand.y)), 1.0 if self.hand.tool == "contract" else -1.0
+            action = action + sign * press(point, self._corner(), self.env.spec.patch / NODES, size)
+        return np.ascontiguousarray(np.clip(action, -1.0, 1.0), np.float32)
+
+    def _decide(self) -> np.ndarray:
+        """The policy's action (2, R, R); it may tell the gate, too."""
+        policy, images = self.policy, self.observation.cpu().numpy()
+        if hasattr(policy, "predict_with_gate"):
+            chosen, gate = policy.predict_with_gate(images, policy.deterministic_by_default)
+            self.gate = self.gate if gate is None else self._as_image(gate)[0]
+        else:
+            start = np.array([not self.actions])
+            chosen, self.memory = policy.predict(images, self.memory, start, policy.deterministic_by_default)
+        return self._as_image(chosen)[0]
+
+    def _as_image(self, array: np.ndarray) -> np.ndarray:
+        """What a policy returns (B, 2, R, R), in the orientation of the environment's actions."""
+        told = self.policy.description.get("environment", {})
+        layout: Any = told.get("action_layout") or ("grid" if told.get("parity") == "reference" else "image")
+        turned = from_grid_indexing(to_grid_indexing(torch.as_tensor(array), layout), self.env.action_layout)
+        return turned.numpy()
+
+    def _pull(self) -> None:
+        """Let the hand pull at matter, which it takes hold of the first time."""
+        if self.hand.tool != "pull":
+            return
+        state = self.env.env_state
+        point = state.centre.new_tensor((self.hand.x, self.hand.y))
+        self.grip = self.grip or Grip.take(state.particles, point)
+        if self.grip is not None:
+            self.env.env_state = replace(state, particles=self.grip.pull(state.particles, point))
+            self._note("pulled by hand")
+
+    def _note(self, change: str) -> None:
+        """Remember why the actions do not tell the whole story of an episode."""
+        if change not in self.touched:
+            self.touched.append(change)
+
+    def _corner(self) -> np.ndarray:
+        """Lower left corner (2,) of the action image in the world, m."""
+        state, spec = self.env.env_state, self.env.spec
+        corner = patch_corner(centre_in_window(spec.reach, state.centre, state.origin), spec.patch, NODES)
+        return (state.origin[0] + corner[0] / NODES).cpu().double().numpy()
+
+    def _apply_play(self, message: protocol.Play) -> None:
+        self.playing = message.playing and not self.invalid
+
+    def _apply_speed(self, message: protocol.Speed) -> None:
+        self.speed = message.factor
+
+    def _apply_step(self, message: protocol.Step) -> None:
+        self.playing = False
+        self.advance()
+
+    def _apply_reset(self, message: protocol.Reset) -> Answers:
+        self._reset(message.seed)
+        return [{"type": "reset"}]
+
+    def _apply_hand(self, message: protocol.Hand) -> None:
+        self.grip = self.grip if message.tool == self.hand.tool else None
+        self.hand = message
+
+    def _apply_paint(self, message: protocol.Paint) -> None:
+        size, (rows, columns) = self.env.action_resolution, np.array(message.cells).T
+        if (largest := int(np.max(message.cells))) >= size:
+            raise ValueError(f"cells must be rows and columns below {size}, got {largest}")
+        self.painted = self.painted.copy()
+        self.painted[CHANNELS[message.muscles], rows, columns] = message.value
+        self.action = self.action if self.playing else self.painted
+
+    def _apply_clear(self, message: protocol.Clear) -> None:
+        self.painted = np.zeros_like(self.painted)
+        self.action = self.action if self.playing else self.painted
+
+    def _apply_wave(self, message: protocol.Wave) -> None:
+        self.direction = message.direction
+
+    def _apply_policy(self, message: protocol.Policy) -> Answers:
+        if message.name is not None and message.name not in self.policies:
+            raise ValueError(f"name must be one of {', '.join(self.policies) or 'none'}, got {message.name!r}")
+        policy: Any = None if message.name is None else self.policies[message.name]()
+        resolution = self.own_resolution if policy is None else policy.resolution
+        if resolution != self.env.action_resolution:
+            env = TorchEnv(self.task, 1, **{**self.options, "resolution": resolution})
+            env.reset(seed=self.seed, options={"physics": self.physics})
+            env.env_state = self.env.env_state
+            self.env, self.painted = env, np.zeros(env.action_shape, np.float32)
+            self.action = self.painted
+        self.policy = policy.attached(self.env) if hasattr(policy, "attached") else policy
+        self.policy_name, self.memory, self.gate = message.name, None, np.zeros((2, 0, 0), np.float32)
+        return [{"type": "policy", "name": message.name}]
+
+    def _apply_colour(self, message: protocol.Colour) -> None:
+        self.colour = message.by
+
+    def _apply_matter(self, message: protocol.Matter) -> None:
+        spec, state = self.env.spec, self.env.env_state
+        physics: dict[str, Any] = {}
+        if message.stiffness != 1:
+            physics |= {"mu": message.stiffness * spec.mu, "lam": message.stiffness * spec.lam}
+        if message.yield_stress != 1:
+            physics["yield_stress"] = message.yield_stress * spec.yield_stress
+        if message.gravity != -spec.gravity[1]:
+            physics["gravity"] = (spec.gravity[0], -message.gravity)
+        values = physics_values(physics, 1, self.env.num_particles, state.centre[:, 0])
+        check_stability(self.env.model, values)
+        if physics != self.physics:
+            self._note("other matter or gravity")
+        self.physics, self.env.env_state = physics, replace(state, physics=values)
+
+    def _apply_save(self, message: protocol.Save) -> Answers:
+        file, name = io.BytesIO(), f"{self.env.spec.name}-{self.shot.step}"
+        if message.what == "moment":
+            self.moment, name = self.env.save(), f"{name}.pt"
+            torch.save(self.moment, file)
+        elif not self.actions:
+            raise ValueError(f"{message.what} must be of at least one step, got none since the reset")
+        elif message.what == "actions":
+            name += "-actions.npz"
+            np.savez_compressed(file, actions=self._sequence(), seed=self.seed, touched=np.array(self.touched, str))
+        else:
+            name += ".html"
+            file.write(self.recording.page().encode())
+        return [{"type": "file", "name": name, "content": base64.b64encode(file.getvalue()).decode()}]
+
+    def _sequence(self) -> np.ndarray:
+        """The actions since the reset (T, 2, R, R); those of several resolutions as executed, on the patch."""
+        if len({action.shape for action in self.actions}) == 1:
+            return np.stack(self.actions)
+        return np.stack([bicubic(torch.from_numpy(each), self.env.spec.patch).numpy() for each in self.actions])
+
+    def _apply_back(self, message: protocol.Back) -> None:
+        if self.moment is None:
+            raise ValueError("there is no moment to go back to: save one first")
+        self.observation = self.env.load(self.moment)
+        self.terminated = self.truncated = self.success = self.invalid = False
+        self.grip, self.shot = None, self.env.shot()
+        self._note("went back to a saved moment")
+
+    def _apply_draw(self, message: protocol.Draw) -> Answers:
+        size = round(len(message.pixels) ** 0.5)
+        if size**2 != len(message.pixels):
+            raise ValueError(f"pixels must be those of a square, got {len(message.pixels)}")
+        picture = np.frombuffer(message.pixels, np.uint8).reshape(size, size)
+        old = self.env, self.options
+        self.options = {**self.options, message.what: picture}
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            try:
+                self.env = TorchEnv(self.task, 1, **{**self.options, "resolution": self.env.action_resolution})
+                self._reset(self.seed)
+            except ValueError:
+                self.env, self.options = old
+                raise
+        self.moment = None
+        self._apply_policy(protocol.Policy(self.policy_name))
+        notices = ({"type": "notice", "message": str(warning.message)} for warning in caught)
+        return [{"type": "hello", **self.describe()}, {"type": "reset"}, *notices]

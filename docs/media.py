@@ -1,0 +1,87 @@
+"""Films of the tasks, with the policies that come with the package: `python docs/media.py [TASK ...]`.
+
+Each task gets `images/films/TASK.webp`, and all of them together `images/tasks.webp`. `images/films/sources.json` keeps
+the hash of the policy behind each film; a test compares them with those of the package.
+"""
+
+import hashlib
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+import cfp
+import dittogym
+from cfp.weights import SHIPPED, shipped
+from dittogym.render.film import write_film
+from dittogym.render.recording import Recording
+
+IMAGES = Path(__file__).resolve().parent / "images"
+FILMS = IMAGES / "films"
+SOURCES = FILMS / "sources.json"
+#: Pixels of a task's own film and of a cell of the grid, and cells in a row.
+SIZE, CELL, COLUMNS = 360, 240, 4
+#: Duration of a film, s, and pictures per second.
+SECONDS, RATE = 8.0, 12
+
+
+def record_task(task: str, seed: int = 0) -> Recording:
+    """One episode of a task at the lite tier."""
+    policy = cfp.load(task) if task in shipped() else None
+    env = dittogym.TorchEnv(task, particles="lite", resolution=policy.resolution if policy else "coarse")
+    grid = np.arange(env.action_resolution, dtype=np.float32) / env.action_resolution
+
+    def wave(_: np.ndarray) -> np.ndarray:
+        step = float(env.env_state.steps[0])
+        column, row = np.meshgrid(grid, grid)
+        directions = np.sin(2 * math.pi * (column + 0.15 * step)), np.cos(2 * math.pi * (row - 0.1 * step))
+        return np.stack(directions)[None].astype(np.float32)
+
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)  # policies act with noise
+        return env.film(policy or wave, seed=seed)
+
+
+def write_media(recording: Recording, stem: Path, size: int = 384) -> None:
+    """Write ``stem.webp`` (the film), ``stem.png`` (a picture of it) and ``stem.html`` (the replay)."""
+    recording.save(stem.with_suffix(".webp"), size=size, rate=25)
+    Image.fromarray(recording.picture(0.6 * recording.duration, size=size)).save(stem.with_suffix(".png"))
+    recording.save(stem.with_suffix(".html"))
+
+
+def policy_hash(task: str) -> str:
+    """Hash of the policy of a task that comes with the package."""
+    return hashlib.sha256((SHIPPED / f"{task}.safetensors").read_bytes()).hexdigest()
+
+
+def grid_frames(recordings: dict[str, Recording]) -> list[np.ndarray]:
+    """The film of all tasks, each from the start to the end of its episode."""
+    frames = []
+    for moment in np.linspace(0.0, 1.0, round(SECONDS * RATE)):
+        cells = []
+        for task, recording in recordings.items():
+            time = moment * recording.duration
+            cells.append(recording.picture(time, size=CELL, caption=(task.upper(), f"{time:.1f} s")))
+        rows = [np.concatenate(cells[i : i + COLUMNS], 1) for i in range(0, len(cells), COLUMNS)]
+        frames.append(np.concatenate(rows, 0))
+    return frames
+
+
+def main(tasks: list[str]) -> None:
+    """Make the films of some tasks, or of all, and the grid."""
+    sources = json.loads(SOURCES.read_text()) if SOURCES.exists() else {}
+    recordings = {task: record_task(task) for task in dittogym.TASKS}
+    for task in tasks or dittogym.TASKS:
+        speed = max(0.1, round(recordings[task].duration / SECONDS, 1))
+        recordings[task].save(FILMS / f"{task}.webp", size=SIZE, rate=RATE, speed=speed)
+        sources[task] = policy_hash(task)
+    write_film(IMAGES / "tasks.webp", grid_frames(recordings), RATE)
+    SOURCES.write_text(json.dumps(dict(sorted(sources.items())), indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,175 @@
+"""The page in a real browser: what is shown, and what pointer, keys and buttons do to the simulation."""
+
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dittogym.play.server import Server
+from dittogym.play.session import Session
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    found = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if found is None:
+        pytest.skip(f"no browser found, of {', '.join(BROWSERS)}")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+class Played:
+    """A page that is open, and the simulation behind it."""
+
+    def __init__(self, browser: Any, width: int = 1280, task: str = "run") -> None:
+        self.sessions: list[Session] = []
+        self.server = Server(lambda: self._session(task), "secret", port=0)
+        self.thread = threading.Thread(target=self.server.run)
+        self.thread.start()
+        self.errors: list[str] = []
+        self.page = browser.new_page(viewport={"width": width, "height": 800})
+        self.page.on("console", lambda message: message.type == "error" and self.errors.append(message.text))
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.goto(self.server.address)
+        self.until(lambda: self.page.evaluate("stats.frames") > 3)
+
+    def _session(self, task: str) -> Session:
+        self.sessions.append(Session(task, particles=400, substeps=20, resolution=8))
+        return self.sessions[-1]
+
+    @property
+    def session(self) -> Session:
+        return self.sessions[-1]
+
+    def until(self, condition: Callable[[], Any], seconds: float = 30) -> None:
+        """Wait for something that the page does."""
+        deadline = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < deadline, self.errors
+            self.page.wait_for_timeout(20)
+
+    def place(self, x: float, y: float) -> tuple[float, float]:
+        """Where in the window a point of the world is drawn, pixels."""
+        return tuple(self.page.evaluate("([x, y]) => stats.place(x, y)", [x, y]))
+
+    def close(self) -> None:
+        self.server.stop()
+        self.thread.join(10)
+        self.page.close()
+
+
+@pytest.fixture
+def played(browser: Any) -> Iterator[Played]:
+    played = Played(browser)
+    yield played
+    played.close()
+    assert played.errors == []
+
+
+def test_dragging_pulls_at_the_robot(played: Played) -> None:
+    session, mouse = played.session, played.page.mouse
+    start = session.env.env_state.centre[0].tolist()
+    mouse.move(*played.place(*start))
+    mouse.down()
+    for step in range(10):
+        mouse.move(*played.place(start[0], start[1] + 0.02 * step))
+        played.page.wait_for_timeout(50)
+    played.until(lambda: float(session.env.env_state.centre[0, 1]) > start[1] + 0.05)
+    assert session.hand.tool == "pull" and played.page.evaluate("stats.latencies.length") > 0
+    mouse.up()
+    played.until(lambda: session.grip is None)
+    played.until(lambda: float(session.env.env_state.centre[0, 1]) < start[1] + 0.03)  # falls down
+
+
+def test_the_robot_is_drawn_where_it_is(played: Played) -> None:
+    """Pixels on the robot, next to it and on the floor differ, and have the colours of what is there."""
+    page = played.page
+    page.click("#play")
+    played.until(lambda: not played.session.playing)
+    page.wait_for_timeout(300)
+    x, y = played.session.env.env_state.centre[0].tolist()
+
+    def pixel(x: float, y: float) -> list[int]:
+        code = """([x, y]) => { const canvas = document.getElementById("scene"), box = canvas.getBoundingClientRect();
+            const at = [(x - box.left) * canvas.width / box.width, (y - box.top) * canvas.height / box.height];
+            return [...canvas.getContext("2d").getImageData(...at, 1, 1).data]; }"""
+        return page.evaluate(code, list(played.place(x, y)))  # type: ignore[no-any-return]
+
+    robot, air, floor = pixel(x, y), pixel(x + 0.137, y + 0.1), pixel(x + 0.137, 0.1)
+    assert max(robot[:3]) < 150 and min(air[:3]) > 240 and floor[:3] == [112, 119, 130]
+
+
+def test_keys_and_brush(played: Played) -> None:
+    page, session = played.page, played.session
+    page.keyboard.press(" ")
+    played.until(lambda: not session.playing)
+    before = int(session.env.env_state.steps[0])
+    page.keyboard.press(".")
+    played.until(lambda: int(session.env.env_state.steps[0]) == before + 1)
+    page.keyboard.press("4")
+    x, y = session.env.env_state.centre[0].tolist()
+    page.mouse.click(*played.place(x, y))
+    played.until(lambda: session.painted.any())
+    assert session.painted.sum() == 2 and session.painted[:, 3:5, 3:5].sum() == 2  # the cell next to the middle
+    page.keyboard.press("r")
+    played.until(lambda: int(session.env.env_state.steps[0]) == 0 and not session.painted.any())
+    page.keyboard.down("ArrowRight")
+    page.keyboard.press(".")
+    played.until(lambda: session.direction == "right" and len(session.actions) == 1)
+    page.keyboard.up("ArrowRight")
+    played.until(lambda: session.direction is None)
+    assert session.actions[0].any() and page.input_value("#colour") == "muscle"
+
+
+def test_sliders_and_files(played: Played) -> None:
+    page, session = played.page, played.session
+    page.locator("#gravity").fill("-5")
+    page.locator("#stiffness").fill("1")
+    played.until(lambda: session.physics.get("gravity") == (0.0, 5.0) and session.physics.get("mu") == 1300.0)
+    assert "μ = 1300 Pa" in page.inner_text("#matter")
+    page.click("#default")
+    played.until(lambda: session.physics == {})
+    page.click("#play")
+    with page.expect_download() as caught:
+        page.click("#actions")
+    saved = np.load(caught.value.path())
+    assert saved["actions"].shape[1:] == (2, 8, 8) and list(saved["touched"]) == ["other matter or gravity"]
+    with page.expect_download() as caught:
+        page.click("#moment")
+    assert caught.value.suggested_filename.endswith(".pt") and page.is_enabled("#back")
+
+
+def test_a_drawn_robot(played: Played) -> None:
+    page, session = played.page, played.session
+    page.click("#draw")
+    box = page.locator("#paper").bounding_box()
+    page.mouse.move(box["x"] + 130, box["y"] + 160)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 190, box["y"] + 160, steps=5)
+    page.mouse.up()
+    page.click("#use")
+    played.until(lambda: "body" in session.options)
+    width, height = np.ptp(session.env.state.x[0, :400].numpy(), axis=0)
+    assert width > 1.8 * height
+    page.click("#draw")
+    page.click("#use")  # nothing was drawn
+    played.until(lambda: "body must be a picture" in page.inner_text("#toasts"))
+
+
+def test_small_screens_and_the_end_of_the_program(browser: Any) -> None:
+    played = Played(browser, width=390, task="shapematch")
+    assert played.page.evaluate("document.documentElement.scrollWidth") <= 390
+    assert played.page.locator("#what option").count() == 2 and played.page.input_value("#speed") == "0.1"
+    played.server.stop()
+    played.until(lambda: played.page.is_visible("#lost"))
+    played.close()
+    assert played.errors == []

@@ -1,0 +1,231 @@
+"""The server of the page and its command line: who is let in, what malformed messages get, and what stays behind."""
+
+import contextlib
+import gc
+import json
+import re
+import socket
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import pytest
+import tyro
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from dittogym.play import __main__ as program
+from dittogym.play.protocol import HEAD
+from dittogym.play.server import LARGEST_NUMBER, Pace, Server
+from dittogym.play.session import Session
+
+SMALL: dict[str, Any] = {"particles": 200, "substeps": 10}
+MALFORMED = [
+    "",
+    "{",
+    "null",
+    '{"type": "fly"}',
+    '{"type": "play"}',
+    '{"type": "play", "playing": "yes"}',
+    '{"type": "hand", "tool": "pull", "x": NaN, "y": 0}',
+    '{"type": "paint", "muscles": "both", "value": 1, "cells": [[0, 999]]}',
+    '{"type": "policy", "name": "../../etc/passwd"}',
+    '{"type": "draw", "what": "body", "pixels": "AAAA"}',
+]
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    """A server on a free port, in a thread."""
+    server = Server(partial(Session, "run", **SMALL), "secret", port=0)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    yield server
+    server.stop()
+    thread.join(10)
+    assert not thread.is_alive()
+
+
+def open_page(server: Server, token: str = "secret", origin: str | None = "own") -> ClientConnection:
+    """A WebSocket as the page opens it."""
+    origin = f"http://127.0.0.1:{server.port}" if origin == "own" else origin
+    return connect(f"ws://127.0.0.1:{server.port}/ws?token={token}", origin=origin, proxy=None)  # type: ignore[arg-type]
+
+
+def receive(page: ClientConnection, wanted: str) -> Any:
+    """The next message of a type, or of a frame the number of its step; frames on the way are acknowledged."""
+    while True:
+        content = page.recv(timeout=60)
+        if isinstance(content, bytes):
+            number, step, *_ = HEAD.unpack_from(content)
+            page.send(json.dumps({"type": "seen", "frame": number}))
+            if wanted == "frame":
+                return step
+        elif (message := json.loads(content))["type"] == wanted:
+            return message
+
+
+def tell(page: ClientConnection, kind: str, **fields: Any) -> None:
+    page.send(json.dumps({"type": kind, **fields}))
+
+
+def status(server: Server, path: str, host: str | None = None) -> tuple[int, str, Any]:
+    request = urllib.request.Request(f"http://127.0.0.1:{server.port}{path}", headers={"Host": host} if host else {})
+    try:
+        with urllib.request.urlopen(request) as answer:
+            return answer.status, answer.read().decode(), answer.headers
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode(), error.headers
+
+
+def test_page_and_token(server: Server) -> None:
+    assert status(server, "/")[0] == status(server, "/?token=guess")[0] == 403
+    code, page, headers = status(server, "/?token=secret")
+    assert code == 200 and "default-src 'self'" in headers["content-security-policy"]
+    assert "http" not in page  # nothing comes from elsewhere
+    assert status(server, "/page/main.js")[0] == 200 and status(server, "/page/../server.py")[0] == 404
+    assert status(server, "/?token=secret", host="example.org")[0] == 400
+
+
+@pytest.mark.parametrize(
+    ("token", "origin"),
+    [("", "own"), ("guess", "own"), ("secret", None), ("secret", "null"), ("secret", "http://127.0.0.1:1")],
+)
+def test_strangers_are_refused(server: Server, token: str, origin: str | None) -> None:
+    with pytest.raises(InvalidStatus, match="403"):
+        open_page(server, token, origin)
+
+
+def test_malformed_messages_are_answered_and_survived(server: Server) -> None:
+    with open_page(server) as page:
+        assert receive(page, "hello")["task"] == "run"
+        for text in MALFORMED:
+            page.send(text)
+            assert 10 < len(receive(page, "error")["message"]) < 400
+        page.send(b"\x00")
+        assert receive(page, "error")["message"] == "message must be text, got bytes"
+        tell(page, "play", playing=False)
+        tell(page, "reset")
+        receive(page, "reset")
+        assert receive(page, "frame") == 0
+    with open_page(server) as page:
+        receive(page, "hello")
+        page.send("x" * 2**20)  # ends this connection, but not the server
+        with pytest.raises(ConnectionClosed):
+            receive(page, "error")
+    with open_page(server) as page:
+        receive(page, "hello")
+
+
+def test_time_stops_and_goes_on_in_single_steps(server: Server) -> None:
+    with open_page(server) as page:
+        assert receive(page, "hello")["dt"] == pytest.approx(1e-3)
+        while receive(page, "frame") < 5:
+            pass
+        tell(page, "play", playing=False)
+        tell(page, "reset")
+        receive(page, "reset")
+        steps = [receive(page, "frame")]
+        for _ in range(2):
+            tell(page, "step")
+            steps.append(receive(page, "frame"))
+        assert steps == [0, 1, 2]
+        with pytest.raises(TimeoutError):
+            page.recv(timeout=0.2)
+
+
+def test_a_page_that_lags_behind_is_waited_for(server: Server) -> None:
+    with open_page(server) as page:
+        receive(page, "hello")
+        frames = 0
+        with contextlib.suppress(TimeoutError):
+            while True:
+                frames += isinstance(page.recv(timeout=0.5), bytes)
+        assert 1 <= frames <= 4
+        page.send("{")
+        assert receive(page, "error")
+
+
+def test_pages_that_come_and_go_leave_nothing(server: Server) -> None:
+    for _ in range(5):
+        with open_page(server) as page:
+            receive(page, "frame")
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline:
+        gc.collect()
+        threads = [thread for thread in threading.enumerate() if thread.name.startswith("play")]
+        sessions = [each for each in gc.get_objects() if type(each) is Session]
+        if not (server.connections or threads or sessions):
+            return
+        time.sleep(0.1)
+    raise AssertionError((server.connections, threads, sessions))
+
+
+def test_only_a_few_pages_at_once(server: Server) -> None:
+    with contextlib.ExitStack() as stack:
+        for _ in range(LARGEST_NUMBER):
+            receive(stack.enter_context(open_page(server)), "hello")
+        with open_page(server) as page:
+            assert "at most 4 pages" in receive(page, "error")["message"]
+            with pytest.raises(ConnectionClosed):
+                page.recv(timeout=10)
+
+
+def test_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fractions of a step are kept; what cannot be caught up is dropped."""
+    now = [100.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    pace = Pace(0.01)
+    steps = []
+    for _ in range(60):
+        now[0] += 1 / 60
+        steps.append(pace.due(1.0))
+        pace.count(steps[-1])
+    assert sum(steps) in (99, 100) and set(steps) == {1, 2}
+    now[0] += 3600
+    assert pace.due(1.0) <= 17 and 0 <= pace.left() <= 1 / 60
+    pace.restart()
+    assert pace.due(4.0) == 0
+
+
+def test_command_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr(Server, "run", lambda self: self._socket.close())
+    monkeypatch.setattr(program.webbrowser, "open", opened.append)
+    arguments = "--policy shapematch --particles 200 --target T --port 0"
+    assert program.main(arguments.split()) == 0
+    (address,) = opened
+    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{22}", address)
+    assert address in capsys.readouterr().out
+    played = Session(**program.options(tyro.cli(program.Command, args=arguments.split())))
+    assert (played.env.spec.name, played.policy_name, list(played.policies)) == (
+        "shapematch",
+        "shapematch",
+        ["shapematch"],
+    )
+    assert not played.env.spec.target[40, 20] and played.env.action_resolution == 32
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        for arguments, message in (
+            ("fly", "task must be one of"),
+            ("run --target star", "unexpected keyword argument 'target'"),
+            ("run --policy nowhere", "there is no policy"),
+            ("run --particles 0", "particles must be at least 1"),
+            ("run --body nowhere.png", "no such file"),
+            (f"run --particles 200 --port {other.getsockname()[1]}", "in use"),
+        ):
+            assert program.main(arguments.split()) == 2
+            error = capsys.readouterr().err
+            assert error.startswith("error: ") and message in error and error.count("\n") == 1
+
+
+def test_without_the_extra(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.delitem(sys.modules, "dittogym.play.server")
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    assert program.main(["run"]) == 2
+    assert "pip install torchmpm[play]" in capsys.readouterr().err

@@ -1,0 +1,324 @@
+"""What a page may ask of a simulation, without a server or a browser."""
+
+import base64
+import io
+import json
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import cfp
+from cfp import ActorPolicy, ActorSpec
+from dittogym import TASKS, TorchEnv, make_spec
+from dittogym.play import protocol
+from dittogym.play.hand import press, wave
+from dittogym.play.protocol import HEAD, Draw, Hand, Matter, Paint, Reset, Save, Step, Wave, parse
+from dittogym.play.session import FLAGS, Session
+
+SMALL = {"particles": 200, "substeps": 10}
+
+
+@dataclass
+class Constant:
+    """A policy with one action, which counts its steps in its memory."""
+
+    resolution: int = 4
+    deterministic_by_default: bool = True
+    description: dict[str, Any] = field(default_factory=dict)
+
+    def predict(self, observation, state, episode_start, deterministic):
+        assert observation.shape == (1, 3, 64, 64) and deterministic
+        action = np.zeros((1, 2, self.resolution, self.resolution), np.float32)
+        action[0, 0, 0] = 0.5  # the top row
+        return action, (np.array([1 if state is None else state[0][0] + 1]),)
+
+
+def session(task: str = "run", **arguments: Any) -> Session:
+    return Session(task, **(SMALL | arguments))
+
+
+def shown(played: Session) -> SimpleNamespace:
+    """The next frame as the page reads it."""
+    frame = played.frame(1.0)
+    number, step, echo, flags, rows, width, count, resolution, gate, *numbers = HEAD.unpack_from(frame)
+    result = SimpleNamespace(number=number, step=step, echo=echo, numbers=numbers)
+    result.flags = {name for bit, name in enumerate(FLAGS) if flags >> bit & 1}
+    shapes = {
+        "rows": ("<f4", (rows, width)),
+        "positions": ("<u2", (count, 2)),
+        "colours": ("u1", (count,)),
+        "observation": ("u1", (3, 64, 64)),
+        "action": ("i1", (2, resolution, resolution)),
+        "gate": ("u1", (2, gate, gate)),
+    }
+    at = HEAD.size
+    for name, (kind, shape) in shapes.items():
+        array = np.frombuffer(frame, kind, int(np.prod(shape)), at).reshape(shape)
+        setattr(result, name, array)
+        at += array.nbytes
+    assert at == len(frame)
+    return result
+
+
+@pytest.mark.parametrize("task", sorted(TASKS))
+def test_every_task_can_be_played(task: str) -> None:
+    played = session(task)
+    about = json.loads(json.dumps(played.describe(), allow_nan=False))
+    assert about["task"] == task and sum(body["count"] for body in about["bodies"]) == played.env.num_particles
+    assert ("target" in about["draws"]) == (task == "shapematch") == bool(about["target"])
+    for _ in range(2):
+        played.advance()
+    frame, state = shown(played), played.env.env_state
+    assert frame.step == 2 and "playing" in frame.flags and len(frame.rows) == 2
+    assert frame.rows[-1, 0] == pytest.approx(frame.numbers[6]) == played.total
+    sent = protocol.LOW + frame.positions / (protocol.HIDDEN - 1) * (protocol.HIGH - protocol.LOW) + frame.numbers[:2]
+    assert np.abs(sent - state.particles.x[0].numpy()).max() < 2e-5
+    assert np.array_equal(frame.observation, played.observation[0])
+    assert len(shown(played).rows) == 0
+
+
+def test_pulling_moves_matter_towards_the_pointer() -> None:
+    played, alone = (session(substeps=100) for _ in range(2))
+    com = played.env.env_state.centre[0].tolist()
+    for step in range(1, 31):
+        played.apply(Hand("pull", com[0], com[1] + 0.01 * min(step, 8), id=step))
+        played.advance()
+        alone.advance()
+    up = float(played.env.env_state.centre[0, 1] - alone.env.env_state.centre[0, 1])
+    assert 0.02 < up < 0.12
+    assert shown(played).echo == 30
+    played.apply(Hand("pull", 9.0, 9.0))  # still holds it
+    assert played.grip is not None
+    for tool, x in ((None, 0.0), ("pull", 9.0)):  # lets go, and finds nothing
+        played.apply(Hand(tool, x, 9.0))
+        played.advance()
+        assert played.grip is None
+
+
+def test_muscles_under_the_pointer() -> None:
+    """The action has its largest value in the cell that holds the pointer."""
+    played = session(resolution=16)
+    corner, cell = played._corner(), 0.5 / 16
+    for tool, sign in (("contract", 1), ("expand", -1)):
+        played.apply(Hand(tool, corner[0] + 5.5 * cell, corner[1] + 0.5 - 7.5 * cell))
+        played.advance()
+        action = sign * played.actions[-1]
+        corner = played._corner()
+        assert np.unravel_index(action[0].argmax(), (16, 16)) == (7, 5) and action.max() == pytest.approx(1, abs=0.1)
+    near = press(np.array((0.1, 0.2)), np.zeros(2), 0.5, 8)
+    assert near.shape == (2, 8, 8) and near.max() <= 1
+
+
+def test_paint_waves_and_policy_add_up() -> None:
+    policies = {"constant": Constant}
+    played = session(policies=policies, policy="constant")
+    played.apply(Paint("vertical", -1.0, [[3, 0], [3, 1]]))
+    played.advance()
+    expected = np.zeros((2, 4, 4))
+    expected[0, 0], expected[1, 3, :2] = 0.5, -1.0
+    assert np.array_equal(played.actions[-1], expected)
+    played.apply(protocol.Clear())
+    played.apply(Wave("up"))
+    played.advance()
+    assert np.allclose(
+        played.actions[-1],
+        np.clip(wave("up", 1, 4) + Constant().predict(np.zeros((1, 3, 64, 64)), None, None, True)[0][0], -1, 1),
+    )
+    assert played.memory[0][0] == 2
+    with pytest.raises(ValueError, match="cells must be rows and columns below 4"):
+        played.apply(Paint("both", 1.0, [[4, 0]]))
+    with pytest.raises(ValueError, match="name must be one of constant, got '/etc/passwd'"):
+        played.apply(protocol.Policy("/etc/passwd"))
+    played.apply(protocol.Policy(None))
+    assert played.env.action_resolution == make_spec("run").coarse
+    before = played.env.state.x.clone()
+    played.apply(protocol.Policy("constant"))
+    assert torch.equal(before, played.env.state.x) and shown(played).action.shape == (2, 4, 4)
+
+
+def test_waves_travel() -> None:
+    for direction, axis, sign in (("right", 2, 1), ("left", 2, -1), ("down", 1, 1), ("up", 1, -1)):
+        now, later = (wave(direction, step, 64) for step in (0, 5))  # phase 1.5
+        shift = round(sign * 1.5 / (2 * np.pi * 2) * 64)
+        assert np.abs(np.roll(now, shift, axis) - later).max() < 0.1
+
+
+def test_policies_with_other_orientations_and_gates() -> None:
+    """An action of the reference's orientation is turned; the gate of a policy with several stages is shown."""
+    turned = Constant(description={"environment": {"action_layout": "grid"}})
+    played = session(policies={"turned": lambda: turned}, policy="turned")
+    played.advance()
+    assert (played.actions[-1][0, :, 0] == 0.5).all() and played.actions[-1].sum() == 2.0
+    fine = ActorPolicy(ActorSpec((8, 16), gate_bias=(0.0,)), deterministic_by_default=True)
+    played = session(policies={"fine": lambda: fine}, policy="fine")
+    played.advance()
+    images = played.observation.numpy()
+    assert shown(played).gate.shape == (2, 16, 16) and shown(played).gate.any()
+    action, gate = fine.predict_with_gate(images, True)
+    assert np.array_equal(action, fine.predict(images, deterministic=True)[0]) and gate.shape == (1, 2, 16, 16)
+
+
+def test_matter_changes_while_it_moves_and_stays_after_a_reset() -> None:
+    played = session()
+    played.apply(Matter(stiffness=2.0, yield_stress=0.5, gravity=3.0))
+    for _ in range(2):
+        physics = played.env.env_state.physics
+        assert {name: value.flatten().tolist() for name, value in physics.items()} == {
+            "mu": [1300.0], "lam": [100.0], "yield_stress": [45.0], "gravity": [0.0, -3.0],
+        }  # fmt: skip
+        played.apply(Reset())
+    played.apply(Matter(stiffness=1.0, yield_stress=1.0, gravity=9.0))
+    assert played.env.env_state.physics == {} and played.touched
+    with pytest.raises(ValueError, match="dt must be at most"):
+        played.apply(Matter(stiffness=1e4, yield_stress=1.0, gravity=9.0))
+    played.advance()
+
+
+def test_saved_actions_repeat_an_episode() -> None:
+    played = session(resolution="coarse", seed=3)
+    played.apply(Wave("right"))
+    for _ in range(4):
+        played.advance()
+    (replay,) = played.apply(Save("replay"))
+    assert replay["name"] == "run-4.html" and b'"rewards":[' in base64.b64decode(replay["content"])
+    (answer,) = played.apply(Save("actions"))
+    saved = np.load(io.BytesIO(base64.b64decode(answer["content"])))
+    assert (
+        answer["name"] == "run-4-actions.npz" and saved["actions"].shape == (4, 2, 8, 8) and not len(saved["touched"])
+    )
+    env = TorchEnv("run", **SMALL)
+    env.reset(seed=int(saved["seed"]))
+    for action in saved["actions"]:
+        env.step(torch.from_numpy(action)[None])
+    assert torch.equal(env.state.x, played.env.state.x)
+
+
+def test_moments() -> None:
+    played = session()
+    with pytest.raises(ValueError, match="save one first"):
+        played.apply(protocol.Back())
+    played.advance()
+    (answer,) = played.apply(Save("moment"))
+    snapshot = torch.load(io.BytesIO(base64.b64decode(answer["content"])), weights_only=True)
+    then = played.env.state.x.clone()
+    played.advance()
+    played.apply(protocol.Back())
+    assert torch.equal(played.env.state.x, then) and shown(played).step == 1
+    env = TorchEnv("run", **SMALL)
+    env.load(snapshot)
+    assert torch.equal(env.state.x, then)
+
+
+def drawing(mask: np.ndarray, what: str) -> Draw:
+    return Draw(what, (mask.astype(np.uint8) * 255).tobytes())
+
+
+def test_drawings() -> None:
+    """A drawn robot stands where the task's stood; a drawn target is what the reward compares with."""
+    y, x = np.mgrid[:128, :128] - 63.5
+    played = session("shapematch")
+    hello, reset, *_ = played.apply(drawing(np.hypot(x, y) < 30, "target"))
+    assert hello["type"] == "hello" and reset["type"] == "reset"
+    assert played.env.spec.target[32, 32] and not played.env.spec.target[:10].any()
+    played.apply(drawing((abs(x) < 40) & (abs(y) < 20), "body"))
+    width, height = np.ptp(played.env.state.x[0].numpy(), axis=0)
+    assert width / height == pytest.approx(2.0, rel=0.1) and played.env.spec.target[32, 32]
+    before = played.env
+    with pytest.raises(ValueError, match="body must be a picture"):
+        played.apply(drawing(np.zeros((64, 64)), "body"))
+    with pytest.raises(ValueError, match="body must lie inside the window"):
+        session().apply(drawing(abs(y) < 2, "body"))
+    assert played.env is before
+    answers = played.apply(drawing(np.hypot(abs(x) - 30, y) < 20, "target"))  # two discs
+    assert answers[-1]["type"] == "notice" and "no robot can be expected" in answers[-1]["message"]
+
+
+def test_the_end_of_an_episode_is_told_and_failure_stops_time() -> None:
+    played = session("shapematch")
+    for _ in range(31):
+        played.advance()
+    assert {"truncated", "playing"} <= shown(played).flags
+    total = played.total
+    played.advance()
+    assert played.total == total
+    played.env.state.v.fill_(torch.nan)
+    played.advance()
+    frame = shown(played)
+    assert "invalid" in frame.flags and "playing" not in frame.flags and frame.step == 33
+    played.advance()
+    played.apply(protocol.Play(True))
+    assert shown(played).step == 33 and not played.playing
+    played.apply(Reset(seed=5))
+    played.apply(Step())
+    assert shown(played).step == 1 and not played.playing
+
+
+def test_a_policy_that_fails_stops_time() -> None:
+    broken = Constant(resolution=4)
+    played = session(policies={"broken": lambda: broken}, policy="broken")
+    broken.predict = None  # type: ignore[method-assign]
+    with pytest.raises(TypeError):
+        played.advance()
+    assert not played.playing
+
+
+def test_a_shipped_policy_acts_as_it_does_elsewhere() -> None:
+    policy = cfp.load("shapematch")
+    played = Session("shapematch", {"shapematch": lambda: policy}, "shapematch", particles="lite")
+    for _ in range(30):
+        played.advance()
+    assert played.success and 350 < played.total < 500
+
+
+GOOD = [
+    '{"type": "play", "playing": false}',
+    '{"type": "hand", "tool": "pull", "x": 0.5, "y": 0.25, "id": 7}',
+    '{"type": "hand", "tool": null}',
+    '{"type": "reset"}',
+    '{"type": "paint", "muscles": "both", "value": 1, "cells": [[0, 3]]}',
+]
+BAD = {
+    "": "truncated",
+    "[" * 100_000: "Expected `object`, got `array`",
+    "{}": "missing required field `type`",
+    '{"type": ["play"]}': "Expected `str` - at `$.type`",
+    '{"type": "message"}': "Invalid value 'message' - at `$.type`",
+    '{"type": "play"}': "missing required field `playing`",
+    '{"type": "play", "playing": 1}': "Expected `bool`, got `int` - at `$.playing`",
+    '{"type": "step", "count": 9}': "unknown field `count`",
+    '{"type": "speed", "factor": 1e99}': "Expected `float` <= 16.0 - at `$.factor`",
+    '{"type": "speed", "factor": NaN}': "invalid character",
+    '{"type": "hand", "tool": "bite"}': "Invalid enum value 'bite' - at `$.tool`",
+    '{"type": "hand", "tool": "pull", "x": "0"}': "Expected `float`, got `str` - at `$.x`",
+    '{"type": "hand", "tool": "pull", "x": 1e999}': "Number out of range - at `$.x`",
+    '{"type": "hand", "tool": "pull", "id": -1}': "Expected `int` >= 0 - at `$.id`",
+    '{"type": "reset", "seed": 1.5}': "Expected `int | null`, got `float` - at `$.seed`",
+    '{"type": "paint", "muscles": "both", "value": 1, "cells": []}': "length >= 1 - at `$.cells`",
+    '{"type": "paint", "muscles": "both", "value": 1, "cells": [[0]]}': "length 2 - at `$.cells[0]`",
+    '{"type": "paint", "muscles": "both", "value": 1, "cells": [[-1, 0]]}': "`int` >= 0 - at `$.cells[0][0]`",
+    '{"type": "policy", "name": 3}': "Expected `str | null`, got `int`",
+    '{"type": "matter", "stiffness": 0, "yield_stress": 1, "gravity": 9}': "Expected `float` > 0.0 - at `$.stiffness`",
+    '{"type": "save", "what": "../../x"}': "Invalid enum value '../../x' - at `$.what`",
+    '{"type": "draw", "what": "body", "pixels": "!"}': "Invalid base64 encoded string - at `$.pixels`",
+    '{"type": "draw", "what": "body", "pixels": "AAAA"}': "Expected `bytes` of length >= 64 - at `$.pixels`",
+    '{"type": "seen", "frame": true}': "Expected `int`, got `bool` - at `$.frame`",
+}
+
+
+@pytest.mark.parametrize("text", GOOD)
+def test_messages(text: str) -> None:
+    message = parse(text)
+    for name, value in json.loads(text).items():
+        told = type(message).__name__.lower() if name == "type" else getattr(message, name)
+        assert told == value or [list(cell) for cell in told] == value
+
+
+@pytest.mark.parametrize("text", BAD, ids=range(len(BAD)))
+def test_malformed_messages(text: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        parse(text)
+    assert BAD[text] in str(caught.value) and len(str(caught.value)) < 300

@@ -1,0 +1,88 @@
+"""The pure step under the transforms of ``torch.func``, which an environment, as it keeps what it is given, refuses."""
+
+import copy
+import pickle
+from collections.abc import Callable
+
+import pytest
+import torch
+from tiny import TASKS, actions, set_particles, tiny
+from torch import Tensor
+
+from dittogym import core
+from dittogym.action import bicubic_matrix
+from torchmpm import tree
+
+
+def reward_of(task: str) -> tuple[Callable[[Tensor], Tensor], Tensor]:
+    """Smooth reward of the first step of an episode as a function of its actions, and such actions (3, B, 2, R, R)."""
+    env = tiny(task, 2, backend="eager", substeps=2)
+    env.reset(seed=0)
+    start = env.state.x.clone()
+
+    def reward(action: Tensor) -> Tensor:
+        state, _ = core.reset(env.model, start)
+        return core.step(env.model, state, action, soft=True).reward.sum()
+
+    return reward, actions(env, 3)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_transforms_of_the_pure_step_give_what_autograd_gives(task: str) -> None:
+    reward, drive = reward_of(task)
+    leaf = drive.clone().requires_grad_()
+    values = torch.stack([reward(action) for action in leaf])
+    (expected,) = torch.autograd.grad(values.sum(), leaf)
+    assert expected.abs().max() > 0
+    got, mapped = torch.func.grad(reward)(drive[0]), torch.func.vmap(torch.func.grad(reward))(drive)
+    for ours, theirs in ((got, expected[0]), (mapped, expected), (torch.func.vmap(reward)(drive), values.detach())):
+        torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-12 * theirs.abs().max().item())
+
+
+def test_an_environment_refuses_transforms_and_is_as_it_was() -> None:
+    env, drive = tiny("run", 2), torch.zeros(2, 2, 8, 8)
+    env.reset(seed=0)
+    moment, positions = env.save(), env.state.x.clone()
+    before = env.step(drive)[1]
+    env.load(moment)
+    with pytest.raises(RuntimeError, match=r"TorchEnv.step must not .* use dittogym.core.reset and dittogym.core.step"):
+        torch.func.grad(lambda action: env.step(action)[1].sum())(drive)
+    with pytest.raises(RuntimeError, match=r"TorchEnv.reset must not"):
+        torch.func.vmap(lambda x: env.reset(options={"positions": x}))(positions[None])
+    with pytest.raises(RuntimeError, match=r"TorchEnv.env_state must not"):
+        torch.func.grad(lambda x: set_particles(env, x=x) or x.sum())(positions)
+    assert torch.equal(env.step(drive)[1], before)
+
+
+def test_nothing_is_kept_from_a_transform() -> None:
+    bicubic_matrix.__wrapped__.cache_clear()
+    reward, drive = reward_of("run")
+    torch.func.grad(reward)(drive[0])
+    kept = bicubic_matrix(8, 64, False, torch.float64, torch.device("cpu"))
+    assert kept.data_ptr()  # a tensor of its own, no wrapper of one
+
+
+@pytest.mark.parametrize("backend", ["eager", "native"])
+@pytest.mark.parametrize("task", TASKS)
+def test_gradients_from_a_state_that_was_made_in_inference_mode(task: str, backend: str) -> None:
+    env, results = tiny(task, 2, backend=backend, substeps=2), []
+    for inference in (False, True):
+        with torch.inference_mode(inference), torch.set_grad_enabled(False):
+            env.reset(seed=0)
+            env.step(actions(env, 1)[0])
+        drive = actions(env, 1, seed=1)[0].requires_grad_()
+        env.step(drive, soft=True)[1].sum().backward()
+        results.append(drive.grad)
+    assert results[0].abs().max() > 0 and torch.equal(*results)
+
+
+def test_a_graph_is_neither_pickled_nor_copied_without_a_word() -> None:
+    env = tiny("run", 1)
+    env.reset(seed=0)
+    env.step(torch.zeros(1, 2, 8, 8, requires_grad=True))
+    for copied in (copy.deepcopy, pickle.dumps):
+        for thing, name in ((env, "TorchEnv"), (env.save(), "TorchEnv"), (env.state, "ParticleState")):
+            with pytest.raises(RuntimeError, match=rf"{name} cannot be pickled .* call its detach\(\) first"):
+                copied(thing)
+    env.detach()
+    assert not any(leaf.requires_grad for leaf in tree.leaves(pickle.loads(pickle.dumps(env)).env_state))
