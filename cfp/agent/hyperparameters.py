@@ -75,8 +75,8 @@ class LearningConfig:
             check_positive(target_std=self.target_std)
         if self.critic == "categorical" and self.reward_scale != "return":
             raise ConfigError("critic categorical requires reward_scale return: its atoms cover [-5, 5]")
-        if self.noise_cells not in (0, *RESOLUTIONS):
-            raise ConfigError(f"noise_cells must be 0 or one of {RESOLUTIONS}, got {self.noise_cells}")
+        if self.noise_cells not in (allowed := (0, 1, 2, *RESOLUTIONS)):
+            raise ConfigError(f"noise_cells must be one of {allowed}, got {self.noise_cells}")
         for scale in self.noise_scale:
             check_positive(noise_scale=scale)
 

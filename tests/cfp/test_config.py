@@ -122,11 +122,11 @@ def test_another_number_of_levels_stretches_what_each_has_one_of():
     first, second = sac_preset("shapematch").alpha
     assert five.alpha == (first, second, second, second, second)
     assert five.gate_bias == (-2.0,) * 4 and five.gate_penalty == (0.8,) * 4
-    assert five.random_steps == (480, 100, 100, 100, 100)
+    assert five.random_steps == (0,) * 5
     three = parse(PROGRAM, "--learner sac --resolutions 4 8 16 --alpha 1 2 3 --handover 100 200".split()).run
     assert (three.alpha, three.handover) == ((1.0, 2.0, 3.0), (100, 200))
     one = parse(PROGRAM, "--learner sac --resolutions 16".split()).run
-    assert (one.handover, one.gate_bias, one.alpha) == ((), (), (0.005,))
+    assert (one.handover, one.gate_bias, one.alpha) == ((), (), (first,))
     with pytest.raises(ConfigError, match="alpha must have 3 values"):
         parse(PROGRAM, "--learner sac --resolutions 4 8 16 --alpha 1 2 3 4".split())
 

@@ -15,11 +15,11 @@ from cfp.envs.vec_env import monitored
 from cfp.presets import sac_preset
 
 STEPS = 6
-"""Of an episode: the height starts between -0.5 and 0.9, and is to be brought to 0.5 and held there."""
+"""Of an episode: the height starts between -0.4 and 0.3, and is to be brought to 0.5 and held there."""
 
 
 def make_env():
-    return monitored(FakeEnv(num_envs=8, resolution=4, horizon=STEPS, start=-0.4, push=0.5))
+    return monitored(FakeEnv(num_envs=8, resolution=4, horizon=STEPS, start=-0.4, push=0.2))
 
 
 def mean_return(model):
@@ -36,14 +36,16 @@ def mean_return(model):
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_quick_learns_a_small_task(seed):
     quick = sac_preset("run")
-    hyperparameters = replace(
-        quick.hyperparameters(1), batch_size=32, buffer_size=4_000, update_start=160, gamma=0.8, alpha=1e-3
-    )
+    small = {"batch_size": 32, "buffer_size": 4_000, "update_start": 160, "gradient_steps": 4}
+    # The height moves by the mean of all entries, over which noise of more cells would average out.
+    hyperparameters = replace(quick.hyperparameters(1), **small, gamma=0.8, alpha=1e-3, noise_cells=1)
     spec = ActorSpec((4,), encoder=quick.network.encoder, initial_std=quick.network.initial_std)
     model = CFP(CFPPolicy, make_env(), hyperparameters, seed=seed, device="cpu", policy_kwargs={"spec": spec})
     model.set_logger(Logger(None, []))
     torch.manual_seed(seed)
     before = mean_return(model)
-    model.learn(8 * 200)
-    assert before < 4.2
-    assert mean_return(model) > 5.0
+    model.learn(8 * 100)
+    after = mean_return(model)
+    print(before, after)
+    assert before < 3.5
+    assert after > 4.0
