@@ -18,7 +18,7 @@ from cfp.validation import check_at_least
 from dittogym import make_spec
 from dittogym.tasks import allowed_instead, task_name
 
-Preset = Literal["quick", "long", "paper"]
+Preset = Literal["quick", "lean", "long", "paper"]
 Learner = Literal["analytic", "sac"]
 
 LARGEST_SEED = 2**31 - 1
@@ -35,7 +35,7 @@ class RunConfig:
     algo: str = "cfp"
     """Algorithm."""
     preset: Preset = "quick"
-    """Source of the defaults: quick (minutes on two cores), long (a night; learner sac) or paper (as published)."""
+    """Source of the defaults: quick (minutes), paper (as published); for learner sac also lean and long (a night)."""
     seed: int = 0
     """Seed of everything that is random."""
     device: str = "auto"

@@ -120,8 +120,9 @@ def preset(task: str, name: Preset = "quick", learner: Learner | None = None) ->
         task: One of `dittogym.TASKS`, or ``"MODULE:NAME"``. A custom task, for which nothing was published, gets the
             numbers of RUN with its own action grids, and has no preset ``"paper"``.
         name: ``"paper"``: one robot at full size, the published numbers, the reference's interpolation and faults.
-            ``"quick"``: several robots with fewer particles, minutes instead of days. ``"long"``: the same for a night
-            of eight hours on two cores, for the learner ``"sac"``.
+            ``"quick"``: several robots with fewer particles, minutes instead of days. For the learner ``"sac"`` also
+            ``"lean"``, with small networks and what later publications found, and ``"long"``, the same for a night of
+            eight hours on two cores.
         learner: ``"analytic"`` or ``"sac"``; by default ``"analytic"`` for ``"quick"``, and ``"sac"`` for the other
             presets, which have no other.
 
@@ -138,11 +139,11 @@ def preset(task: str, name: Preset = "quick", learner: Learner | None = None) ->
 def sac_preset(task: str, name: str = "quick") -> Config:
     """The defaults of the learner ``sac``, see `preset`."""
     check_task(task)
-    allowed = typing.get_args(Preset) if task in TASKS else ("quick", "long")
+    allowed = typing.get_args(Preset) if task in TASKS else ("quick", "lean", "long")
     if name not in allowed:
         raise ConfigError(f"preset must be {' or '.join(allowed)} for {task}, got {name!r}")
     numbers = _numbers(task)
-    return {"paper": _paper, "quick": _quick, "long": _long}[name](task, numbers)
+    return {"paper": _paper, "quick": _quick, "lean": _lean, "long": _long}[name](task, numbers)
 
 
 def analytic_preset(task: str, name: str = "quick") -> AnalyticConfig:
@@ -200,11 +201,31 @@ def _paper(task: str, numbers: TaskNumbers) -> Config:
 
 
 def _quick(task: str, numbers: TaskNumbers) -> Config:
-    """Minutes instead of days: many small robots, small networks, and what later publications found."""
+    """Minutes instead of days: many small robots, small batches, a shorter horizon of credit."""
     paper = _paper(task, numbers)
     return replace(
         paper,
         preset="quick",
+        seed=0,
+        steps=4_800,
+        handover=(3_200,),
+        random_steps=(480, 100),
+        alpha=(0.5 * numbers.alpha[0], numbers.alpha[1]),
+        environment=EnvironmentConfig(),
+        network=replace(paper.network, interpolation="half_pixel"),
+        learning=LearningConfig(
+            batch_size=64, learning_rate=1e-3, gamma=0.9, tau=0.01, buffer_size=20_000, gradient_steps=4
+        ),
+        report=ReportConfig(eval_every=480, checkpoint_every=480, log_every=160),
+    )
+
+
+def _lean(task: str, numbers: TaskNumbers) -> Config:
+    """Minutes instead of days: many small robots, small networks, and what later publications found."""
+    paper = _paper(task, numbers)
+    return replace(
+        paper,
+        preset="lean",
         seed=0,
         steps=96_000,
         handover=(64_000,),
@@ -235,14 +256,14 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
 
 def _long(task: str, numbers: TaskNumbers) -> Config:
     """A night of eight hours on two cores: more steps, smaller rates, a longer memory."""
-    quick, steps = _quick(task, numbers), 4_000_000
+    lean, steps = _lean(task, numbers), 4_000_000
     return replace(
-        quick,
+        lean,
         preset="long",
         steps=steps,
         handover=(steps * 2 // 3,),
-        learning=replace(quick.learning, learning_rate=3e-4, tau=0.005, buffer_size=100_000),
-        report=replace(quick.report, eval_every=steps // 40, checkpoint_every=steps // 80, log_every=4_800),
+        learning=replace(lean.learning, learning_rate=3e-4, tau=0.005, buffer_size=100_000),
+        report=replace(lean.report, eval_every=steps // 40, checkpoint_every=steps // 80, log_every=4_800),
     )
 
 

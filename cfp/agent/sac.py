@@ -32,8 +32,7 @@ from cfp.agent.losses import actor_loss, critic_loss, critic_target
 from cfp.agent.networks import TwinCritic, upsample
 from cfp.agent.policies import CFPPolicy, NetworkPolicy
 from cfp.agent.replay import ReplayRing
-from cfp.agent.rewards import ReturnScale, RewardStatistics
-from cfp.agent.values import ATOMS
+from cfp.agent.values import ATOMS, ReturnScale, RewardStatistics
 from cfp.errors import NonFiniteError
 
 METRICS: dict[str, str] = {

@@ -54,12 +54,13 @@ def series(name: str) -> tuple[list[int], list[float]]:
 #   the policy in separate evaluation episodes.
 # - ``train/critic_loss`` should decrease after its first peak and then stay constant. If it keeps growing, the values
 #   diverge.
-# - ``train/q`` is the mean value, from -5 to 5; ``train/reward_scale`` is what rewards are divided by for that.
-# - ``train/entropy`` approaches a target, to which ``train/alpha`` is adapted. If the policy were certain at once, it
-#   would not explore.
+# - ``train/q`` and the reward statistics show the scale of the values. Rewards are normalised, so 0 is an average
+#   reward.
+# - ``train/entropy`` decreases as the policy becomes more certain. If it is minimal from the start, the policy does not
+#   explore; if it never decreases, the critics do not distinguish actions.
 # - ``train/gate`` exists from the second stage on: 0 keeps the coarse action, and 1 replaces it.
 
-shown = ("rollout/return", "train/critic_loss", "train/q", "train/entropy", "train/reward_scale", "train/gate")
+shown = ("rollout/return", "train/critic_loss", "train/q", "train/entropy", "train/reward_std", "train/gate")
 figure, axes = plt.subplots(2, 3, figsize=(11, 5.4))
 for axis, name in zip(axes.flat, shown, strict=True):
     axis.plot(*series(name))

@@ -18,7 +18,7 @@ from dittogym import make_spec
 
 
 @pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("name", ["quick", "long", "paper"])
+@pytest.mark.parametrize("name", ["quick", "lean", "long", "paper"])
 def test_every_preset_is_valid_and_survives_json(task, name):
     config = sac_preset(task, name)
     config.check()
@@ -34,9 +34,8 @@ def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):
     config = sac_preset("hop")
     config.check()
     assert (config.task, config.resolutions) == ("hop", (4, 32))
-    run = sac_preset("run")
-    assert replace(config, task="run", resolutions=(8, 16), alpha=run.alpha) == run
-    with pytest.raises(ConfigError, match="preset must be quick or long for hop, got 'paper'"):
+    assert replace(config, task="run", resolutions=(8, 16)) == sac_preset("run")
+    with pytest.raises(ConfigError, match="preset must be quick or lean or long for hop, got 'paper'"):
         sac_preset("hop", "paper")
 
 
@@ -119,14 +118,13 @@ def test_fewer_steps_shorten_every_level():
 def test_another_number_of_levels_stretches_what_each_has_one_of():
     five = parse(PROGRAM, "--learner sac --resolutions 4 8 16 32 64 --steps 5000".split()).run
     assert five.handover == (1000, 2000, 3000, 4000)
-    first, second = sac_preset("shapematch").alpha
-    assert five.alpha == (first, second, second, second, second)
+    assert five.alpha == (0.005, 0.0, 0.0, 0.0, 0.0)
     assert five.gate_bias == (-2.0,) * 4 and five.gate_penalty == (0.8,) * 4
-    assert five.random_steps == (0,) * 5
+    assert five.random_steps == (480, 100, 100, 100, 100)
     three = parse(PROGRAM, "--learner sac --resolutions 4 8 16 --alpha 1 2 3 --handover 100 200".split()).run
     assert (three.alpha, three.handover) == ((1.0, 2.0, 3.0), (100, 200))
     one = parse(PROGRAM, "--learner sac --resolutions 16".split()).run
-    assert (one.handover, one.gate_bias, one.alpha) == ((), (), (first,))
+    assert (one.handover, one.gate_bias, one.alpha) == ((), (), (0.005,))
     with pytest.raises(ConfigError, match="alpha must have 3 values"):
         parse(PROGRAM, "--learner sac --resolutions 4 8 16 --alpha 1 2 3 4".split())
 

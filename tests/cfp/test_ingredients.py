@@ -16,9 +16,8 @@ from cfp.agent.exploration import LONGEST, CellNoise
 from cfp.agent.lean import halved
 from cfp.agent.networks import normalise_image
 from cfp.agent.replay import ReplayRing
-from cfp.agent.rewards import ReturnScale
 from cfp.agent.spec import ActorSpec
-from cfp.agent.values import ATOMS, LIMIT, expected_value, two_hot, value_loss
+from cfp.agent.values import ATOMS, LIMIT, ReturnScale, expected_value, two_hot, value_loss
 from cfp.errors import ConfigError
 from cfp.presets import sac_preset
 from cfp.weights import describe, load, save_policy
@@ -158,7 +157,7 @@ def test_halved_images_are_means_of_four_pixels():
 
 
 def test_lean_policy_is_saved_and_loaded(tmp_path):
-    config = sac_preset("run")
+    config = sac_preset("run", "lean")
     spec = config.actor_spec(2)
     assert spec.encoder == "lean"
     actor, images = build_actor(spec), make_batch(8).observations
@@ -254,6 +253,6 @@ def test_options_out_of_range_are_refused():
         ({"n_steps": 0}, "n_steps must be at least 1, got 0"),
         ({"target_std": 0.0}, "target_std must be positive"),
     ):
-        config = sac_preset("run")
+        config = sac_preset("run", "lean")
         with pytest.raises(ConfigError, match=message):
             replace(config, learning=replace(config.learning, **changes)).check()
