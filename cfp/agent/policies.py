@@ -55,7 +55,7 @@ class NetworkPolicy(sac_policies.SACPolicy, ABC):
         return None
 
     def encode(self, observations: Tensor) -> Observation:
-        """What actor and critics take for ``observations`` in an update."""
+        """What actor and critics take for ``observations`` (B, ...) in an update."""
         return normalise_image(observations)
 
     def _build(self, lr_schedule: Schedule) -> None:
@@ -133,7 +133,7 @@ class CFPPolicy(NetworkPolicy):
         return cast(Actor, self.actor).encoder if self.spec.encoder == "lean" else None
 
     def encode(self, observations: Tensor) -> Observation:
-        """What actor and critics take for ``observations`` in an update: with a lean encoder its features too."""
+        """What actor and critics take for ``observations`` (B, 3, 64, 64): with a lean encoder its features too."""
         encoder = self.shared_encoder()
         if encoder is None:
             return super().encode(observations)
