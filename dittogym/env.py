@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.envs.registration import EnvSpec
 
 from dittogym.model import Snapshot
 from dittogym.render.frame import frame, pace
@@ -64,7 +66,32 @@ def first(value: Any) -> Any:
     return {name: entry[0] for name, entry in value.items()} if isinstance(value, dict) else value[0]
 
 
-class Env(gymnasium.Env[np.ndarray, np.ndarray]):
+class JsonSpec:
+    """Keeps Gymnasium's specification with options that ``to_json`` can write and that make the same again."""
+
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium made the environment from."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec and replace(spec, kwargs={name: _plain(value) for name, value in spec.kwargs.items()})
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, torch.dtype | torch.device | os.PathLike):
+        return str(value)
+    if not isinstance(value, np.ndarray):
+        return value
+    if value.dtype.kind == "u" and value.shape[1:] != (2,):  # a picture; lists of whole numbers are outlines
+        value = (value // 257 if value.dtype == np.uint16 else value) / 255
+    return value.tolist()
+
+
+class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
     """One simulation behind the Gymnasium interface.
 
     Made by :func:`gymnasium.make` it leaves the time limit to Gymnasium's wrapper; made directly it truncates itself.

@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
 from dittogym.bodies.positions import Seed
-from dittogym.env import RENDER_FPS, RENDER_MODES, as_numpy, as_tensor, spaces
+from dittogym.env import RENDER_FPS, RENDER_MODES, JsonSpec, as_numpy, as_tensor, spaces
 from dittogym.model import Snapshot
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
@@ -46,7 +46,7 @@ def autoreset_step(env: Any, action: Tensor, max_episode_steps: float | None = N
     return AutoresetStep(observation, final_observation, reward, terminated, truncated, done, info, reset_info)
 
 
-class BatchEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """``num_envs`` simulations behind Gymnasium's vector interface.
 
     Args:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dittogym.bodies.drawings import BodyLike, with_body
-from dittogym.geometry import Obstacle
+from dittogym.geometry import Obstacle, obstacle_from
 from dittogym.spec import TaskSpec
 from dittogym.tasks.catch import catch
 from dittogym.tasks.dig import dig
@@ -99,6 +99,7 @@ def make_spec(
             raise TypeError(f"task {task!r} got an unexpected keyword argument {unknown[0]!r}; {names}")
         spec = make(**options)
     if obstacles is not None:
+        obstacles = [obstacle_from(each) for each in obstacles] if isinstance(obstacles, list | tuple) else obstacles
         checks.instances("obstacles", obstacles, Obstacle)
         spec = replace(spec, obstacles=tuple(obstacles))
     return spec if body is None else with_body(spec, body)

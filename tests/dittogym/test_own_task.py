@@ -17,7 +17,7 @@ from tiny import SMALL, actions, assert_same_bits, everything, make_vec, tiny
 import dittogym
 from dittogym.bodies.shapes import Disc, Rectangle
 from dittogym.contract import Moment, Outcome
-from dittogym.geometry import ceiling, floor
+from dittogym.geometry import ceiling, floor, solid
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.tasks import fingerprint
 from dittogym.window import Window
@@ -419,3 +419,21 @@ def test_a_robot_of_another_material_and_size() -> None:
         env.step(torch.ones(1, *env.action_shape, dtype=env.dtype))
     assert elastic.num_particles == 100
     assert (elastic.state.x - own.state.x).abs().max() > 1e-6
+
+
+@pytest.mark.parametrize(
+    ("task", "options"),
+    [
+        ("run", {"body": np.ones((9, 5), np.uint8) * 200, "dtype": torch.float64}),
+        ("run", {"body": np.array([(0, 0), (4, 0), (4, 1), (0, 1)]), "device": torch.device("cpu")}),
+        ("run", {"obstacles": (solid("box", i=(60, 66), j=(None, 24), friction=math.inf), floor(), ceiling(119))}),
+        ("shapematch", {"target": dittogym.make_spec("shapematch", target="T").target}),
+    ],
+)
+def test_an_environment_is_made_again_from_the_json_of_its_specification(task: str, options: dict) -> None:
+    env = gymnasium.make(f"dittogym/{task}-coarse-v0", **SMALL, **options)
+    same = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    models = [each.unwrapped.torch_env.model for each in (env, same)]
+    assert models[0].constants == models[1].constants
+    assert np.array_equal(env.reset(seed=0)[0], same.reset(seed=0)[0])
+    gymnasium.make_vec(f"dittogym/{task}-coarse-v0", 2, **SMALL, **options).spec.to_json()
