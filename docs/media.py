@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from task_pages import headline
 
 import cfp
 import dittogym
@@ -26,7 +27,7 @@ SOURCES = FILMS / "sources.json"
 #: Pixels of a task's own film and of a cell of the grid, and cells in a row.
 SIZE, CELL, COLUMNS = 360, 240, 4
 #: Duration of a film, s, and pictures per second.
-SECONDS, RATE = 8.0, 12
+SECONDS, RATE = 6.0, 10
 
 
 def record_task(task: str, seed: int = 0) -> Recording:
@@ -65,7 +66,7 @@ def grid_frames(recordings: dict[str, Recording]) -> list[np.ndarray]:
         cells = []
         for task, recording in recordings.items():
             time = moment * recording.duration
-            cells.append(recording.picture(time, size=CELL, caption=(task.upper(), f"{time:.1f} s")))
+            cells.append(recording.picture(time, size=CELL, caption=(headline(task)[0], f"{time:.1f} s")))
         rows = [np.concatenate(cells[i : i + COLUMNS], 1) for i in range(0, len(cells), COLUMNS)]
         frames.append(np.concatenate(rows, 0))
     return frames

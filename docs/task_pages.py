@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
-import torch
 from PIL import Image
 
 import dittogym
@@ -19,17 +18,18 @@ from torchmpm import Snow, VelocityRule
 
 DOCS = Path(__file__).resolve().parent
 NOTES, PAGES = DOCS / "tasks", DOCS / "generated"
-STEPS, EVERY, SIZE = 80, 2, 256
-#: Without gravity and floor, strong waves tear the robot.
-STRENGTH = {"shapematch": 0.5}
+SIZE = 384
 
 TEMPLATE = """# [[ title ]]
 
 [[ what ]]
 
-| initial state | under a travelling wave of contraction |
-| --- | --- |
-| ![The task in its initial state]([[ spec.name ]]-rest.png) | ![The robot under a wave]([[ spec.name ]]-wave.webp) |
+```{image} ../images/films/[[ spec.name ]].webp
+:alt: An episode of the pretrained policy
+```
+
+The pretrained policy `cfp.load("[[ spec.name ]]")` with 2,000 particles ([](../policies.md)). Contraction is
+red, expansion blue.
 
 ```python
 import dittogym, gymnasium
@@ -38,15 +38,18 @@ env = gymnasium.make("dittogym/[[ spec.name ]]-coarse-v0", particles="lite")
 batch = dittogym.TorchEnv("[[ spec.name ]]", num_envs=16, particles="lite")
 ```
 
+```bash
+python -m dittogym.play [[ spec.name ]] --policy [[ spec.name ]]   # in the browser
+python -m cfp.train --task [[ spec.name ]] --out runs/[[ spec.name ]]
+```
+
 [[ notes ]]
 
-## Constants
-
-| | |
-| --- | --- |
-[% for name, value in numbers %]| [[ name ]] | [[ value ]] |
-[% endfor %]
 ## Geometry
+
+```{image} [[ spec.name ]]-rest.png
+:alt: The whole simulation window in the initial state
+```
 
 Ranges of nodes are inclusive, and nodes are counted from the origin of the world, 128 per metre. Where several rules
 for the same direction cover a node, the first one applies.
@@ -55,16 +58,22 @@ for the same direction cover a node, the first one applies.
 | --- | --- | --- |
 [% for row in geometry %]| [[ row | join(" | ") ]] |
 [% endfor %]
+## Constants
+
+| | |
+| --- | --- |
+[% for name, value in numbers %]| [[ name ]] | [[ value ]] |
+[% endfor %]
 """
 
 
 def write_pages() -> None:
-    """Write `generated/{task}.md` and its pictures for every task."""
+    """Write `generated/{task}.md` and a picture for every task."""
     PAGES.mkdir(exist_ok=True)
     write(PAGES / "summary.md", summary())
     for name in dittogym.TASKS:
         spec, module = dittogym.make_spec(name), importlib.import_module(f"dittogym.tasks.{name}")
-        pictures(name)
+        picture(name)
         environment = jinja2.Environment(
             undefined=jinja2.StrictUndefined,
             variable_start_string="[[",
@@ -194,24 +203,10 @@ def extent(low: int | None, high: int | None) -> str:
     return f"{low}" if low == high else f"{low} … {high}"
 
 
-def pictures(task: str) -> None:
-    """Draw a task in its initial state, and record it under a wave, unless an earlier build has done so."""
-    rest, film = PAGES / f"{task}-rest.png", PAGES / f"{task}-wave.webp"
-    if rest.exists() and film.exists():
-        return
-    env = dittogym.TorchEnv(task, particles="lite")
-    env.reset(seed=0)
-    Image.fromarray(env.render(size=SIZE)).save(rest)
-    grid = torch.arange(float(env.action_resolution)) / env.action_resolution
-    row, column = torch.meshgrid(grid, grid, indexing="ij")
-    frames = []
-    with torch.no_grad():
-        for step in range(min(STEPS, env.spec.horizon)):
-            across, along = torch.sin(2 * math.pi * (column + 0.15 * step)), torch.cos(2 * math.pi * (row - 0.1 * step))
-            action = STRENGTH.get(task, 1.0) * torch.stack((across, along))
-            _, _, terminated, _, _ = env.step(action[None])
-            if step % EVERY == 0:
-                frames.append(Image.fromarray(env.render(muscles=True, size=SIZE)))
-            if terminated:
-                break
-    frames[0].save(film, save_all=True, append_images=frames[1:], duration=60, loop=0, quality=70)
+def picture(task: str) -> None:
+    """Draw the whole window of a task in its initial state, unless an earlier build has done so."""
+    path = PAGES / f"{task}-rest.png"
+    if not path.exists():
+        env = dittogym.TorchEnv(task, particles="lite")
+        env.reset(seed=0)
+        Image.fromarray(env.render(size=SIZE, zoom=1)).save(path)

@@ -89,7 +89,7 @@ POLICIES = [
     Case(
         "policy missing",
         lambda desk: cfp.load("nobody"),
-        ("nobody.safetensors", "(catch, grow, run, "),
+        ("nobody.safetensors", "(catch, dig, grow, kick, "),
         CheckpointError,
     ),
     *(

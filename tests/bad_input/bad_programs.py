@@ -130,7 +130,7 @@ OTHERS = [
     distilling("no labels", "--capacity 0", "capacity must be at least 1, got 0"),
     evaluating("nothing", "", "either policy or a folder must be given, got None"),
     evaluating("a folder that is not there", "{folder}/none", "none: there is no run (no config.json)"),
-    evaluating("an unknown policy", "--policy alchemy", "no shipped one has that name (catch, grow, run, "),
+    evaluating("an unknown policy", "--policy alchemy", "no shipped one has that name (catch, dig, grow, kick, "),
     evaluating("no episodes", "--policy run --episodes 0", "episodes must be at least 1, got 0"),
     evaluating("a policy and a folder", "{folder} --policy run", "either policy or a folder must be given"),
     evaluating(

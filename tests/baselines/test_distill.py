@@ -334,7 +334,7 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch, caps
         ("shapematch", "gradient", "T", "teacher must be a policy for the target star, got T"),
         ("kick", "gradient", None, "teacher must be a policy for run, got one for kick"),
         ("run", "gradient", "T", "teacher: cannot compare its target"),
-        (None, "", None, "teacher must be mpc, shac, gradient, catch, grow, run, shapematch"),
+        (None, "", None, "teacher must be mpc, shac, gradient, catch, dig, grow, kick, obstacle, run, "),
     ],
 )
 def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, kind, target, message):
