@@ -151,6 +151,8 @@ class CFP(SAC):
 
     def _learn_meanwhile(self) -> None:
         if self.num_timesteps > self.learning_starts:
+            # Also in the first step after a resume, where stable-baselines3 has not done so yet.
+            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
             self._perform_updates(self.gradient_steps, self.batch_size)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:

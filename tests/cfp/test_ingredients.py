@@ -1,6 +1,8 @@
 """The options that make soft actor-critic cheaper and more stable, each on its own."""
 
 import math
+import os
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +11,7 @@ import torch
 from fakes import FakeEnv
 from stable_baselines3.common.vec_env import VecEnvWrapper
 from test_algorithm import make_batch, make_model
+from tiny_runs import assert_same_run, at_step, run
 from torch.nn import functional as F
 
 from cfp.agent.actor import build_actor
@@ -244,6 +247,16 @@ def test_updates_during_simulation_are_the_same_every_time():
         assert torch.equal(value, again.policy.state_dict()[name])
     with pytest.raises(ValueError, match=r"env must be a cfp.TorchVecEnv with overlap, got Unthreaded"):
         model.collect_rollouts(Unthreaded(model.env))
+
+
+def test_resumed_run_is_the_uninterrupted_one(tmp_path):
+    options = "--preset lean --steps 60 --handover 32 --eval-every 0 --gradient-steps 2".split()
+    assert run(tmp_path / "whole", *options) == 0
+    for step, folder in ((20, "first"), (50, "second")):
+        with at_step(step, lambda: os.kill(os.getpid(), signal.SIGTERM)):
+            assert run(tmp_path / folder, *options) == 128 + signal.SIGTERM
+        assert run(tmp_path / folder, *options, "--resume") == 0
+        assert_same_run(tmp_path / "whole", tmp_path / folder, ["progress.csv", "policy.safetensors"])
 
 
 def test_options_out_of_range_are_refused():
