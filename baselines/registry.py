@@ -10,6 +10,7 @@ from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm, Sees
 from cfp.from_dict import update_from_dict
 from cfp.policy_protocols import Policy
+from cfp.presets import like_start
 from cfp.weights import read_policy
 
 ALGORITHMS: dict[str, str] = {
@@ -62,8 +63,10 @@ def configure(values: dict[str, Any]) -> RunConfig:
         algo = ALIASES[algo]
         values = {**values, "algo": algo}
     reference = isinstance(algo, str) and algo in REFERENCE_POLICIES
+    if not reference and preset not in (allowed := find(algo).presets):
+        raise ConfigError(f"preset must be {' or '.join(allowed)} for {algo}, got {preset!r}")
     base = reference_preset(algo, task, preset) if reference else find(algo).preset(task, preset)
-    config: RunConfig = update_from_dict(base, values)
+    config: RunConfig = update_from_dict(like_start(base, values), values)
     return config
 
 

@@ -23,9 +23,10 @@ from torch.nn import functional as F
 from torch.utils.flop_counter import FlopCounterMode
 
 import dittogym  # noqa: F401  (registers the environments)
-from cfp import CFP, CFPPolicy, Config, preset
+from cfp import CFP, CFPPolicy, Config
 from cfp.envs.make import make_env
 from cfp.experiment.process import keep_memory
+from cfp.presets import sac_preset
 
 
 def make_model(config: Config, stage: int, num_envs: int) -> CFP:
@@ -124,21 +125,23 @@ def timed(owner: object, name: str, clock: dict[str, float]) -> Iterator[None]:
 
 
 def training(config: Config, steps: int) -> None:
-    """Print training steps per second and the shares of their parts."""
-    print("| stage | robots | updates per step | training steps/s | simulation | updates | rest |")
-    print("| --- " * 7 + "|")
+    """Print training steps per second and the shares of their parts; with overlap, the simulation's holds updates."""
+    print("| stage | robots | updates per step | overlap | training steps/s | simulation | updates | rest |")
+    print("| --- " * 8 + "|")
+    many = config.environment.num_envs, config.learning.gradient_steps
     for stage in (1, 2):
-        for num_envs, gradient_steps in ((1, 1), (config.environment.num_envs, config.learning.gradient_steps)):
-            learning = replace(config.learning, gradient_steps=gradient_steps)
+        for num_envs, gradient_steps, overlap in ((1, 1, False), (*many, False), (*many, True)):
+            learning = replace(config.learning, gradient_steps=gradient_steps, overlap=overlap)
             model, clock = make_model(replace(config, learning=learning), stage, num_envs), dict[str, float]()
             model.learn(config.learning.batch_size + 2 * num_envs)
-            with timed(model.env, "step", clock), timed(model, "train", clock):
+            with timed(model.env, "step", clock), timed(model, "_perform_updates", clock):
                 start = time.perf_counter()
                 model.learn(steps * num_envs, reset_num_timesteps=False)
                 total = time.perf_counter() - start
-            simulation, update = clock["step"] / total, clock["train"] / total
-            shares = " | ".join(f"{100 * share:.0f} %" for share in (simulation, update, 1 - simulation - update))
-            head = f"| {stage} | {num_envs} | {gradient_steps}"
+            simulation, update = clock["step"] / total, clock["_perform_updates"] / total
+            rest = 1 - simulation - (0 if overlap else update)
+            shares = " | ".join(f"{100 * share:.0f} %" for share in (simulation, update, rest))
+            head = f"| {stage} | {num_envs} | {gradient_steps} | {'yes' if overlap else 'no'}"
             print(f"{head} | {steps * num_envs / total:.1f} | {shares} |", flush=True)
 
 
@@ -162,11 +165,11 @@ def main() -> None:
     arguments = parser.parse_args()
     keep_memory()
     print(f"torch {torch.__version__}, {torch.get_num_threads()} threads")
-    config = preset("shapematch")
+    config = sac_preset("shapematch", "lean")
     if "updates" not in arguments.skip:
         for task in ("run", "shapematch"):
             print(f"{task}, preset paper")
-            updates(preset(task, "paper"), arguments.rounds)
+            updates(sac_preset(task, "paper"), arguments.rounds)
     if "training" not in arguments.skip:
         training(config, arguments.steps)
     if "environments" not in arguments.skip:

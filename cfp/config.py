@@ -18,7 +18,7 @@ from cfp.validation import check_at_least
 from dittogym import make_spec
 from dittogym.tasks import allowed_instead, task_name
 
-Preset = Literal["quick", "paper"]
+Preset = Literal["quick", "lean", "long", "paper"]
 Learner = Literal["analytic", "sac"]
 
 LARGEST_SEED = 2**31 - 1
@@ -35,7 +35,7 @@ class RunConfig:
     algo: str = "cfp"
     """Algorithm."""
     preset: Preset = "quick"
-    """Source of the defaults: quick (minutes on two cores) or paper (the published numbers)."""
+    """Source of the defaults: quick (minutes), paper (as published); for learner sac also lean and long (a night)."""
     seed: int = 0
     """Seed of everything that is random."""
     device: str = "auto"
@@ -149,6 +149,8 @@ class StagedConfig(RunConfig):
             self.network.gate_scale,
             self.network.interpolation,
             None if self.network.interpolation == "aligned" else make_spec(self.task).patch,
+            self.network.encoder,
+            self.network.initial_std,
         )
 
     def with_derived(self, base: RunConfig, given: Collection[str]) -> RunConfig:
@@ -244,8 +246,12 @@ class Config(CoarseToFineConfig):
         super().check()
         for name in ("random_steps", "alpha", "gate_penalty"):
             check_at_least(0, **{name: min(getattr(self, name), default=0)})
+        if self.learning.target_std is not None and min(self.alpha, default=1) <= 0:
+            raise ConfigError(f"alpha must be positive with target_std, got {self.alpha}")
         if self.learning.warm_critic and self.start_from is not None:
             raise ConfigError("warm_critic must be False with start_from, got True (a policy file has no critics)")
+        if self.learning.warm_critic and self.network.encoder == "lean":
+            raise ConfigError("warm_critic must be False with encoder lean, got True (each stage has its own encoder)")
 
 
 def check_training_layouts(name: str, count: int, before: int = 0) -> None:

@@ -15,8 +15,9 @@ from cfp.analytic.config import AnalyticConfig
 from cfp.analytic.reward import RewardConfig
 from cfp.config import CoarseToFineConfig, Config, Learner, Preset, check_task
 from cfp.errors import ConfigError
-from cfp.from_dict import update_from_dict
+from cfp.from_dict import Options, update_from_dict
 from cfp.sections import EnvironmentConfig, NetworkConfig, ReportConfig
+from cfp.weights import load
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,8 @@ ANALYTIC: dict[str, AnalyticNumbers] = {
 }
 """Those of the tasks that differ from the defaults of `AnalyticNumbers`."""
 
+ENTROPY_SHARE = 0.05
+"""Temperature at the start of the presets that adapt it, times the number of entries of an action."""
 DEFAULT_TASK = "shapematch"
 """Task of a command line that names none."""
 CUSTOM_TASK = TASKS["run"]
@@ -117,15 +120,17 @@ def preset(task: str, name: Preset = "quick", learner: Learner | None = None) ->
         task: One of `dittogym.TASKS`, or ``"MODULE:NAME"``. A custom task, for which nothing was published, gets the
             numbers of RUN with its own action grids, and has no preset ``"paper"``.
         name: ``"paper"``: one robot at full size, the published numbers, the reference's interpolation and faults.
-            ``"quick"``: several robots with fewer particles, minutes instead of days.
-        learner: ``"analytic"`` or ``"sac"``; by default ``"sac"`` for ``"paper"``, which has no other, and
-            ``"analytic"`` for ``"quick"``.
+            ``"quick"``: several robots with fewer particles, minutes instead of days. For the learner ``"sac"`` also
+            ``"lean"``, with small networks and what later publications found, and ``"long"``, the same for a night of
+            eight hours on two cores.
+        learner: ``"analytic"`` or ``"sac"``; by default ``"analytic"`` for ``"quick"``, and ``"sac"`` for the other
+            presets, which have no other.
 
     Raises:
         ConfigError: There is no such task, preset or learner.
     """
     if learner is None:
-        learner = "sac" if name == "paper" else "analytic"
+        learner = "analytic" if name == "quick" else "sac"
     if learner not in typing.get_args(Learner):
         raise ConfigError(f"learner must be analytic or sac, got {learner!r}")
     return sac_preset(task, name) if learner == "sac" else analytic_preset(task, name)
@@ -134,11 +139,11 @@ def preset(task: str, name: Preset = "quick", learner: Learner | None = None) ->
 def sac_preset(task: str, name: str = "quick") -> Config:
     """The defaults of the learner ``sac``, see `preset`."""
     check_task(task)
-    allowed = typing.get_args(Preset) if task in TASKS else ("quick",)
+    allowed = typing.get_args(Preset) if task in TASKS else ("quick", "lean", "long")
     if name not in allowed:
         raise ConfigError(f"preset must be {' or '.join(allowed)} for {task}, got {name!r}")
     numbers = _numbers(task)
-    return _paper(task, numbers) if name == "paper" else _quick(task, numbers)
+    return {"paper": _paper, "quick": _quick, "lean": _lean, "long": _long}[name](task, numbers)
 
 
 def analytic_preset(task: str, name: str = "quick") -> AnalyticConfig:
@@ -146,7 +151,7 @@ def analytic_preset(task: str, name: str = "quick") -> AnalyticConfig:
     check_task(task)
     if name != "quick":
         raise ConfigError(f"preset must be quick for learner analytic, got {name!r}")
-    published, own = _quick(task, _numbers(task)), ANALYTIC.get(task, AnalyticNumbers())
+    published, own = _paper(task, _numbers(task)), ANALYTIC.get(task, AnalyticNumbers())
     return AnalyticConfig(
         task=task,
         steps=own.steps,
@@ -163,8 +168,8 @@ def analytic_preset(task: str, name: str = "quick") -> AnalyticConfig:
         displacement=not own.on_speed,
         reward=RewardConfig("speed" if own.on_speed else "task"),
         environment=EnvironmentConfig(num_envs=own.num_envs),
-        network=published.network,
-        report=replace(published.report, eval_every=own.steps // 12, checkpoint_every=own.steps // 12, log_every=320),
+        network=replace(published.network, interpolation="half_pixel"),
+        report=ReportConfig(eval_every=own.steps // 12, checkpoint_every=own.steps // 12, log_every=320),
     )
 
 
@@ -215,10 +220,65 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
     )
 
 
+def _lean(task: str, numbers: TaskNumbers) -> Config:
+    """Minutes instead of days: many small robots, small networks, and what later publications found."""
+    paper = _paper(task, numbers)
+    return replace(
+        paper,
+        preset="lean",
+        seed=0,
+        steps=96_000,
+        handover=(64_000,),
+        random_steps=(0, 0),
+        alpha=tuple(ENTROPY_SHARE / (2 * resolution**2) for resolution in paper.resolutions),
+        environment=EnvironmentConfig(num_envs=32),
+        network=replace(paper.network, interpolation="half_pixel", encoder="lean", initial_std=0.15),
+        learning=LearningConfig(
+            learning_rate=1e-3,
+            gamma=0.97,
+            tau=0.01,
+            buffer_size=50_000,
+            batch_size=64,
+            gradient_steps=8,
+            update_start=1_024,
+            critic="categorical",
+            reward_scale="return",
+            target_std=0.15,
+            noise_cells=4,
+            n_steps=3,
+            actor_every=2,
+            final_rate=0.1,
+            overlap=True,
+        ),
+        report=ReportConfig(eval_every=9_600, checkpoint_every=9_600, log_every=960),
+    )
+
+
+def _long(task: str, numbers: TaskNumbers) -> Config:
+    """A night of eight hours on two cores: more steps, smaller rates, a longer memory."""
+    lean, steps = _lean(task, numbers), 4_000_000
+    return replace(
+        lean,
+        preset="long",
+        steps=steps,
+        handover=(steps * 2 // 3,),
+        learning=replace(lean.learning, learning_rate=3e-4, tau=0.005, buffer_size=100_000),
+        report=replace(lean.report, eval_every=steps // 40, checkpoint_every=steps // 80, log_every=4_800),
+    )
+
+
 def from_json(values: dict[str, Any]) -> CoarseToFineConfig:
     """A configuration from JSON values; those that are left out come from the preset that the values name."""
     if (algo := values.get("algo", "cfp")) != "cfp":
         programs = "python -m baselines.train, baselines.evaluate and baselines.robustness run other algorithms"
         raise ConfigError(f"algo must be 'cfp', got {algo!r}; {programs}")
     base = preset(values.get("task", DEFAULT_TASK), values.get("preset", "quick"), values.get("learner"))
-    return update_from_dict(base, values)
+    return update_from_dict(like_start(base, values), values)
+
+
+def like_start(base: Options, values: dict[str, Any]) -> Options:
+    """A default configuration with the kind of networks of the policy that the JSON ``values`` start from, if any."""
+    if not isinstance(base, CoarseToFineConfig) or values.get("start_from") is None or "network" in values:
+        return base
+    spec = load(values["start_from"]).spec
+    return replace(base, network=replace(base.network, encoder=spec.encoder, initial_std=spec.initial_std))

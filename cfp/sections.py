@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
-from cfp.agent.spec import Interpolation
+from cfp.agent.spec import EncoderKind, Interpolation
 from cfp.errors import ConfigError
 from cfp.validation import check_at_least, check_positive
 from dittogym.spec import CONTROL_STEP, DT
@@ -115,10 +115,16 @@ class NetworkConfig:
     """Separate narrow encoders for observation and action."""
     gate_scale: float = 1.0
     """Largest gate value (the reference: 0.25 with split encoders)."""
+    encoder: EncoderKind = "full"
+    """full (the paper's), or lean (half the size and width; actions join its features)."""
+    initial_std: float | None = None
+    """Standard deviation before tanh of a new actor; None: the reference's, 0.31."""
 
     def check(self) -> None:
         """Raise a `ConfigError` for values out of range."""
         check_positive(gate_scale=self.gate_scale)
+        if self.initial_std is not None:
+            check_positive(initial_std=self.initial_std)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, cast, get_args
 
@@ -66,7 +66,8 @@ class ModularConfig(RunConfig):
 
     def ineffective(self) -> dict[str, str]:
         """Options of several stages, and of grids of actions, have no effect: segments act on nodes."""
-        needs = dict.fromkeys(("learning.anchor", "learning.warm_critic", "environment.action_layout"), "algo cfp")
+        names = ("anchor", "warm_critic", "noise_cells", "noise_scale")
+        needs = dict.fromkeys((*(f"learning.{name}" for name in names), "environment.action_layout"), "algo cfp")
         return super().ineffective() | needs
 
     def hyperparameters(self, stage: int) -> Hyperparameters:
@@ -92,17 +93,19 @@ class ModularConfig(RunConfig):
 class ModularPolicy(NetworkPolicy):
     """Actor and critics over segments, for `cfp.agent.sac.CFP`; observes rows (K, columns) of `Nodes`."""
 
-    def __init__(self, *arguments: Any, kind: Kind, features: int, **options: Any) -> None:
-        self.kind, self.features = kind, features
+    def __init__(
+        self, *arguments: Any, kind: Kind, features: int, initial_std: float | None = None, **options: Any
+    ) -> None:
+        self.kind, self.features, self.initial_std = kind, features, initial_std
         super().__init__(*arguments, **options)
 
     def new_actor(self) -> ModularActor:
         """An actor."""
-        return ModularActor(self.kind, self.features)
+        return ModularActor(self.kind, self.features, self.initial_std)
 
     def new_critic(self) -> ModularCritics:
         """Twin critics."""
-        return ModularCritics(self.kind, self.features)
+        return ModularCritics(self.kind, self.features, self.critic_outputs)
 
 
 class Modular(SACAlgorithm):
@@ -122,7 +125,7 @@ class Modular(SACAlgorithm):
             preset=base.preset,
             environment=base.environment,
             report=base.report,
-            learning=base.learning,
+            learning=replace(base.learning, noise_cells=0),
             steps=base.steps,
             random_steps=base.random_steps[0],
             alpha=base.alpha[0],
@@ -132,7 +135,11 @@ class Modular(SACAlgorithm):
     def create(cls, config: ModularConfig, stage: int, folder: Path, resumed: bool = False) -> Modular:
         """The algorithm at the beginning of its only stage."""
         env = SegmentedEnv(make_torch_env(config, config.resolution(stage)), config.nodes)
-        networks = {"kind": config.kind, "features": config.nodes.num_features(env.env.spec)}
+        networks = {
+            "kind": config.kind,
+            "features": config.nodes.num_features(env.env.spec),
+            "initial_std": config.learning.target_std,
+        }
         monitor = VecMonitor(TorchVecEnv(env, env.spaces))
         model = cls.make_model(config, monitor, ModularPolicy, networks, cls.hyperparameters(config, stage, folder))
         return cls(config, stage, model)

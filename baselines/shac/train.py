@@ -257,6 +257,8 @@ class Shac(Stateful, Algorithm):
         policy, resolutions = policy_for(config, config.start_from), (config.resolution(1),)
         if policy.spec.resolutions != resolutions:
             raise ConfigError(f"start_from must have the resolutions {resolutions}, got {policy.spec.resolutions}")
+        if policy.spec.encoder != "full":
+            raise ConfigError(f"start_from must be a policy with encoder full, got {policy.spec.encoder}")
         return policy
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:

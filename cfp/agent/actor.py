@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from cfp.agent import fused
 from cfp.agent.composition import blend
+from cfp.agent.lean import LeanEncoder, Observation, Trunk, image_of
 from cfp.agent.networks import IMAGE_SIZE, Encoder, PairEncoder, initialise, make_head, normalise_image, upsample
 from cfp.agent.spec import ActorSpec
 
@@ -65,11 +66,22 @@ def squashed_log_prob(noise: Tensor, std: Tensor, action: Tensor) -> Tensor:
     return (normal - torch.log(1 - action.square() + 1e-6)).flatten(1).sum(1)
 
 
+def standard_deviation(raw_std: Tensor, initial: float | None = None) -> Tensor:
+    """``clip(softplus(3 raw_std - 1), 0.1, 6)``; with ``initial`` it is this at 0, and at least a third of it."""
+    if initial is None:
+        return F.softplus(3 * raw_std - 1).clamp(*STD_BOUNDS)
+    return F.softplus(3 * raw_std + math.log(math.expm1(initial))).clamp(initial / 3, STD_BOUNDS[1])
+
+
 def sample_squashed_gaussian(
-    mean: Tensor, raw_std: Tensor, deterministic: bool, generator: torch.Generator | None = None
+    mean: Tensor,
+    raw_std: Tensor,
+    deterministic: bool,
+    generator: torch.Generator | None = None,
+    initial_std: float | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Sample tanh(mean + s eps) with s = clip(softplus(3 raw_std - 1), 0.1, 6), and its log-density (B,)."""
-    std = F.softplus(3 * raw_std - 1).clamp(*STD_BOUNDS)
+    """Sample tanh(mean + s eps) with s from `standard_deviation`, and its log-density (B,)."""
+    std = standard_deviation(raw_std, initial_std)
     noise = torch.zeros_like(mean)
     if not deterministic:
         noise.normal_(generator=generator)
@@ -107,45 +119,52 @@ class SquashedActor(nn.Module):
 class Actor(SquashedActor):
     """Actor of stage 1: a squashed Gaussian over (2, R, R), given the observation."""
 
-    def __init__(self, resolution: int) -> None:
+    def __init__(self, resolution: int, spec: ActorSpec | None = None) -> None:
         super().__init__()
         self.resolution = resolution
-        self.encoder: nn.Module = Encoder(3, 32)
+        self.initial_std = spec.initial_std if spec else None
+        lean = spec is not None and spec.encoder == "lean"
+        self.encoder: nn.Module = LeanEncoder() if lean else Encoder(3, 32)
+        self.trunk = Trunk() if lean else None
         self.mean = make_head(resolution)
         self.std = make_head(resolution)
         initialise(self)
 
     def outputs(
-        self, observation: Tensor, deterministic: bool = False, generator: torch.Generator | None = None
+        self, observation: Observation, deterministic: bool = False, generator: torch.Generator | None = None
     ) -> Outputs:
         """Evaluate the networks for uint8 observations (B, 3, 64, 64).
 
         Args:
-            observation: The images.
+            observation: The images; with a lean encoder also `cfp.agent.lean.Encoded`.
             deterministic: Whether a coarser actor acts without noise.
             generator: Of its noise; None for torch's own.
         """
-        latent = self.encoder(normalise_image(observation))
+        if self.trunk is None:
+            latent = self.encoder(normalise_image(image_of(observation)))
+        else:
+            latent = self.trunk(self.encoder(observation))
         mean, raw_std = fused.decode([self.mean, self.std], latent)
         return Outputs(mean, raw_std)
 
     def act(self, outputs: Outputs, deterministic: bool = False, generator: torch.Generator | None = None) -> Sample:
         """Sample an action from the networks' outputs, without noise if ``deterministic``."""
-        action, log_prob = sample_squashed_gaussian(outputs.mean, outputs.raw_std, deterministic, generator)
+        mean, raw_std = outputs.mean, outputs.raw_std
+        action, log_prob = sample_squashed_gaussian(mean, raw_std, deterministic, generator, self.initial_std)
         return Sample(action, log_prob, None, (action,))
 
     def sample(
-        self, observation: Tensor, deterministic: bool = False, generator: torch.Generator | None = None
+        self, observation: Observation, deterministic: bool = False, generator: torch.Generator | None = None
     ) -> Sample:
         """Sample an action for uint8 observations (B, 3, 64, 64); a residual actor's ``log_prob`` is its own part's."""
         return self.act(self.outputs(observation, deterministic, generator), deterministic, generator)
 
     def fix_std(self) -> None:
-        """Set the standard deviation to 0.105 before tanh, and exclude it from training."""
+        """Set the standard deviation to 0.105 before tanh, or the initial one, and exclude it from training."""
         layers = [layer for layer in self.std.modules() if isinstance(layer, nn.Linear | nn.ConvTranspose2d)]
         nn.init.zeros_(layers[-1].weight)
         assert layers[-1].bias is not None
-        nn.init.constant_(layers[-1].bias, STD_BIAS)
+        nn.init.constant_(layers[-1].bias, STD_BIAS if self.initial_std is None else 0.0)
         self.std.requires_grad_(False)
 
 
@@ -158,24 +177,31 @@ class ResidualActor(Actor):
     """
 
     def __init__(self, coarse: Actor, resolution: int, gate_bias: float, spec: ActorSpec) -> None:
-        super().__init__(resolution)
+        super().__init__(resolution, spec)
         self.interpolation = spec.interpolation
         self.action_size = spec.patch or resolution
         self.gate_bias, self.gate_scale = gate_bias, spec.gate_scale
-        self.encoder = PairEncoder(spec.split)
+        if self.trunk is None:
+            self.encoder = PairEncoder(spec.split)
+        else:
+            self.trunk = Trunk(self.action_size)
         self.gate = make_head(resolution)
         initialise(self.gate)
         self.coarse = coarse.requires_grad_(False)
 
     def outputs(
-        self, observation: Tensor, deterministic: bool = False, generator: torch.Generator | None = None
+        self, observation: Observation, deterministic: bool = False, generator: torch.Generator | None = None
     ) -> Outputs:
         """Evaluate the networks; the coarser actor is sampled."""
+        image = image_of(observation)
         with torch.no_grad():
-            coarse = self.coarse.sample(observation, deterministic, generator)
+            coarse = self.coarse.sample(image, deterministic, generator)
             coarse = coarse._replace(action=self._enlarge(coarse.action))
-        patch = upsample(coarse.action, IMAGE_SIZE, self.interpolation)
-        latent = self.encoder(normalise_image(observation), patch)
+        if self.trunk is None:
+            patch = upsample(coarse.action, IMAGE_SIZE, self.interpolation)
+            latent = self.encoder(normalise_image(image), patch)
+        else:
+            latent = self.trunk(self.encoder(observation), coarse.action)
         mean, raw_std, gate_logit = fused.decode([self.mean, self.std, self.gate], latent)
         return Outputs(mean, raw_std, gate_logit, coarse)
 
@@ -183,7 +209,7 @@ class ResidualActor(Actor):
         """Compose an action; ``log_prob`` is that of the residual part alone, as in the reference."""
         mean, raw_std, gate_logit, coarse = outputs
         assert gate_logit is not None and coarse is not None
-        residual, log_prob = sample_squashed_gaussian(mean, raw_std, deterministic, generator)
+        residual, log_prob = sample_squashed_gaussian(mean, raw_std, deterministic, generator, self.initial_std)
         gate = self.gate_scale * torch.sigmoid(gate_logit + self.gate_bias)
         action = blend(coarse.action, residual, gate, self._enlarge)
         return Sample(action, log_prob, gate, (*coarse.parts, residual, gate))
@@ -194,7 +220,7 @@ class ResidualActor(Actor):
 
 def build_actor(spec: ActorSpec) -> Actor:
     """Build the freshly initialised actor of the last stage, which contains those of all coarser stages."""
-    actor = Actor(spec.resolutions[0])
+    actor = Actor(spec.resolutions[0], spec)
     for resolution, bias in zip(spec.resolutions[1:], spec.gate_bias, strict=True):
         actor = ResidualActor(actor, resolution, bias, spec)
     return actor

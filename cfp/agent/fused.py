@@ -32,17 +32,17 @@ def channels_last(image: Tensor) -> Tensor:
 
 
 def encode(encoders: Sequence[EncoderLayers], *images: Tensor) -> Tensor:
-    """Evaluate n encoders of the same shape on the same images (B, c, 64, 64); returns latents (B, n w, 4, 4).
+    """Evaluate n encoders of the same shape on the same images (B, c, size, size); returns latents (B, n w, 4, 4).
 
     The first layer is linear in its channels, so it is evaluated for each image separately and summed: this avoids
     stacking the images with a batch of constant coordinates, and the gradients of images that need none.
     """
-    sizes = [image.shape[1] for image in images]
+    sizes, stride = [image.shape[1] for image in images], encoders[0].first.stride[0]
     weight, bias = _concatenated([encoder.first for encoder in encoders])
     *weights, position = weight.split([*sizes, 2], dim=1)
     coordinates = torch.addmm(bias, encoders[0].patches, position.flatten(1).T).flatten()
     hidden, *others = (
-        (_folded_conv if image.requires_grad else F.conv2d)(channels_last(image), part, stride=4)
+        (_folded_conv if image.requires_grad else F.conv2d)(channels_last(image), part, stride=stride)
         for image, part in zip(images, weights, strict=True)
     )
     # Expanded before it is brought to the format of the images: its gradient is then the sum of contiguous rows.
@@ -81,6 +81,9 @@ def multilayer_perceptrons(perceptrons: Sequence[nn.Sequential], values: Tensor)
         if isinstance(layers[0], nn.Linear):
             weight, bias = map(torch.stack, _parameters(layers))
             values = torch.baddbmm(bias[:, None], values, weight.transpose(1, 2))
+        elif isinstance(layers[0], nn.LayerNorm):
+            weight, bias = map(torch.stack, _parameters(layers))
+            values = torch.addcmul(bias[:, None], F.layer_norm(values, layers[0].normalized_shape), weight[:, None])
         elif isinstance(layers[0], nn.ELU):
             values = layers[0](values)
     return values

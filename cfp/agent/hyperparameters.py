@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
+from cfp.agent.spec import RESOLUTIONS
+from cfp.errors import ConfigError
 from cfp.validation import check_at_least, check_fraction, check_positive
 
 
@@ -35,6 +38,24 @@ class LearningConfig:
     """Momentum of the running mean and variance of the rewards."""
     max_grad_norm: float = 10.0
     """Largest gradient norm of each parameter tensor."""
+    critic: Literal["mse", "categorical"] = "mse"
+    """Critics: mse (one value each, as in the paper) or categorical (a distribution over 101 atoms, LayerNorm)."""
+    reward_scale: Literal["batch", "return"] = "batch"
+    """Rewards are centred and divided by their deviation in batches, or divided by the scale of the return."""
+    target_std: float | None = None
+    """Standard deviation of an action entry to whose entropy the temperature is adapted; None: it is constant."""
+    noise_cells: int = 0
+    """Rows and columns of cells with equal exploration noise, held for some steps; 0: the policy's own noise alone."""
+    noise_scale: tuple[float, float] = (0.05, 0.4)
+    """Standard deviation of that noise before tanh, of the first and of the last robot."""
+    n_steps: int = 1
+    """Steps whose rewards a critic's target sums up."""
+    actor_every: int = 1
+    """Updates of the critics for one of the actor."""
+    final_rate: float = 1.0
+    """Fraction of the learning rates at the end of a stage; they fall linearly."""
+    overlap: bool = False
+    """Learn while the robots are simulated, each on half of the cores; the updates lack the latest transitions."""
     warm_critic: bool = False
     """Initialise critics and reward statistics of each stage from the previous one, instead of anew."""
 
@@ -44,11 +65,20 @@ class LearningConfig:
         check_at_least(
             1, buffer_size=self.buffer_size, gradient_steps=self.gradient_steps, update_start=self.update_start
         )
-        check_fraction(gamma=self.gamma, tau=self.tau, reward_momentum=self.reward_momentum)
+        check_at_least(1, n_steps=self.n_steps, actor_every=self.actor_every)
+        check_fraction(gamma=self.gamma, tau=self.tau, reward_momentum=self.reward_momentum, final_rate=self.final_rate)
         check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
         if self.actor_rate is not None:
             check_positive(actor_rate=self.actor_rate)
         check_at_least(0, actor_start=self.actor_start, anchor=self.anchor)
+        if self.target_std is not None:
+            check_positive(target_std=self.target_std)
+        if self.critic == "categorical" and self.reward_scale != "return":
+            raise ConfigError("critic categorical requires reward_scale return: its atoms cover [-5, 5]")
+        if self.noise_cells not in (allowed := (0, 1, 2, *RESOLUTIONS)):
+            raise ConfigError(f"noise_cells must be one of {allowed}, got {self.noise_cells}")
+        for scale in self.noise_scale:
+            check_positive(noise_scale=scale)
 
 
 @dataclass(frozen=True)
@@ -56,7 +86,7 @@ class Hyperparameters(LearningConfig):
     """All hyperparameters of one stage: those of `LearningConfig` and those that differ between stages."""
 
     alpha: float = 0.01
-    """Entropy temperature, a constant."""
+    """Entropy temperature; with target_std the one at the start."""
     gate_penalty: float = 0.0
     """Weight rho of the gate penalty ``mean ||g||_2 / R`` in the actor loss of a residual actor."""
     random_steps: int = 500

@@ -4,34 +4,47 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from cfp.agent.actor import Actor
+from cfp.agent.lean import Observation, image_of
 from cfp.agent.networks import TwinCritic
+from cfp.agent.values import expected_value, value_loss
 
 
 def critic_target(
-    actor: Actor, target: TwinCritic, next_obs: Tensor, rewards: Tensor, not_done: Tensor, alpha: Tensor, gamma: float
+    actor: Actor,
+    target: TwinCritic,
+    next_obs: Observation,
+    rewards: Tensor,
+    not_done: Tensor,
+    alpha: Tensor | float,
+    gamma: Tensor | float,
 ) -> Tensor:
-    """Regression target ``y = r + c gamma (min Q'(s', a') - alpha log pi(a'|s'))``, (B, 1), without gradient.
+    """Target of the critics, ``y = r + c gamma (min Q'(s', a') - alpha log pi(a'|s'))``, (B, 1), without gradient.
 
-    The rewards r are normalised; the continuation flag c (``not_done``) is 1 at a time limit.
+    The rewards r are normalised; the continuation flag c (``not_done``) is 1 at a time limit. Over n steps, r is their
+    discounted sum, and ``gamma`` its n-th power, (B, 1).
     """
     with torch.no_grad():
         sample = actor.sample(next_obs)
-        q_values = torch.minimum(*target(next_obs, sample.action))
+        q_values = smaller_value(target, next_obs, sample.action)
         return rewards + not_done * gamma * (q_values - alpha * sample.log_prob[:, None])
 
 
-def critic_loss(critic: TwinCritic, obs: Tensor, actions: Tensor, target_q: Tensor) -> Tensor:
-    """Sum of the mean squared errors of both critics for observations (B, 3, 64, 64) and actions (B, 2, R, R)."""
-    return torch.stack([F.mse_loss(q_values, target_q) for q_values in critic(obs, actions)]).sum()
+def smaller_value(critic: TwinCritic, obs: Observation, action: Tensor) -> Tensor:
+    """The smaller one of both critics' values, (B, 1)."""
+    return torch.minimum(*map(expected_value, critic(obs, action)))
+
+
+def critic_loss(critic: TwinCritic, obs: Observation, actions: Tensor, target_q: Tensor) -> Tensor:
+    """Sum of both critics' losses, mean squared errors or cross-entropies, for actions (B, 2, R, R)."""
+    return torch.stack([value_loss(outputs, target_q) for outputs in critic(obs, actions)]).sum()
 
 
 def actor_loss(
     actor: Actor,
     critic: TwinCritic,
-    obs: Tensor,
+    obs: Observation,
     alpha: Tensor,
     gate_penalty: float,
     origin: Actor | None = None,
@@ -42,7 +55,7 @@ def actor_loss(
     ``gate_penalty`` weighs a residual actor's gate, ``anchor`` the mean squared distance to ``origin``'s mean actions.
     """
     action, log_prob, gate, _ = actor.sample(obs)
-    q_values = torch.minimum(*critic(obs, action))
+    q_values = smaller_value(critic, obs, action)
     loss = (alpha * log_prob[:, None] - q_values).mean()
     scalars = {"q": q_values.detach().mean(), "entropy": -log_prob.detach().mean()}
     if gate is not None:
@@ -51,7 +64,7 @@ def actor_loss(
         scalars |= {"gate": gate.detach().mean(), "gate_penalty": penalty.detach()}
     if origin is not None:
         with torch.no_grad():
-            reference = origin(obs, deterministic=True)
+            reference = origin(image_of(obs), deterministic=True)
         drift = (action - reference).square().mean()
         loss = loss + anchor * drift
         scalars["drift"] = drift.detach()

@@ -59,18 +59,19 @@ def initialise(module: nn.Module) -> nn.Module:
 
 
 class Encoder(nn.Module):
-    """Three convolutions from (B, C, 64, 64) to a latent image (B, w, 4, 4), with w, 2w and w channels.
+    """Three convolutions from (B, C, size, size) to a latent image (B, w, 4, 4), with w, 2w and w channels.
 
-    Two constant channels, (row - 32)/32 and (column - 32)/32, are appended to the input (the paper's "position
-    embedding channel"); they are neither trained nor saved.
+    Two constant channels, (row - 32)/32 and (column - 32)/32 if the size is 64, are appended to the input (the paper's
+    "position embedding channel"); they are neither trained nor saved.
     """
 
     patches: Tensor
     """Coordinate channels in the receptive fields of the first layer, unfolded to (225, 2 x 8 x 8)."""
 
-    def __init__(self, channels: int, width: int) -> None:
+    def __init__(self, channels: int, width: int, size: int = IMAGE_SIZE) -> None:
         super().__init__()
-        self.first = nn.Conv2d(channels + 2, width, 8, stride=4)
+        kernel, stride = size // 8, size // 16
+        self.first = nn.Conv2d(channels + 2, width, kernel, stride)
         self.rest = nn.Sequential(
             nn.ELU(inplace=True),
             nn.Conv2d(width, 2 * width, 4, stride=2),
@@ -78,12 +79,12 @@ class Encoder(nn.Module):
             nn.Conv2d(2 * width, width, 3),
             nn.ELU(inplace=True),
         )
-        line = (torch.arange(IMAGE_SIZE) - IMAGE_SIZE / 2) / (IMAGE_SIZE / 2)
+        line = (torch.arange(size) - size / 2) / (size / 2)
         grid = torch.stack(torch.meshgrid(line, line, indexing="ij"))
-        self.register_buffer("patches", F.unfold(grid[None], 8, stride=4)[0].T.contiguous(), persistent=False)
+        self.register_buffer("patches", F.unfold(grid[None], kernel, stride=stride)[0].T.contiguous(), persistent=False)
 
     def forward(self, *images: Tensor) -> Tensor:
-        """Encode images (B, c, 64, 64) with values about [-1, 1], stacked along their channels, to (B, w, 4, 4)."""
+        """Encode images (B, c, size, size) with values about [-1, 1], stacked along their channels, to (B, w, 4, 4)."""
         return fused.encode([self], *images)
 
 
@@ -109,7 +110,7 @@ class PairEncoder(nn.Module):
 def make_head(resolution: int) -> nn.Sequential:
     """Decoder from the latent (B, 32, 4, 4) to an image (B, 2, R, R), without a final activation."""
     if resolution == 4:
-        return nn.Sequential(*_perceptron(LATENT, 128, 128, 2 * 4 * 4), nn.Unflatten(1, (2, 4, 4)))
+        return nn.Sequential(*perceptron(LATENT, 128, 128, 2 * 4 * 4), nn.Unflatten(1, (2, 4, 4)))
     shapes, channels = _DECODERS[resolution]
     layers: list[nn.Module] = []
     for (kernel, stride, padding), (before, after) in zip(shapes, pairwise(channels), strict=True):
@@ -117,36 +118,40 @@ def make_head(resolution: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-def _perceptron(*sizes: int) -> nn.Sequential:
-    """Linear layers of these sizes on a flattened input, with ELUs between them."""
+def perceptron(*sizes: int, normed: bool = False) -> nn.Sequential:
+    """Linear layers of these sizes on a flattened input, with ELUs between them, and LayerNorm before these."""
     layers: list[nn.Module] = [nn.Flatten()]
-    for before, after in pairwise(sizes):
-        layers += [nn.Linear(before, after), nn.ELU(inplace=True)]
-    return nn.Sequential(*layers[:-1])
+    for before, after in pairwise(sizes[:-1]):
+        norm = [nn.LayerNorm(after)] if normed else []
+        layers += [nn.Linear(before, after), *norm, nn.ELU(inplace=True)]
+    return nn.Sequential(*layers, nn.Linear(sizes[-2], sizes[-1]))
 
 
 class Critic(nn.Module):
-    """Parameters of an action-value network: an encoder of its own and a 512-256-256-1 perceptron."""
+    """Parameters of an action-value network: an encoder of its own and a 512-256-256-outputs perceptron."""
 
-    def __init__(self, split: bool) -> None:
+    def __init__(self, split: bool, outputs: int) -> None:
         super().__init__()
         self.encoder = PairEncoder(split)
-        self.value = _perceptron(LATENT, 256, 256, 1)
+        self.value = perceptron(LATENT, 256, 256, outputs, normed=outputs > 1)
         initialise(self)
 
 
 class TwinCritic(nn.Module):
-    """Two critics of actions (2, R, R) that share no parameters with each other or with the actor."""
+    """Two critics of actions (2, R, R) that share no parameters with each other or with the actor.
+
+    ``outputs`` is 1 for a value, or the number of atoms of a distribution, see `cfp.agent.values`.
+    """
 
     optimizer: torch.optim.Optimizer
 
-    def __init__(self, resolution: int, split: bool, interpolation: Interpolation) -> None:
+    def __init__(self, resolution: int, split: bool, interpolation: Interpolation, outputs: int = 1) -> None:
         super().__init__()
         self.resolution, self.interpolation = resolution, interpolation
-        self.critics = nn.ModuleList(Critic(split) for _ in range(2))
+        self.critics = nn.ModuleList(Critic(split, outputs) for _ in range(2))
 
     def forward(self, observation: Tensor, action: Tensor) -> tuple[Tensor, ...]:
-        """Q-values (B, 1) of both critics for observations (B, 3, 64, 64) and actions (B, 2, R, R) or (B, 2 R R)."""
+        """Outputs (B, outputs) of both critics for images (B, 3, 64, 64) and actions (B, 2, R, R) or (B, 2 R R)."""
         image = normalise_image(observation)
         action = action.reshape(-1, 2, self.resolution, self.resolution)
         patch = upsample(action, IMAGE_SIZE, self.interpolation)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from typing import Any, cast
 
@@ -10,11 +11,12 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac import policies as sac_policies
-from torch import nn
+from torch import Tensor, nn
 
 from cfp.agent.actor import Actor, SquashedActor, build_actor
 from cfp.agent.actor_policy import check_images
-from cfp.agent.networks import TwinCritic
+from cfp.agent.lean import Encoded, LeanCritics, Observation, halved
+from cfp.agent.networks import TwinCritic, normalise_image
 from cfp.agent.spec import ActorSpec
 
 
@@ -22,14 +24,23 @@ class NetworkPolicy(sac_policies.SACPolicy, ABC):
     """Base class of the policies that `cfp.agent.sac.CFP` trains; subclasses create actor and critics.
 
     Networks read observations as they are. ``use_sde`` must be False; the optimiser is a fused Adam by default.
+    Critics have ``critic_outputs`` outputs, see `cfp.agent.values`.
     """
 
-    def __init__(self, *spaces_and_schedule: Any, use_sde: bool = False, **options: Any) -> None:
+    def __init__(
+        self, *spaces_and_schedule: Any, use_sde: bool = False, critic_outputs: int = 1, **options: Any
+    ) -> None:
         if use_sde:
             raise ValueError("use_sde must be False, got True: the actor has its own exploration noise")
         options.setdefault("optimizer_kwargs", {"fused": True})
         options["normalize_images"] = False
+        self.critic_outputs = critic_outputs
         super().__init__(*spaces_and_schedule, **options)
+
+    @property
+    def num_sampled(self) -> int:
+        """Number of entries of an action that the actor samples."""
+        return math.prod(cast(spaces.Box, self.action_space).shape)
 
     @abstractmethod
     def new_actor(self) -> SquashedActor:
@@ -37,19 +48,30 @@ class NetworkPolicy(sac_policies.SACPolicy, ABC):
 
     @abstractmethod
     def new_critic(self) -> nn.Module:
-        """Create twin critics: a module that returns two Q-values (B, 1) for observations and actions."""
+        """Create twin critics: a module that returns two tensors (B, critic_outputs) for observations and actions."""
+
+    def shared_encoder(self) -> nn.Module | None:
+        """A part of the actor that the critics read too, and train."""
+        return None
+
+    def encode(self, observations: Tensor) -> Observation:
+        """What actor and critics take for ``observations`` (B, ...) in an update."""
+        return normalise_image(observations)
 
     def _build(self, lr_schedule: Schedule) -> None:
         """Create networks and optimisers; frozen parameters of the actor are not optimised."""
         options = dict(self.optimizer_kwargs, lr=lr_schedule(1))
         # They have the interface that SAC uses, without being subclasses of its own actor and critic.
         actor, critic, target = self.new_actor(), *(cast(TwinCritic, self.new_critic()) for _ in range(2))
-        actor.optimizer = self.optimizer_class(actor.trainable_parameters(), **options)
-        critic.optimizer = self.optimizer_class(critic.parameters(), **options)
+        self.actor = cast(sac_policies.Actor, actor)
+        encoder = self.shared_encoder()
+        shared = [] if encoder is None else list(encoder.parameters())
+        own = [parameter for parameter in actor.trainable_parameters() if all(parameter is not each for each in shared)]
+        actor.optimizer = self.optimizer_class(own, **options)
+        critic.optimizer = self.optimizer_class([*critic.parameters(), *shared], **options)
         target.load_state_dict(critic.state_dict())
         target.requires_grad_(False)
         target.set_training_mode(False)
-        self.actor = cast(sac_policies.Actor, actor)
         self.critic = cast(ContinuousCritic, critic)
         self.critic_target = cast(ContinuousCritic, target)
 
@@ -90,13 +112,33 @@ class CFPPolicy(NetworkPolicy):
             raise ValueError(f"action_space must have shape {(2, size, size)} for resolutions {grids}, got {found}")
         super().__init__(observation_space, action_space, lr_schedule, **options)
 
+    @property
+    def num_sampled(self) -> int:
+        """Number of entries on the action grid of the finest stage."""
+        return int(2 * self.spec.resolutions[-1] ** 2)
+
     def new_actor(self) -> Actor:
         """Create the actor with those of all coarser stages."""
         return build_actor(self.spec)
 
-    def new_critic(self) -> TwinCritic:
+    def new_critic(self) -> TwinCritic | LeanCritics:
         """Create critics of the executed action."""
-        return TwinCritic(self.spec.action_size, self.spec.split, self.spec.interpolation)
+        spec, outputs = self.spec, self.critic_outputs
+        if spec.encoder == "lean":
+            return LeanCritics(spec.action_size, outputs)
+        return TwinCritic(spec.action_size, spec.split, spec.interpolation, outputs)
+
+    def shared_encoder(self) -> nn.Module | None:
+        """The lean encoder, which actor and critics share."""
+        return cast(Actor, self.actor).encoder if self.spec.encoder == "lean" else None
+
+    def encode(self, observations: Tensor) -> Observation:
+        """What actor and critics take for ``observations`` (B, 3, 64, 64): with a lean encoder its features too."""
+        encoder = self.shared_encoder()
+        if encoder is None:
+            return super().encode(observations)
+        image = halved(observations)
+        return Encoded(image, encoder(image))
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """The ``observation``, uint8 (3, 64, 64) or (B, 3, 64, 64), as a batch (B, 3, 64, 64), and if it was one."""
@@ -104,5 +146,5 @@ class CFPPolicy(NetworkPolicy):
         return super().obs_to_tensor(observation)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        names = ("observation_space", "action_space", "spec", "optimizer_class", "optimizer_kwargs")
+        names = ("observation_space", "action_space", "spec", "critic_outputs", "optimizer_class", "optimizer_kwargs")
         return {name: getattr(self, name) for name in names} | {"lr_schedule": self._dummy_schedule}

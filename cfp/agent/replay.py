@@ -16,7 +16,9 @@ from cfp.agent.composition import Composition
 class ReplayRing(ReplayBuffer):
     """stable-baselines3's replay buffer, with batches drawn without replacement from a generator of its own.
 
-    With a ``composition``, actions are stored as vectors of their parts and rebuilt in each batch.
+    With a ``composition``, actions are stored as vectors of their parts and rebuilt in each batch. With ``n_steps``
+    above 1, rewards are summed over that many steps with the discount factor ``gamma``, or until the episode or the
+    memory ends, and ``discounts`` holds the factor of what follows.
     """
 
     def __init__(
@@ -27,6 +29,8 @@ class ReplayRing(ReplayBuffer):
         *args: Any,
         seed: int | None = None,
         composition: Composition | None = None,
+        n_steps: int = 1,
+        gamma: float = 1.0,
         **kwargs: Any,
     ) -> None:
         if kwargs.get("optimize_memory_usage"):  # it takes the next row's observation for the next observation
@@ -34,23 +38,40 @@ class ReplayRing(ReplayBuffer):
         stored = spaces.Box(-np.inf, np.inf, (composition.length,), np.float32) if composition else action_space
         super().__init__(buffer_size, observation_space, stored, *args, **kwargs)
         self.generator = np.random.default_rng(seed)
-        self.composition = composition
+        self.composition, self.n_steps, self.gamma = composition, n_steps, gamma
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """Draw a batch uniformly, without replacement if at least ``batch_size`` transitions are stored."""
         stored = self.size() * self.n_envs
         indices = self.generator.choice(stored, batch_size, replace=batch_size > stored)
         row, element = np.divmod(indices, self.n_envs)
-        terminated = self.dones[row, element] * (1 - self.timeouts[row, element])
+        rewards, last, discounts = self._look_ahead(row, element)
+        terminated = self.dones[last, element] * (1 - self.timeouts[last, element])
         arrays = (
             self._normalize_obs(self.observations[row, element], env),
             self.actions[row, element],
-            self._normalize_obs(self.next_observations[row, element], env),
+            self._normalize_obs(self.next_observations[last, element], env),
             terminated[:, None],
-            self._normalize_reward(self.rewards[row, element, None], env),
+            self._normalize_reward(rewards[:, None], env),
         )
         # Indexing has made copies already.
         batch = ReplayBufferSamples(*(self.to_torch(np.asarray(array), copy=False) for array in arrays))
+        if self.n_steps > 1:
+            batch = batch._replace(discounts=self.to_torch(discounts[:, None], copy=False))
         if self.composition is None:
             return batch
         return batch._replace(actions=self.composition.rebuild(batch.actions).flatten(1))
+
+    def _look_ahead(self, row: np.ndarray, element: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Sums of rewards from transitions on, rows of the last ones, and discount factors of what follows."""
+        rewards, last = self.rewards[row, element].copy(), row
+        discounts = np.full_like(rewards, self.gamma)
+        goes_on = self.dones[row, element] == 0
+        for _ in range(self.n_steps - 1):
+            after = (last + 1) % self.buffer_size
+            goes_on &= after != self.pos  # the newest row has no successor
+            rewards += goes_on * discounts * self.rewards[after, element]
+            discounts = np.where(goes_on, discounts * np.float32(self.gamma), discounts)
+            last = np.where(goes_on, after, last)
+            goes_on &= self.dones[last, element] == 0
+        return rewards, last, discounts

@@ -1,12 +1,15 @@
 """CFP: soft actor-critic with the update rule of the DittoGym reference implementation (paper, Appendix B).
 
 Differences from stable-baselines3's SAC: rewards are normalised by running statistics, the gradient of each tensor is
-clipped separately, the gate is penalised, and the random phase is independent of the start of the updates.
+clipped separately, the gate is penalised, and the random phase is independent of the start of the updates. Options of
+`cfp.agent.hyperparameters.LearningConfig` add what later publications found; the documentation explains them.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,27 +18,33 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples
+from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, RolloutReturn
+from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from cfp.agent.actor import Actor
 from cfp.agent.composition import Composition
+from cfp.agent.exploration import CellNoise
 from cfp.agent.hyperparameters import Hyperparameters
+from cfp.agent.lean import Observation
 from cfp.agent.losses import actor_loss, critic_loss, critic_target
-from cfp.agent.networks import TwinCritic, normalise_image, upsample
+from cfp.agent.networks import TwinCritic, upsample
 from cfp.agent.policies import CFPPolicy, NetworkPolicy
 from cfp.agent.replay import ReplayRing
+from cfp.agent.values import ATOMS, ReturnScale, RewardStatistics
 from cfp.errors import NonFiniteError
 
 METRICS: dict[str, str] = {
-    "train/critic_loss": "sum of both critics' mean squared errors, in normalised rewards",
+    "train/critic_loss": "sum of both critics' mean squared errors, in normalised rewards, or cross-entropies",
     "train/actor_loss": "mean of alpha log pi - min Q, plus the gate penalty",
     "train/q": "mean of min(Q1, Q2) at the actor's own actions, in normalised rewards",
     "train/q_target": "mean of the critics' regression target",
     "train/entropy": "mean of -log pi of the sampled (in stage 2: residual) action, summed over all 2 R R entries",
     "train/reward_mean": "running mean of raw rewards that is subtracted before learning",
     "train/reward_std": "running standard deviation of raw rewards that they are divided by",
+    "train/reward_scale": "scale of the return that rewards are divided by, with reward_scale return",
+    "train/alpha": "entropy temperature, where it is adapted",
     "train/gate": "mean gate of the residual actor: 0 keeps the coarse action, 1 replaces it",
     "train/gate_penalty": "gate penalty inside the actor loss",
     "train/n_updates": "gradient updates so far in this stage",
@@ -45,28 +54,13 @@ METRICS: dict[str, str] = {
 """Scalars that `CFP.train` logs."""
 
 
-class RewardStatistics(nn.Module):
-    """Running mean and variance of raw rewards, updated with each batch before it is normalised.
+TEMPERATURE_RATE = 0.01
+"""Adam's step size for the logarithm of an adapted temperature."""
 
-    ``M <- m M + (1 - m) mean(r)``, ``V <- m V + (1 - m) var(r)`` (unbiased), starting at 0 and 1;
-    ``normalised r = (r - M) / (sqrt(V) + 1e-8)``.
-    """
 
-    mean: Tensor
-    variance: Tensor
-
-    def __init__(self, momentum: float) -> None:
-        super().__init__()
-        self.momentum = momentum
-        self.register_buffer("mean", torch.zeros(()))
-        self.register_buffer("variance", torch.ones(()))
-
-    @torch.no_grad()
-    def forward(self, rewards: Tensor) -> Tensor:
-        """Update the statistics with raw rewards of any shape and return them normalised."""
-        self.mean.lerp_(rewards.mean(), 1 - self.momentum)
-        self.variance.lerp_(rewards.var(), 1 - self.momentum)
-        return (rewards - self.mean) / (self.variance.sqrt() + 1e-8)
+def falling_rate(rate: float, final: float, remaining: float) -> float:
+    """A learning rate that falls along a line to the fraction ``final``; ``remaining`` goes from 1 to 0."""
+    return rate * (final + (1 - final) * remaining)
 
 
 def clip_each(parameters: Iterable[nn.Parameter], max_norm: float) -> None:
@@ -94,7 +88,7 @@ class CFP(SAC):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CFPPolicy": CFPPolicy}
-    reward_statistics: RewardStatistics
+    reward_statistics: RewardStatistics | ReturnScale
 
     def __init__(
         self,
@@ -109,33 +103,74 @@ class CFP(SAC):
         noisy = sac_options.get("action_noise") is not None  # then the executed action is not composed of parts
         composition = Composition.of(spec) if spec and not noisy else None
         sac_options.setdefault("replay_buffer_class", ReplayRing)
-        sac_options.setdefault("replay_buffer_kwargs", {"seed": sac_options.get("seed"), "composition": composition})
-        names = ("learning_rate", "buffer_size", "batch_size", "tau", "gamma", "gradient_steps")
+        replay = {"seed": sac_options.get("seed"), "composition": composition}
+        replay |= {"n_steps": hyperparameters.n_steps, "gamma": hyperparameters.gamma}
+        sac_options.setdefault("replay_buffer_kwargs", replay)
+        names = ("buffer_size", "batch_size", "tau", "gamma", "gradient_steps")
         sac_options |= {name: getattr(hyperparameters, name) for name in names}
+        rate, final = hyperparameters.learning_rate, hyperparameters.final_rate
+        sac_options["learning_rate"] = rate if final == 1 else partial(falling_rate, rate, final)
+        if hyperparameters.critic == "categorical":
+            sac_options["policy_kwargs"] = (sac_options.get("policy_kwargs") or {}) | {"critic_outputs": ATOMS}
         starts, alpha = hyperparameters.update_start, hyperparameters.alpha
-        super().__init__(policy, env, learning_starts=starts, ent_coef=alpha, **sac_options)
+        coefficient = alpha if hyperparameters.target_std is None else f"auto_{alpha}"
+        super().__init__(policy, env, learning_starts=starts, ent_coef=coefficient, **sac_options)
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self.reward_statistics = RewardStatistics(self.hyperparameters.reward_momentum).to(self.device)
+        own, policy = self.hyperparameters, self.policy
+        assert isinstance(policy, NetworkPolicy)
+        scaled = own.reward_scale == "return"
+        statistics = ReturnScale(self.n_envs, self.gamma) if scaled else RewardStatistics(own.reward_momentum)
+        self.reward_statistics = statistics.to(self.device)
+        self.noise = None
+        if own.noise_cells:
+            resolution = self.networks()[0].resolution
+            self.noise = CellNoise(self.n_envs, resolution, own.noise_cells, own.noise_scale, self.seed)
+        if own.target_std is not None:
+            assert self.log_ent_coef is not None
+            self.target_entropy = policy.num_sampled * 0.5 * math.log(2 * math.pi * math.e * own.target_std**2)
+            self.ent_coef_optimizer = torch.optim.Adam([self.log_ent_coef], TEMPERATURE_RATE)
 
     def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
         """Actor, critics and target critics."""
         assert isinstance(self.policy, NetworkPolicy)
         return self.policy.networks()
 
+    def collect_rollouts(self, env: VecEnv, *arguments: Any, **options: Any) -> RolloutReturn:
+        """Take a step in ``env``, with ``arguments`` and ``options`` of stable-baselines3; updates may ``overlap`` with it.
+
+        Raises:
+            ValueError: The environment cannot be simulated in the background.
+        """
+        if self.hyperparameters.overlap:
+            if not hasattr(env.unwrapped, "meanwhile"):
+                raise ValueError(f"env must be a cfp.TorchVecEnv with overlap, got {type(env.unwrapped).__name__}")
+            env.unwrapped.meanwhile = self._learn_meanwhile
+        return super().collect_rollouts(env, *arguments, **options)
+
+    def _learn_meanwhile(self) -> None:
+        if self.num_timesteps > self.learning_starts:
+            self._perform_updates(self.gradient_steps, self.batch_size)
+
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Perform ``gradient_steps`` updates, each with ``batch_size`` transitions.
+        """Perform ``gradient_steps`` updates, each with ``batch_size`` transitions; with ``overlap`` they have been.
 
         Raises:
             NonFiniteError: A loss is not finite; the optimiser step is not taken.
         """
+        if not self.hyperparameters.overlap:
+            self._perform_updates(gradient_steps, batch_size)
+
+    def _perform_updates(self, gradient_steps: int, batch_size: int) -> None:
         assert self.replay_buffer is not None
         actor, critic, _ = self.networks()
         self.policy.set_training_mode(True)
         self._update_learning_rate([actor.optimizer, critic.optimizer])
-        if self.hyperparameters.actor_rate is not None:
-            actor.optimizer.param_groups[0]["lr"] = self.hyperparameters.actor_rate
+        own = self.hyperparameters
+        if own.actor_rate is not None:
+            remaining = self._current_progress_remaining
+            actor.optimizer.param_groups[0]["lr"] = falling_rate(own.actor_rate, own.final_rate, remaining)
         for _ in range(gradient_steps):
             scalars = self.update(self.replay_buffer.sample(batch_size))
             self._n_updates += 1
@@ -146,36 +181,52 @@ class CFP(SAC):
 
     def update(self, batch: ReplayBufferSamples) -> dict[str, Tensor]:
         """Perform one update with a ``batch``; returns scalars by name, see `METRICS`."""
-        obs, next_obs = normalise_image(batch.observations), normalise_image(batch.next_observations)
+        assert isinstance(self.policy, NetworkPolicy)
+        obs = self.policy.encode(batch.observations)
+        with torch.no_grad():
+            next_obs = self.policy.encode(batch.next_observations)
+        if self.origin is not None:
+            obs = obs.detach()  # another encoder would change the policy that is refined, whatever its actor learns
         scalars = self._update_critic(obs, next_obs, batch)
-        if self.num_timesteps >= self.hyperparameters.actor_start:
-            scalars |= self._update_actor(obs)
+        own = self.hyperparameters
+        if self.num_timesteps >= own.actor_start and (self._n_updates + 1) % own.actor_every == 0:
+            scalars |= self._update_actor(obs.detach())
         _, critic, target = self.networks()
         get_ema_multi_avg_fn(1 - self.tau)(list(target.parameters()), list(critic.parameters()), 1)
-        scalars["reward_mean"] = self.reward_statistics.mean
-        scalars["reward_std"] = self.reward_statistics.variance.sqrt()
-        return scalars
+        return scalars | self.reward_statistics.scalars()
 
-    def _update_critic(self, obs: Tensor, next_obs: Tensor, batch: ReplayBufferSamples) -> dict[str, Tensor]:
+    def _update_critic(self, obs: Observation, next_obs: Observation, batch: ReplayBufferSamples) -> dict[str, Tensor]:
         actor, critic, target = self.networks()
         rewards, not_done = self.reward_statistics(batch.rewards), 1 - batch.dones
-        target_q = critic_target(actor, target, next_obs, rewards, not_done, self.ent_coef_tensor, self.gamma)
+        # Of an adapted temperature, critics learn returns without entropy (Yu et al., 2022; Ball et al., ICML 2023):
+        # summed over thousands of action entries, it would drown the rewards.
+        alpha = self.ent_coef_tensor if self.log_ent_coef is None else 0.0
+        gamma = self.gamma if batch.discounts is None else batch.discounts
+        target_q = critic_target(actor, target, next_obs, rewards, not_done, alpha, gamma)
         loss = critic_loss(critic, obs, batch.actions, target_q)
-        self._descend(loss, critic.optimizer, list(critic.parameters()), "critic")
+        self._descend(loss, critic.optimizer, "critic")
         return {"critic_loss": loss.detach(), "q_target": target_q.mean()}
 
-    def _update_actor(self, obs: Tensor) -> dict[str, Tensor]:
+    def _update_actor(self, obs: Observation) -> dict[str, Tensor]:
         actor, critic, _ = self.networks()
         own = self.hyperparameters
+        alpha = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp().squeeze()
         critic.requires_grad_(False)  # avoids computing weight gradients of the critics, which would be discarded
-        loss, scalars = actor_loss(actor, critic, obs, self.ent_coef_tensor, own.gate_penalty, self.origin, own.anchor)
-        self._descend(loss, actor.optimizer, actor.trainable_parameters(), "actor")
+        loss, scalars = actor_loss(actor, critic, obs, alpha, own.gate_penalty, self.origin, own.anchor)
+        self._descend(loss, actor.optimizer, "actor")
         critic.requires_grad_(True)
+        if self.log_ent_coef is not None:
+            self._adapt_temperature(scalars["entropy"])
+            scalars["alpha"] = alpha
         return scalars | {"actor_loss": loss.detach()}
 
-    def _descend(
-        self, loss: Tensor, optimizer: torch.optim.Optimizer, parameters: list[nn.Parameter], name: str
-    ) -> None:
+    def _adapt_temperature(self, entropy: Tensor) -> None:
+        """Raise the temperature if the entropy is below its target (Haarnoja et al., 2018b), else lower it."""
+        assert self.log_ent_coef is not None and self.ent_coef_optimizer is not None
+        self.log_ent_coef.grad = (entropy - float(self.target_entropy)).reshape(1)
+        self.ent_coef_optimizer.step()
+
+    def _descend(self, loss: Tensor, optimizer: torch.optim.Optimizer, name: str) -> None:
         if not torch.isfinite(loss):
             raise NonFiniteError(
                 f"the {name} loss became {loss.item()} at update {self._n_updates + 1} "
@@ -183,7 +234,7 @@ class CFP(SAC):
             )
         optimizer.zero_grad()
         loss.backward()
-        clip_each(parameters, self.hyperparameters.max_grad_norm)
+        clip_each(optimizer.param_groups[0]["params"], self.hyperparameters.max_grad_norm)
         optimizer.step()
 
     def _sample_action(
@@ -195,8 +246,8 @@ class CFP(SAC):
         if self.num_timesteps < random_steps:
             # stable-baselines3 ends its random phase where updates start; here the two are independent.
             return self._on_action_grid(*super()._sample_action(random_steps, action_noise, n_envs), composition)
-        if composition is not None:
-            actions, stored = self._act_in_parts(composition)
+        if composition is not None or self.noise is not None:
+            actions, stored = self._act(composition)
         else:
             actions, stored = super()._sample_action(0, action_noise, n_envs)
         self._check_finite("action", actions)
@@ -216,20 +267,32 @@ class CFP(SAC):
         return actions, actions if composition is None else composition.from_finest(corner).numpy()
 
     @torch.no_grad()
-    def _act_in_parts(self, composition: Composition) -> tuple[np.ndarray, np.ndarray]:
-        """Act as ``predict`` does, and keep the parts of the actions."""
+    def _act(self, composition: Composition | None) -> tuple[np.ndarray, np.ndarray]:
+        """Act as ``predict`` does, with exploration noise, and keep the parts of the actions."""
         assert self._last_obs is not None
         self.policy.set_training_mode(False)
         observation, _ = self.policy.obs_to_tensor(self._last_obs)
         assert isinstance(observation, Tensor)
-        sample = self.networks()[0].sample(observation)
-        return sample.action.cpu().numpy(), composition.join(sample.parts).cpu().numpy()
+        actor = self.networks()[0]
+        outputs = actor.outputs(observation)
+        if self.noise is not None:
+            outputs = outputs._replace(mean=outputs.mean + self.noise().to(outputs.mean.device))
+        sample = actor.act(outputs)
+        action = sample.action.cpu().numpy()
+        return action, action if composition is None else composition.join(sample.parts).cpu().numpy()
 
     def _store_transition(
-        self, replay_buffer: ReplayBuffer, buffer_action: np.ndarray, new_obs: Any, reward: np.ndarray, *rest: Any
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: Any,
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
     ) -> None:
         self._check_finite("reward", reward)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, *rest)
+        self.reward_statistics.observe(reward, dones)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _check_finite(self, name: str, values: np.ndarray) -> None:
         finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
@@ -244,4 +307,4 @@ class CFP(SAC):
         return [*modules, "reward_statistics"], tensors
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "reward_statistics", "origin"]
+        return [*super()._excluded_save_params(), "reward_statistics", "origin", "noise"]

@@ -9,6 +9,7 @@ from cfp.errors import ConfigError
 from dittogym.geometry import NODES
 
 Interpolation = Literal["half_pixel", "aligned"]
+EncoderKind = Literal["full", "lean"]
 
 RESOLUTIONS = (4, 8, 16, 32, 64)
 """Action grids R for which `cfp.agent.networks.make_head` has a decoder."""
@@ -29,6 +30,9 @@ class ActorSpec:
         patch: Size of the images on which a residual actor blends coarse and residual actions; None blends on the
             grid of the stage, as the reference does. Two cubic upsamplings differ from one, so a closed gate leaves
             the coarser force field only if actions are blended at the size of the environment's patch.
+        encoder: ``"full"`` for the paper's, ``"lean"`` for `cfp.agent.lean.LeanEncoder`.
+        initial_std: Standard deviation before tanh of a new actor, and three times the smallest that it can take; None
+            for the reference's, 0.31 and at least 0.1.
 
     Raises:
         ConfigError: A resolution has no decoder, resolutions do not increase, or ``gate_bias`` or ``patch`` do not
@@ -41,6 +45,8 @@ class ActorSpec:
     gate_scale: float = 1.0
     interpolation: Interpolation = "half_pixel"
     patch: int | None = None
+    encoder: EncoderKind = "full"
+    initial_std: float | None = None
 
     @property
     def action_size(self) -> int:
@@ -57,3 +63,5 @@ class ActorSpec:
             raise ConfigError(f"gate_bias must have {count} values for resolutions {self.resolutions}, got {found}")
         if self.patch is not None and not (isinstance(self.patch, int) and finest <= self.patch <= NODES):
             raise ConfigError(f"patch must be between {finest} (the finest action grid) and {NODES}, got {self.patch}")
+        if self.encoder == "lean" and self.action_size % 4:
+            raise ConfigError(f"patch must be a multiple of 4 with encoder lean, got {self.patch}")

@@ -60,6 +60,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
     config: AnalyticConfig
     parts = ("regression", "memory", "critic", "collector", "action_step")
     values = ("generator",)
+    presets = ("quick",)
 
     def __init__(self, config: AnalyticConfig, stage: int, actor: Actor) -> None:
         self.config, self.stage = config, stage

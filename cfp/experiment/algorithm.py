@@ -50,6 +50,7 @@ class Algorithm(ABC):
     """
 
     sees: ClassVar[Sees] = "image"  # what its policies look at; their training may use more
+    presets: ClassVar[tuple[str, ...]] = ("quick", "paper")
     num_timesteps: int = 0  # environment steps taken in this stage
     starts_trained: bool = False  # with a policy that is then evaluated before the first step
     replay_buffer: ReplayBuffer | None = None  # transitions to keep in checkpoints
@@ -62,7 +63,7 @@ class Algorithm(ABC):
     @staticmethod
     @abstractmethod
     def preset(task: str, name: str) -> RunConfig:
-        """Default options for a ``task``; the ``name`` of a preset is ``"quick"`` or ``"paper"``."""
+        """Default options for a ``task``; the ``name`` of a preset is one of `presets`."""
 
     @classmethod
     def initialize(cls, config: Any, folder: Path) -> Position:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from cfp.agent.actor import Actor
 from cfp.agent.hyperparameters import Hyperparameters
 from cfp.agent.policies import CFPPolicy, NetworkPolicy
 from cfp.agent.sac import CFP
-from cfp.config import Config, RunConfig
+from cfp.config import Config, Preset, RunConfig
 from cfp.envs.make import choose_device, make_env
 from cfp.evaluation.pictures import policy_pictures
 from cfp.experiment.algorithm import Algorithm, Scalars
@@ -36,6 +36,8 @@ ROLLOUT_METRICS: dict[str, str] = {
 
 class SACAlgorithm(Algorithm):
     """Trains a `cfp.agent.sac.CFP` with whatever networks; a subclass makes it and knows its policies."""
+
+    presets = get_args(Preset)
 
     def __init__(self, config: Any, stage: int, model: CFP) -> None:
         self.config, self.stage, self.model = config, stage, model

@@ -58,13 +58,14 @@ class Command:
 class _Choice:
     """What must be known before the defaults are: the same options, read first."""
 
-    decisive: ClassVar[tuple[str, ...]] = ("algo", "task", "preset", "learner")
+    decisive: ClassVar[tuple[str, ...]] = ("algo", "task", "preset", "learner", "start_from")
     """Those that choose the defaults."""
 
     algo: str | None = None
     task: str | None = None
     preset: str | None = None
     learner: str | None = None
+    start_from: str | None = None
     out: Folder | None = None
     resume: bool = False
     config: Path | None = None

@@ -1,29 +1,35 @@
 """The presets of every algorithm."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from baselines.registry import ALGORITHMS, configure, find
 from cfp.config import to_json
+from cfp.errors import ConfigError
 from cfp.presets import TASKS, sac_preset
 
 
 @pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("preset", ["quick", "paper"])
+@pytest.mark.parametrize("preset", ["quick", "lean", "long", "paper"])
 def test_presets_are_valid_survive_json_and_agree_with_that_of_cfp(task, preset):
     own = sac_preset(task, preset)
     for name in ALGORITHMS:
-        if name == "analytic" and preset == "paper":  # which it does not have
-            continue
         algorithm = find(name)
+        if preset not in algorithm.presets:
+            with pytest.raises(ConfigError, match=f"preset must be .* for {name}, got '{preset}'"):
+                configure({"algo": name, "task": task, "preset": preset})
+            continue
         config = algorithm.preset(task, preset)
         config.check()
         assert configure(json.loads(json.dumps(to_json(config)))) == config, name
         if algorithm.sees in ("image", "state"):  # the others have no noise
             assert config.report.eval_deterministic == own.report.eval_deterministic, name
         if hasattr(config, "learning"):  # soft actor-critic
-            assert (config.learning, config.environment, config.steps) == (own.learning, own.environment, own.steps)
+            cells = 0 if name.startswith(("gnn", "transformer")) else own.learning.noise_cells
+            assert config.learning == replace(own.learning, noise_cells=cells)
+            assert (config.environment, config.steps) == (own.environment, own.steps)
         if name in ("coarse", "fine"):
             assert config.resolutions == (own.resolutions[0 if name == "coarse" else -1],)
             assert (config.alpha, config.random_steps) == (own.alpha[:1], own.random_steps[:1])

@@ -18,7 +18,7 @@ from dittogym import make_spec
 
 
 @pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("name", ["quick", "paper"])
+@pytest.mark.parametrize("name", ["quick", "lean", "long", "paper"])
 def test_every_preset_is_valid_and_survives_json(task, name):
     config = sac_preset(task, name)
     config.check()
@@ -35,7 +35,7 @@ def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):
     config.check()
     assert (config.task, config.resolutions) == ("hop", (4, 32))
     assert replace(config, task="run", resolutions=(8, 16)) == sac_preset("run")
-    with pytest.raises(ConfigError, match="preset must be quick for hop, got 'paper'"):
+    with pytest.raises(ConfigError, match="preset must be quick or lean or long for hop, got 'paper'"):
         sac_preset("hop", "paper")
 
 
