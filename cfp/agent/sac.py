@@ -138,7 +138,7 @@ class CFP(SAC):
         return self.policy.networks()
 
     def collect_rollouts(self, env: VecEnv, *arguments: Any, **options: Any) -> RolloutReturn:
-        """Take a step in ``env``, with ``arguments`` and ``options`` of stable-baselines3; updates may ``overlap`` with it.
+        """Take a step in ``env``, with ``arguments`` and ``options`` of SAC; updates may ``overlap`` with it.
 
         Raises:
             ValueError: The environment cannot be simulated in the background.
