@@ -141,7 +141,7 @@ def sac_preset(task: str, name: str = "quick") -> Config:
     check_task(task)
     allowed = typing.get_args(Preset) if task in TASKS else ("quick", "lean", "long")
     if name not in allowed:
-        raise ConfigError(f"preset must be {' or '.join(allowed)} for {task}, got {name!r}")
+        raise ConfigError(f"preset must be one of {', '.join(allowed)} for {task}, got {name!r}")
     numbers = _numbers(task)
     return {"paper": _paper, "quick": _quick, "lean": _lean, "long": _long}[name](task, numbers)
 

@@ -35,11 +35,11 @@ class RewardConfig:
     integrity_weight: float = 300.0
     """Cost of particles that were close when the window, or the episode within it, began and drift apart; see
     `Neighbours`."""
+    scale: float = 0.05
+    """Factor of the whole, so that values are not far from one."""
     success_reward: float = 0.0
     """Reward for every step that an episode would have gone on after it ended in success; 0 as in the task, where an
     episode that ends early earns no more."""
-    scale: float = 0.05
-    """Factor of the whole, so that values are not far from one."""
 
     def check(self) -> None:
         """Check what the types do not express."""

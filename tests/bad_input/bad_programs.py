@@ -45,7 +45,11 @@ def planned(name, plan, *words):
 
 TRAIN = [
     training("an unknown task", "--task swim", "task must be catch, dig"),
-    training("an unknown preset", "--preset slow", "preset must be quick or paper for shapematch, got 'slow'"),
+    training(
+        "an unknown preset",
+        "--preset slow",
+        "preset must be one of quick, lean, long, paper for shapematch, got 'slow'",
+    ),
     training("an unknown option", "--colour red", "Unrecognized options: --colour"),
     training("a seed by name", "--seed x", "Error parsing --seed: invalid literal for int()", "'x'"),
     training("seed -1", "--seed -1", "seed must be between 0 and 2147483647, got -1"),

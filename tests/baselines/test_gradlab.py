@@ -136,7 +136,7 @@ def test_bad_options_are_named(arguments: str, named: str, tmp_path, capsys) -> 
 def test_folder_is_made_before_the_measurement(tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setattr(command, "measure", lambda *_: pytest.fail("measured although the folder cannot be made"))
     (tmp_path / "file").touch()
-    assert command.main(["--quick", "--out", str(tmp_path / "file")]) == 1
+    assert command.main(["--quick", "--out", str(tmp_path / "file")]) == 2
     assert "file" in capsys.readouterr().err
 
 

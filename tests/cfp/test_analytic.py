@@ -37,7 +37,7 @@ def make(task="run", stages=1, **changes):
     grids = (4, 8)[:stages]
     defaults = {"resolutions": grids, "handover": (48,)[: stages - 1], "gate_bias": (-1.0,)[: stages - 1], "steps": 96}
     defaults |= {"action_step": (0.1, 0.1)[:stages], "environment": environment, "train_particles": 300}
-    defaults |= {"device": "cpu", "window": 4, "minibatches": 4, "minibatch_size": 8, "windows_kept": 3}
+    defaults |= {"device": "cpu", "window": 4, "minibatches": 4, "minibatch_size": 8, "windows_kept": 3, "warmup": 0}
     return replace(cfp.preset(task, "quick", "analytic"), **defaults | changes)
 
 

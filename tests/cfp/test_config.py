@@ -35,7 +35,7 @@ def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):
     config.check()
     assert (config.task, config.resolutions) == ("hop", (4, 32))
     assert replace(config, task="run", resolutions=(8, 16)) == sac_preset("run")
-    with pytest.raises(ConfigError, match="preset must be quick or lean or long for hop, got 'paper'"):
+    with pytest.raises(ConfigError, match="preset must be one of quick, lean, long for hop, got 'paper'"):
         sac_preset("hop", "paper")
 
 

@@ -373,5 +373,5 @@ def test_every_episode_can_be_differentiated() -> None:
 
 @pytest.mark.parametrize("value", ["big", None, [1.0, [2.0]], 1j])
 def test_values_that_are_no_numbers(value: object) -> None:
-    with pytest.raises(ValueError, match=r"physics\['mu'\] must be (numbers|real), got"):
+    with pytest.raises(ValueError, match=r"physics\['mu'\] must be (real )?numbers"):
         tiny("run").reset(seed=0, options={"physics": {"mu": value}})
