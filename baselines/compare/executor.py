@@ -1,5 +1,6 @@
 """What carries out runs: one interface for this process, processes of this machine, and a cluster."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -240,4 +241,5 @@ def _wait(process: subprocess.Popen[bytes], urgency: Callable[[], int]) -> int:
         raise
     finally:
         assert process.stdin is not None
-        process.stdin.close()
+        with contextlib.suppress(BrokenPipeError):  # of what an ended process has not read
+            process.stdin.close()
