@@ -157,9 +157,12 @@ def test_a_drawn_robot(played: Played) -> None:
     page.mouse.move(box["x"] + 190, box["y"] + 160, steps=5)
     page.mouse.up()
     page.click("#use")
-    played.until(lambda: "body" in session.options)
-    width, height = np.ptp(session.env.state.x[0, :400].numpy(), axis=0)
-    assert width > 1.8 * height
+
+    def is_wide() -> bool:
+        width, height = np.ptp(session.env.state.x[0, :400].numpy(), axis=0)
+        return bool(width > 1.8 * height)
+
+    played.until(is_wide)
     page.click("#draw")
     page.click("#use")  # nothing was drawn
     played.until(lambda: "body must be a picture" in page.inner_text("#toasts"))
