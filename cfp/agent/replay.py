@@ -66,12 +66,12 @@ class ReplayRing(ReplayBuffer):
         """Sums of rewards from transitions on, rows of the last ones, and discount factors of what follows."""
         rewards, last = self.rewards[row, element].copy(), row
         discounts = np.full_like(rewards, self.gamma)
-        goes_on = self.dones[row, element] == 0
+        continues = self.dones[row, element] == 0
         for _ in range(self.n_steps - 1):
             after = (last + 1) % self.buffer_size
-            goes_on &= after != self.pos  # the newest row has no successor
-            rewards += goes_on * discounts * self.rewards[after, element]
-            discounts = np.where(goes_on, discounts * np.float32(self.gamma), discounts)
-            last = np.where(goes_on, after, last)
-            goes_on &= self.dones[last, element] == 0
+            continues &= after != self.pos  # the newest row has no successor
+            rewards += continues * discounts * self.rewards[after, element]
+            discounts = np.where(continues, discounts * np.float32(self.gamma), discounts)
+            last = np.where(continues, after, last)
+            continues &= self.dones[last, element] == 0
         return rewards, last, discounts

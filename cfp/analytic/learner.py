@@ -45,7 +45,7 @@ METRICS: dict[str, str] = {
     "train/episodes": "episodes ended in this stage",
     "train/terminated": "those that the task ended early",
     "train/nonfinite": "simulations that were not finite and were reset",
-    "train/dropped": "gradients of single actions that were not finite and were left out",
+    "train/dropped": "gradients of single actions, of the actor's own, that were not finite and were left out",
 }
 """Every scalar that `AnalyticLearner.update` logs, and what it means."""
 
@@ -126,7 +126,8 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
             self.collector.load_state_dict(start)
             self.generator.set_state(noise)
             images, improved, better = self._improve(step_size, improved)
-        self.collector.load_state_dict(end)  # episodes go on as the actor leads them
+        if iterations > 1:
+            self.collector.load_state_dict(end)  # episodes go on as the actor leads them
         self.memory.add(images, improved.flatten(0, 1))
         regression_loss = torch.zeros(())
         for _ in range(minibatches):
