@@ -70,6 +70,18 @@ class TorchEnv:
     Raises:
         ValueError: An argument is out of range.
         TypeError: The task has no such option.
+
+    Examples:
+        >>> import dittogym, torch
+        >>> env = dittogym.TorchEnv("run", num_envs=4, particles="lite")
+        >>> observation, info = env.reset(seed=0)
+        >>> observation.shape, observation.dtype
+        (torch.Size([4, 3, 64, 64]), torch.uint8)
+        >>> action = torch.zeros(4, *env.action_shape, requires_grad=True)
+        >>> observation, reward, terminated, truncated, info = env.step(action)
+        >>> reward.sum().backward()
+        >>> action.grad.shape
+        torch.Size([4, 2, 8, 8])
     """
 
     observation_shape = SHAPE
