@@ -93,13 +93,14 @@ def overview() -> str:
             [
                 f"[{headline(task)[0]}](generated/{task}.md)",
                 *(number(shipped(task, name)["mean"]) for name in ("zero", "random")),
-                (f"**{value}**" if float(ours["mean"]) > theirs else value) + spread(ours),
+                (f"**{value}**" if float(ours["mean"]) > theirs else value) + f"<br>{spread(ours).strip(' ()')}",
                 number(str(theirs)),
-                f"{number(training['steps'])} / {paper.STEPS[task]:,}",
+                number(training["steps"]),
+                f"{paper.STEPS[task]:,}",
                 training["minutes"],
             ]
         )
-    columns = ("Task", "Zero", "Random", "This package", "Paper's CFP", "Steps, here / paper", "Minutes")
+    columns = ("Task", "Zero", "Random", "This package", "Paper's CFP", "Steps", "Paper's steps", "Minutes")
     return markdown(columns, rows)
 
 

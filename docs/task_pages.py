@@ -44,7 +44,8 @@ The pretrained policy with 2,000 particles; contraction is red, expansion blue.
 import cfp, gymnasium
 
 policy = cfp.load("[[ spec.name ]]")
-env = gymnasium.make("dittogym/[[ spec.name ]]-coarse-v0", particles="lite", resolution=policy.resolution)
+options = {"particles": "lite", "resolution": policy.resolution}
+env = gymnasium.make("dittogym/[[ spec.name ]]-coarse-v0", **options)
 env.unwrapped.film(policy, "[[ spec.name ]].webp")
 ```
 
@@ -55,7 +56,7 @@ python -m cfp.train --task [[ spec.name ]] --out runs/[[ spec.name ]]
 
 ## Arguments
 
-Those of [all tasks](../tasks.md#arguments).
+The [arguments of all tasks](../tasks.md#arguments).
 [[ notes ]]
 
 ## Results
