@@ -125,24 +125,24 @@ def timed(owner: object, name: str, clock: dict[str, float]) -> Iterator[None]:
 
 
 def training(config: Config, steps: int) -> None:
-    """Print training steps per second and the shares of their parts; with overlap, the simulation's holds updates."""
-    print("| stage | robots | updates per step | overlap | training steps/s | simulation | updates | rest |")
-    print("| --- " * 8 + "|")
+    """Print training steps per second and the shares of their parts."""
+    print("| stage | robots | updates per step | training steps/s | simulation | updates | rest |")
+    print("| --- " * 7 + "|")
     many = config.environment.num_envs, config.learning.gradient_steps
     for stage in (1, 2):
-        for num_envs, gradient_steps, overlap in ((1, 1, False), (*many, False), (*many, True)):
-            learning = replace(config.learning, gradient_steps=gradient_steps, overlap=overlap)
+        for num_envs, gradient_steps in ((1, 1), many):
+            learning = replace(config.learning, gradient_steps=gradient_steps)
             model, clock = make_model(replace(config, learning=learning), stage, num_envs), dict[str, float]()
             model.learn(config.learning.batch_size + 2 * num_envs)
-            with timed(model.env, "step", clock), timed(model, "_perform_updates", clock):
+            with timed(model.env, "step", clock), timed(model, "train", clock):
                 start = time.perf_counter()
                 model.learn(steps * num_envs, reset_num_timesteps=False)
                 total = time.perf_counter() - start
-            simulation, update = clock["step"] / total, clock["_perform_updates"] / total
-            rest = 1 - simulation - (0 if overlap else update)
+            simulation, update = clock["step"] / total, clock["train"] / total
+            rest = 1 - simulation - update
             shares = " | ".join(f"{100 * share:.0f} %" for share in (simulation, update, rest))
-            head = f"| {stage} | {num_envs} | {gradient_steps} | {'yes' if overlap else 'no'}"
-            print(f"{head} | {steps * num_envs / total:.1f} | {shares} |", flush=True)
+            speed = steps * num_envs / total
+            print(f"| {stage} | {num_envs} | {gradient_steps} | {speed:.1f} | {shares} |", flush=True)
 
 
 def environments(steps: int) -> None:

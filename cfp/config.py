@@ -18,7 +18,7 @@ from cfp.validation import check_at_least
 from dittogym import make_spec
 from dittogym.tasks import allowed_instead, task_name
 
-Preset = Literal["quick", "lean", "long", "paper"]
+Preset = Literal["quick", "long", "paper"]
 Learner = Literal["analytic", "sac"]
 
 LARGEST_SEED = 2**31 - 1
@@ -150,7 +150,6 @@ class StagedConfig(RunConfig):
             self.network.interpolation,
             None if self.network.interpolation == "aligned" else make_spec(self.task).patch,
             self.network.encoder,
-            self.network.initial_std,
         )
 
     def with_derived(self, base: RunConfig, given: Collection[str]) -> RunConfig:
@@ -246,8 +245,6 @@ class Config(CoarseToFineConfig):
         super().check()
         for name in ("random_steps", "alpha", "gate_penalty"):
             check_at_least(0, **{name: min(getattr(self, name), default=0)})
-        if self.learning.target_std is not None and min(self.alpha, default=1) <= 0:
-            raise ConfigError(f"alpha must be positive with target_std, got {self.alpha}")
         if self.learning.warm_critic and self.start_from is not None:
             raise ConfigError("warm_critic must be False with start_from, got True (a policy file has no critics)")
         if self.learning.warm_critic and self.network.encoder == "lean":

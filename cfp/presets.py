@@ -105,8 +105,8 @@ ANALYTIC: dict[str, AnalyticNumbers] = {
 }
 """Those of the tasks that differ from the defaults of `AnalyticNumbers`."""
 
-ENTROPY_SHARE = 0.05
-"""Temperature at the start of the presets that adapt it, times the number of entries of an action."""
+NOISE_SCALE: dict[str, tuple[float, float]] = {"shapematch": (0.1, 0.4)}
+"""Exploration noise of the presets ``quick`` and ``long`` where it is weaker: without gravity it tears robots."""
 DEFAULT_TASK = "shapematch"
 """Task of a command line that names none."""
 CUSTOM_TASK = TASKS["run"]
@@ -121,8 +121,7 @@ def preset(task: str, name: Preset = "quick", learner: Learner | None = None) ->
             numbers of RUN with its own action grids, and has no preset ``"paper"``.
         name: ``"paper"``: one robot at full size, the published numbers, the reference's interpolation and faults.
             ``"quick"``: several robots with fewer particles, minutes instead of days. For the learner ``"sac"`` also
-            ``"lean"``, with small networks and what later publications found, and ``"long"``, the same for a night of
-            eight hours on two cores.
+            ``"long"``, the same as ``"quick"`` for a night of eight hours on two cores.
         learner: ``"analytic"`` or ``"sac"``; by default ``"analytic"`` for ``"quick"``, and ``"sac"`` for the other
             presets, which have no other.
 
@@ -139,11 +138,11 @@ def preset(task: str, name: Preset = "quick", learner: Learner | None = None) ->
 def sac_preset(task: str, name: str = "quick") -> Config:
     """The defaults of the learner ``sac``, see `preset`."""
     check_task(task)
-    allowed = typing.get_args(Preset) if task in TASKS else ("quick", "lean", "long")
+    allowed = typing.get_args(Preset) if task in TASKS else ("quick", "long")
     if name not in allowed:
         raise ConfigError(f"preset must be one of {', '.join(allowed)} for {task}, got {name!r}")
     numbers = _numbers(task)
-    return {"paper": _paper, "quick": _quick, "lean": _lean, "long": _long}[name](task, numbers)
+    return {"paper": _paper, "quick": _quick, "long": _long}[name](task, numbers)
 
 
 def analytic_preset(task: str, name: str = "quick") -> AnalyticConfig:
@@ -201,69 +200,46 @@ def _paper(task: str, numbers: TaskNumbers) -> Config:
 
 
 def _quick(task: str, numbers: TaskNumbers) -> Config:
-    """Minutes instead of days: many small robots, small batches, a shorter horizon of credit."""
-    paper = _paper(task, numbers)
+    """Minutes instead of days: many small robots, small networks with many updates, coarser actions first."""
+    paper, steps = _paper(task, numbers), 25_600
+    coarse = numbers.resolutions[0]
     return replace(
         paper,
         preset="quick",
         seed=0,
-        steps=4_800,
-        handover=(3_200,),
+        steps=steps,
+        handover=(steps // 2,),
+        resolutions=(4, coarse) if coarse > 4 else numbers.resolutions,
         random_steps=(480, 100),
-        alpha=(0.5 * numbers.alpha[0], numbers.alpha[1]),
+        alpha=(0.5 * numbers.alpha[0], 0.5 * numbers.alpha[0]),
         environment=EnvironmentConfig(),
-        network=replace(paper.network, interpolation="half_pixel"),
+        network=replace(paper.network, interpolation="half_pixel", encoder="lean"),
         learning=LearningConfig(
-            batch_size=64, learning_rate=1e-3, gamma=0.9, tau=0.01, buffer_size=20_000, gradient_steps=4
-        ),
-        report=ReportConfig(eval_every=480, checkpoint_every=480, log_every=160),
-    )
-
-
-def _lean(task: str, numbers: TaskNumbers) -> Config:
-    """Minutes instead of days: many small robots, small networks, and what later publications found."""
-    paper = _paper(task, numbers)
-    return replace(
-        paper,
-        preset="lean",
-        seed=0,
-        steps=96_000,
-        handover=(64_000,),
-        random_steps=(0, 0),
-        alpha=tuple(ENTROPY_SHARE / (2 * resolution**2) for resolution in paper.resolutions),
-        environment=EnvironmentConfig(num_envs=32),
-        network=replace(paper.network, interpolation="half_pixel", encoder="lean", initial_std=0.15),
-        learning=LearningConfig(
-            learning_rate=1e-3,
-            gamma=0.97,
-            tau=0.01,
-            buffer_size=50_000,
             batch_size=64,
-            gradient_steps=8,
-            update_start=1_024,
-            critic="categorical",
-            reward_scale="return",
-            target_std=0.15,
+            learning_rate=5e-4,
+            gamma=0.95,
+            tau=0.01,
+            buffer_size=20_000,
+            gradient_steps=16,
+            actor_start=800,
             noise_cells=4,
-            n_steps=3,
-            actor_every=2,
+            noise_scale=NOISE_SCALE.get(task, (0.2, 1.0)),
             final_rate=0.1,
-            overlap=True,
         ),
-        report=ReportConfig(eval_every=9_600, checkpoint_every=9_600, log_every=960),
+        report=ReportConfig(eval_every=steps // 16, checkpoint_every=steps // 16, log_every=320),
     )
 
 
 def _long(task: str, numbers: TaskNumbers) -> Config:
-    """A night of eight hours on two cores: more steps, smaller rates, a longer memory."""
-    lean, steps = _lean(task, numbers), 4_000_000
+    """A night of eight hours on two cores: more steps and a longer memory."""
+    quick, steps = _quick(task, numbers), 800_000
     return replace(
-        lean,
+        quick,
         preset="long",
         steps=steps,
-        handover=(steps * 2 // 3,),
-        learning=replace(lean.learning, learning_rate=3e-4, tau=0.005, buffer_size=100_000),
-        report=replace(lean.report, eval_every=steps // 40, checkpoint_every=steps // 80, log_every=4_800),
+        handover=(steps // 2,),
+        learning=replace(quick.learning, buffer_size=100_000),
+        report=replace(quick.report, eval_every=steps // 40, checkpoint_every=steps // 80, log_every=4_800),
     )
 
 
@@ -281,4 +257,4 @@ def like_start(base: Options, values: dict[str, Any]) -> Options:
     if not isinstance(base, CoarseToFineConfig) or values.get("start_from") is None or "network" in values:
         return base
     spec = load(values["start_from"]).spec
-    return replace(base, network=replace(base.network, encoder=spec.encoder, initial_std=spec.initial_std))
+    return replace(base, network=replace(base.network, encoder=spec.encoder))

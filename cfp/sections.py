@@ -117,14 +117,10 @@ class NetworkConfig:
     """Largest gate value (the reference: 0.25 with split encoders)."""
     encoder: EncoderKind = "full"
     """full (the paper's), or lean (half the size and width; actions join its features)."""
-    initial_std: float | None = None
-    """Standard deviation before tanh of a new actor; None: the reference's, 0.31."""
 
     def check(self) -> None:
         """Raise a `ConfigError` for values out of range."""
         check_positive(gate_scale=self.gate_scale)
-        if self.initial_std is not None:
-            check_positive(initial_std=self.initial_std)
 
 
 @dataclass(frozen=True)

@@ -192,7 +192,7 @@ class Distill(Stateful, Algorithm):
             handover=(steps // 2,),
             resolutions=base.resolutions,
             gate_bias=base.gate_bias,
-            network=replace(base.network, encoder="full", initial_std=None),
+            network=replace(base.network, encoder="full"),
             student_noise=not base.report.eval_deterministic,
             dropout=0.2,
         )

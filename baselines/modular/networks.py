@@ -82,9 +82,8 @@ class Trunk(nn.Module):
 class ModularActor(SquashedActor):
     """A tanh-Gaussian of two muscles for every segment, with the weights of all segments shared."""
 
-    def __init__(self, kind: Kind, features: int, initial_std: float | None = None) -> None:
+    def __init__(self, kind: Kind, features: int) -> None:
         super().__init__()
-        self.initial_std = initial_std
         self.trunk = Trunk(kind, features)
         self.head = nn.Sequential(nn.Linear(WIDTH, WIDTH), nn.ELU(), nn.Linear(WIDTH, 4))
         initialise(self)
@@ -92,7 +91,7 @@ class ModularActor(SquashedActor):
     def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
         """Draw actions (B, K, 2) for rows (B, K, columns)."""
         mean, width = self.head(self.trunk(observation)).chunk(2, -1)
-        return Sample(*sample_squashed_gaussian(mean, width, deterministic, initial_std=self.initial_std), None)
+        return Sample(*sample_squashed_gaussian(mean, width, deterministic), None)
 
 
 class ModularCritics(nn.Module):
@@ -100,14 +99,14 @@ class ModularCritics(nn.Module):
 
     optimizer: torch.optim.Optimizer
 
-    def __init__(self, kind: Kind, features: int, outputs: int = 1) -> None:
+    def __init__(self, kind: Kind, features: int) -> None:
         super().__init__()
         self.trunks = nn.ModuleList(Trunk(kind, features, 2) for _ in range(2))
-        self.values = nn.ModuleList(perceptron(WIDTH, 256, 256, outputs, normed=outputs > 1) for _ in range(2))
+        self.values = nn.ModuleList(perceptron(WIDTH, 256, 256, 1) for _ in range(2))
         initialise(self)
 
     def forward(self, observation: Tensor, action: Tensor) -> tuple[Tensor, ...]:
-        """Outputs of both critics, (B, outputs) each, for rows (B, K, columns) and actions (B, K, 2) or (B, 2 K)."""
+        """Values of both critics, (B, 1) each, for rows (B, K, columns) and actions (B, K, 2) or (B, 2 K)."""
         values = action.reshape(*observation.shape[:2], 2)
         pairs = zip(self.trunks, self.values, strict=True)
         return tuple(value(trunk(observation, values).mean(1)) for trunk, value in pairs)
@@ -174,7 +173,7 @@ class SegmentPolicy(StateBasedPolicy):
     def save(self, path: Path) -> None:
         """Write ``path`` (``.safetensors``) and the ``.json`` beside it."""
         trunk = self.actor.trunk
-        network = {"kind": trunk.kind, "features": trunk.features, "initial_std": self.actor.initial_std}
+        network = {"kind": trunk.kind, "features": trunk.features}
         own = {"nodes": dataclasses.asdict(self.nodes), "network": network}
         write_policy(path, self.actor.state_dict(), self.description | own)
 

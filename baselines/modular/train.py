@@ -93,19 +93,17 @@ class ModularConfig(RunConfig):
 class ModularPolicy(NetworkPolicy):
     """Actor and critics over segments, for `cfp.agent.sac.CFP`; observes rows (K, columns) of `Nodes`."""
 
-    def __init__(
-        self, *arguments: Any, kind: Kind, features: int, initial_std: float | None = None, **options: Any
-    ) -> None:
-        self.kind, self.features, self.initial_std = kind, features, initial_std
+    def __init__(self, *arguments: Any, kind: Kind, features: int, **options: Any) -> None:
+        self.kind, self.features = kind, features
         super().__init__(*arguments, **options)
 
     def new_actor(self) -> ModularActor:
         """An actor."""
-        return ModularActor(self.kind, self.features, self.initial_std)
+        return ModularActor(self.kind, self.features)
 
     def new_critic(self) -> ModularCritics:
         """Twin critics."""
-        return ModularCritics(self.kind, self.features, self.critic_outputs)
+        return ModularCritics(self.kind, self.features)
 
 
 class Modular(SACAlgorithm):
@@ -125,7 +123,7 @@ class Modular(SACAlgorithm):
             preset=base.preset,
             environment=base.environment,
             report=base.report,
-            learning=replace(base.learning, noise_cells=0),
+            learning=replace(base.learning, noise_cells=0, gradient_steps=4),
             steps=base.steps,
             random_steps=base.random_steps[0],
             alpha=base.alpha[0],
@@ -138,7 +136,6 @@ class Modular(SACAlgorithm):
         networks = {
             "kind": config.kind,
             "features": config.nodes.num_features(env.env.spec),
-            "initial_std": config.learning.target_std,
         }
         monitor = VecMonitor(TorchVecEnv(env, env.spaces))
         model = cls.make_model(config, monitor, ModularPolicy, networks, cls.hyperparameters(config, stage, folder))

@@ -66,11 +66,9 @@ def squashed_log_prob(noise: Tensor, std: Tensor, action: Tensor) -> Tensor:
     return (normal - torch.log(1 - action.square() + 1e-6)).flatten(1).sum(1)
 
 
-def standard_deviation(raw_std: Tensor, initial: float | None = None) -> Tensor:
-    """``clip(softplus(3 raw_std - 1), 0.1, 6)``; with ``initial`` it is this at 0, and at least a third of it."""
-    if initial is None:
-        return F.softplus(3 * raw_std - 1).clamp(*STD_BOUNDS)
-    return F.softplus(3 * raw_std + math.log(math.expm1(initial))).clamp(initial / 3, STD_BOUNDS[1])
+def standard_deviation(raw_std: Tensor) -> Tensor:
+    """``clip(softplus(3 raw_std - 1), 0.1, 6)``."""
+    return F.softplus(3 * raw_std - 1).clamp(*STD_BOUNDS)
 
 
 def sample_squashed_gaussian(
@@ -78,10 +76,9 @@ def sample_squashed_gaussian(
     raw_std: Tensor,
     deterministic: bool,
     generator: torch.Generator | None = None,
-    initial_std: float | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Sample tanh(mean + s eps) with s from `standard_deviation`, and its log-density (B,)."""
-    std = standard_deviation(raw_std, initial_std)
+    std = standard_deviation(raw_std)
     noise = torch.zeros_like(mean)
     if not deterministic:
         noise.normal_(generator=generator)
@@ -122,7 +119,6 @@ class Actor(SquashedActor):
     def __init__(self, resolution: int, spec: ActorSpec | None = None) -> None:
         super().__init__()
         self.resolution = resolution
-        self.initial_std = spec.initial_std if spec else None
         lean = spec is not None and spec.encoder == "lean"
         self.encoder: nn.Module = LeanEncoder() if lean else Encoder(3, 32)
         self.trunk = Trunk() if lean else None
@@ -150,7 +146,7 @@ class Actor(SquashedActor):
     def act(self, outputs: Outputs, deterministic: bool = False, generator: torch.Generator | None = None) -> Sample:
         """Sample an action from the networks' outputs, without noise if ``deterministic``."""
         mean, raw_std = outputs.mean, outputs.raw_std
-        action, log_prob = sample_squashed_gaussian(mean, raw_std, deterministic, generator, self.initial_std)
+        action, log_prob = sample_squashed_gaussian(mean, raw_std, deterministic, generator)
         return Sample(action, log_prob, None, (action,))
 
     def sample(
@@ -160,11 +156,11 @@ class Actor(SquashedActor):
         return self.act(self.outputs(observation, deterministic, generator), deterministic, generator)
 
     def fix_std(self) -> None:
-        """Set the standard deviation to 0.105 before tanh, or the initial one, and exclude it from training."""
+        """Set the standard deviation to 0.105 before tanh, and exclude it from training."""
         layers = [layer for layer in self.std.modules() if isinstance(layer, nn.Linear | nn.ConvTranspose2d)]
         nn.init.zeros_(layers[-1].weight)
         assert layers[-1].bias is not None
-        nn.init.constant_(layers[-1].bias, STD_BIAS if self.initial_std is None else 0.0)
+        nn.init.constant_(layers[-1].bias, STD_BIAS)
         self.std.requires_grad_(False)
 
 
@@ -209,7 +205,7 @@ class ResidualActor(Actor):
         """Compose an action; ``log_prob`` is that of the residual part alone, as in the reference."""
         mean, raw_std, gate_logit, coarse = outputs
         assert gate_logit is not None and coarse is not None
-        residual, log_prob = sample_squashed_gaussian(mean, raw_std, deterministic, generator, self.initial_std)
+        residual, log_prob = sample_squashed_gaussian(mean, raw_std, deterministic, generator)
         gate = self.gate_scale * torch.sigmoid(gate_logit + self.gate_bias)
         action = blend(coarse.action, residual, gate, self._enlarge)
         return Sample(action, log_prob, gate, (*coarse.parts, residual, gate))

@@ -81,9 +81,6 @@ def multilayer_perceptrons(perceptrons: Sequence[nn.Sequential], values: Tensor)
         if isinstance(layers[0], nn.Linear):
             weight, bias = map(torch.stack, _parameters(layers))
             values = torch.baddbmm(bias[:, None], values, weight.transpose(1, 2))
-        elif isinstance(layers[0], nn.LayerNorm):
-            weight, bias = map(torch.stack, _parameters(layers))
-            values = torch.addcmul(bias[:, None], F.layer_norm(values, layers[0].normalized_shape), weight[:, None])
         elif isinstance(layers[0], nn.ELU):
             values = layers[0](values)
     return values

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 from cfp.agent.spec import RESOLUTIONS
 from cfp.errors import ConfigError
@@ -38,12 +37,6 @@ class LearningConfig:
     """Momentum of the running mean and variance of the rewards."""
     max_grad_norm: float = 10.0
     """Largest gradient norm of each parameter tensor."""
-    critic: Literal["mse", "categorical"] = "mse"
-    """Critics: mse (one value each, as in the paper) or categorical (a distribution over 101 atoms, LayerNorm)."""
-    reward_scale: Literal["batch", "return"] = "batch"
-    """Rewards are centred and divided by their deviation in batches, or divided by the scale of the return."""
-    target_std: float | None = None
-    """Standard deviation of an action entry to whose entropy the temperature is adapted; None: it is constant."""
     noise_cells: int = 0
     """Rows and columns of cells with equal exploration noise, held for some steps; 0: the policy's own noise alone."""
     noise_scale: tuple[float, float] = (0.05, 0.4)
@@ -54,8 +47,6 @@ class LearningConfig:
     """Updates of the critics for one of the actor."""
     final_rate: float = 1.0
     """Fraction of the learning rates at the end of a stage; they fall linearly."""
-    overlap: bool = False
-    """Learn while the robots are simulated, each on half of the cores; the updates lack the latest transitions."""
     warm_critic: bool = False
     """Initialise critics and reward statistics of each stage from the previous one, instead of anew."""
 
@@ -71,10 +62,6 @@ class LearningConfig:
         if self.actor_rate is not None:
             check_positive(actor_rate=self.actor_rate)
         check_at_least(0, actor_start=self.actor_start, anchor=self.anchor)
-        if self.target_std is not None:
-            check_positive(target_std=self.target_std)
-        if self.critic == "categorical" and self.reward_scale != "return":
-            raise ConfigError("critic categorical requires reward_scale return: its atoms cover [-5, 5]")
         if self.noise_cells not in (allowed := (0, 1, 2, *RESOLUTIONS)):
             raise ConfigError(f"noise_cells must be one of {allowed}, got {self.noise_cells}")
         for scale in self.noise_scale:
@@ -86,7 +73,7 @@ class Hyperparameters(LearningConfig):
     """All hyperparameters of one stage: those of `LearningConfig` and those that differ between stages."""
 
     alpha: float = 0.01
-    """Entropy temperature; with target_std the one at the start."""
+    """Entropy temperature."""
     gate_penalty: float = 0.0
     """Weight rho of the gate penalty ``mean ||g||_2 / R`` in the actor loss of a residual actor."""
     random_steps: int = 500

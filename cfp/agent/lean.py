@@ -106,20 +106,19 @@ class LeanCritics(nn.Module):
 
     Args:
         size: A.
-        outputs: 1 for a value, or the atoms of a distribution, see `cfp.agent.values`.
     """
 
     optimizer: torch.optim.Optimizer
 
-    def __init__(self, size: int, outputs: int = 1) -> None:
+    def __init__(self, size: int) -> None:
         super().__init__()
         self.size = size
         self.actions = ActionEncoder(size, 2 * WIDTH)  # half of the channels for each critic
-        self.heads = nn.ModuleList(perceptron(LATENT, 256, 256, outputs, normed=outputs > 1) for _ in range(2))
+        self.heads = nn.ModuleList(perceptron(LATENT, 256, 256, 1) for _ in range(2))
         initialise(self)
 
     def forward(self, observation: Encoded, action: Tensor) -> tuple[Tensor, ...]:
-        """Outputs (B, outputs) of both critics for encoded observations and actions (B, 2, A, A) or (B, 2 A A)."""
+        """Values (B, 1) of both critics for encoded observations and actions (B, 2, A, A) or (B, 2 A A)."""
         features = self.actions(action.reshape(-1, 2, self.size, self.size))
         latents = torch.stack([torch.cat([observation.features, part], dim=1) for part in features.chunk(2, dim=1)])
         heads: list[nn.Sequential] = list(self.heads)  # type: ignore[arg-type]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from cfp.agent.actor import Actor
 from cfp.agent.lean import Observation, image_of
 from cfp.agent.networks import TwinCritic
-from cfp.agent.values import expected_value, value_loss
 
 
 def critic_target(
@@ -33,12 +33,12 @@ def critic_target(
 
 def smaller_value(critic: TwinCritic, obs: Observation, action: Tensor) -> Tensor:
     """The smaller one of both critics' values, (B, 1)."""
-    return torch.minimum(*map(expected_value, critic(obs, action)))
+    return torch.minimum(*critic(obs, action))
 
 
 def critic_loss(critic: TwinCritic, obs: Observation, actions: Tensor, target_q: Tensor) -> Tensor:
-    """Sum of both critics' losses, mean squared errors or cross-entropies, for actions (B, 2, R, R)."""
-    return torch.stack([value_loss(outputs, target_q) for outputs in critic(obs, actions)]).sum()
+    """Sum of both critics' mean squared errors for actions (B, 2, R, R)."""
+    return torch.stack([F.mse_loss(values, target_q) for values in critic(obs, actions)]).sum()
 
 
 def actor_loss(

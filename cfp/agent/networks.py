@@ -118,40 +118,36 @@ def make_head(resolution: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-def perceptron(*sizes: int, normed: bool = False) -> nn.Sequential:
-    """Linear layers of these sizes on a flattened input, with ELUs between them, and LayerNorm before these."""
+def perceptron(*sizes: int) -> nn.Sequential:
+    """Linear layers of these sizes on a flattened input, with ELUs between them."""
     layers: list[nn.Module] = [nn.Flatten()]
     for before, after in pairwise(sizes[:-1]):
-        norm = [nn.LayerNorm(after)] if normed else []
-        layers += [nn.Linear(before, after), *norm, nn.ELU(inplace=True)]
+        layers += [nn.Linear(before, after), nn.ELU(inplace=True)]
     return nn.Sequential(*layers, nn.Linear(sizes[-2], sizes[-1]))
 
 
 class Critic(nn.Module):
-    """Parameters of an action-value network: an encoder of its own and a 512-256-256-outputs perceptron."""
+    """Parameters of an action-value network: an encoder of its own and a 512-256-256-1 perceptron."""
 
-    def __init__(self, split: bool, outputs: int) -> None:
+    def __init__(self, split: bool) -> None:
         super().__init__()
         self.encoder = PairEncoder(split)
-        self.value = perceptron(LATENT, 256, 256, outputs, normed=outputs > 1)
+        self.value = perceptron(LATENT, 256, 256, 1)
         initialise(self)
 
 
 class TwinCritic(nn.Module):
-    """Two critics of actions (2, R, R) that share no parameters with each other or with the actor.
-
-    ``outputs`` is 1 for a value, or the number of atoms of a distribution, see `cfp.agent.values`.
-    """
+    """Two critics of actions (2, R, R) that share no parameters with each other or with the actor."""
 
     optimizer: torch.optim.Optimizer
 
-    def __init__(self, resolution: int, split: bool, interpolation: Interpolation, outputs: int = 1) -> None:
+    def __init__(self, resolution: int, split: bool, interpolation: Interpolation) -> None:
         super().__init__()
         self.resolution, self.interpolation = resolution, interpolation
-        self.critics = nn.ModuleList(Critic(split, outputs) for _ in range(2))
+        self.critics = nn.ModuleList(Critic(split) for _ in range(2))
 
     def forward(self, observation: Tensor, action: Tensor) -> tuple[Tensor, ...]:
-        """Outputs (B, outputs) of both critics for images (B, 3, 64, 64) and actions (B, 2, R, R) or (B, 2 R R)."""
+        """Values (B, 1) of both critics for images (B, 3, 64, 64) and actions (B, 2, R, R) or (B, 2 R R)."""
         image = normalise_image(observation)
         action = action.reshape(-1, 2, self.resolution, self.resolution)
         patch = upsample(action, IMAGE_SIZE, self.interpolation)

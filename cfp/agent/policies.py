@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from typing import Any, cast
 
@@ -24,23 +23,14 @@ class NetworkPolicy(sac_policies.SACPolicy, ABC):
     """Base class of the policies that `cfp.agent.sac.CFP` trains; subclasses create actor and critics.
 
     Networks read observations as they are. ``use_sde`` must be False; the optimiser is a fused Adam by default.
-    Critics have ``critic_outputs`` outputs, see `cfp.agent.values`.
     """
 
-    def __init__(
-        self, *spaces_and_schedule: Any, use_sde: bool = False, critic_outputs: int = 1, **options: Any
-    ) -> None:
+    def __init__(self, *spaces_and_schedule: Any, use_sde: bool = False, **options: Any) -> None:
         if use_sde:
             raise ValueError("use_sde must be False, got True: the actor has its own exploration noise")
         options.setdefault("optimizer_kwargs", {"fused": True})
         options["normalize_images"] = False
-        self.critic_outputs = critic_outputs
         super().__init__(*spaces_and_schedule, **options)
-
-    @property
-    def num_sampled(self) -> int:
-        """Number of entries of an action that the actor samples."""
-        return math.prod(cast(spaces.Box, self.action_space).shape)
 
     @abstractmethod
     def new_actor(self) -> SquashedActor:
@@ -48,7 +38,7 @@ class NetworkPolicy(sac_policies.SACPolicy, ABC):
 
     @abstractmethod
     def new_critic(self) -> nn.Module:
-        """Create twin critics: a module that returns two tensors (B, critic_outputs) for observations and actions."""
+        """Create twin critics: a module that returns two values (B, 1) for observations and actions."""
 
     def shared_encoder(self) -> nn.Module | None:
         """A part of the actor that the critics read too, and train."""
@@ -112,21 +102,16 @@ class CFPPolicy(NetworkPolicy):
             raise ValueError(f"action_space must have shape {(2, size, size)} for resolutions {grids}, got {found}")
         super().__init__(observation_space, action_space, lr_schedule, **options)
 
-    @property
-    def num_sampled(self) -> int:
-        """Number of entries on the action grid of the finest stage."""
-        return int(2 * self.spec.resolutions[-1] ** 2)
-
     def new_actor(self) -> Actor:
         """Create the actor with those of all coarser stages."""
         return build_actor(self.spec)
 
     def new_critic(self) -> TwinCritic | LeanCritics:
         """Create critics of the executed action."""
-        spec, outputs = self.spec, self.critic_outputs
+        spec = self.spec
         if spec.encoder == "lean":
-            return LeanCritics(spec.action_size, outputs)
-        return TwinCritic(spec.action_size, spec.split, spec.interpolation, outputs)
+            return LeanCritics(spec.action_size)
+        return TwinCritic(spec.action_size, spec.split, spec.interpolation)
 
     def shared_encoder(self) -> nn.Module | None:
         """The lean encoder, which actor and critics share."""
@@ -146,5 +131,5 @@ class CFPPolicy(NetworkPolicy):
         return super().obs_to_tensor(observation)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        names = ("observation_space", "action_space", "spec", "critic_outputs", "optimizer_class", "optimizer_kwargs")
+        names = ("observation_space", "action_space", "spec", "optimizer_class", "optimizer_kwargs")
         return {name: getattr(self, name) for name in names} | {"lr_schedule": self._dummy_schedule}

@@ -7,7 +7,6 @@ clipped separately, the gate is penalised, and the random phase is independent o
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from functools import partial
 from typing import Any, ClassVar
@@ -18,8 +17,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, RolloutReturn
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
@@ -32,19 +30,17 @@ from cfp.agent.losses import actor_loss, critic_loss, critic_target
 from cfp.agent.networks import TwinCritic, upsample
 from cfp.agent.policies import CFPPolicy, NetworkPolicy
 from cfp.agent.replay import ReplayRing
-from cfp.agent.values import ATOMS, ReturnScale, RewardStatistics
+from cfp.agent.reward_statistics import RewardStatistics
 from cfp.errors import NonFiniteError
 
 METRICS: dict[str, str] = {
-    "train/critic_loss": "sum of both critics' mean squared errors, in normalised rewards, or cross-entropies",
+    "train/critic_loss": "sum of both critics' mean squared errors, in normalised rewards",
     "train/actor_loss": "mean of alpha log pi - min Q, plus the gate penalty",
     "train/q": "mean of min(Q1, Q2) at the actor's own actions, in normalised rewards",
     "train/q_target": "mean of the critics' regression target",
     "train/entropy": "mean of -log pi of the sampled (in stage 2: residual) action, summed over all 2 R R entries",
     "train/reward_mean": "running mean of raw rewards that is subtracted before learning",
     "train/reward_std": "running standard deviation of raw rewards that they are divided by",
-    "train/reward_scale": "scale of the return that rewards are divided by, with reward_scale return",
-    "train/alpha": "entropy temperature, where it is adapted",
     "train/gate": "mean gate of the residual actor: 0 keeps the coarse action, 1 replaces it",
     "train/gate_penalty": "gate penalty inside the actor loss",
     "train/n_updates": "gradient updates so far in this stage",
@@ -52,10 +48,6 @@ METRICS: dict[str, str] = {
     "train/drift": "where a policy is refined: mean square by which sampled actions differ from its mean ones",
 }
 """Scalars that `CFP.train` logs."""
-
-
-TEMPERATURE_RATE = 0.01
-"""Adam's step size for the logarithm of an adapted temperature."""
 
 
 def falling_rate(rate: float, final: float, remaining: float) -> float:
@@ -88,7 +80,7 @@ class CFP(SAC):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CFPPolicy": CFPPolicy}
-    reward_statistics: RewardStatistics | ReturnScale
+    reward_statistics: RewardStatistics
 
     def __init__(
         self,
@@ -110,61 +102,29 @@ class CFP(SAC):
         sac_options |= {name: getattr(hyperparameters, name) for name in names}
         rate, final = hyperparameters.learning_rate, hyperparameters.final_rate
         sac_options["learning_rate"] = rate if final == 1 else partial(falling_rate, rate, final)
-        if hyperparameters.critic == "categorical":
-            sac_options["policy_kwargs"] = (sac_options.get("policy_kwargs") or {}) | {"critic_outputs": ATOMS}
         starts, alpha = hyperparameters.update_start, hyperparameters.alpha
-        coefficient = alpha if hyperparameters.target_std is None else f"auto_{alpha}"
-        super().__init__(policy, env, learning_starts=starts, ent_coef=coefficient, **sac_options)
+        super().__init__(policy, env, learning_starts=starts, ent_coef=alpha, **sac_options)
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        own, policy = self.hyperparameters, self.policy
-        assert isinstance(policy, NetworkPolicy)
-        scaled = own.reward_scale == "return"
-        statistics = ReturnScale(self.n_envs, self.gamma) if scaled else RewardStatistics(own.reward_momentum)
-        self.reward_statistics = statistics.to(self.device)
+        own = self.hyperparameters
+        self.reward_statistics = RewardStatistics(own.reward_momentum).to(self.device)
         self.noise = None
         if own.noise_cells:
             resolution = self.networks()[0].resolution
             self.noise = CellNoise(self.n_envs, resolution, own.noise_cells, own.noise_scale, self.seed)
-        if own.target_std is not None:
-            assert self.log_ent_coef is not None
-            self.target_entropy = policy.num_sampled * 0.5 * math.log(2 * math.pi * math.e * own.target_std**2)
-            self.ent_coef_optimizer = torch.optim.Adam([self.log_ent_coef], TEMPERATURE_RATE)
 
     def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
         """Actor, critics and target critics."""
         assert isinstance(self.policy, NetworkPolicy)
         return self.policy.networks()
 
-    def collect_rollouts(self, env: VecEnv, *arguments: Any, **options: Any) -> RolloutReturn:
-        """Take a step in ``env``, with ``arguments`` and ``options`` of SAC; updates may ``overlap`` with it.
-
-        Raises:
-            ValueError: The environment cannot be simulated in the background.
-        """
-        if self.hyperparameters.overlap:
-            if not hasattr(env.unwrapped, "meanwhile"):
-                raise ValueError(f"env must be a cfp.TorchVecEnv with overlap, got {type(env.unwrapped).__name__}")
-            env.unwrapped.meanwhile = self._learn_meanwhile
-        return super().collect_rollouts(env, *arguments, **options)
-
-    def _learn_meanwhile(self) -> None:
-        if self.num_timesteps > self.learning_starts:
-            # Also in the first step after a resume, where stable-baselines3 has not done so yet.
-            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-            self._perform_updates(self.gradient_steps, self.batch_size)
-
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Perform ``gradient_steps`` updates, each with ``batch_size`` transitions; with ``overlap`` they have been.
+        """Perform ``gradient_steps`` updates, each with ``batch_size`` transitions.
 
         Raises:
             NonFiniteError: A loss is not finite; the optimiser step is not taken.
         """
-        if not self.hyperparameters.overlap:
-            self._perform_updates(gradient_steps, batch_size)
-
-    def _perform_updates(self, gradient_steps: int, batch_size: int) -> None:
         assert self.replay_buffer is not None
         actor, critic, _ = self.networks()
         self.policy.set_training_mode(True)
@@ -200,11 +160,8 @@ class CFP(SAC):
     def _update_critic(self, obs: Observation, next_obs: Observation, batch: ReplayBufferSamples) -> dict[str, Tensor]:
         actor, critic, target = self.networks()
         rewards, not_done = self.reward_statistics(batch.rewards), 1 - batch.dones
-        # Of an adapted temperature, critics learn returns without entropy (Yu et al., 2022; Ball et al., ICML 2023):
-        # summed over thousands of action entries, it would drown the rewards.
-        alpha = self.ent_coef_tensor if self.log_ent_coef is None else 0.0
         gamma = self.gamma if batch.discounts is None else batch.discounts
-        target_q = critic_target(actor, target, next_obs, rewards, not_done, alpha, gamma)
+        target_q = critic_target(actor, target, next_obs, rewards, not_done, self.ent_coef_tensor, gamma)
         loss = critic_loss(critic, obs, batch.actions, target_q)
         self._descend(loss, critic.optimizer, "critic")
         return {"critic_loss": loss.detach(), "q_target": target_q.mean()}
@@ -212,21 +169,11 @@ class CFP(SAC):
     def _update_actor(self, obs: Observation) -> dict[str, Tensor]:
         actor, critic, _ = self.networks()
         own = self.hyperparameters
-        alpha = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp().squeeze()
         critic.requires_grad_(False)  # avoids computing weight gradients of the critics, which would be discarded
-        loss, scalars = actor_loss(actor, critic, obs, alpha, own.gate_penalty, self.origin, own.anchor)
+        loss, scalars = actor_loss(actor, critic, obs, self.ent_coef_tensor, own.gate_penalty, self.origin, own.anchor)
         self._descend(loss, actor.optimizer, "actor")
         critic.requires_grad_(True)
-        if self.log_ent_coef is not None:
-            self._adapt_temperature(scalars["entropy"])
-            scalars["alpha"] = alpha
         return scalars | {"actor_loss": loss.detach()}
-
-    def _adapt_temperature(self, entropy: Tensor) -> None:
-        """Raise the temperature if the entropy is below its target (Haarnoja et al., 2018b), else lower it."""
-        assert self.log_ent_coef is not None and self.ent_coef_optimizer is not None
-        self.log_ent_coef.grad = (entropy - float(self.target_entropy)).reshape(1)
-        self.ent_coef_optimizer.step()
 
     def _descend(self, loss: Tensor, optimizer: torch.optim.Optimizer, name: str) -> None:
         if not torch.isfinite(loss):
@@ -293,7 +240,6 @@ class CFP(SAC):
         infos: list[dict[str, Any]],
     ) -> None:
         self._check_finite("reward", reward)
-        self.reward_statistics.observe(reward, dones)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _check_finite(self, name: str, values: np.ndarray) -> None:

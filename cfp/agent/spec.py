@@ -31,8 +31,6 @@ class ActorSpec:
             grid of the stage, as the reference does. Two cubic upsamplings differ from one, so a closed gate leaves
             the coarser force field only if actions are blended at the size of the environment's patch.
         encoder: ``"full"`` for the paper's, ``"lean"`` for `cfp.agent.lean.LeanEncoder`.
-        initial_std: Standard deviation before tanh of a new actor, and three times the smallest that it can take; None
-            for the reference's, 0.31 and at least 0.1.
 
     Raises:
         ConfigError: A resolution has no decoder, resolutions do not increase, or ``gate_bias`` or ``patch`` do not
@@ -46,7 +44,6 @@ class ActorSpec:
     interpolation: Interpolation = "half_pixel"
     patch: int | None = None
     encoder: EncoderKind = "full"
-    initial_std: float | None = None
 
     @property
     def action_size(self) -> int:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import gymnasium
@@ -30,12 +29,7 @@ class TorchVecEnv(VecEnv):
     Args:
         env: A `dittogym.TorchEnv`, or an environment with its interface; it is stepped without gradients.
         spaces: Spaces of observations and actions; None: those of `dittogym.TorchEnv`.
-
-    Attributes:
-        meanwhile: What to do while a step is simulated in a thread of its own; None: nothing, and no such thread.
     """
-
-    meanwhile: Callable[[], None] | None = None
 
     def __init__(self, env: Any, spaces: tuple[Space[Any], Space[Any]] | None = None) -> None:
         self.torch_env = env
@@ -77,14 +71,7 @@ class TorchVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         """Step with these actions; returns observation, reward (B,) float32, done (B,) bool, and infos."""
         assert self._actions is not None, "step_async must be called first"
-        if self.meanwhile is None:
-            step = autoreset_step(self.torch_env, self._actions)
-        else:
-            simulate = torch.no_grad()(autoreset_step)  # gradients are switched off in each thread separately
-            with ThreadPoolExecutor(1) as background, torch.enable_grad():
-                simulation = background.submit(simulate, self.torch_env, self._actions)
-                self.meanwhile()
-                step = simulation.result()
+        step = autoreset_step(self.torch_env, self._actions)
         self._actions = None
         infos, done = self._split_info(step.info), _to_numpy(step.done)
         if done.any():

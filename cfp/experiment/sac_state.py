@@ -24,7 +24,6 @@ def model_state_dict(model: CFP) -> dict[str, Any]:
         "recent": [{key: float(value) for key, value in info.items()} for info in model.ep_info_buffer or ()],
         "successes": [bool(success) for success in model.ep_success_buffer or ()],
         "means": {name: (values[name], count) for name, count in model.logger.name_to_count.items()},
-        "temperature": model.log_ent_coef,
         "environment": _environment_state(model),
         "random": _random_state(model),
     }
@@ -34,8 +33,6 @@ def load_model_state_dict(model: CFP, state: dict[str, Any]) -> None:
     """Undo `model_state_dict`."""
     for name, part in _parts(model).items():
         part.load_state_dict(state[name])
-    if model.log_ent_coef is not None:
-        model.log_ent_coef.data.copy_(state["temperature"])
     model._episode_num = state["episodes"]
     model._n_updates = state["updates"]
     model.ep_info_buffer = deque(state["recent"], maxlen=model._stats_window_size)
@@ -52,8 +49,7 @@ def _parts(model: CFP) -> dict[str, Any]:
     actor, critic, _ = model.networks()
     optimizers = {"actor_optimizer": actor.optimizer, "critic_optimizer": critic.optimizer}
     parts = {"policy": model.policy, "reward_statistics": model.reward_statistics, **optimizers}
-    options = {"noise": model.noise, "temperature_optimizer": model.ent_coef_optimizer}
-    return parts | {name: part for name, part in options.items() if part is not None}
+    return parts if model.noise is None else parts | {"noise": model.noise}
 
 
 def _environment_state(model: CFP) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from dittogym import make_spec
 
 
 @pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("name", ["quick", "lean", "long", "paper"])
+@pytest.mark.parametrize("name", ["quick", "long", "paper"])
 def test_every_preset_is_valid_and_survives_json(task, name):
     config = sac_preset(task, name)
     config.check()

@@ -1,6 +1,5 @@
 """The options that make soft actor-critic cheaper and more stable, each on its own."""
 
-import math
 import os
 import signal
 from dataclasses import replace
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from fakes import FakeEnv
-from stable_baselines3.common.vec_env import VecEnvWrapper
 from test_algorithm import make_batch, make_model
 from tiny_runs import assert_same_run, at_step, run
 from torch.nn import functional as F
@@ -20,43 +18,11 @@ from cfp.agent.lean import halved
 from cfp.agent.networks import normalise_image
 from cfp.agent.replay import ReplayRing
 from cfp.agent.spec import ActorSpec
-from cfp.agent.values import ATOMS, LIMIT, ReturnScale, expected_value, two_hot, value_loss
 from cfp.errors import ConfigError
 from cfp.presets import sac_preset
 from cfp.weights import describe, load, save_policy
 
 LEAN = {"plain": ActorSpec((8,), encoder="lean"), "residual": ActorSpec((4, 8), (-1.0,), patch=16, encoder="lean")}
-
-
-def test_two_hot_targets_keep_the_value():
-    values = torch.linspace(-LIMIT, LIMIT, 333)[:, None]
-    hot = two_hot(values)
-    assert hot.min() >= 0 and (hot > 1e-6).sum(1).max() == 2
-    torch.testing.assert_close(hot.sum(1), torch.ones(333))
-    torch.testing.assert_close(hot @ torch.linspace(-LIMIT, LIMIT, ATOMS)[:, None], values, rtol=0, atol=1e-5)
-    beyond = two_hot(torch.tensor([[9.0], [-9.0]]))
-    assert beyond[0, -1] == beyond[1, 0] == 1
-
-
-def test_cross_entropy_leads_to_the_mean_of_the_targets():
-    logits = torch.zeros(1, ATOMS, requires_grad=True)
-    adam = torch.optim.Adam([logits], 0.1)
-    targets = torch.tensor([[-1.23], [2.5], [0.5]])
-    for _ in range(300):
-        adam.zero_grad()
-        value_loss(logits.expand(3, -1), targets).backward()
-        adam.step()
-    assert expected_value(logits.detach()).item() == pytest.approx(targets.mean().item(), abs=0.02)
-
-
-def test_rewards_are_scaled_by_the_largest_return_and_keep_their_sign():
-    scale, gamma = ReturnScale(2, 0.5), 0.5
-    for rewards, ended in (([1.0, -1.0], [False, True]), ([1.0, 3.0], [False, False])):
-        scale.observe(np.array(rewards, np.float32), np.array(ended))
-    # Returns so far: 1, 1.5 and -1, then a new episode with 3.
-    assert scale.scalars()["reward_scale"].item() == pytest.approx(3 / LIMIT)
-    torch.testing.assert_close(scale(torch.tensor([3.0, 0.0, -1.5])), torch.tensor([LIMIT, 0.0, -LIMIT / 2]))
-    assert scale.returns.tolist() == [1 + gamma, 3.0]
 
 
 def test_steps_ahead_are_summed_until_the_episode_or_the_memory_ends():
@@ -107,21 +73,21 @@ def test_noise_is_equal_in_cells_held_for_steps_and_larger_from_robot_to_robot()
 
 def test_robots_explore_with_the_noise_of_cells():
     env = FakeEnv(num_envs=8, resolution=8)
-    options = {"update_start": 100, "random_steps": 0, "noise_cells": 2, "noise_scale": (0.01, 1.0)}
-    model = make_model(ActorSpec((8,), initial_std=1e-3), env, **options)
+    options = {"update_start": 100, "random_steps": 0, "noise_cells": 2, "noise_scale": (0.01, 2.0)}
+    model = make_model(ActorSpec((8,)), env, **options)
+    model.networks()[0].fix_std()
     model.learn(80)
     actions = torch.stack(env.actions)
     spread = actions.std((0, 2, 3, 4))
     assert spread[-1] > 5 * spread[0]
     inside = actions[:, -1, :, :4, :4]
-    assert inside.flatten(2).std(2).mean() < 0.1 * spread[-1]
+    assert inside.flatten(2).std(2).mean() < 0.2 * spread[-1]
 
 
 @pytest.mark.parametrize("spec", LEAN.values(), ids=LEAN)
 def test_the_critics_alone_train_the_shared_encoder(spec):
     size = spec.action_size
-    model = make_model(spec, FakeEnv(num_envs=2, resolution=size), critic="categorical", reward_scale="return")
-    model.reward_statistics.largest.fill_(3.0)
+    model = make_model(spec, FakeEnv(num_envs=2, resolution=size))
     actor, critic, _ = model.networks()
     encoder = list(actor.encoder.parameters())
     owners = [optimizer.param_groups[0]["params"] for optimizer in (actor.optimizer, critic.optimizer)]
@@ -132,9 +98,8 @@ def test_the_critics_alone_train_the_shared_encoder(spec):
         obs = model.policy.encode(batch.observations)
     model._update_actor(obs)
     assert all(map(torch.equal, before, encoder))
-    scalars = model.update(batch)
+    model.update(batch)
     assert not any(map(torch.equal, before, encoder))
-    assert math.log(2) < scalars["critic_loss"] < 3 * math.log(ATOMS)
     coarse = [name for name, _ in actor.named_parameters() if name.startswith("coarse.")]
     assert bool(coarse) == (len(spec.resolutions) > 1)
     assert all(not actor.get_parameter(name).requires_grad for name in coarse)
@@ -160,7 +125,7 @@ def test_halved_images_are_means_of_four_pixels():
 
 
 def test_lean_policy_is_saved_and_loaded(tmp_path):
-    config = sac_preset("run", "lean")
+    config = sac_preset("run", "quick")
     spec = config.actor_spec(2)
     assert spec.encoder == "lean"
     actor, images = build_actor(spec), make_batch(8).observations
@@ -168,26 +133,11 @@ def test_lean_policy_is_saved_and_loaded(tmp_path):
     loaded = load(tmp_path)
     assert loaded.spec == spec
     assert torch.equal(loaded(images, deterministic=True), actor(images, deterministic=True))
-    paper = build_actor(sac_preset("run", "paper").actor_spec(2))
-    count = [sum(parameter.numel() for parameter in network.parameters()) for network in (actor, paper)]
+    full = build_actor(replace(spec, encoder="full"))
+    count = [sum(parameter.numel() for parameter in network.parameters()) for network in (actor, full)]
     assert count[0] < 0.75 * count[1]
     with pytest.raises(ConfigError, match="patch must be a multiple of 4"):
         ActorSpec((4, 8), (0.0,), patch=18, encoder="lean")
-
-
-def test_temperature_follows_the_entropy():
-    model = make_model(ActorSpec((8,), initial_std=0.15), target_std=0.15, alpha=1.0)
-    assert model.target_entropy == pytest.approx(-61.2, abs=0.1)
-    alphas = [1.0]
-    for distance in (5.0, -50.0):  # above the target, and far below
-        model._adapt_temperature(torch.tensor(model.target_entropy + distance))
-        alphas.append(model.log_ent_coef.exp().item())
-    assert alphas[1] == pytest.approx(0.99, rel=1e-3) and alphas[2] > alphas[1]
-    sampled = model.networks()[0].sample(make_batch(8).observations)
-    assert -sampled.log_prob.mean().item() == pytest.approx(model.target_entropy, abs=15)  # close at the beginning
-    scalars = model.update(make_batch(8))
-    assert scalars["alpha"].item() == pytest.approx(1.0, rel=0.02)
-    assert abs(scalars["q_target"].item()) < 10  # without the entropy, whose sum is near -61
 
 
 def test_actor_is_updated_in_every_third_update_and_rates_fall():
@@ -211,46 +161,8 @@ def test_actor_is_updated_in_every_third_update_and_rates_fall():
     assert rates == sorted(rates, reverse=True)
 
 
-class Unthreaded(VecEnvWrapper):
-    """Something else than a `cfp.TorchVecEnv`."""
-
-    @property
-    def unwrapped(self):
-        return self
-
-    def reset(self):
-        return self.venv.reset()
-
-    def step_wait(self):
-        return self.venv.step_wait()
-
-    def __getattr__(self, name):
-        if name == "meanwhile":
-            raise AttributeError(name)
-        return super().__getattr__(name)
-
-
-def test_updates_during_simulation_are_the_same_every_time():
-    def train():
-        env = FakeEnv(num_envs=2, resolution=8)
-        model = make_model(ActorSpec((8,)), env, update_start=4, batch_size=4, overlap=True, gradient_steps=2)
-        sizes = []
-        sample = model.replay_buffer.sample
-        model.replay_buffer.sample = lambda *arguments: (sizes.append(model.replay_buffer.pos), sample(*arguments))[1]
-        model.learn(16)
-        return model, sizes
-
-    (model, sizes), (again, _) = train(), train()
-    assert sizes == [3, 3, 4, 4, 5, 5, 6, 6, 7, 7]  # rows in memory: without that of the step that is simulated
-    assert model._n_updates == 10
-    for name, value in model.policy.state_dict().items():
-        assert torch.equal(value, again.policy.state_dict()[name])
-    with pytest.raises(ValueError, match=r"env must be a cfp.TorchVecEnv with overlap, got Unthreaded"):
-        model.collect_rollouts(Unthreaded(model.env))
-
-
 def test_resumed_run_is_the_uninterrupted_one(tmp_path):
-    options = "--preset lean --steps 60 --handover 32 --eval-every 0 --gradient-steps 2".split()
+    options = "--preset quick --steps 60 --handover 32 --eval-every 0 --gradient-steps 2".split()
     assert run(tmp_path / "whole", *options) == 0
     for step, folder in ((20, "first"), (50, "second")):
         with at_step(step, lambda: os.kill(os.getpid(), signal.SIGTERM)):
@@ -261,11 +173,10 @@ def test_resumed_run_is_the_uninterrupted_one(tmp_path):
 
 def test_options_out_of_range_are_refused():
     for changes, message in (
-        ({"reward_scale": "batch"}, "critic categorical requires reward_scale return"),
         ({"noise_cells": 3}, "noise_cells must be one of"),
         ({"n_steps": 0}, "n_steps must be at least 1, got 0"),
-        ({"target_std": 0.0}, "target_std must be positive"),
+        ({"noise_scale": (0.0, 1.0)}, "noise_scale must be positive"),
     ):
-        config = sac_preset("run", "lean")
+        config = sac_preset("run", "quick")
         with pytest.raises(ConfigError, match=message):
             replace(config, learning=replace(config.learning, **changes)).check()

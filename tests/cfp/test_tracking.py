@@ -66,7 +66,7 @@ def wandb(monkeypatch):
 
 
 def test_everything_written_is_explained_and_everything_explained_is_written(finished):
-    optional = {"train/drift", "train/alpha", "train/reward_scale"}  # of refinement, of other options
+    optional = {"train/drift"}  # of refinement
     rows = set(METRICS | LOG_METRICS | ROLLOUT_METRICS) - optional
     columns = set(read_table(finished / "progress.csv")[0])
     assert columns - {"step"} == rows - {"time/steps_per_second"}
