@@ -1,11 +1,16 @@
 """Algorithms to compare the coarse-to-fine policy with, behind the same command lines, folders and policies."""
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from baselines.registry import ALGORITHMS, load
+if TYPE_CHECKING:
+    from baselines.registry import ALGORITHMS as ALGORITHMS
+    from baselines.registry import load as load
+    from baselines.runs import Run as Run
+    from baselines.runs import fit as fit
 
 _MODULES = {
+    "ALGORITHMS": "baselines.registry",
     "Algorithm": "cfp.experiment.algorithm",
     "CEM": "baselines.planning.mpc",
     "CEMConfig": "baselines.planning.mpc",
@@ -21,18 +26,21 @@ _MODULES = {
     "MPCConfig": "baselines.planning.mpc",
     "ModularConfig": "baselines.modular.train",
     "OpenLoop": "baselines.common.open_loop",
+    "Run": "baselines.runs",
     "SegmentPolicy": "baselines.modular.networks",
     "Shac": "baselines.shac.train",
     "ShacConfig": "baselines.shac.train",
     "StatePolicy": "baselines.shac.networks",
+    "fit": "baselines.runs",
+    "load": "baselines.registry",
 }
-"""Where each public class is; its module is imported when it is used."""
+"""Where each public name is; its module is imported when it is used, so that ``torchmpm --help`` is quick."""
 
-__all__ = ["ALGORITHMS", "load", *_MODULES]
+__all__ = [*_MODULES]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public class."""
+    """Import a public name."""
     if name not in _MODULES:
         raise AttributeError(f"module 'baselines' has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)

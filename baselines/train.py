@@ -9,6 +9,7 @@ from cfp.experiment import training
 PROGRAM = training.Program(
     "baselines",
     f"Train an algorithm (--algo {'|'.join(ALGORITHMS)}) on a DittoGym task; name it to see its options here.",
+    ("--algo shac --task run", "--algo gnn-16 --task kick --seed 1 --out runs/gnn", "--algo mpc --task run --dry-run"),
     configure,
     lambda config: find(config.algo),
     load,

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from cfp.agent.policies import CFPPolicy
     from cfp.agent.sac import CFP
     from cfp.envs.vec_env import TorchVecEnv
+    from cfp.runs import Run, fit
 
 __all__ = [
     "CFP",
@@ -29,7 +30,9 @@ __all__ = [
     "Hyperparameters",
     "ImageFeatures",
     "NonFiniteError",
+    "Run",
     "TorchVecEnv",
+    "fit",
     "load",
     "preset",
 ]
@@ -39,6 +42,8 @@ _ON_FIRST_USE = {
     "CFP": "cfp.agent.sac",
     "CFPPolicy": "cfp.agent.policies",
     "ImageFeatures": "cfp.agent.features",
+    "Run": "cfp.runs",
+    "fit": "cfp.runs",
     "TorchVecEnv": "cfp.envs.vec_env",
 }
 

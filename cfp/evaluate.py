@@ -16,7 +16,7 @@ from cfp.errors import CheckpointError, ConfigError
 from cfp.evaluation.evaluate import Noise, compare
 from cfp.evaluation.tables import format_table, to_rows
 from cfp.evaluation.video import check_files, record_policy, save_media
-from cfp.experiment.cli import program_name, run_command
+from cfp.experiment.cli import program_name, run_command, with_examples
 from cfp.experiment.folder import policy_files, read_config
 from cfp.experiment.training import Program
 from cfp.from_dict import update_from_dict
@@ -145,7 +145,14 @@ def run(program: Program, command: Command) -> str:
 def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:
     """Command line entry; returns the exit code."""
     started = program_name(f"{program.package}.evaluate", arguments)
-    return run_command(lambda: print(run(program, tyro.cli(Command, prog=started, args=arguments))))
+    about = with_examples(
+        Command.__doc__ or "",
+        started,
+        "runs/run --episodes 10 --video run.mp4",
+        "--policy run --particles full --json",
+        "runs/run --noise both --replay run.html",
+    )
+    return run_command(lambda: print(run(program, tyro.cli(Command, prog=started, description=about, args=arguments))))
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from cfp.evaluation.episodes import Trial
 from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
 from cfp.evaluation.plots import write_figure
 from cfp.evaluation.tables import numbers
-from cfp.experiment.cli import program_name, run_command
+from cfp.experiment.cli import program_name, run_command, with_examples
 from cfp.experiment.folder import Folder, make_folder
 from cfp.experiment.training import Program
 from cfp.files import write_json, write_text
@@ -184,7 +184,10 @@ def run(program: Program, command: Command) -> str:
 def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:
     """Command line entry; returns the exit code."""
     started = program_name(f"{program.package}.robustness", arguments)
-    return run_command(lambda: print(run(program, tyro.cli(Command, prog=started, args=arguments))))
+    about = with_examples(
+        Command.__doc__ or "", started, "runs/run", "--policy run --cases noise shift --out runs/noise"
+    )
+    return run_command(lambda: print(run(program, tyro.cli(Command, prog=started, description=about, args=arguments))))
 
 
 if __name__ == "__main__":

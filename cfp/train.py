@@ -15,6 +15,12 @@ from cfp.weights import load
 PROGRAM = training.Program(
     "cfp",
     "Train the coarse-to-fine policy on a DittoGym task, one stage after the other.",
+    (
+        "--task run",
+        "--task shapematch --target M --seed 1 --out runs/M",
+        "--resume --out runs/M",
+        "--task run --dry-run",
+    ),
     from_json,
     lambda config: AnalyticLearner if isinstance(config, AnalyticConfig) else CoarseToFine,
     load,

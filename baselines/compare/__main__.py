@@ -19,7 +19,7 @@ from baselines.compare.worker import Outcome
 from baselines.registry import ALGORITHMS
 from cfp.config import Preset, RunConfig
 from cfp.errors import ConfigError
-from cfp.experiment.cli import program_name, run_command
+from cfp.experiment.cli import program_name, run_command, with_examples
 from cfp.experiment.folder import Folder, make_folder
 from cfp.experiment.process import Stopped, StopSignals
 from cfp.sections import Particles
@@ -178,8 +178,14 @@ def _report(command: Command, jobs: Sequence[Job]) -> list[RunResult]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry point; returns the exit code."""
     names = f"Algorithms: {', '.join(ALGORITHMS)}. Reference policies: {', '.join(REFERENCE_POLICIES)}."
-    description = f"{names}\n\n{inspect.getdoc(Command)}"
     program = program_name("baselines.compare", arguments)
+    description = with_examples(
+        f"{names}\n\n{inspect.getdoc(Command)}",
+        program,
+        "--tasks shapematch --algos cfp shac --seeds 0 1",
+        "--tasks run kick --algos zero gradient --out runs/reach --workers 2",
+        "--out runs/reach --report-only",
+    )
     return run_command(lambda: compare(tyro.cli(Command, prog=program, description=description, args=arguments)))
 
 

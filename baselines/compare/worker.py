@@ -21,7 +21,7 @@ from baselines.registry import configure, find
 from cfp.config import to_json
 from cfp.envs.make import choose_device
 from cfp.experiment.process import Stopped, StopSignals, keep_memory, peak_memory
-from cfp.experiment.run import Run
+from cfp.experiment.run import TrainingRun
 from cfp.experiment.run_lock import FolderInUse, run_lock
 from cfp.files import write_json, write_text
 from cfp.from_dict import update_from_dict
@@ -83,7 +83,7 @@ def _train_and_evaluate(job: Job, signals: StopSignals, own_process: bool) -> No
 def train(job: Job, signals: StopSignals, own_process: bool = True) -> None:
     """Train to the end, and record the cost of this session in ``sessions.json``; a killed process leaves no record."""
     earlier = read_sessions(job.folder)["sessions"]
-    run = Run(find(job.config.algo), job.config, job.folder, True, signals)
+    run = TrainingRun(find(job.config.algo), job.config, job.folder, True, signals)
     first_step, start, finished = run.step, time.perf_counter(), False
     try:
         run.train()

@@ -19,7 +19,7 @@ from cfp.analytic.stateful import Stateful
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.folder import copy_policy, policy_path
 from cfp.experiment.process import StopSignals
-from cfp.experiment.run import Run
+from cfp.experiment.run import TrainingRun
 from cfp.files import read_json, write_json
 from cfp.policy_protocols import Policy, SeesState
 from cfp.sections import TASK_OPTIONS, EnvironmentConfig
@@ -149,7 +149,7 @@ def train_teacher(config: DistillConfig, folder: Path, signals: StopSignals) -> 
     environment = replace(chosen.environment, **same)
     chosen = replace(chosen, seed=config.seed, device=config.device, environment=environment)
     algorithm, own = find(config.teacher), folder / "teacher"
-    run = Run(algorithm, chosen, own, True, signals)
+    run = TrainingRun(algorithm, chosen, own, True, signals)
     print(f"training the teacher first: {config.teacher} -> {own}")
     start, begin = run.step, time.perf_counter()
     try:

@@ -16,7 +16,7 @@ from baselines.gradlab.measure import ReturnFunction, measure
 from baselines.gradlab.report import write
 from cfp.envs.make import choose_device
 from cfp.errors import ConfigError
-from cfp.experiment.cli import run_command
+from cfp.experiment.cli import program_name, run_command, with_examples
 from cfp.experiment.folder import Folder, make_folder
 from cfp.validation import check_at_least
 from dittogym import TorchEnv
@@ -75,10 +75,12 @@ class GradLabConfig:
 QUICK = GradLabConfig(quick=True, particles=200, substeps=5, horizons=(1, 2, 4), warmup=1, samples=4)
 
 
-def parse(arguments: Sequence[str]) -> GradLabConfig:
+def parse(given: Sequence[str] | None) -> GradLabConfig:
     """Read a command line; ``--quick`` chooses other defaults."""
+    arguments, program = sys.argv[1:] if given is None else list(given), program_name("baselines.gradlab", given)
     default = QUICK if "--quick" in arguments else GradLabConfig()
-    config = tyro.cli(GradLabConfig, prog="python -m baselines.gradlab", args=list(arguments), default=default)
+    about = with_examples(GradLabConfig.__doc__ or "", program, "--task run", "--task kick --quick")
+    config = tyro.cli(GradLabConfig, prog=program, description=about, args=arguments, default=default)
     config.check()
     return replace(config, out=config.out or Path("runs") / f"gradlab-{task_name(config.task)}")
 
@@ -121,7 +123,7 @@ def run(config: GradLabConfig) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
-    return run_command(lambda: print(run(parse(sys.argv[1:] if arguments is None else arguments))))
+    return run_command(lambda: print(run(parse(arguments))))
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -38,6 +39,14 @@ def run_command(command: Callable[[], int | None]) -> int:
 
 
 def program_name(module: str, arguments: Sequence[str] | None) -> str:
-    """How the user started a program: ``python -m MODULE``, or ``python FILE`` for a script that calls its ``main``."""
+    """How the user started a program: ``torchmpm NAME``, ``python -m MODULE``, or ``python FILE`` for a script."""
     own = arguments is None and getattr(sys.modules["__main__"], "__spec__", None) is None
+    if arguments is None and sys.argv[0].startswith("torchmpm "):  # set by the console command
+        return sys.argv[0]
     return f"python {sys.argv[0]}" if own else f"python -m {module}"
+
+
+def with_examples(about: str, program: str, *examples: str) -> str:
+    """The description of a ``program`` for its help, followed by ``examples`` of its options."""
+    lines = "\n".join(f"  {program} {example}" for example in examples)
+    return f"{inspect.cleandoc(about)}\n\nExamples:\n{lines}"

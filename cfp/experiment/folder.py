@@ -14,7 +14,8 @@ from cfp.files import copy_atomically, read_json
 from cfp.weights import read_policy
 
 
-def _parse_folder(words: list[str]) -> Path:
+def parse_folder(words: list[str]) -> Path:
+    """The folder that an option names; a ``ValueError`` if it cannot be the name of one."""
     word = words[0]
     if not word:  # a shell's variable that is not set; it would stand for the current folder
         raise ValueError("it must name a folder, got ''")
@@ -31,7 +32,7 @@ Folder = Annotated[
     PrimitiveConstructorSpec(
         nargs=1,
         metavar="PATH",
-        instance_from_str=_parse_folder,
+        instance_from_str=parse_folder,
         is_instance=lambda value: isinstance(value, Path),
         str_from_instance=lambda folder: [str(folder)],
     ),

@@ -49,7 +49,7 @@ def check_options(config: RunConfig) -> None:
         make_env(config, config.action_size(stage), 1)
 
 
-class Run:
+class TrainingRun:
     """Trains all stages of a run in its folder.
 
     ``policy.safetensors`` is the policy with the best evaluation of its stage so far (without evaluations: the newest),
@@ -61,7 +61,9 @@ class Run:
     ) -> None:
         check_options(config)
         if holds_progress(folder) and not resume:
-            raise ConfigError(f"out: {folder} already holds a run; continue it with --resume, or name another folder")
+            raise ConfigError(
+                f"out: {folder} already holds a run; continue it with --resume (resume=True), or name another folder"
+            )
         self.algorithm, self.config, self.folder, self.signals = algorithm, config, folder, signals
         self.stages = len(config.ends())
         self.evaluation_seconds = 0.0  # in this session

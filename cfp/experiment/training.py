@@ -1,11 +1,13 @@
-"""The command line that trains: options from preset, file and command line."""
+"""Training as a program: options from preset, file, and command line or Python."""
 
 from __future__ import annotations
 
+import difflib
 import inspect
 import json
+import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -15,13 +17,13 @@ import tyro
 from cfp.config import RunConfig, to_json
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm
-from cfp.experiment.cli import program_name, run_command
+from cfp.experiment.cli import program_name, run_command, with_examples
 from cfp.experiment.folder import Folder, holds_run, read_config
 from cfp.experiment.process import Stopped, StopSignals
-from cfp.experiment.run import Run, check_options
+from cfp.experiment.run import TrainingRun, check_options
 from cfp.experiment.run_lock import run_lock
 from cfp.files import read_json
-from cfp.from_dict import update_from_dict
+from cfp.from_dict import flatten, update_from_dict
 from cfp.policy_protocols import Policy
 
 
@@ -31,6 +33,7 @@ class Program:
 
     package: str  # python -m PACKAGE.train
     about: str  # first words of the help
+    examples: tuple[str, ...]  # of options, for the help
     configure: Callable[[dict[str, Any]], RunConfig]  # options from JSON values; the others come from the preset
     find: Callable[[RunConfig], type[Algorithm]]  # the algorithm that the options name
     load: Callable[[Path, str], Policy]  # loads a policy file onto a device
@@ -74,14 +77,13 @@ class _Choice:
 def parse(program: Program, arguments: Sequence[str], started: str | None = None) -> Command:
     """Read a command line; ``SystemExit`` after ``--help``, or for an option that does not exist or cannot be read."""
     choice, _ = tyro.cli(_Choice, args=list(arguments), return_unknown_args=True, add_help=False, console_outputs=False)
-    values = _values(choice)
-    preset = program.configure({name: values[name] for name in _Choice.decisive if name in values})
 
     def read(defaults: RunConfig) -> Command:
+        prog = started or program_name(f"{program.package}.train", arguments)
         command = tyro.cli(
             Command,
-            prog=started or program_name(f"{program.package}.train", arguments),
-            description=f"{program.about}\n\n{inspect.getdoc(Command)}",
+            prog=prog,
+            description=with_examples(f"{program.about}\n\n{inspect.getdoc(Command)}", prog, *program.examples),
             args=list(arguments),
             default=Command(defaults),
             config=(tyro.conf.OmitArgPrefixes,),
@@ -89,20 +91,72 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
         # the command line may spell the name of the algorithm in another way
         return command if choice.algo is None else replace(command, run=replace(command.run, algo=defaults.algo))
 
-    if choice.resume:
-        folder = choice.out or Path("runs") / read(program.configure(values)).run.name
+    named = {word[2:].partition("=")[0].replace("-", "_") for word in arguments if word.startswith("--")}
+    return complete(program, _values(choice), choice.out, choice.resume, read, named)
+
+
+def complete(
+    program: Program,
+    values: dict[str, Any],
+    out: Path | None,
+    resume: bool,
+    read: Callable[[RunConfig], Command],
+    named: Collection[str] = (),
+) -> Command:
+    """Complete the options of a run from its preset, or from the run that is resumed, and check them.
+
+    Args:
+        program: Whose options they are.
+        values: Options as JSON values, in sections.
+        out: Folder of the run, if given.
+        resume: Whether to continue the run in that folder.
+        read: Changes these options further.
+        named: Options that it changes.
+    """
+    preset = program.configure(_decisive(values))
+    if "algo" in values:
+        values = {**values, "algo": preset.algo}  # may be given in another spelling
+    if resume:
+        folder = out or Path("runs") / read(program.configure(values)).run.name
         if (folder / "config.json").exists():
             past = read_config(folder, program.configure)
-            # a value of the file that differs from the run's is refused later
-            command = read(past if choice.config is None else update_from_dict(past, values))
+            if (algo := values.get("algo", past.algo)) != past.algo:
+                raise ConfigError(f"algo must be {past.algo!r}, that of the run in {folder}, got {algo!r}")
+            command = read(update_from_dict(past, values))  # a value that differs from the run's is refused later
             command.run.check()
             return replace(command, out=folder)
     command = read(program.configure(values))
-    named = {word[2:].partition("=")[0].replace("-", "_") for word in arguments if word.startswith("--")}
     run = command.run.with_derived(preset, values.keys() | named)
     run.check()
     run.check_effect(preset)
     return replace(command, run=run, out=command.out or Path("runs") / run.name)
+
+
+def from_python(program: Program, options: Mapping[str, Any], out: Path | None, resume: bool) -> Command:
+    """Complete a run's ``options``, named as on the command line.
+
+    Raises:
+        ConfigError: There is no such option, or a value is wrong.
+    """
+    plain = {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in options.items()}
+    places = {name.split(".")[-1]: name.split(".") for name in flatten(to_json(program.configure(_decisive(plain))))}
+    values: dict[str, Any] = {}
+    for name, value in plain.items():
+        if name not in places:
+            close = difflib.get_close_matches(name, places, 1)
+            instead = f"did you mean {close[0]}?" if close else f"python -m {program.package}.train --help lists them"
+            raise ConfigError(f"{name} is not an option of this run; {instead}")
+        *sections, key = places[name]
+        section = values
+        for each in sections:
+            section = section.setdefault(each, {})
+        section[key] = value
+    return complete(program, values, out, resume, lambda config: Command(config, out, resume), plain.keys())
+
+
+def _decisive(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Of some options those that choose the defaults."""
+    return {name: values[name] for name in _Choice.decisive if name in values}
 
 
 def _values(choice: _Choice) -> dict[str, Any]:
@@ -113,8 +167,7 @@ def _values(choice: _Choice) -> dict[str, Any]:
             values = read_json(choice.config)
         except (OSError, ValueError) as error:
             raise ConfigError(f"config: {choice.config} cannot be read as JSON ({error})") from error
-    names = _Choice.decisive
-    return values | {name: value for name in names if (value := getattr(choice, name)) is not None}
+    return values | {name: value for name, value in _decisive(vars(choice)).items() if value is not None}
 
 
 def main(program: Program, arguments: Sequence[str] | None = None, started: str | None = None) -> int:
@@ -125,6 +178,12 @@ def main(program: Program, arguments: Sequence[str] | None = None, started: str 
 
 def _train(program: Program, arguments: Sequence[str], started: str) -> None:
     command = parse(program, arguments, started)
+    algo = "" if command.run.algo == "cfp" or "distill" in started else f" --algo {command.run.algo}"
+    train(program, command, f"resume with: {started}{algo} --resume --out {command.out}")
+
+
+def train(program: Program, command: Command, hint: str) -> None:
+    """Train, or resume, the run that `complete` has completed; ``hint`` tells how to resume it once stopped."""
     folder, config = command.out, command.run
     assert folder is not None
     if folder.exists() and not folder.is_dir():
@@ -138,11 +197,11 @@ def _train(program: Program, arguments: Sequence[str], started: str) -> None:
     print(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed} -> {folder}")
     with run_lock(folder):
         with StopSignals() as signals:
-            run = Run(program.find(config), config, folder, command.resume, signals)
+            run = TrainingRun(program.find(config), config, folder, command.resume, signals)
             if config.environment.backend == "compile":
                 print("compiling the physics; the first time on a machine this takes half a minute ...")
             try:
                 run.train()
             except Stopped as stopped:
-                raise Stopped(stopped.number, f"resume with: {started} --resume --out {folder}") from None
+                raise Stopped(stopped.number, hint) from None
         run.finish()

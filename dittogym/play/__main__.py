@@ -18,6 +18,9 @@ from dittogym.tasks import allowed_instead
 #: Options of its training that a policy plays with, too, unless the command line says otherwise.
 FROM_POLICY = ("dt", "substeps", "dtype", "parity", "target", "variant")
 
+EXAMPLES = ("run", "--policy runs/kick", "shapematch --target M --particles 1000", "run --body robot.png")
+"""Options that the help shows."""
+
 
 @dataclass(frozen=True)
 class Command:
@@ -86,7 +89,11 @@ def play(command: Command) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
-    command = tyro.cli(Command, prog="python -m dittogym.play", args=arguments)
+    console = arguments is None and sys.argv[0].startswith("torchmpm ")
+    program = sys.argv[0] if console else "python -m dittogym.play"
+    examples = "".join(f"\n  {program} {words}" for words in EXAMPLES)
+    description = f"{Command.__doc__}\n\nExamples:{examples}"
+    command = tyro.cli(Command, prog=program, description=description, args=arguments)
     try:
         play(command)
     except KeyboardInterrupt:

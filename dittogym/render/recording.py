@@ -158,7 +158,7 @@ class Recording:
 
     def _repr_html_(self) -> str:
         page = escape(self.page())
-        return f'<iframe srcdoc="{page}" width="600" height="760" style="border:0"></iframe>'
+        return f'<iframe srcdoc="{page}" width="600" height="760" style="border:0; max-width:100%"></iframe>'
 
 
 def check_film(
@@ -183,12 +183,17 @@ def check_film(
     return path
 
 
-def film(env: Any, act: Act, path: Any, seed: Any, index: int, options: dict[str, Any]) -> Recording:
-    """Record an episode, see :func:`record`, and save it if a ``path`` is given, see :meth:`Recording.save`."""
+def check_wanted(path: Any, options: dict[str, Any]) -> None:
+    """Check the arguments of :meth:`Recording.save`, of which none may be given without a path."""
     if path is not None:
-        check_film(path, **options)  # before the episode
+        check_film(path, **options)
     elif options:
         raise TypeError(f"path must be given with {', '.join(options)}, got None")
+
+
+def film(env: Any, act: Act, path: Any, seed: Any, index: int, options: dict[str, Any]) -> Recording:
+    """Record an episode, see :func:`record`, and save it if a ``path`` is given, see :meth:`Recording.save`."""
+    check_wanted(path, options)  # before the episode
     recording = record(env, act, seed, index)
     if path is not None:
         recording.save(path, **options)

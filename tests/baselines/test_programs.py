@@ -101,6 +101,19 @@ def finished(request, tmp_path_factory):
     return request.param, folder
 
 
+def test_fit_is_the_command_line(tmp_path):
+    assert run("cem", tmp_path / "command") == 0
+    names = ("grid", "horizon", "commit", "iterations", "candidates", "elites", "eval_every", "checkpoint_every")
+    options = dict(zip((*names, "log_every"), (8, 3, 2, 2, 5, 2, 12, 5, 5), strict=True))
+    options |= {"particles": 100, "substeps": 1, "eval_episodes": 2, "video": False, "device": "cpu"}
+    fitted = baselines.fit("cem", "shapematch", out=tmp_path / "python", **options)
+    assert fitted.policy.description["kind"] == "cem" and fitted.results[-1]["policy"] == "  own layout"
+    for name in ("config.json", "evaluations.csv", "results.json"):
+        assert (fitted.folder / name).read_bytes() == (tmp_path / "command" / name).read_bytes(), name
+    with pytest.raises(ConfigError, match=r"algo must be 'cem', that of the run in .* got 'gnn-16'"):
+        baselines.fit("gnn16", "shapematch", out=fitted.folder, resume=True)
+
+
 def test_run_leaves_its_files(finished):
     algo, folder = finished
     for name in ("results.json", "curve.png", "policy.safetensors", "policy.json"):

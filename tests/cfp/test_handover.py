@@ -11,7 +11,7 @@ from cfp import train
 from cfp.evaluation.evaluate import evaluate
 from cfp.experiment.coarse_to_fine import CoarseToFine
 from cfp.experiment.process import StopSignals
-from cfp.experiment.run import Run
+from cfp.experiment.run import TrainingRun
 from cfp.experiment.training import parse
 from cfp.tables import read_table
 from cfp.train import PROGRAM
@@ -131,7 +131,7 @@ def test_critics_of_a_level_begin_with_those_before_if_asked_to(tmp_path, monkey
         callbacks.callbacks[0].stage.save_policy()
 
     monkeypatch.setattr(CoarseToFine, "learn", learn)
-    Run(CoarseToFine, config, tmp_path / "run", False, StopSignals()).train()
+    TrainingRun(CoarseToFine, config, tmp_path / "run", False, StopSignals()).train()
     kept = all((value == 0.125).all() for key, value in seen[1].items() if value.requires_grad or "patches" not in key)
     assert kept == warm
 

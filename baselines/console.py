@@ -1,0 +1,55 @@
+"""``torchmpm``: one command for all programs; it imports only the program that it starts."""
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+PROGRAMS = {
+    "train": ("baselines.train", "train a policy on a task, by the coarse-to-fine method or another --algo"),
+    "evaluate": ("baselines.evaluate", "returns of a trained policy, with films, replays and recorded trajectories"),
+    "robustness": ("baselines.robustness", "returns of a policy in disturbed simulations"),
+    "play": ("dittogym.play.__main__", "play with a robot on a page in the browser"),
+    "compare": ("baselines.compare.__main__", "train and evaluate several algorithms, and report about them"),
+    "teach": ("baselines.distill", "let an image policy learn from a teacher that observes more"),
+    "gradlab": ("baselines.gradlab.__main__", "measure up to which horizon gradients are useful"),
+}
+"""Module of each program, with a function ``main``, and what it does."""
+EXAMPLES = """Examples:
+  torchmpm train --task run --out runs/run
+  torchmpm evaluate runs/run --video run.mp4
+  torchmpm play run"""
+
+
+def usage() -> str:
+    """What ``torchmpm --help`` prints."""
+    rows = "\n".join(f"  {name:<11} {about}" for name, (_, about) in PROGRAMS.items())
+    return (
+        f"usage: torchmpm PROGRAM [OPTIONS]\n\nSoft robots, simulated and differentiated in PyTorch.\n\n"
+        f"Programs (torchmpm PROGRAM --help lists the options):\n{rows}\n\n{EXAMPLES}"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line entry; returns the exit code."""
+    name, *words = (sys.argv[1:] if arguments is None else list(arguments)) or ["--help"]
+    if name in ("-h", "--help"):
+        print(usage())
+        return 0
+    if name == "--version":
+        from importlib.metadata import version  # takes longer than all the rest
+
+        print(f"torchmpm {version('torchmpm')}")
+        return 0
+    if name not in PROGRAMS:
+        print(f"error: PROGRAM must be one of {', '.join(PROGRAMS)}, got {name!r}", file=sys.stderr)
+        return 2
+    module, _ = PROGRAMS[name]
+    if name == "train" and not any(word.partition("=")[0] == "--algo" for word in words):
+        module = "cfp.train"
+    sys.argv = [f"torchmpm {name}", *words]  # from which the programs read their options and their name
+    code: int = import_module(module).main()
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,126 @@
+"""Training from Python: the same runs as those of the command line."""
+
+from __future__ import annotations
+
+import json
+import os
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+from cfp.config import RunConfig
+from cfp.envs.make import choose_device
+from cfp.errors import CheckpointError, ConfigError
+from cfp.evaluation.video import record_policy
+from cfp.experiment.folder import parse_folder, policy_path, read_config
+from cfp.experiment.process import Stopped, keep_memory
+from cfp.experiment.training import Program, from_python, train
+from cfp.policy_protocols import Policy
+from cfp.tables import read_table
+from cfp.train import PROGRAM
+from dittogym.render.recording import Recording, check_wanted
+
+
+class Run:
+    """A run in its folder, finished, stopped, or still in training.
+
+    Args:
+        folder: Where a training, from Python or from the command line, wrote it.
+
+    Raises:
+        CheckpointError: There is no run.
+    """
+
+    program: ClassVar[Program] = PROGRAM
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
+        self.config: RunConfig = read_config(self.folder, self.program.configure)
+
+    @classmethod
+    def fit(cls, options: dict[str, Any], out: str | os.PathLike[str] | None, resume: bool) -> Run:
+        """Train with these ``options``, into the folder ``out``; see `cfp.fit`."""
+        try:
+            folder = None if out is None else parse_folder([os.fspath(out)])
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"out must be the path of a folder, got {out!r}") from error
+        command = from_python(cls.program, options, folder, resume)
+        keep_memory()
+        try:
+            train(cls.program, command, "the same call with resume=True continues the run")
+        except Stopped as stopped:
+            raise KeyboardInterrupt(str(stopped)) from None
+        assert command.out is not None
+        return cls(command.out)
+
+    @cached_property
+    def policy(self) -> Policy:
+        """The policy of the last stage, that with its best evaluation."""
+        return self.program.load(policy_path(self.folder), choose_device(self.config.device))
+
+    @property
+    def evaluations(self) -> list[dict[str, float | None]]:
+        """Rows of ``evaluations.csv``: step, stage, and the mean and spread of the returns; None for no value."""
+        rows = read_table(self.folder / "evaluations.csv")
+        return [{name: float(value) if value else None for name, value in row.items()} for row in rows]
+
+    @property
+    def results(self) -> list[dict[str, Any]]:
+        """Rows of the final table, ``results.json``, beside zero and random action.
+
+        Raises:
+            CheckpointError: The run is not finished.
+        """
+        path = self.folder / "results.json"
+        if not path.exists():
+            raise CheckpointError(f"{self.folder}: the run is not finished (no results.json)")
+        rows: list[dict[str, Any]] = json.loads(path.read_text())
+        return rows
+
+    def film(self, path: str | os.PathLike[str] | None = None, **options: Any) -> Recording:
+        """Record one episode of the policy, which a notebook shows.
+
+        Args:
+            path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
+            options: Such as ``size``, ``speed`` and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
+        """
+        check_wanted(path, options)  # before the episode
+        recording = record_policy(self.config, self.policy)
+        if path is not None:
+            recording.save(path, **options)
+        return recording
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self.folder)!r})"
+
+
+def fit(
+    task: str,
+    *,
+    steps: int | None = None,
+    out: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    **options: Any,
+) -> Run:
+    """Train the coarse-to-fine policy, as ``python -m cfp.train`` does, with the same folder of the run.
+
+    Ctrl-C writes a checkpoint and raises `KeyboardInterrupt`; the same call with ``resume=True`` continues.
+
+    Args:
+        task: Task, or ``"MODULE:NAME"`` for a custom one.
+        steps: Environment steps of all stages together; None: those of the preset.
+        out: Folder of the run; None: in ``runs/``, named by algorithm, task, preset and seed.
+        resume: Continue the run in the folder.
+        options: Options of the command line with underscores, such as ``seed=1``, ``particles=500``,
+            ``handover=(3200,)`` or ``video=False``.
+
+    Returns:
+        The finished run.
+
+    Raises:
+        ConfigError: An option does not exist or is wrong.
+        NonFiniteError: Training has diverged.
+    """
+    if steps is not None:
+        options["steps"] = steps
+    return Run.fit({"task": task, **options}, out, resume)

@@ -1,0 +1,64 @@
+"""The console command ``torchmpm``."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from baselines import console
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(autouse=True)
+def own_arguments(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["torchmpm"])
+
+
+def output_of(capsys, *words):
+    """Exit code and output of a command; a program's help ends with ``SystemExit``."""
+    try:
+        code = console.main(words)
+    except SystemExit as stop:
+        code = stop.code or 0
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_help_is_quick_because_it_imports_no_program():
+    program = "import sys; from baselines import console; console.main(['--help']); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    text, _, modules = done.stdout.rstrip().rpartition("\n")
+    assert all(f"\n  {name} " in text for name in console.PROGRAMS) and "Examples:" in text
+    assert not {"torch", "numpy", "tyro", "gymnasium"} & set(modules.split())
+
+
+@pytest.mark.parametrize("name", [*console.PROGRAMS, "train --algo shac"])
+def test_every_program_is_started_under_its_name_with_examples(name, capsys):
+    code, text, _ = output_of(capsys, *name.split(), "--help")
+    started = f"torchmpm {name.split()[0]}"
+    assert code == 0 and text.startswith(f"usage: {started} ") and f"Examples:\n  {started} " in text
+    assert ("--learner" in text) == (name == "train") and ("--td-lambda" in text) == name.startswith("train")
+
+
+def test_options_and_exit_codes_reach_the_program_and_the_shell(tmp_path, capsys):
+    assert output_of(capsys, "train", "--task", "run", "--steps", "0") == (
+        2,
+        "",
+        "error: steps must be at least 1, got 0\n",
+    )
+    code, text, _ = output_of(
+        capsys, "train", "--algo=cem", "--task", "run", "--dry-run", "--out", str(tmp_path / "run")
+    )
+    assert code == 0 and '"algo": "cem"' in text
+
+
+def test_no_program_shows_the_help_and_a_wrong_one_the_choice(capsys):
+    assert output_of(capsys) == output_of(capsys, "-h") and console.main([]) == 0
+    capsys.readouterr()
+    code, text, error = output_of(capsys, "tarin")
+    assert (code, text) == (
+        2,
+        "",
+    ) and error == f"error: PROGRAM must be one of {', '.join(console.PROGRAMS)}, got 'tarin'\n"

@@ -1,0 +1,94 @@
+"""Training from Python is training from the command line."""
+
+import signal
+from pathlib import Path
+
+import pytest
+from tiny_runs import assert_same_run, at_step
+
+import cfp
+from cfp.weights import read_policy
+
+#: The options of `tiny_runs.TINY`.
+OPTIONS = {
+    "learner": "sac",
+    "particles": 100,
+    "substeps": 1,
+    "num_envs": 2,
+    "resolutions": (4, 8),
+    "handover": [70],
+    "random_steps": (10, 4),
+    "batch_size": 4,
+    "buffer_size": 60,
+    "update_start": 8,
+    "gradient_steps": 1,
+    "eval_every": 60,
+    "eval_episodes": 2,
+    "checkpoint_every": 20,
+    "log_every": 10,
+    "video": False,
+    "device": "cpu",
+    "backend": "eager",
+}
+
+
+def test_fit_is_the_command_line_and_resumes_after_ctrl_c(finished, tmp_path):
+    with at_step(44, lambda: signal.raise_signal(signal.SIGINT)), pytest.raises(KeyboardInterrupt, match="resume=True"):
+        cfp.fit("shapematch", steps=150, out=tmp_path / "run", **OPTIONS)
+    run = cfp.fit("shapematch", steps=150, out=str(tmp_path / "run"), resume=True, **OPTIONS)
+    assert_same_run(run.folder, finished)
+    assert run.folder == tmp_path / "run" and run.config == cfp.Run(finished).config
+
+
+def test_run_holds_policy_evaluations_results_and_film(finished, tmp_path):
+    run = cfp.Run(finished)
+    assert run.policy.resolution == 64 and run.policy.description == read_policy(finished)[1]
+    assert [row["step"] for row in run.evaluations] == [60, 70, 70, 120, 150]
+    best = max((row for row in run.evaluations if row["stage"] == 2), key=lambda row: row["mean"])
+    assert run.policy.description["steps"] == best["step"]
+    assert [row["policy"] for row in run.results] == ["zero action", "random action", "stage 1", "stage 2"]
+    recording = run.film(tmp_path / "film.html", speed=0.5)
+    assert len(recording.rewards) == 30 and (tmp_path / "film.html").stat().st_size > 10_000
+    with pytest.raises(ValueError, match="path must end in"):
+        run.film(tmp_path / "film.doc")
+    with pytest.raises(cfp.CheckpointError, match="no run"):
+        cfp.Run(tmp_path)
+
+
+def test_unfinished_run_has_no_results(finished, tmp_path):
+    for name in ("config.json", "policy.safetensors"):
+        (tmp_path / name).write_bytes((finished / name).read_bytes())
+    run = cfp.Run(tmp_path)
+    assert run.policy.resolution == 64 and run.evaluations == []
+    with pytest.raises(cfp.CheckpointError, match="not finished"):
+        run.results  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"gama": 0.9}, "gama is not an option of this run; did you mean gamma"),
+        ({"environment": {"particles": 100}}, "environment is not an option .* --help lists them"),
+        ({"particles": "few"}, "particles must be 'full' or 'lite' or an integer .* got 'few'"),
+        ({"steps": 0}, "steps must be at least 1, got 0"),
+        ({"handover": (10, 20)}, "handover must have 1 values"),
+        ({"alpha": (1.0, 1.0)}, "alpha is not an option"),  # of the learner sac only
+        ({"refine": True}, "refine requires start_from"),
+        ({"warmup": 3, "task": "nowhere"}, "task must be .* got 'nowhere'"),
+        ({"out": ""}, "out must be the path of a folder, got ''"),
+        ({"out": 5}, "out must be the path of a folder, got 5"),
+        ({"out": Path(__file__)}, "out must be a folder, got the file"),
+    ],
+)
+def test_wrong_options_are_refused_before_anything_is_written(options, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(cfp.ConfigError, match=message):
+        cfp.fit(**({"task": "run"} | options))
+    assert not list(tmp_path.iterdir())
+
+
+def test_another_run_in_the_folder_is_refused(finished):
+    with pytest.raises(cfp.ConfigError, match="resume=True"):
+        cfp.fit("shapematch", out=finished)
+    with pytest.raises(cfp.CFPError, match="task: the run was started with 'shapematch', got 'run'"):
+        cfp.fit("run", out=finished, resume=True)
