@@ -34,7 +34,7 @@ class Selection:
     folder: tyro.conf.Positional[Path | None] = None
     """A folder that a training wrote or is writing."""
     policy: str | None = None
-    """In place of a folder: a policy file, or the name of a policy that comes with the package."""
+    """In place of a folder: a policy file, the name of a policy that comes with the package, or hf://OWNER/NAME."""
     episodes: int = 5
     """Episodes of each row."""
     seed: int | None = None
@@ -118,7 +118,8 @@ def open_run(
 
 def open_policy(program: Program, path: str, device: str, seed: int | None) -> tuple[RunConfig, dict[str, Policy]]:
     """A single policy and options to evaluate it with, as the run that trained it does; see `open_run`."""
-    policy = program.load(Path(path), choose_device(device))
+    file = policy_file(path)
+    policy = program.load(file, choose_device(device))
     about = policy.description
     base = program.configure({"algo": about["kind"], "task": about["task"]})
     network = about["network"] if isinstance(about.get("network"), dict) else {}
@@ -127,7 +128,7 @@ def open_policy(program: Program, path: str, device: str, seed: int | None) -> t
     config = update_from_dict(base, {"environment": about["environment"], **stages}).with_derived(base, stages)
     config = replace(config, device=device, seed=about["seed"] if seed is None else seed)
     config.check()
-    return config, {policy_file(path).stem: policy}
+    return config, {file.stem: policy}
 
 
 def run(program: Program, command: Command) -> str:
