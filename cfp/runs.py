@@ -6,7 +6,7 @@ import json
 import os
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
@@ -98,11 +98,8 @@ class Run:
             repo: ``"OWNER/NAME"``.
             private: Create the repository as a private one.
         """
-        policy = self.policy
-        if not isinstance(policy, Shareable):
-            raise ConfigError(f"policy must have a method push, got {type(policy).__name__}")
         finished = (self.folder / "results.json").exists()
-        return policy.push(repo, results=self.results if finished else (), private=private)
+        return cast(Shareable, self.policy).push(repo, results=self.results if finished else (), private=private)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self.folder)!r})"
