@@ -165,6 +165,15 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
 
     Raises:
         CheckpointError: The file is missing, damaged, or not such a policy.
+
+    Examples:
+        >>> import cfp, dittogym, gymnasium
+        >>> policy = cfp.load("run")
+        >>> env = gymnasium.make("dittogym/run-coarse-v0", resolution=policy.resolution, particles="lite")
+        >>> observation, info = env.reset(seed=0)
+        >>> action, _ = policy.predict(observation, deterministic=True)
+        >>> action.shape, policy.description["task"]
+        ((2, 8, 8), 'run')
     """
     tensors, description = read_policy(path, device)
     if description["kind"] != KIND:

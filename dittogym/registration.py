@@ -27,6 +27,14 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
     Raises:
         ValueError: The name belongs to another function, differs from that in the specification or is not one word.
         TypeError: ``make`` is not a function, or does not return a :class:`dittogym.TaskSpec`.
+
+    Examples:
+        >>> import dataclasses, dittogym, gymnasium
+        >>> def short_run(horizon=200):
+        ...     return dataclasses.replace(dittogym.make_spec("run"), name="short_run", horizon=horizon)
+        >>> dittogym.register("short_run", short_run)
+        >>> gymnasium.spec("dittogym/short_run-coarse-v0").max_episode_steps
+        200
     """
     if not isinstance(task, str) or re.fullmatch(r"\w+", task) is None:
         raise ValueError(f"task must be a name of letters, digits and underscores, got {task!r}")

@@ -11,19 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dittogym import core
+from dittogym import arguments, core
 from dittogym.action import ActionIndexing, to_grid_indexing
-from dittogym.arguments import (
-    DTYPES,
-    check_action,
-    choice,
-    find_device,
-    find_mask,
-    find_resolution,
-    find_substeps,
-    refuse_transforms,
-    reset_options,
-)
 from dittogym.bodies.positions import InitialPositions, Particles, Seed, get_state, particle_counts, set_state
 from dittogym.contract import measure
 from dittogym.model import EnvState, Parity, Snapshot, check_snapshot, check_stability, make_model
@@ -70,6 +59,18 @@ class TorchEnv:
     Raises:
         ValueError: An argument is out of range.
         TypeError: The task has no such option.
+
+    Examples:
+        >>> import dittogym, torch
+        >>> env = dittogym.TorchEnv("run", num_envs=4, particles="lite")
+        >>> observation, info = env.reset(seed=0)
+        >>> observation.shape
+        torch.Size([4, 3, 64, 64])
+        >>> action = torch.zeros(4, *env.action_shape, requires_grad=True)
+        >>> observation, reward, terminated, truncated, info = env.step(action)
+        >>> reward.sum().backward()
+        >>> action.grad.shape
+        torch.Size([4, 2, 8, 8])
     """
 
     observation_shape = SHAPE
@@ -94,19 +95,21 @@ class TorchEnv:
         **task_options: Any,
     ) -> None:
         self.spec = make_spec(task, **task_options)
-        self.num_envs, substeps = checks.whole("num_envs", num_envs, 1), find_substeps(dt, substeps)
+        self.num_envs, substeps = checks.whole("num_envs", num_envs, 1), arguments.find_substeps(dt, substeps)
         check_repetition(substeps, segment)
         for name, flag in (("resample", resample), ("deterministic", deterministic)):
             checks.flag(name, flag)
-        self.dtype, self.device = choice("dtype", str(dtype).removeprefix("torch."), DTYPES), find_device(device)
+        self.dtype = arguments.choice("dtype", str(dtype).removeprefix("torch."), arguments.DTYPES)
+        self.device = arguments.find_device(device)
         if deterministic and (self.device.type != "cpu" or backend == "compile"):
             needs = "deterministic=True needs device 'cpu' and a backend other than 'compile'"
             raise ValueError(f"{needs}, got {device!r} and {backend!r}")
-        self.action_resolution = find_resolution(self.spec, resolution)
+        self.action_resolution = arguments.find_resolution(self.spec, resolution)
         self.action_shape = (2, self.action_resolution, self.action_resolution)
-        self._as_reference = choice("parity", parity, {"clean": False, "reference": True})
+        self._as_reference = arguments.choice("parity", parity, {"clean": False, "reference": True})
         own: ActionIndexing = "grid" if self._as_reference else "image"
-        self.action_layout = choice("action_layout", action_layout, {"image": "image", "grid": "grid", None: own})
+        layouts: dict[str | None, ActionIndexing] = {"image": "image", "grid": "grid", None: own}
+        self.action_layout = arguments.choice("action_layout", action_layout, layouts)
         counts = particle_counts(self.spec, particles)
         self.model = make_model(self.spec, counts, substeps, backend, parity, segment, float(dt))
         random = self._as_reference or counts == tuple(body.count for body in self.spec.bodies)
@@ -136,7 +139,7 @@ class TorchEnv:
 
     @env_state.setter
     def env_state(self, value: EnvState) -> None:
-        refuse_transforms("TorchEnv.env_state")
+        arguments.refuse_transforms("TorchEnv.env_state")
         checks.instance("env_state", value, EnvState)
         theirs = value.particles
         kind = theirs.batch_size, theirs.num_particles, theirs.dtype, theirs.device
@@ -198,7 +201,7 @@ class TorchEnv:
                 type, device or batch size.
         """
         checks.instance("snapshot", snapshot, Snapshot)
-        chosen = find_mask("mask", mask, self.num_envs, self.device)
+        chosen = arguments.find_mask("mask", mask, self.num_envs, self.device)
         check_snapshot(self.model, snapshot, self._like)
         index = torch.arange(self.num_envs, device=self.device) % len(snapshot.state.steps)
         state, observation = tree.map(lambda t: t[index], (snapshot.state, snapshot.observation))
@@ -229,9 +232,9 @@ class TorchEnv:
             ValueError: An option is unknown, has the wrong shape, puts particles outside the window, or makes matter
                 too stiff for the substeps.
         """
-        refuse_transforms("TorchEnv.reset")
-        options = reset_options(options)
-        mask = find_mask("reset_mask", options.get("reset_mask"), self.num_envs, self.device)
+        arguments.refuse_transforms("TorchEnv.reset")
+        options = arguments.reset_options(options)
+        mask = arguments.find_mask("reset_mask", options.get("reset_mask"), self.num_envs, self.device)
         if self._env_state is None and not bool(mask.all()):
             raise ValueError("reset_mask must reset all elements the first time")
         physics = self._next_physics(options.get("physics"), mask)
@@ -287,8 +290,8 @@ class TorchEnv:
         Raises:
             ValueError: The action has the wrong shape or type or is not finite.
         """
-        refuse_transforms("TorchEnv.step")
-        action = check_action(action, (self.num_envs, *self.action_shape)).to(self.device, self.dtype)
+        arguments.refuse_transforms("TorchEnv.step")
+        action = arguments.check_action(action, (self.num_envs, *self.action_shape)).to(self.device, self.dtype)
         action = to_grid_indexing(action, self.action_layout)
         result = core.step(self.model, self.env_state, action, soft=soft)
         info: dict[str, Any] = {"reward_terms": dict(result.terms), **result.info}

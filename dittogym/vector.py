@@ -62,6 +62,14 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     Raises:
         ValueError: Unknown mode, or as in :class:`dittogym.TorchEnv`.
+
+    Examples:
+        >>> import dittogym, gymnasium
+        >>> envs = gymnasium.make_vec("dittogym/kick-coarse-v0", num_envs=3, particles="lite")
+        >>> observations, infos = envs.reset(seed=0)
+        >>> observations, rewards, terminations, truncations, infos = envs.step(envs.action_space.sample())
+        >>> observations.shape, rewards.shape, infos["object_displacement"].shape
+        ((3, 3, 64, 64), (3,), (3,))
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES[:1]), "render_fps": RENDER_FPS}

@@ -18,6 +18,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(Path(__file__).parent))
 
 import architecture  # noqa: E402
+from media import write_replays  # noqa: E402
+from result_tables import write_results  # noqa: E402
 from task_pages import write_pages  # noqa: E402
 
 project = "torchmpm"
@@ -31,10 +33,18 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
+    "sphinx_design",
     "sphinx_gallery.gen_gallery",
     "sphinx-mathjax-offline",  # formulas without a network; the site opens from disk
 ]
-exclude_patterns = ["_build", "generated/summary.md", "sg_execution_times.rst", "tasks"]
+exclude_patterns = [
+    "_build",
+    "generated/planning.md",
+    "generated/returns*.md",
+    "generated/summary.md",
+    "sg_execution_times.rst",
+    "tasks",
+]
 sphinx_gallery_conf = {
     "examples_dirs": "../examples/tutorials",
     "gallery_dirs": "gallery",
@@ -163,9 +173,16 @@ def drop_links_back(app: Sphinx, page: str, template: str, context: dict[str, ob
         context["body"] = re.sub(r'<a class="viewcode-back".*?</a>', "", str(context["body"]))
 
 
+def write_generated(app: Sphinx) -> None:
+    """Write the pages of the tasks, the tables of results, and replays."""
+    write_pages()
+    write_results()
+    write_replays(Path(app.outdir) / "replays")
+
+
 def setup(app: Sphinx) -> None:
-    """Register the directives, and write the pages of the tasks before any page is read."""
-    app.connect("builder-inited", lambda app: write_pages(), priority=100)  # before tutorials register tasks
+    """Register the directives, and write what is generated before any page is read."""
+    app.connect("builder-inited", write_generated, priority=100)  # before tutorials register tasks
     app.connect("html-page-context", drop_links_back)
     app.connect("missing-reference", accept_undocumented)
     KeepColons(app)

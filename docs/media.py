@@ -37,6 +37,14 @@ def record_task(task: str, seed: int = 0) -> Recording:
         return env.film(policy, seed=seed)
 
 
+def write_replays(folder: Path) -> None:
+    """Write `TASK.html`, an episode of each task, unless it is newer than the policy."""
+    for task in dittogym.TASKS:
+        path, policy = folder / f"{task}.html", SHIPPED / f"{task}.safetensors"
+        if not path.exists() or path.stat().st_mtime < policy.stat().st_mtime:
+            record_task(task).save(path)
+
+
 def policy_hash(task: str) -> str:
     """Hash of the policy of a task that comes with the package."""
     return hashlib.sha256((SHIPPED / f"{task}.safetensors").read_bytes()).hexdigest()

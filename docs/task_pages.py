@@ -28,14 +28,25 @@ TEMPLATE = """# [[ title ]]
 :alt: An episode of the pretrained policy
 ```
 
-The pretrained policy `cfp.load("[[ spec.name ]]")` with 2,000 particles ([](../policies.md)). Contraction is
-red, expansion blue.
+The pretrained policy with 2,000 particles; contraction is red, expansion blue.
+<a href="../replays/[[ spec.name ]].html">Replay of a whole episode</a>, to pause, scrub and recolour.
+
+| | |
+| --- | --- |
+| Environments | `dittogym/[[ spec.name ]]-coarse-v0`, `dittogym/[[ spec.name ]]-fine-v0` |
+| Action space | `Box(-1, 1, (2, [[ spec.coarse ]], [[ spec.coarse ]]), float32)`, fine: \
+`(2, [[ spec.fine ]], [[ spec.fine ]])`; \
+[muscle stress](../concepts/actions.md) along x and y |
+| Observation space | `Box(0, 255, (3, 64, 64), uint8)`: occupancy, horizontal and vertical velocity |
+| Steps in an episode | [[ spec.horizon ]], of 10 ms each |
 
 ```python
-import dittogym, gymnasium
+import cfp, gymnasium
 
-env = gymnasium.make("dittogym/[[ spec.name ]]-coarse-v0", particles="lite")
-batch = dittogym.TorchEnv("[[ spec.name ]]", num_envs=16, particles="lite")
+policy = cfp.load("[[ spec.name ]]")
+options = {"particles": "lite", "resolution": policy.resolution}
+env = gymnasium.make("dittogym/[[ spec.name ]]-coarse-v0", **options)
+env.unwrapped.film(policy, "[[ spec.name ]].webp")
 ```
 
 ```bash
@@ -43,7 +54,17 @@ python -m dittogym.play [[ spec.name ]] --policy [[ spec.name ]]   # in the brow
 python -m cfp.train --task [[ spec.name ]] --out runs/[[ spec.name ]]
 ```
 
+## Arguments
+
+The [arguments of all tasks](../tasks.md#arguments).
 [[ notes ]]
+
+## Results
+
+```{include} returns-[[ spec.name ]].md
+```
+
+[](../results.md) says how the returns were measured, and [](../algorithms.md) what the algorithms are.
 
 ## Geometry
 
@@ -64,6 +85,10 @@ for the same direction cover a node, the first one applies.
 | --- | --- |
 [% for name, value in numbers %]| [[ name ]] | [[ value ]] |
 [% endfor %]
+## Versions
+
+- `v0`: the dynamics and rewards of the reference implementation, with the exceptions listed in
+  [](../concepts/deviations.md).
 """
 
 

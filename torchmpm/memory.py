@@ -43,6 +43,19 @@ def estimate_memory(
 
     Raises:
         ValueError: A number is below 1, the solver cannot run such a state, or would run it natively on CUDA.
+
+    Examples:
+        Checkpoints need less memory than the whole graph:
+
+        >>> import torch, torchmpm
+        >>> robot = torchmpm.Body(2000, torchmpm.VonMises(mu=500.0, lam=50.0, yield_stress=62.0), mass=2.0)
+        >>> solver = torchmpm.Solver(torchmpm.Grid(128), (robot,), backend="eager")
+        >>> whole, segments = (
+        ...     torchmpm.estimate_memory(solver, (1, 2000, torch.float32), substeps=100, segment=segment)
+        ...     for segment in (None, 10)
+        ... )
+        >>> whole > 5 * segments
+        True
     """
     substeps, segment = check_repetition(substeps, segment, "substeps")
     return _estimate(solver, state, substeps, env_steps)(segment)

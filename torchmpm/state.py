@@ -36,6 +36,12 @@ class ParticleState:
         ValueError: A field has the wrong shape, is neither float32 nor float64, or dtype or device differ between
             fields.
         TypeError: A field is not a tensor.
+
+    Examples:
+        >>> import torch, torchmpm
+        >>> state = torchmpm.ParticleState.at_rest(torch.rand(8, 1000, 2))  # eight simulations
+        >>> state.F.shape, bool(state.v.any())
+        (torch.Size([8, 1000, 2, 2]), False)
     """
 
     x: Float[Tensor, "B N 2"]

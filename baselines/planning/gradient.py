@@ -28,7 +28,17 @@ class GradientPlannerConfig(PlannerConfig):
 
 
 class GradientPlanner(Planner[GradientPlannerConfig]):
-    """Improves the next actions by Adam on the smooth return; its arguments are those of `Planner`."""
+    """Improves the next actions by Adam on the smooth return; its arguments are those of `Planner`.
+
+    Examples:
+        >>> import dittogym
+        >>> from baselines import GradientPlanner, GradientPlannerConfig
+        >>> env = dittogym.TorchEnv("run", particles=300, substeps=10)
+        >>> observation, info = env.reset(seed=0)
+        >>> planner = GradientPlanner(env, GradientPlannerConfig(horizon=4, commit=2, iterations=2), seed=0)
+        >>> planner.act().shape
+        torch.Size([1, 2, 8, 8])
+    """
 
     config_type = GradientPlannerConfig
 

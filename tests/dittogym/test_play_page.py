@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -146,6 +147,19 @@ def test_sliders_and_files(played: Played) -> None:
     with page.expect_download() as caught:
         page.click("#moment")
     assert caught.value.suggested_filename.endswith(".pt") and page.is_enabled("#back")
+
+
+def test_a_film_of_what_is_shown(played: Played) -> None:
+    page = played.page
+    page.click("#film")
+    shown = page.evaluate("stats.frames")
+    played.until(lambda: page.evaluate("stats.frames") > shown + 10)
+    with page.expect_download() as caught:
+        page.click("#film")
+    film = cv2.VideoCapture(str(caught.value.path()))
+    pictures = [picture for _ in range(3) if (picture := film.read()[1]) is not None]
+    assert len(pictures) == 3 and np.ptp(pictures[-1]) > 100  # not one colour
+    assert page.inner_text("#film") == "Film"
 
 
 def test_a_drawn_robot(played: Played) -> None:

@@ -1,0 +1,194 @@
+"""Writes the tables and the figure of measured returns from the committed CSV files, next to the paper's."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from task_pages import PAGES, headline, write
+
+import dittogym
+from baselines.compare import paper
+
+DOCS = Path(__file__).resolve().parent
+OBSERVES = ("image", "state", "simulator", "nothing")
+Row = dict[str, str]
+
+
+def read(name: str) -> list[Row]:
+    """Rows of a CSV file of this folder."""
+    with (DOCS / name).open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def policies() -> list[Row]:
+    """Rows of `policies.csv` in the form of `returns.csv`: zero and random actions, and trained policies."""
+    rows = []
+    for row in read("policies.csv"):
+        name = row["policy"]
+        observes = "nothing" if name in ("zero", "random") else "image"
+        label = f"{name} actions" if observes == "nothing" else f'`cfp.load("{name}")`' if name == row["task"] else name
+        rows.append(row | {"algorithm": label, "observes": observes, "name": name})
+    return rows
+
+
+def shape_match_rows() -> list[Row]:
+    """Rows of the comparison of all algorithms on SHAPE MATCH."""
+    return [
+        {
+            "task": "shapematch",
+            "particles": "lite",
+            "algorithm": f"`{row['algorithm']}`",
+            "observes": row["sees"],
+            "episodes": row["success"].rpartition(" ")[2],
+            "mean": row["return, lite (mean of seeds)"],
+            "success": row["success"],
+        }
+        for row in read("compare-shapematch.csv")
+    ]
+
+
+def number(text: str) -> str:
+    """A return or a count with thousands separated."""
+    return f"{float(text.replace(',', '')):,.0f}" if text else ""
+
+
+def spread(row: Row) -> str:
+    """What is known about the spread of the episodes: lowest and highest, or standard deviation."""
+    if row.get("lowest"):
+        return f" ({number(row['lowest'])} to {number(row['highest'])})"
+    return f" ± {number(row['std'])}" if row.get("std") else ""
+
+
+def success(row: Row) -> str:
+    """Share of successful episodes."""
+    share = row.get("success") or ""
+    return f"{float(share):.0%}" if share and " of " not in share else share
+
+
+def markdown(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table."""
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+
+
+def shipped(task: str, name: str) -> Row:
+    """The full evaluation of a task's own policy, or of `zero` or `random`, with the most episodes."""
+    found = [row for row in policies() if (row["task"], row["name"], row["particles"]) == (task, name, "full")]
+    return max(found, key=lambda row: int(row["episodes"]))
+
+
+def overview() -> str:
+    """All tasks: untrained and shipped policies, and the paper's."""
+    rows = []
+    for training in read("training.csv"):
+        task = training["task"]
+        ours, (theirs, _) = shipped(task, task), paper.CURVES[task][0]
+        value = number(ours["mean"])
+        rows.append(
+            [
+                f"[{headline(task)[0]}](generated/{task}.md)",
+                *(number(shipped(task, name)["mean"]) for name in ("zero", "random")),
+                (f"**{value}**" if float(ours["mean"]) > theirs else value) + f"<br>{spread(ours).strip(' ()')}",
+                number(str(theirs)),
+                number(training["steps"]),
+                f"{paper.STEPS[task]:,}",
+                training["minutes"],
+            ]
+        )
+    columns = ("Task", "Zero", "Random", "This package", "Paper's CFP", "Steps", "Paper's steps", "Minutes")
+    return markdown(columns, rows)
+
+
+def planning() -> str:
+    """Returns of planners and optimised action sequences with full particles."""
+    rows = [row for row in read("returns.csv") if row["particles"] == "full" and row["minutes"]]
+    rows = [row for row in rows if row["observes"] in ("simulator", "nothing")]
+    return markdown(
+        ("Task", "Algorithm", "Episodes", "Return", "Paper's CFP", "Steps", "Minutes"),
+        (
+            [
+                f"[{headline(row['task'])[0]}](generated/{row['task']}.md)",
+                row["algorithm"],
+                row["episodes"],
+                number(row["mean"]) + spread(row),
+                number(str(paper.CURVES[row["task"]][0][0])),
+                number(row["steps"]),
+                row["minutes"],
+            ]
+            for row in rows
+        ),
+    )
+
+
+def of_task(task: str) -> str:
+    """Every measured return of a task, then those of the paper; by particles and by what the policy observes."""
+    rows = [row for row in (*policies(), *read("returns.csv"), *shape_match_rows()) if row["task"] == task]
+    rows.sort(key=lambda row: (row["particles"], OBSERVES.index(row["observes"]), -float(row["mean"])))
+    ours = (
+        [
+            row["algorithm"],
+            row["observes"],
+            row["particles"],
+            row["episodes"],
+            number(row["mean"]) + spread(row),
+            success(row),
+        ]
+        for row in rows
+    )
+    columns = ("Algorithm", "Observes", "Particles", "Episodes", "Return", "Success")
+    published = zip(paper.COLUMNS, paper.CURVES[task], strict=True)
+    names = [f"`{name}`" for name, _ in published]
+    values = [f"{mean:,.0f} ± {band:,.0f}" for mean, band in paper.CURVES[task]]
+    return (
+        markdown(columns, ours)
+        + f"\nThe paper's training returns after {paper.STEPS[task]:,} steps with full particles, three seeds each:\n\n"
+        + markdown(names, [values])
+    )
+
+
+def normalised(task: str, name: str, key: str) -> float:
+    """A number of the evaluation of a policy on a scale where the paper's resting robot has 0 and its CFP 1."""
+    return paper.normalised(task, float(shipped(task, name)[key]))
+
+
+def figure(path: Path) -> None:
+    """Draw the normalised returns of all tasks."""
+    tasks = [row["task"] for row in read("training.csv")]
+    drawing = Figure(figsize=(7.2, 3.9), layout="constrained")
+    FigureCanvasSVG(drawing)
+    axis = drawing.subplots()
+    axis.axvline(0, color="0.8", zorder=0)
+    axis.axvline(1, color="#b03a2e", linestyle="--", zorder=0)
+    for place, task in enumerate(reversed(tasks)):
+        for name, colour in (("zero", "0.65"), ("random", "0.35")):
+            axis.plot(normalised(task, name, "mean"), place, "|", ms=11, mew=2, color=colour)
+        low, mean, high = (normalised(task, task, key) for key in ("lowest", "mean", "highest"))
+        axis.plot((low, high), (place, place), color="#26798c", lw=2)
+        axis.plot(mean, place, "o", ms=8, color="#26798c")
+    axis.set_yticks(range(len(tasks)), [headline(task)[0] for task in reversed(tasks)])
+    axis.set_xlabel("return; 0: a robot at rest, 1: the paper's CFP")
+    axis.spines[["top", "right", "left"]].set_visible(False)
+    axis.tick_params(axis="y", length=0)
+    entries = [
+        Line2D([], [], marker="o", ms=8, lw=2, color="#26798c", label="this package, lowest to highest episode"),
+        Line2D([], [], color="#b03a2e", linestyle="--", label="paper's CFP"),
+        Line2D([], [], marker="|", ms=11, mew=2, lw=0, color="0.65", label="zero actions"),
+        Line2D([], [], marker="|", ms=11, mew=2, lw=0, color="0.35", label="random actions"),
+    ]
+    axis.legend(handles=entries, loc="lower right", fontsize=9, frameon=False)
+    drawing.savefig(path, metadata={"Date": None})
+
+
+def write_results() -> None:
+    """Write everything into the folder of the generated pages."""
+    PAGES.mkdir(exist_ok=True)
+    write(PAGES / "returns.md", overview())
+    write(PAGES / "planning.md", planning())
+    for task in dittogym.TASKS:
+        write(PAGES / f"returns-{task}.md", of_task(task))
+    figure(PAGES / "returns.svg")

@@ -1,0 +1,35 @@
+"""The examples in the docstrings of the public names run."""
+
+import doctest
+import inspect
+
+import pytest
+
+import baselines
+import cfp
+import dittogym
+import torchmpm
+
+PACKAGES = (torchmpm, dittogym, cfp, baselines)
+FINDER = doctest.DocTestFinder(recurse=False, exclude_empty=True)
+EXAMPLES = [
+    test
+    for package in PACKAGES
+    for name in package.__all__
+    if callable(item := getattr(package, name))
+    for test in FINDER.find(item, f"{package.__name__}.{name}", module=inspect.getmodule(item), globs={})
+    if test.examples
+]
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.name)
+def test_example(example: doctest.DocTest) -> None:
+    report: list[str] = []
+    failed, attempted = doctest.DocTestRunner().run(example, out=report.append, clear_globs=False)
+    assert attempted > 0
+    assert failed == 0, "".join(report)
+
+
+def test_main_classes_have_examples() -> None:
+    found = {example.name for example in EXAMPLES}
+    assert found >= {"torchmpm.Solver", "dittogym.TorchEnv", "cfp.load", "baselines.GradientPlanner"}
