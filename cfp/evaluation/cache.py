@@ -22,7 +22,7 @@ from cfp.envs.make import choose_device
 from cfp.files import read_json, write_json
 from dittogym import make_spec
 from dittogym.tasks import fingerprint
-from torchmpm.native.cpu.library import cache_folder, find_compiler, processor
+from torchmpm.native.cpu.library import cache_folder, processor, provenance
 
 VARIABLE = "TORCHMPM_EPISODES"
 """Environment variable that names the folder; empty: nothing is kept."""
@@ -82,7 +82,7 @@ def _conditions(config: RunConfig) -> dict[str, Any]:
         "target": None if target is None else hashlib.sha256(np.asarray(target).tobytes()).hexdigest(),
         "device": choose_device(config.device),
         "sources": _sources(),
-        "machine": [platform.python_version(), np.__version__, torch.__version__, find_compiler(), processor()],
+        "machine": [platform.python_version(), np.__version__, torch.__version__, str(provenance()), processor()],
     }
 
 

@@ -12,7 +12,7 @@ import torch
 from scenes import lively, robot
 
 from torchmpm.backends import compiler_found
-from torchmpm.native.cpu import library
+from torchmpm.native.cpu import compiler, library
 
 
 @pytest.fixture(autouse=True)
@@ -97,8 +97,8 @@ def test_damaged_file_is_replaced(quick_compiler: None, monkeypatch: pytest.Monk
 
 def test_another_source_is_another_file(quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     library.load(torch.float32)
-    for name, value in (("processor", lambda: "another processor"), ("_FLAGS", ("-O0",))):
-        monkeypatch.setattr(library, name, value)
+    for module, name, value in ((library, "processor", lambda: "another processor"), (compiler, "_FLAGS", ("-O0",))):
+        monkeypatch.setattr(module, name, value)
         forget()
         library.load(torch.float32)
     assert runs(tmp_path) == 3
@@ -114,8 +114,38 @@ def test_folder_that_cannot_be_written(quick_compiler: None, monkeypatch: pytest
     assert runs(tmp_path) == 2
 
 
-def test_import_without_fork() -> None:
-    """Windows has no ``os.register_at_fork``."""
-    program = "import os, torch, jaxtyping; del os.register_at_fork; import torchmpm; print(torchmpm.Grid().h)"
+@pytest.mark.skipif(library.family() is None, reason="no wheel has kernels for this processor")
+def test_kernels_of_the_package_come_first(
+    quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """They need no compiler; one that does not load, or is of other sources, is not used."""
+    source = tmp_path / "package" / "some.cpp"
+    source.parent.mkdir()
+    source.write_text("// nothing")
+    path = compiler.compiled_path(source, ["-DA"], str(library.family()))
+    path.write_bytes(b"of another system")
+    library.build(source, "-DA")
+    assert runs(tmp_path) == 1
+    forget()
+    path.write_bytes(Path(torch._C.__file__).read_bytes())
+    library.build(source, "-DA")
+    assert runs(tmp_path) == 1 and library.packaged(source, "-DA") == path
+    assert library.packaged(source, "-DB") is None
+    source.write_text("// changed")
+    assert library.packaged(source, "-DA") is None
+    monkeypatch.setattr(library, "family", lambda: None)
+    assert library.packaged(source, "-DA") is None
+
+
+def test_windows() -> None:
+    """There the package imports and runs on the eager backend; the native one says what it needs."""
+    program = (
+        "import os, sys, torch, jaxtyping; del os.register_at_fork, os.uname; sys.platform = 'win32'\n"
+        "import torchmpm; body = torchmpm.Body(1, torchmpm.Elastic(1.0, 1.0), mass=1.0)\n"
+        "state = torchmpm.ParticleState.at_rest(torch.full((1, 2), 0.5))\n"
+        "print(torchmpm.Solver(torchmpm.Grid(128), bodies=(body,), gravity=(0, -9)).step(state).v[0, 0].tolist())\n"
+        "torchmpm.Solver(torchmpm.Grid(128), bodies=(body,), backend='native')"
+    )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
-    assert done.stdout.strip() == str(1 / 128), done.stderr
+    assert done.stdout.startswith("[0.0, -0.0008999"), done.stderr
+    assert done.stderr.endswith("backend 'native' does not run on Windows, except in WSL: use 'eager'\n"), done.stderr

@@ -12,16 +12,11 @@ import torch
 from torch import Tensor
 
 from dittogym.geometry import Box
-from dittogym.observation.image import BLOCK, CLIP, RASTER, SATURATION, SHAPE, SIZE
-from dittogym.observation.raster import FRAME
+from dittogym.observation.image import CLIP, SATURATION, SHAPE
 from dittogym.window import GRID, Centre
 from torchmpm.native.cpu.library import POOL, build, thread_pool
 
 _SOURCE = Path(__file__).parent / "picture.cpp"
-_OPTIONS = (
-    "-ffp-contract=off",
-    *(f"-DDITTOGYM_{k}={v}" for k, v in {"SIZE": SIZE, "BLOCK": BLOCK, "RASTER": RASTER, "FRAME": FRAME}.items()),
-)
 
 
 class Picture(ctypes.Structure):
@@ -44,7 +39,7 @@ def drawing(
 ) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
     """A function that draws what a :class:`dittogym.observation.camera.Camera` sees, for tensors on the CPU."""
     kind = {torch.float32: "float", torch.float64: "double"}[dtype]
-    function = getattr(build(_SOURCE, *_OPTIONS), f"dittogym_draw_{kind}")
+    function = getattr(build(_SOURCE, "-ffp-contract=off"), f"dittogym_draw_{kind}")
     body = torch.tensor(list(bodies), dtype=torch.float64, device="cpu")
     edges = [(b.left, b.right, b.bottom, b.top, b.closed) for b in boxes]
     box = torch.tensor(edges, dtype=torch.float64, device="cpu")

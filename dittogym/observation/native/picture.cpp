@@ -1,5 +1,4 @@
 // The observation of all simulations in one call: the arithmetic of dittogym/observation/raster.py in the same order.
-// The sizes DITTOGYM_* are those of dittogym/observation/image.py.
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -10,7 +9,8 @@
 
 #include "team.hpp"
 
-constexpr int SIZE = DITTOGYM_SIZE, BLOCK = DITTOGYM_BLOCK, RASTER = DITTOGYM_RASTER, FRAME = DITTOGYM_FRAME;
+// As in dittogym/observation/image.py and raster.py.
+constexpr int SIZE = 64, BLOCK = 8, RASTER = 1024, FRAME = 3;
 constexpr int FINE = SIZE * BLOCK, WORDS = FINE / 64, WIDE = SIZE + 2 * FRAME;
 
 // As `class Picture` in __init__.py. Tensors are contiguous, of Real; where nothing else is said leading batch.

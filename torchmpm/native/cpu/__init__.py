@@ -1,4 +1,4 @@
-"""The kernels in C++: ``library`` compiles and loads them, ``call`` runs them on tensors.
+"""The kernels in C++: ``compiler`` has the flags, ``library`` loads them, ``call`` runs them on tensors.
 
 The C++ files, in the order in which they build on each other: ``simd``, ``linalg``, ``material``, ``scene``,
 ``transfer``, ``grid``, ``team``, ``workspace``, ``step``; the adjoint: ``material_adjoint``, ``grid_adjoint``,

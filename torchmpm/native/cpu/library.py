@@ -1,8 +1,7 @@
-"""Compiles the kernels on first use, keeps them on disk, and loads them."""
+"""Loads the kernels that came with the package, or compiles them on first use and keeps them on disk."""
 
 import ctypes
 import functools
-import hashlib
 import logging
 import os
 import platform
@@ -15,16 +14,16 @@ from pathlib import Path
 
 import torch
 
-_SOURCES = Path(__file__).parent
-#: Not -ffast-math: it lets compilers assume that there is no NaN.
-_FLAGS = (
-    *("-std=c++17", "-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
-    *("-fopenmp-simd", "-fPIC", "-shared", "-pthread"),
-)
-_X86_FLAGS = ("-mprefer-vector-width=512",)
-_REAL = {torch.float32: "float", torch.float64: "double"}
+from torchmpm.native.cpu import compiler
+
 #: Completes the message "backend 'native' ...".
-NO_COMPILER = "needs a C++ compiler (g++, clang++ or $CXX), found none: use 'eager'"
+NO_COMPILER = (
+    "does not run on Windows, except in WSL: use 'eager'"
+    if sys.platform == "win32"
+    else "needs a C++ compiler (g++, clang++ or $CXX), found none: use 'eager'"
+)
+#: Classes of x86 processors that a wheel has kernels for, by the names that torch gives to their vector instructions.
+_FAMILIES = {"AVX2": "x86-64-v3", "AVX512": "x86-64-v4"}
 _logger = logging.getLogger(__name__)
 #: Members of ``struct Pool`` in ``team.hpp``.
 POOL = ("pool_parallel", "pool_rank", "pool_team_size")
@@ -51,36 +50,51 @@ if hasattr(os, "register_at_fork"):  # not on Windows
     os.register_at_fork(after_in_child=_after_fork)
 
 
-def find_compiler() -> tuple[str, ...] | None:
-    """The C++ compiler as a command: ``$CXX`` or else g++, and clang++ where that is not installed."""
-    for command in (os.environ.get("CXX") or "g++", "clang++"):
-        try:
-            words = tuple(shlex.split(command))
-        except ValueError:  # a quotation that does not end
-            continue
-        if words and shutil.which(words[0]) is not None:
-            return words
-    return None
-
-
 def cache_folder() -> str:
     """Where compiled kernels are kept: ``$XDG_CACHE_HOME/torchmpm``, else in the system's folder for caches."""
     usual = {"darwin": "~/Library/Caches", "win32": "~/AppData/Local"}.get(sys.platform, "~/.cache")
     return os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser(usual), "torchmpm")
 
 
+def provenance() -> Path | tuple[str, ...] | None:
+    """Where the kernels come from: a library of the package, or else a compiler; ``None`` if there is neither."""
+    return packaged(compiler.NATIVE, compiler.REAL["float32"]) or compiler.find_compiler()
+
+
+def family() -> str | None:
+    """The class of processors, as a value of ``-march``, that a wheel has kernels for; ``None`` for other processors.
+
+    The environment variable ``ATEN_CPU_CAPABILITY=avx2`` lets a processor with AVX-512 pass for one without it.
+    """
+    return "armv8-a" if platform.machine() == "aarch64" else _FAMILIES.get(torch.backends.cpu.get_cpu_capability())
+
+
+def packaged(source: Path, *options: str) -> Path | None:
+    """The library that the package holds for this processor; ``None`` if it holds none."""
+    processors = family()
+    path = processors and compiler.compiled_path(source, options, processors)
+    return path if path and path.exists() else None
+
+
 def load(dtype: torch.dtype) -> ctypes.CDLL:
     """The compiled kernels for a dtype, see :func:`build`."""
-    return build(_SOURCES / "native.cpp", f"-DTORCHMPM_REAL={_REAL[dtype]}")
+    return build(compiler.NATIVE, compiler.REAL[str(dtype).removeprefix("torch.")])
 
 
 @functools.cache
 def build(source: Path, *options: str) -> ctypes.CDLL:
-    """Compile a C++ file, which may include the headers of this folder and of its own, and load it.
+    """Load the library of a C++ file, which may include the headers of this folder and of its own.
 
-    The first call on a machine takes some seconds; later processes find the library in :func:`cache_folder`, if that
-    can be written. Raises a ValueError where there is no compiler, or it failed; the message holds what it said.
+    Wheels contain it for usual processors. Otherwise the first call on a machine compiles it, which takes up to a
+    minute; later processes find it in :func:`cache_folder`, if that can be written. Raises a ValueError where there is
+    no compiler, or it failed; the message holds what it said.
     """
+    ready = packaged(source, *options)
+    if ready is not None:
+        try:
+            return ctypes.CDLL(str(ready))
+        except OSError as error:  # for instance where the system's C library is too old
+            _logger.info("the kernels of the package do not load (%s)", error)
     found = _load(source, options, cache_folder(), os.environ.get("CXX"), os.environ.get("PATH"))
     if isinstance(found, str):
         raise ValueError(f"backend 'native' {found}")
@@ -90,12 +104,11 @@ def build(source: Path, *options: str) -> ctypes.CDLL:
 @functools.cache
 def _load(source: Path, options: tuple[str, ...], folder: str, *_: str | None) -> ctypes.CDLL | str:
     """Find or build the library; returns a failure as text, so that it is not tried again in this process."""
-    compiler = find_compiler()
-    if compiler is None:
+    program = compiler.find_compiler()
+    if program is None:
         return NO_COMPILER
-    flags = [*_FLAGS, *(_X86_FLAGS if platform.machine() in ("x86_64", "AMD64") else ()), *options, f"-I{_SOURCES}"]
-    command = [*compiler, *flags, str(source), "-o"]
-    path = Path(folder) / f"{source.stem}-{_key(command, source.parent)}.so"
+    command = [*program, *compiler.arguments(source, options, "native"), "-o"]
+    path = Path(folder) / f"{source.stem}-{_key(command, source)}.so"
     try:
         return ctypes.CDLL(str(path))
     except OSError:
@@ -108,7 +121,7 @@ def _load(source: Path, options: tuple[str, ...], folder: str, *_: str | None) -
         path, scratch = Path(), tempfile.TemporaryDirectory()
     with scratch:
         fresh = Path(scratch.name) / "fresh.so"
-        _logger.info("compiling %s with %s (once on this machine, some seconds)", source.name, compiler[0])
+        _logger.info("compiling %s with %s (once on this machine, some seconds)", source.name, program[0])
         done = subprocess.run([*command, str(fresh)], capture_output=True, text=True, check=False)
         if done.returncode != 0:
             failure = f"{shlex.join(command)} failed with code {done.returncode}:\n{done.stderr[-4000:]}"
@@ -122,14 +135,11 @@ def _load(source: Path, options: tuple[str, ...], folder: str, *_: str | None) -
             return f"could not be built: the compiled library does not load: {error}"
 
 
-def _key(command: list[str], folder: Path) -> str:
+def _key(command: list[str], source: Path) -> str:
     """Hash of the sources, the command, the compiler and the processor it compiles for."""
-    compiler = Path(shutil.which(command[0]) or command[0])
-    facts = [*command[:-2], f"{compiler.resolve()} {compiler.stat().st_mtime_ns}", processor()]
-    digest = hashlib.sha256("\n".join(facts).encode())
-    for source in sorted(file for place in {folder, _SOURCES} for file in place.glob("*.[ch]pp")):
-        digest.update(source.read_bytes())
-    return digest.hexdigest()[:24]
+    program = Path(shutil.which(command[0]) or command[0])
+    facts = (*command, f"{program.resolve()} {program.stat().st_mtime_ns}", processor())
+    return compiler.digest_of(source, *facts)[:24]
 
 
 def processor() -> str:
