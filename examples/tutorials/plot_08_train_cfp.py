@@ -2,8 +2,8 @@ r"""
 Train a policy and watch it
 ===========================
 
-This tutorial trains a policy for SHAPE MATCH with the command line, and watches it. It stops after one of five
-minutes: for a better policy, leave out the options below, or run ``make demo``.
+This tutorial trains a policy for SHAPE MATCH from the command line for less than a minute, and watches it. Without the
+options below, as in ``make demo``, training takes a few minutes and leads to a better policy.
 """
 
 # %%

@@ -51,7 +51,7 @@ class Played:
     def session(self) -> Session:
         return self.sessions[-1]
 
-    def until(self, condition: Callable[[], Any], seconds: float = 30) -> None:
+    def until(self, condition: Callable[[], Any], seconds: float = 120) -> None:
         """Wait for something that the page does."""
         deadline = time.monotonic() + seconds
         while not condition():

@@ -11,7 +11,7 @@ const observation = new Images($("observation"), ["occupancy", "velocity →", "
 const actions = new Images($("action"), ["horizontal", "vertical"]);
 const gates = new Images($("action"), ["gate, hor.", "gate, vert."]);
 const ui = { tool: "pull", colour: "deformation", pointer: null, brush: false };
-let task = null, frame = null, fresh = false, ids = 0, shades = null, policy = null, chosen = false;
+let task = null, frame = null, fresh = false, ids = 0, shades = null, policy = null, chosen = false, toldSlow = false;
 const presses = new Map();
 // For tests and the console: frames drawn, and milliseconds from the pointer to the frame that it has changed.
 const stats = window.stats = { frames: 0, latencies: [], place: (x, y) => scene.toClient(x, y) };
@@ -72,6 +72,10 @@ function show() {
   $("return").textContent = frame.total.toFixed(1);
   $("step").textContent = frame.step;
   $("rate").textContent = frame.playing ? `${frame.rate.toFixed(2)} ×` : "paused";
+  if (!toldSlow && frame.playing && frame.step > 100 && frame.rate < 0.7 * $("speed").value) {
+    toldSlow = true;
+    toast(`this machine simulates the task at ${frame.rate.toFixed(2)} × real time, slower than chosen`);
+  }
   $("play").textContent = frame.playing ? "Pause" : "Play";
   verdict();
   if (stats.frames % 3 && frame.playing) return;  // pictures for people to read need no more than 20 a second
