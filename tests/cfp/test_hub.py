@@ -95,7 +95,9 @@ class Handler(BaseHTTPRequestHandler):
             return self.reply({"errors": [], "warnings": []})
         values = [json.loads(line)["value"] for line in body.splitlines() if json.loads(line)["key"] == "file"]
         commit = server.commit({value["path"]: base64.b64decode(value["content"]) for value in values})
-        self.reply({"success": True, "commitOid": commit, "commitUrl": f"https://huggingface.co/{REPO}/commit/{commit}"})
+        self.reply(
+            {"success": True, "commitOid": commit, "commitUrl": f"https://huggingface.co/{REPO}/commit/{commit}"}
+        )
 
 
 @pytest.fixture
