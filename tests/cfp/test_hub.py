@@ -30,6 +30,7 @@ class Hub(ThreadingHTTPServer):
 
     def __init__(self):
         super().__init__(("127.0.0.1", 0), Handler)
+        self.address = f"http://127.0.0.1:{self.server_port}"
         self.created, self.commits, self.head = [], {}, ""
 
     def commit(self, files):
@@ -86,7 +87,7 @@ class Handler(BaseHTTPRequestHandler):
         body, server = self.rfile.read(int(self.headers["Content-Length"])), self.server
         if self.path == "/api/repos/create":
             server.created.append(json.loads(body))
-            return self.reply({"url": f"http://127.0.0.1/{REPO}"})
+            return self.reply({"url": REPO})
         if "/preupload/" in self.path:
             files = json.loads(body)["files"]
             return self.reply({"files": [{**file, "uploadMode": "regular", "shouldIgnore": False} for file in files]})
@@ -94,14 +95,16 @@ class Handler(BaseHTTPRequestHandler):
             return self.reply({"errors": [], "warnings": []})
         values = [json.loads(line)["value"] for line in body.splitlines() if json.loads(line)["key"] == "file"]
         commit = server.commit({value["path"]: base64.b64decode(value["content"]) for value in values})
-        self.reply({"success": True, "commitOid": commit, "commitUrl": f"http://127.0.0.1/{REPO}/commit/{commit}"})
+        self.reply(
+            {"success": True, "commitOid": commit, "commitUrl": f"https://huggingface.co/{REPO}/commit/{commit}"}
+        )
 
 
 @pytest.fixture
 def server(monkeypatch, tmp_path):
     with Hub() as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        api = huggingface_hub.HfApi(endpoint=f"http://127.0.0.1:{server.server_port}", token="hf_local")
+        api = huggingface_hub.HfApi(endpoint=server.address, token="hf_local")
         monkeypatch.setattr(huggingface_hub, "create_repo", api.create_repo)
         monkeypatch.setattr(huggingface_hub, "upload_folder", api.upload_folder)
         cached = partial(api.snapshot_download, cache_dir=tmp_path / "cache")
