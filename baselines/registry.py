@@ -11,7 +11,7 @@ from cfp.experiment.algorithm import Algorithm, Sees
 from cfp.from_dict import update_from_dict
 from cfp.policy_protocols import Policy
 from cfp.presets import like_start
-from cfp.weights import read_policy
+from cfp.weights import policy_file, read_policy
 
 ALGORITHMS: dict[str, str] = {
     "cfp": "cfp.experiment.coarse_to_fine:CoarseToFine",
@@ -80,7 +80,7 @@ def load(path: str | Path, device: str = "cpu") -> Policy:
     """Load a trained policy of any algorithm; nothing is unpickled.
 
     Args:
-        path: A run folder, a ``.safetensors`` file, or the ``.json`` beside one.
+        path: As in `cfp.load`: a run folder, a ``.safetensors`` file, ``"hf://OWNER/NAME"``, ...
         device: Where its tensors go.
 
     Returns:
@@ -91,4 +91,5 @@ def load(path: str | Path, device: str = "cpu") -> Policy:
         CheckpointError: No such file, a damaged one, or one that is not such a policy.
         ConfigError: It is of an algorithm that is not known here.
     """
-    return find(read_policy(path)[1]["kind"]).load(Path(path), device)
+    file = policy_file(path)
+    return find(read_policy(file)[1]["kind"]).load(file, device)

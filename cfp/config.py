@@ -197,8 +197,8 @@ class CoarseToFineConfig(StagedConfig):
     learner: Learner
     """analytic: learns by exact gradients of the simulation; sac: from rewards alone, as in the paper."""
     start_from: str | None = None
-    """Policy of the first stages (a run folder, policy.safetensors, or the name of one that comes with the package):
-    training begins with the stage after it."""
+    """Policy of the first stages (a run folder, policy.safetensors, the name of one that comes with the package, or
+    hf://OWNER/NAME): training begins with the stage after it."""
     refine: bool = False
     """Continue to train the last stage of start_from instead."""
 

@@ -6,16 +6,18 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
 from cfp.errors import CheckpointError, ConfigError
-from cfp.evaluation.evaluate import Noise, compare
+from cfp.evaluation.evaluate import Noise, compare, evaluation_seed, without_noise
 from cfp.evaluation.tables import format_table, to_rows
-from cfp.evaluation.video import check_files, record_policy, save_media
+from cfp.evaluation.video import check_files, record_episode, record_policy, save_media
 from cfp.experiment.cli import program_name, run_command, with_examples
 from cfp.experiment.folder import policy_files, read_config
 from cfp.experiment.training import Program
@@ -25,6 +27,8 @@ from cfp.sections import Particles
 from cfp.train import PROGRAM
 from cfp.validation import check_at_least
 from cfp.weights import policy_file
+from dittogym.trajectories import Episode, save_episodes
+from dittogym.trajectories.episode import record_batch
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,7 @@ class Selection:
     folder: tyro.conf.Positional[Path | None] = None
     """A folder that a training wrote or is writing."""
     policy: str | None = None
-    """In place of a folder: a policy file, or the name of a policy that comes with the package."""
+    """In place of a folder: a policy file, the name of a policy that comes with the package, or hf://OWNER/NAME."""
     episodes: int = 5
     """Episodes of each row."""
     seed: int | None = None
@@ -89,6 +93,10 @@ class Command(Selection):
     """Also film one episode of the newest policy: a file .mp4, .gif or .webp, or .png for a row of pictures."""
     replay: Path | None = None
     """Also write one episode of it as a page (.html) that plays in any browser."""
+    record: Path | None = None
+    """Also write its episodes to a file .npz: observations, actions, rewards, ends and particles."""
+    record_fields: tuple[Literal["x", "v", "C", "F", "Jp"], ...] = ("x", "v")
+    """Fields of the particles in that file: x, v, C, F and Jp are the whole state."""
     film: tyro.conf.OmitArgPrefixes[FilmOptions] = field(default_factory=FilmOptions)
 
 
@@ -118,7 +126,8 @@ def open_run(
 
 def open_policy(program: Program, path: str, device: str, seed: int | None) -> tuple[RunConfig, dict[str, Policy]]:
     """A single policy and options to evaluate it with, as the run that trained it does; see `open_run`."""
-    policy = program.load(Path(path), choose_device(device))
+    file = policy_file(path)
+    policy = program.load(file, choose_device(device))
     about = policy.description
     base = program.configure({"algo": about["kind"], "task": about["task"]})
     network = about["network"] if isinstance(about.get("network"), dict) else {}
@@ -127,19 +136,34 @@ def open_policy(program: Program, path: str, device: str, seed: int | None) -> t
     config = update_from_dict(base, {"environment": about["environment"], **stages}).with_derived(base, stages)
     config = replace(config, device=device, seed=about["seed"] if seed is None else seed)
     config.check()
-    return config, {policy_file(path).stem: policy}
+    return config, {file.stem: policy}
 
 
 def run(program: Program, command: Command) -> str:
     """Evaluate, film if asked to, and return the table."""
     files, options = {"video": command.video, "replay": command.replay}, vars(command.film)
     check_files(files, options)
+    if command.record is not None and command.record.suffix != ".npz":
+        raise ConfigError(f"record must end in .npz, got {command.record}")
     config, policies = command.open(program)
     results = compare(config, policies, command.episodes, command.noise)
     if any(files.values()):
         recording = record_policy(config, list(policies.values())[-1])
         save_media(recording, files, sys.stderr if command.json else None, **options)
+    if command.record is not None:
+        episodes = _record(command, config, list(policies.values())[-1])
+        print(f"record: {save_episodes(command.record, episodes)}", file=sys.stderr if command.json else None)
     return json.dumps(to_rows(results), indent=2) if command.json else format_table(config, results)
+
+
+def _record(command: Command, config: RunConfig, policy: Policy) -> list[Episode]:
+    """The episodes of a policy that were evaluated, played again."""
+    quiet, first = without_noise(policy, command.noise), evaluation_seed(config)
+    recorder = partial(record_batch, fields=command.record_fields)
+    return [
+        record_episode(config, policy, policy.resolution, quiet, seed, recorder)
+        for seed in range(first, first + command.episodes)
+    ]
 
 
 def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:
@@ -151,6 +175,7 @@ def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> 
         "runs/run --episodes 10 --video run.mp4",
         "--policy run --particles full --json",
         "runs/run --noise both --replay run.html",
+        "runs/run --episodes 20 --record run.npz",
     )
     return run_command(lambda: print(run(program, tyro.cli(Command, prog=started, description=about, args=arguments))))
 

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import safetensors.torch
+from torch import Tensor
+
 LARGEST_JSON = 2**20  # bytes
+FORMAT = "cfp-policy"
+"""Entry of a policy file under which its description is."""
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], Any]) -> None:
@@ -86,3 +91,11 @@ def write_json(path: Path, value: Any) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text, atomically."""
     write_atomically(path, lambda file: file.write(text.encode()))
+
+
+def write_policy(path: Path, tensors: Mapping[str, Tensor], description: dict[str, Any]) -> None:
+    """Write a policy of any kind: weights with the description, `cfp.weights.describe_run`'s and more, and its JSON."""
+    plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    content = safetensors.torch.save(plain, {FORMAT: json.dumps(description)})
+    write_atomically(path, lambda file: file.write(content))
+    write_json(path.with_suffix(".json"), description)

@@ -6,7 +6,7 @@ import json
 import os
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
@@ -15,6 +15,7 @@ from cfp.evaluation.video import record_policy
 from cfp.experiment.folder import parse_folder, policy_path, read_config
 from cfp.experiment.process import Stopped, keep_memory
 from cfp.experiment.training import Program, from_python, train
+from cfp.hub import Shareable
 from cfp.policy_protocols import Policy
 from cfp.tables import read_table
 from cfp.train import PROGRAM
@@ -89,6 +90,16 @@ class Run:
         if path is not None:
             recording.save(path, **options)
         return recording
+
+    def push(self, repo: str, *, private: bool = False) -> str:
+        """Upload the policy to the Hugging Face Hub, with a model card about the run; see `ActorPolicy.push`.
+
+        Args:
+            repo: ``"OWNER/NAME"``.
+            private: Create the repository as a private one.
+        """
+        finished = (self.folder / "results.json").exists()
+        return cast(Shareable, self.policy).push(repo, results=self.results if finished else (), private=private)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self.folder)!r})"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import os
 from collections.abc import Iterator, Mapping
@@ -22,14 +21,14 @@ from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.spec import RESOLUTIONS, ActorSpec
 from cfp.config import LARGEST_SEED, Config, RunConfig
 from cfp.errors import CheckpointError, ConfigError
-from cfp.files import parse_json, write_atomically, write_json
+from cfp.files import FORMAT, parse_json, write_policy
 from cfp.from_dict import type_name, update_from_dict
+from cfp.hub import download, is_address
 from cfp.sections import TASK_OPTIONS, EnvironmentConfig
 from dittogym import make_spec
 from dittogym.geometry import NODES
 from dittogym.tasks import fingerprint
 
-FORMAT = "cfp-policy"
 VERSION = 1
 KIND = "cfp"
 _DESCRIBED: dict[str, type | range] = {
@@ -79,14 +78,6 @@ def describe(config: Config, stage: int, steps: int) -> dict[str, Any]:
     return describe_run(config, KIND, stage, steps) | {"network": dataclasses.asdict(config.actor_spec(stage))}
 
 
-def write_policy(path: Path, tensors: Mapping[str, Tensor], description: dict[str, Any]) -> None:
-    """Write a policy of any kind: weights with the description, `describe_run`'s and more, and JSON for readers."""
-    plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    content = safetensors.torch.save(plain, {FORMAT: json.dumps(description)})
-    write_atomically(path, lambda file: file.write(content))
-    write_json(path.with_suffix(".json"), description)
-
-
 def shipped() -> list[str]:
     """Names of the policies that come with the package."""
     return sorted(file.stem for file in SHIPPED.glob("*.safetensors"))
@@ -96,6 +87,8 @@ def policy_file(path: str | Path) -> Path:
     """The ``.safetensors`` file of a policy; see `load` for what ``path`` may be."""
     if not isinstance(path, str | os.PathLike):
         raise CheckpointError(f"path must be a folder, a file or the name of a policy, got {path!r}")
+    if is_address(path):
+        return download(str(path))
     file = Path(path)
     if not file.exists() and str(path) in shipped():
         file = SHIPPED / str(path)
@@ -161,8 +154,9 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
     """Load a trained policy; nothing is unpickled.
 
     Args:
-        path: A run folder, a ``.safetensors`` file, the ``.json`` beside one, or the name of a policy that comes with
-            the package, such as ``"run"``.
+        path: A run folder, a ``.safetensors`` file, the ``.json`` beside one, the name of a policy that comes with
+            the package, such as ``"run"``, or ``"hf://OWNER/NAME"`` on the Hugging Face Hub, with ``@REVISION`` (a
+            branch, a tag or a commit) and ``?sha256=HASH`` if wanted.
         device: Device of its tensors.
 
     Returns:

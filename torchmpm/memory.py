@@ -43,6 +43,7 @@ def estimate_memory(
 
     Raises:
         ValueError: A number is below 1, the solver cannot run such a state, or would run it natively on CUDA.
+        TypeError: The solver or the state has another type.
 
     Examples:
         Checkpoints need less memory than the whole graph:
@@ -75,7 +76,10 @@ def segment_for(solver: Solver, state: Start, *, substeps: int, budget: int, env
 
     Raises:
         ValueError: The smallest need exceeds the budget, or a number is below 1.
+        TypeError: The solver or the state has another type.
     """
+    checks.whole("budget", budget, 1)
+    checks.whole("substeps", substeps, 1)
     need = _estimate(solver, state, substeps, env_steps)
     needs = []
     for segment in (None, *range(substeps - 1, 0, -1)):
@@ -88,12 +92,19 @@ def segment_for(solver: Solver, state: Start, *, substeps: int, budget: int, env
     )
 
 
-def _estimate(solver: Solver, start: Start, substeps: int, env_steps: int) -> Need:
+def _state(start: Start) -> ParticleState:
+    """The state where a step starts; for sizes alone one whose memory is never written to, so it takes none."""
     if isinstance(start, ParticleState):
-        state = start
-    else:  # nothing is written to the memory of this state, so it takes none
-        batch, count, dtype = start
-        state = ParticleState.from_stack(torch.empty(PLANES, batch, count, dtype=dtype))
+        return start
+    if not isinstance(start, tuple) or len(start) != 3 or start[2] not in (torch.float32, torch.float64):
+        raise TypeError(f"state must be a ParticleState, or (B, N, torch.float32 or torch.float64), got {start!r}")
+    batch, count = checks.whole("B of the state", start[0], 1), checks.whole("N of the state", start[1], 1)
+    return ParticleState.from_stack(torch.empty(PLANES, batch, count, dtype=start[2]))
+
+
+def _estimate(solver: Solver, start: Start, substeps: int, env_steps: int) -> Need:
+    checks.instance("solver", solver, Solver)
+    state = _state(start)
     if state.num_particles != solver.num_particles:
         raise ValueError(f"state has {state.num_particles} particles, the solver's bodies {solver.num_particles}")
     checks.whole("substeps", substeps, 1)

@@ -192,8 +192,8 @@ class Solver:
             The new state, differentiable in state, actuation, origin, material values, masses, volumes and gravity.
 
         Raises:
-            ValueError: Shapes, dtypes or devices do not fit together, or the native backend was chosen and cannot run
-                this.
+            ValueError: Shapes, dtypes or devices do not fit together, the origin is not finite or too far away for its
+                dtype, or the native backend was chosen and cannot run this.
             TypeError: The state, the actuation or the origin has another type.
             RuntimeError: In the backward pass: one of these tensors was changed in place before it is read again.
         """
@@ -294,6 +294,9 @@ class Solver:
                     f"{name} must be {state.dtype} on {state.device} of shape {shape}, "
                     f"got {value.dtype} on {value.device} of shape {tuple(value.shape)}"
                 )
+        if origin is not None and origin.device.type == "cpu" and not torch.compiler.is_compiling():  # no wait on CUDA
+            furthest = self.grid.h / torch.finfo(origin.dtype).eps  # beyond, nodes have no positions of their own
+            checks.entries("origin", origin, above=-furthest, below=furthest)
         gravity = self.gravity
         if isinstance(gravity, Tensor) and tuple(gravity.shape) not in ((2,), (1, 2), (batch, 2)):
             raise ValueError(f"gravity must have shape (2,) or ({batch}, 2), got {tuple(gravity.shape)}")

@@ -9,10 +9,12 @@ import numpy as np
 from torch import Tensor
 
 from cfp.experiment.algorithm import Algorithm
-from cfp.weights import read_policy, report_mismatch, write_policy
+from cfp.files import write_policy
+from cfp.hub import Shareable
+from cfp.weights import read_policy, report_mismatch
 
 
-class OpenLoop:
+class OpenLoop(Shareable):
     """Plays a sequence of actions from the beginning of an episode; afterwards muscles are slack.
 
     Args:

@@ -11,13 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from cfp.hub import Shareable
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
 
 Network = TypeVar("Network", bound=nn.Module)
 
 
-class StateBasedPolicy(ABC):
+class StateBasedPolicy(Shareable, ABC):
     """A policy that acts on the state of the environment given to `attached`; the image is not looked at."""
 
     uses_image = False

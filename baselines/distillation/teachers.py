@@ -20,10 +20,11 @@ from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.folder import copy_policy, policy_path
 from cfp.experiment.process import StopSignals
 from cfp.experiment.run import TrainingRun
-from cfp.files import read_json, write_json
+from cfp.files import read_json, write_json, write_policy
+from cfp.hub import is_address
 from cfp.policy_protocols import Policy, SeesState
 from cfp.sections import TASK_OPTIONS, EnvironmentConfig
-from cfp.weights import check_trained_for, read_policy, shipped, write_policy
+from cfp.weights import check_trained_for, read_policy, shipped
 from dittogym import TorchEnv, make_spec
 from dittogym.action import ActionIndexing, bicubic_matrix, from_grid_indexing, to_grid_indexing
 
@@ -120,7 +121,7 @@ def copy_teacher(config: DistillConfig, folder: Path) -> None:
     try:
         read_teacher(teacher, config.task, config.environment)
     except CheckpointError as error:
-        if Path(teacher).exists():
+        if Path(teacher).exists() or is_address(teacher):
             raise
         names = ", ".join(("mpc", *TRAINED, *shipped()))
         raise ConfigError(f"teacher must be {names}, a run folder or a policy.safetensors, got {teacher!r}") from error

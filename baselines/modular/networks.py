@@ -19,7 +19,8 @@ from baselines.modular.kmeans import fit, update
 from baselines.modular.nodes import Nodes, unpack, visible_positions
 from cfp.agent.actor import Sample, SquashedActor, sample_squashed_gaussian
 from cfp.agent.networks import initialise, perceptron
-from cfp.weights import read_policy, report_mismatch, write_policy
+from cfp.files import write_policy
+from cfp.weights import read_policy, report_mismatch
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
 

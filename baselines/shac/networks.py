@@ -16,7 +16,8 @@ from cfp.agent.networks import LATENT, Encoder, initialise
 from cfp.agent.spec import ActorSpec
 from cfp.analytic.critic import mlp
 from cfp.analytic.features import StateFeatures
-from cfp.weights import read_policy, report_mismatch, write_policy
+from cfp.files import write_policy
+from cfp.weights import read_policy, report_mismatch
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -12,6 +13,8 @@ from torch import Tensor, nn
 from cfp.agent.actor import build_actor
 from cfp.agent.networks import IMAGE_SIZE
 from cfp.agent.spec import ActorSpec
+from cfp.files import write_policy
+from cfp.hub import Shareable
 
 IMAGE_SHAPE = (3, IMAGE_SIZE, IMAGE_SIZE)
 
@@ -32,7 +35,7 @@ def check_images(observation: object) -> None:
     raise ValueError(f"observation must be a uint8 array of shape (3, 64, 64) or (B, 3, 64, 64), got {found}")
 
 
-class ActorPolicy(nn.Module):
+class ActorPolicy(nn.Module, Shareable):
     """An actor with stable-baselines3's ``predict``; `cfp.load` returns one.
 
     Args:
@@ -60,6 +63,10 @@ class ActorPolicy(nn.Module):
         """Actions (B, 2, R, R) for a uint8 ``observation`` (B, 3, 64, 64), without noise if ``deterministic``."""
         action: Tensor = self.actor(observation, deterministic)
         return action
+
+    def save(self, path: Path) -> None:
+        """Write ``path`` (``.safetensors``) and the ``.json`` beside it."""
+        write_policy(path, self.actor.state_dict(), self.description)
 
     @torch.no_grad()
     def predict(

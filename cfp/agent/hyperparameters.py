@@ -56,6 +56,8 @@ class LearningConfig:
         check_at_least(
             1, buffer_size=self.buffer_size, gradient_steps=self.gradient_steps, update_start=self.update_start
         )
+        if self.buffer_size < self.batch_size:
+            raise ConfigError(f"buffer_size must be at least batch_size, {self.batch_size}, got {self.buffer_size}")
         check_at_least(1, n_steps=self.n_steps, actor_every=self.actor_every)
         check_fraction(gamma=self.gamma, tau=self.tau, reward_momentum=self.reward_momentum, final_rate=self.final_rate)
         check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)

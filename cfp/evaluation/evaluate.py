@@ -100,7 +100,7 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, no
         for kind in ("zero", "random")
     ]
     for name, trained in policies.items():
-        deterministic = trained.deterministic_by_default if noise == "default" else noise == "without"
+        deterministic = without_noise(trained, noise)
         size = trained.resolution
         for quiet in (False, True) if noise == "both" else (deterministic,):
             label = f"{name}, {'mean' if quiet else 'noisy'}" if noise == "both" else name
@@ -110,6 +110,11 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, no
             own = trained.description["layout"]
             trials.append(make_trial(config, "  own layout", trained, size, 1, deterministic=deterministic, seed=own))
     return evaluate(trials, horizon(config))
+
+
+def without_noise(policy: Policy, noise: Noise) -> bool:
+    """Whether a policy acts without noise."""
+    return policy.deterministic_by_default if noise == "default" else noise == "without"
 
 
 def horizon(config: RunConfig) -> int:

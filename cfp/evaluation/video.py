@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
 
 import numpy as np
 import torch
@@ -16,17 +16,27 @@ from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
 from cfp.evaluation.episodes import SeededPolicy, attached
 from cfp.policy_protocols import Policy
+from dittogym import TorchEnv
 from dittogym.render.film import VideoUnavailable
-from dittogym.render.recording import Recording, check_film, record
+from dittogym.render.recording import Act, Recording, check_film, record
+
+Recorded = TypeVar("Recorded")
 
 
 def record_policy(config: RunConfig, policy: Policy) -> Recording:
     """One episode of a policy as it is evaluated; of one made for a single layout, that layout."""
     seed = policy.description.get("layout", config.seed + EVALUATION_SEED)
-    return record_episode(config, policy, policy.resolution, policy.deterministic_by_default, seed)
+    return record_episode(config, policy, policy.resolution, policy.deterministic_by_default, seed, record)
 
 
-def record_episode(config: RunConfig, policy: PolicyPredictor, size: int, deterministic: bool, seed: int) -> Recording:
+def record_episode(
+    config: RunConfig,
+    policy: PolicyPredictor,
+    size: int,
+    deterministic: bool,
+    seed: int,
+    recorder: Callable[[TorchEnv, Act, int], Recorded],
+) -> Recorded:
     """One episode of a policy with actions (2, size, size); torch's generator is left as it was."""
     venv = make_env(config, size, 1).venv
     assert isinstance(venv, TorchVecEnv)
@@ -39,7 +49,7 @@ def record_episode(config: RunConfig, policy: PolicyPredictor, size: int, determ
         return action
 
     with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
-        return record(venv.torch_env, act, seed)
+        return recorder(venv.torch_env, act, seed)
 
 
 def check_files(paths: Mapping[str, Path | None], options: Mapping[str, Any]) -> None:

@@ -20,6 +20,7 @@ from cfp.experiment.loggers import Tracker
 from cfp.experiment.process import Stopped, StopSignals
 from cfp.tables import Table
 from cfp.weights import describe_run
+from dittogym.render.recording import record
 
 LOG_METRICS: dict[str, str] = {
     "stage": "stage in training, 1 is the first",
@@ -215,7 +216,8 @@ class FilmCallback(StageCallback):
         stage, config = self.stage, self.stage.config
         path = stage.folder / "videos" / f"step{stage.step:09d}.mp4"
         size, (seed, _) = config.action_size(stage.number), config.evaluation(stage.number)
-        record_episode(config, stage.algorithm, size, config.report.eval_deterministic, seed).save(path)
+        deterministic = config.report.eval_deterministic
+        record_episode(config, stage.algorithm, size, deterministic, seed, record).save(path)
         self.tracker.film(stage.step, path)
 
 

@@ -13,7 +13,8 @@ from cfp.config import StagedConfig
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm, Position
 from cfp.experiment.folder import policy_path
-from cfp.weights import KIND, load, policy_for, read_policy, report_mismatch, save_policy, write_policy
+from cfp.files import write_policy
+from cfp.weights import KIND, load, policy_for, read_policy, report_mismatch, save_policy
 
 
 class CoarseToFineStages(Algorithm):

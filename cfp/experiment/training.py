@@ -179,7 +179,7 @@ def main(program: Program, arguments: Sequence[str] | None = None, started: str 
 def _train(program: Program, arguments: Sequence[str], started: str) -> None:
     command = parse(program, arguments, started)
     algo = "" if command.run.algo == "cfp" or "distill" in started else f" --algo {command.run.algo}"
-    train(program, command, f"resume with: {started}{algo} --resume --out {command.out}")
+    train(program, command, f"resume with: {started} --resume --out {command.out}{algo}")
 
 
 def train(program: Program, command: Command, hint: str) -> None:

@@ -158,7 +158,7 @@ class Recording:
 
     def _repr_html_(self) -> str:
         page = escape(self.page())
-        return f'<iframe srcdoc="{page}" width="600" height="760" style="border:0; max-width:100%"></iframe>'
+        return f'<iframe srcdoc="{page}" width="600" height="800" style="border:0; max-width:100%"></iframe>'
 
 
 def check_film(

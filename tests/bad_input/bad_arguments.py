@@ -13,7 +13,18 @@ from dittogym import Outcome, TorchEnv, make_spec
 from dittogym.bodies.shapes import Disc, Figure
 from dittogym.geometry import solid
 from dittogym.spec import BodySpec as RobotBody
-from torchmpm import Body, Elastic, Grid, ParticleState, Solver, VelocityRule, lame, sampling
+from torchmpm import (
+    Body,
+    Elastic,
+    Grid,
+    ParticleState,
+    Solver,
+    VelocityRule,
+    estimate_memory,
+    lame,
+    sampling,
+    segment_for,
+)
 
 ID = "dittogym/run-coarse-v0"
 
@@ -69,6 +80,55 @@ def table(rows, error=ValueError):
         for name, call, words in rows
     ]
 
+
+MEMORY = table(
+    [
+        (
+            "memory of two numbers",
+            lambda: estimate_memory(solver(), (1, 5), substeps=1),
+            "state must be a ParticleState",
+        ),
+        (
+            "memory of a dtype by name",
+            lambda: estimate_memory(solver(), (1, 5, "float32"), substeps=1),
+            "(B, N, torch.float32 or torch.float64), got (1, 5, 'float32')",
+        ),
+        (
+            "memory of no solver",
+            lambda: estimate_memory(None, state(), substeps=1),
+            "solver must be a Solver, got None",
+        ),
+    ],
+    TypeError,
+) + table(
+    [
+        (
+            "memory of minus five particles",
+            lambda: estimate_memory(solver(), (1, -5, torch.float32), substeps=1),
+            "N of the state must be at least 1, got -5",
+        ),
+        (
+            "segment for a budget as text",
+            lambda: segment_for(solver(), state(), substeps=2, budget="1 GB"),
+            "budget must be a whole number, got '1 GB'",
+        ),
+        (
+            "segment for half substeps",
+            lambda: segment_for(solver(), state(), substeps=2.5, budget=10**9),
+            "substeps must be a whole number, got 2.5",
+        ),
+        (
+            "origin of NaN",
+            lambda: solver().step(state(), origin=torch.full((1, 2), math.nan)),
+            ("origin must be above -", "got nan"),
+        ),
+        (
+            "origin far away",
+            lambda: solver().step(state(), origin=torch.full((1, 2), 1e30)),
+            "origin must be",
+        ),
+    ]
+)
 
 SOLVER = table(
     [
@@ -186,4 +246,4 @@ ENVIRONMENT = table(
     TypeError,
 )
 
-CASES = [*SOLVER, *ENVIRONMENT]
+CASES = [*MEMORY, *SOLVER, *ENVIRONMENT]

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cfp import train
-from cfp.weights import SHIPPED, read_policy, write_policy
+from cfp.files import write_policy
+from cfp.weights import SHIPPED, read_policy
 
 TINY = (
     "--learner sac --task shapematch --particles 100 --substeps 1 --num-envs 2 --resolutions 4 --steps 20 "

@@ -75,6 +75,7 @@ TRAIN = [
     training("a policy of another task", "--start-from run", "start_from must be a policy for shapematch, got one"),
     training("an algorithm of baselines", "--algo shac", "algo must be 'cfp', got 'shac'; python -m baselines.train"),
     training("robots on judging layouts", "--num-envs 10001", "num_envs must be at most 10000, got 10001"),
+    training("a buffer smaller than a batch", "--buffer-size 1", "buffer_size must be at least batch_size, 4, got 1"),
     Case(
         "train with a memory of years",
         command(cfp.train.main, TINY + NEW + "--buffer-size 99999999999999", 1),

@@ -11,7 +11,8 @@ from tiny_runs import assert_same_run, at_step, run
 
 import cfp
 from cfp import evaluate
-from cfp.weights import read_policy, write_policy
+from cfp.files import write_policy
+from cfp.weights import read_policy
 
 
 @contextmanager

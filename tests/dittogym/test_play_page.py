@@ -173,7 +173,7 @@ def test_a_drawn_robot(played: Played) -> None:
     page.click("#use")
 
     def is_wide() -> bool:
-        width, height = np.ptp(session.env.state.x[0, :400].numpy(), axis=0)
+        width, height = np.ptp(session.shot.x[:400], axis=0)
         return bool(width > 1.8 * height)
 
     played.until(is_wide)

@@ -1,0 +1,123 @@
+"""Recorded episodes: they are what happened, and files give them back."""
+
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+import dittogym
+from dittogym import trajectories
+from dittogym.trajectories.storage import ARRAYS
+
+OPTIONS = {"particles": 100, "substeps": 1}
+ID = "dittogym/shapematch-coarse-v0"
+
+
+def noise(seed=0):
+    generator = np.random.default_rng(seed)
+    return lambda observation: generator.uniform(-1, 1, (*observation.shape[:-3], 2, 32, 32)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return gymnasium.make(ID, **OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def episodes(env):
+    return [trajectories.record(env, noise(seed), seed=seed, fields=("x", "v", "C", "F", "Jp")) for seed in (0, 7)]
+
+
+def assert_same(one, other):
+    assert (one.seed, one.task) == (other.seed, other.task) and one.particles.keys() == other.particles.keys()
+    mine, theirs = (
+        [getattr(each, name) for name in ARRAYS] + [each.particles[name] for name in one.particles]
+        for each in (one, other)
+    )
+    for array, expected in zip(mine, theirs, strict=True):
+        assert array.dtype == expected.dtype and np.array_equal(array, expected)
+
+
+def test_episode_is_what_the_environment_did(env, episodes):
+    episode = episodes[1]
+    assert (episode.task, episode.seed, len(episode.rewards)) == ("shapematch", 7, 30)
+    observation, _ = env.reset(seed=7)
+    for t, action in enumerate(episode.actions):
+        assert np.array_equal(observation, episode.observations[t])
+        for name, values in episode.particles.items():
+            assert np.array_equal(getattr(env.unwrapped.state, name)[0].numpy(), values[t]), name
+        observation, reward, terminated, truncated, _ = env.step(action)
+        assert reward == episode.rewards[t] and terminated == episode.terminations[t]
+    assert truncated and episode.truncations.tolist() == [False] * 29 + [True]
+    assert np.array_equal(observation, episode.observations[30]) and episode.particles["x"].shape == (31, 100, 2)
+
+
+def test_batch_of_one_records_the_same(episodes):
+    batch = dittogym.TorchEnv("shapematch", **OPTIONS)
+    again = trajectories.record(batch, noise(7), seed=7)
+    assert list(again.particles) == ["x", "v"] and np.array_equal(again.particles["x"], episodes[1].particles["x"])
+    assert np.array_equal(again.actions, episodes[1].actions) and np.array_equal(again.rewards, episodes[1].rewards)
+
+
+def test_archive_gives_the_same_back(episodes, tmp_path):
+    path = trajectories.save_episodes(tmp_path / "new" / "episodes.npz", episodes)
+    for episode, again in zip(episodes, trajectories.load_episodes(path), strict=True):
+        assert_same(again, episode)
+
+
+def test_minari_gives_the_same_back(env, episodes, tmp_path, monkeypatch):
+    pytest.importorskip("h5py")
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    about = {"algorithm_name": "noise", "author": "a", "author_email": "b", "code_permalink": "c", "eval_env": env.spec}
+    dataset = trajectories.save_minari("dittogym/shapematch/noise-v0", episodes, env, **about)
+    assert dataset.total_steps == 60 and (tmp_path / "dittogym/shapematch/noise-v0/data/main_data.hdf5").exists()
+    for episode, again in zip(episodes, trajectories.load_minari("dittogym/shapematch/noise-v0"), strict=True):
+        assert_same(again, episode)
+    read = minari.load_dataset("dittogym/shapematch/noise-v0")  # as its own users read it
+    assert np.array_equal(next(read.iterate_episodes()).actions, episodes[0].actions)
+    assert read.recover_environment().spec.kwargs["particles"] == 100
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"), [(b"", "No data"), (b"PK\x03\x04 no", "zip"), (b"\x80\x04K\x05.", "pickle"), (None, "about")]
+)
+def test_other_files_are_refused(content, reason, tmp_path):
+    path = tmp_path / "other.npz"
+    np.savez(path, x=np.ones(3)) if content is None else path.write_bytes(content)
+    with pytest.raises(
+        ValueError, match=rf"(?s)must be a dittogym-episodes file of version 1, got '{path}' .*{reason}"
+    ):
+        trajectories.load_episodes(path)
+
+
+def test_archive_of_another_version_or_with_pickles_is_refused(episodes, tmp_path):
+    path = trajectories.save_episodes(tmp_path / "a.npz", episodes[:1])
+    arrays = dict(np.load(path))
+    np.savez(path, **arrays | {"about": np.array(str(arrays["about"]).replace('"version": 1', '"version": 2'))})
+    with pytest.raises(ValueError, match="its format is dittogym-episodes 2"):
+        trajectories.load_episodes(path)
+    np.savez(path, **arrays | {"0/actions": np.array([{}], object)})
+    with pytest.raises(ValueError, match="allow_pickle"):
+        trajectories.load_episodes(path)
+
+
+def test_wrong_arguments_are_named(env, episodes, tmp_path, monkeypatch):
+    record = trajectories.record
+    with pytest.raises(ValueError, match="env must have 1 simulation, got 2"):
+        record(dittogym.TorchEnv("shapematch", 2, **OPTIONS), torch.zeros)
+    with pytest.raises(ValueError, match="fields must be among x, v, C, F, Jp, got y"):
+        record(env, noise(), fields=("x", "y"))
+    with pytest.raises(TypeError, match="env must be"):
+        record(None, noise())
+    with pytest.raises(TypeError, match="policy must be"):
+        record(env, 5)
+    with pytest.raises(ValueError, match=r"path must end in \.npz"):
+        trajectories.save_episodes(tmp_path / "a.h5", episodes)
+    with pytest.raises(ValueError, match="at least 1 episode, got 0"):
+        trajectories.save_episodes(tmp_path / "a.npz", [])
+    monkeypatch.setitem(sys.modules, "minari", None)
+    with pytest.raises(ImportError, match=r"pip install 'torchmpm\[minari\]'"):
+        trajectories.load_minari("a/b-v0")
