@@ -60,6 +60,8 @@ def _convert(value: Any, kind: Any, where: str) -> Any:
         with suppress(OverflowError):  # an integer beyond the largest float
             return float(value)
     elif isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
+        if kind is int and abs(value) >= 2**63:
+            raise ConfigError(f"{where} must be between -2**63 and 2**63, got a number of {len(str(value))} digits")
         return value
     raise ConfigError(f"{where} must be {type_name(kind)}, got {value!r}")
 

@@ -241,6 +241,7 @@ CONFIGS = [
     file_of_options("with steps as text", '{"steps": "x"}', "steps must be an integer, got 'x'"),
     file_of_options("with a rate of NaN", '{"learning_rate": NaN}', "learning_rate must be finite,"),
     file_of_options("with a rate of 400 digits", f'{{"tau": 1{"0" * 400}}}', "tau must be a number"),
+    file_of_options("with steps of 401 digits", f'{{"steps": 1{"0" * 400}}}', "steps must be between", "of 401 digits"),
     file_of_options("with floats of 16 bits", '{"environment": {"dtype": "float16"}}', "dtype must be 'float32' or"),
     file_of_options("with half particles", '{"environment": {"particles": [1.5, 2]}}', "a list of 2, each an integer"),
     Case(
