@@ -83,8 +83,8 @@ def test_policy_that_does_not_fit_is_refused(coarse, tmp_path, capsys, options, 
 def test_ladder_of_three_levels_in_one_command(tmp_path):
     folder = tmp_path / "ladder"
     options = "--learner sac --task shapematch --particles 100 --substeps 1 --num-envs 2 --device cpu --no-video "
-    options += "--batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 --eval-every 10 --eval-episodes 2 "
-    options += "--resolutions 4 8 16 --steps 90 --log-every 10 --checkpoint-every 20"
+    options += "--batch-size 4 --buffer-size 60 --update-start 8 --actor-start 0 --gradient-steps 1 --eval-every 10 "
+    options += "--eval-episodes 2 --resolutions 4 8 16 --steps 90 --log-every 10 --checkpoint-every 20"
     assert train.main([*options.split(), "--out", str(folder)]) == 0
     rows = read_table(folder / "evaluations.csv")
     assert [(row["stage"], row["step"]) for row in rows if row["step"] in ("30", "60")] == [
@@ -114,7 +114,9 @@ def test_ladder_of_three_levels_in_one_command(tmp_path):
 
 @pytest.mark.parametrize("warm", [False, True])
 def test_critics_of_a_level_begin_with_those_before_if_asked_to(tmp_path, monkeypatch, warm):
-    options = "--learner sac --particles 100 --substeps 1 --num-envs 2 --resolutions 4 8 --device cpu".split()
+    options = (
+        "--learner sac --encoder full --particles 100 --substeps 1 --num-envs 2 --resolutions 4 8 --device cpu".split()
+    )
     config = parse(PROGRAM, [*options, "--warm-critic" if warm else "--no-warm-critic"]).run
     config = replace(config, report=replace(config.report, eval_every=0))
     seen = []

@@ -83,7 +83,7 @@ def test_other_options_than_the_checkpoint_s_are_refused(finished, tmp_path, cap
     assert "task: the run was started with 'shapematch', got 'run'" in capsys.readouterr().err
     (tmp_path / "new.json").write_text('{"learning": {"gamma": 0.5}}')
     assert train.main(["--out", str(finished), "--resume", "--config", str(tmp_path / "new.json")]) == 2
-    assert "gamma: the run was started with 0.9, got 0.5" in capsys.readouterr().err
+    assert "gamma: the run was started with 0.95, got 0.5" in capsys.readouterr().err
 
 
 def test_finished_run_can_be_prolonged_and_its_results_do_not_outlive_it(tmp_path, capsys):

@@ -9,8 +9,9 @@ from cfp.experiment.callbacks import StopCallback
 
 TINY = (
     "--task shapematch --learner sac --particles 100 --substeps 1 --num-envs 2 --resolutions 4 8 --steps 150 "
-    "--handover 70 --random-steps 10 4 --batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 "
-    "--eval-every 60 --eval-episodes 2 --checkpoint-every 20 --log-every 10 --no-video --device cpu --backend eager"
+    "--handover 70 --random-steps 10 4 --batch-size 4 --buffer-size 60 --update-start 8 --actor-start 0 "
+    "--gradient-steps 1 --eval-every 60 --eval-episodes 2 --checkpoint-every 20 --log-every 10 --no-video "
+    "--device cpu --backend eager"
 ).split()
 TABLES = ("progress.csv", "evaluations.csv", "results.json")
 
