@@ -183,7 +183,8 @@ class Solver:
             actuation: (B, 2, G, G) muscle actuation in Pa on the nodes of the window, ``[:, 0]`` along material x,
                 indices (i, j) rightwards and upwards; acts on bodies with ``muscle=True``. ``None`` for none.
             substeps: Number of substeps.
-            origin: (B, 2) lower left corner of the window in the world, m; ``None`` for (0, 0).
+            origin: (B, 2) lower left corner of the window in the world, m; ``None`` for (0, 0). An element whose origin
+                is not finite does not move the others.
             segment: Substeps between checkpoints when gradients are enabled, see :func:`torchmpm.repeated` and
                 :func:`torchmpm.segment_for`. The native backend keeps the start of a segment and replays its substeps
                 onto a tape; ``"auto"`` and ``None`` make its segments as long as the memory that it keeps for tapes.
@@ -192,8 +193,8 @@ class Solver:
             The new state, differentiable in state, actuation, origin, material values, masses, volumes and gravity.
 
         Raises:
-            ValueError: Shapes, dtypes or devices do not fit together, the origin is not finite or too far away for its
-                dtype, or the native backend was chosen and cannot run this.
+            ValueError: Shapes, dtypes or devices do not fit together, or the native backend was chosen and cannot run
+                this.
             TypeError: The state, the actuation or the origin has another type.
             RuntimeError: In the backward pass: one of these tensors was changed in place before it is read again.
         """
@@ -294,9 +295,6 @@ class Solver:
                     f"{name} must be {state.dtype} on {state.device} of shape {shape}, "
                     f"got {value.dtype} on {value.device} of shape {tuple(value.shape)}"
                 )
-        if origin is not None and origin.device.type == "cpu" and not torch.compiler.is_compiling():  # no wait on CUDA
-            furthest = self.grid.h / torch.finfo(origin.dtype).eps  # beyond, nodes have no positions of their own
-            checks.entries("origin", origin, above=-furthest, below=furthest)
         gravity = self.gravity
         if isinstance(gravity, Tensor) and tuple(gravity.shape) not in ((2,), (1, 2), (batch, 2)):
             raise ValueError(f"gravity must have shape (2,) or ({batch}, 2), got {tuple(gravity.shape)}")

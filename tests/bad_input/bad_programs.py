@@ -48,7 +48,7 @@ TRAIN = [
     training(
         "an unknown preset",
         "--preset slow",
-        "preset must be one of quick, lean, long, paper for shapematch, got 'slow'",
+        "preset must be one of quick, long, paper for shapematch, got 'slow'",
     ),
     training("an unknown option", "--colour red", "Unrecognized options: --colour"),
     training("a seed by name", "--seed x", "Error parsing --seed: invalid literal for int()", "'x'"),
@@ -66,7 +66,7 @@ TRAIN = [
     training("a negative temperature", "--alpha -1", "alpha must be at least 0, got -1.0"),
     training("a temperature that is no number", "--alpha nan", "alpha must be finite, got (nan,)"),
     training("a gate without scale", "--gate-scale 0", "gate_scale must be positive, got 0.0"),
-    training("warm critics of nothing", "--warm-critic", "warm_critic requires "),
+    training("warm critics of nothing", "--warm-critic --encoder full", "warm_critic requires "),
     training("an anchor to nothing", "--anchor 3", "anchor requires refine"),
     training("an unknown backend", "--backend warp", "backend must be one of ('auto', 'eager'", "got 'warp'"),
     training("a target that is not there", "--target none.png", "target must be 'star'", "no such file: 'none.png'"),

@@ -53,7 +53,8 @@ def test_options_without_effect_are_refused_where_they_are_for_one_algorithm(tmp
         assert compare(tmp_path / "out", "--algos", label, "--tasks", "run", plan={"algos": algos}) == 2
         error = capsys.readouterr().err
         assert f"{label} on run: warm_critic requires " in error
-    plan = {"common": idle, "algos": {"gnn-16": {"learning": {"warm_critic": False}}}}
+    full = {"network": {"encoder": "full"}}
+    plan = {"common": idle, "algos": {"cfp": full, "coarse": full, "gnn-16": {"learning": {"warm_critic": False}}}}
     assert compare(tmp_path / "out", "--dry-run", "--algos", "cfp", "coarse", "gnn-16", plan=plan) == 0
 
 

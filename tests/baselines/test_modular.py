@@ -100,6 +100,7 @@ def model_of(algo, folder):
 @pytest.mark.parametrize("algo", ["gnn-16", "transformer-16"])
 def test_updates_reduce_the_critic_loss_of_a_fixed_batch(algo, tmp_path):
     model = model_of(algo, tmp_path / "run")
+    model.hyperparameters = replace(model.hyperparameters, actor_start=0)
     env, generator = model.get_env(), torch.Generator().manual_seed(0)
     now = torch.as_tensor(env.reset()).repeat(8, 1, 1)
     now[..., :FEATURES] += torch.randn(now[..., :FEATURES].shape, generator=generator)

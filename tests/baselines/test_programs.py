@@ -203,7 +203,9 @@ def test_algorithm_is_asked_for_its_scalars_when_a_row_is_written(tmp_path, monk
 
 
 def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, monkeypatch, stop_at):
-    config = baselines.registry.configure({"algo": "coarse", "resolutions": [8], "environment": {"substeps": 1}})
+    config = baselines.registry.configure(
+        {"algo": "coarse", "resolutions": [8], "environment": {"substeps": 1}, "network": {"encoder": "full"}}
+    )
     start = tmp_path / "start.safetensors"
     save_policy(start, build_actor(config.actor_spec(1)), describe(config, 1, 5))
     words = ["--sees", "image", "--start-from", str(start), "--steps", "24", "--eval-every", "24"]

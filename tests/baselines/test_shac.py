@@ -281,7 +281,7 @@ def test_policy_goes_through_its_file(sees, tmp_path):
 def test_actor_on_the_image_begins_with_a_policy_of_any_algorithm(tmp_path):
     config = make(sees="image")
     actor, path = build_actor(ActorSpec((config.resolution(1),))), tmp_path / "policy.safetensors"
-    trained = configure({"algo": "coarse", "task": "run"})
+    trained = configure({"algo": "coarse", "task": "run", "network": {"encoder": "full"}})
     origins = replace(trained, environment=config.environment, resolutions=(config.resolution(1),))
     save_policy(path, actor, describe(origins, 1, 5))
     warm = replace(config, start_from=str(path))

@@ -32,5 +32,5 @@ def test_stages_that_learn_nothing_are_named(tmp_path):
     assert warnings(first_stage=2) == warnings()[1:]
     learns = "--random-steps 9 0 --update-start 50 --actor-start 0".split()
     assert warnings(*learns) == []
-    late = "stage 2: no actor update in its 200 steps (--actor-start 201)"
-    assert warnings(*learns, "--actor-start", "201") == [late]
+    late = "stage 2: no actor update in its 180 steps (--actor-start 200)"
+    assert warnings(*learns, "--handover", "220", "--actor-start", "200") == [late]

@@ -24,6 +24,7 @@ OPTIONS = {
     "batch_size": 4,
     "buffer_size": 60,
     "update_start": 8,
+    "actor_start": 0,
     "gradient_steps": 1,
     "eval_every": 60,
     "eval_episodes": 2,
