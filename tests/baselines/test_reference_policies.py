@@ -64,8 +64,8 @@ def test_scripted_drives_the_whole_episode_in_the_layout_of_the_environment():
 
 
 LEARNING = (
-    "--num-envs 2 --random-steps 10 --batch-size 4 --buffer-size 80 --update-start 8 --gradient-steps 1 --actor-start 0 "
-    "--final-rate 1 --eval-every 10 --log-every 10 --checkpoint-every 80"
+    "--num-envs 2 --random-steps 10 --batch-size 4 --buffer-size 80 --update-start 8 --gradient-steps 1 "
+    "--actor-start 0 --final-rate 1 --eval-every 10 --log-every 10 --checkpoint-every 80"
 ).split()
 
 
