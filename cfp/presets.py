@@ -253,8 +253,16 @@ def from_json(values: dict[str, Any]) -> CoarseToFineConfig:
 
 
 def like_start(base: Options, values: dict[str, Any]) -> Options:
-    """A default configuration with the kind of networks of the policy that the JSON ``values`` start from, if any."""
+    """A default configuration for the networks of the policy that the JSON ``values`` start from, if any.
+
+    With the paper's networks an update takes several times as long, so there are fewer; and strong exploration noise
+    would disturb a policy that can do something already.
+    """
     if not isinstance(base, CoarseToFineConfig) or values.get("start_from") is None or "network" in values:
         return base
     spec = load(values["start_from"]).spec
-    return replace(base, network=replace(base.network, encoder=spec.encoder))
+    base = replace(base, network=replace(base.network, encoder=spec.encoder))
+    if not isinstance(base, Config) or spec.encoder == "lean":
+        return base
+    updates = min(4, base.learning.gradient_steps)
+    return replace(base, learning=replace(base.learning, gradient_steps=updates, noise_cells=0))

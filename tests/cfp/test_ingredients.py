@@ -19,7 +19,7 @@ from cfp.agent.networks import normalise_image
 from cfp.agent.replay import ReplayRing
 from cfp.agent.spec import ActorSpec
 from cfp.errors import ConfigError
-from cfp.presets import sac_preset
+from cfp.presets import from_json, sac_preset
 from cfp.weights import describe, load, save_policy
 
 LEAN = {"plain": ActorSpec((8,), encoder="lean"), "residual": ActorSpec((4, 8), (-1.0,), patch=16, encoder="lean")}
@@ -180,3 +180,11 @@ def test_options_out_of_range_are_refused():
         config = sac_preset("run", "quick")
         with pytest.raises(ConfigError, match=message):
             replace(config, learning=replace(config.learning, **changes)).check()
+
+
+def test_a_policy_with_the_papers_networks_goes_on_with_fewer_updates_and_without_noise_of_cells():
+    quick, started = sac_preset("run"), from_json({"task": "run", "learner": "sac", "start_from": "run"})
+    assert (quick.network.encoder, started.network.encoder) == ("lean", "full")
+    assert started.learning == replace(quick.learning, gradient_steps=4, noise_cells=0)
+    asked = {"task": "run", "learner": "sac", "start_from": "run", "learning": {"noise_cells": 2, "gradient_steps": 8}}
+    assert (from_json(asked).learning.noise_cells, from_json(asked).learning.gradient_steps) == (2, 8)
