@@ -255,8 +255,8 @@ def from_json(values: dict[str, Any]) -> CoarseToFineConfig:
 def like_start(base: Options, values: dict[str, Any]) -> Options:
     """A default configuration for the networks of the policy that the JSON ``values`` start from, if any.
 
-    With the paper's networks an update takes several times as long, so there are fewer; and strong exploration noise
-    would disturb a policy that can do something already.
+    Policies with the paper's networks have its action grids. An update takes several times as long, so there are fewer;
+    and strong exploration noise would disturb a policy that can do something already.
     """
     if not isinstance(base, CoarseToFineConfig) or values.get("start_from") is None or "network" in values:
         return base
@@ -265,4 +265,5 @@ def like_start(base: Options, values: dict[str, Any]) -> Options:
     if not isinstance(base, Config) or spec.encoder == "lean":
         return base
     updates = min(4, base.learning.gradient_steps)
-    return replace(base, learning=replace(base.learning, gradient_steps=updates, noise_cells=0))
+    learning = replace(base.learning, gradient_steps=updates, noise_cells=0)
+    return replace(base, learning=learning, resolutions=_numbers(base.task).resolutions)
