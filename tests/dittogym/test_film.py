@@ -191,6 +191,7 @@ def test_a_replay_plays_in_a_browser(recording: Recording, tmp_path) -> None:
     path = recording.save(tmp_path / "replay.html")
     probe = """<script>
     addEventListener("load", () => setTimeout(() => {
+      time = 0; setPlaying(true); tick(last - 5000);
       setPlaying(false); seek(0.1);
       const shot = () => document.getElementById("scene").toDataURL();
       const colours = ["muscle", "deformation", "speed"].map((name) => {
