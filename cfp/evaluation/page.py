@@ -6,7 +6,6 @@ import json
 import shlex
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
-from datetime import timedelta
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -24,15 +23,19 @@ from dittogym.render.recording import Recording
 
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #282c34; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
-img, video { max-width: 100%; } .film { width: 32rem; border-radius: 6px; }
-figure { display: inline-block; margin: 0 1rem 1rem 0; }
-figure img { width: min(12rem, 25vw); image-rendering: pixelated; }
+h1 { font-size: 1.7rem; } h2 { font-size: 1.3rem; margin-top: 2rem; } img, video { max-width: 100%; }
+.episode { display: flex; flex-wrap: wrap; align-items: flex-start; gap: 1rem 2rem; }
+.episode > div { flex: 1 1 20rem; }
+.film { flex: 0 1 auto; width: 32rem; border-radius: 6px; } .episode h2 { margin-top: 0; }
+figure { display: inline-block; margin: 0 1rem 1rem 0; vertical-align: top; width: min(7rem, 25vw); }
+figure img { width: 100%; image-rendering: pixelated; }
 .wide { overflow-x: auto; } table { border-collapse: collapse; }
-th, td { padding: 0.2rem 0.8rem; text-align: right; border-bottom: 1px solid #ccc; }
+th, td { padding: 0.2rem 0.8rem; text-align: right; white-space: nowrap; border-bottom: 1px solid #ccc; }
 th:first-child, td:first-child { text-align: left; }
-pre { background: #f4f4f4; padding: 1rem; overflow-x: auto; white-space: pre-wrap; }
+@media (max-width: 40rem) { th, td { padding: 0.2rem 0.25rem; font-size: 0.75rem; } }
+pre { background: #f4f4f4; padding: 1rem; overflow-x: auto; white-space: pre-wrap; } pre span { white-space: nowrap; }
 """
-HEADER = ("policy", "action", "episodes", "mean return", "95 % interval", "std", "success")
+HEADER = ("policy", "action", "episodes", "mean return", "± 95 %", "std", "success")
 #: When the picture that a film shows before it plays was taken, as a share of the episode.
 POSTER_TIME = 0.6
 
@@ -61,12 +64,11 @@ def write_page(
         '<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">',
         f"<title>{title}</title><style>{STYLE}</style></head><body>",
         f"<h1>{title}</h1>",
-        _film(folder, recording) if recording else "",
-        _match(config, recording) if recording else "",
+        _episode(folder, config, recording) if recording else "",
         f"<h2>Final evaluation</h2>{_table(HEADER, map(_cells, results))}",
         f'<h2>Learning curve</h2><img src="curve.png" alt="Return over environment steps"><p>{_training(folder)}</p>',
         _films(folder),
-        f"<h2>This run</h2><p>{_about(seconds)}</p><pre>{escape(command_line(config, preset))}</pre>",
+        f"<h2>This run</h2><p>{_about(seconds)}</p><pre>{_command(config, preset)}</pre>",
         _changes(config, preset),
         f"<details><summary>All options</summary><pre>{escape(json.dumps(to_json(config), indent=2))}</pre></details>",
         "</body></html>",
@@ -83,8 +85,8 @@ def changed_options(config: RunConfig, preset: RunConfig) -> dict[str, tuple[Any
     return {name: (value, usual.get(name)) for name, value in own.items() if value != usual.get(name)}
 
 
-def command_line(config: RunConfig, preset: RunConfig) -> str:
-    """The command that trains with these options."""
+def command_words(config: RunConfig, preset: RunConfig) -> list[str]:
+    """The words of the command that trains with these options."""
     decisive = {"algo": config.algo, "learner": getattr(config, "learner", None)}
     package = "cfp" if config.algo == "cfp" else "baselines"
     given = {name: value for name, value in decisive.items() if value and (name, value) != ("algo", "cfp")}
@@ -97,17 +99,23 @@ def command_line(config: RunConfig, preset: RunConfig) -> str:
             words.append(f"--{option}" if value else f"--no-{option}")
         else:
             words += [f"--{option}", *map(str, value if isinstance(value, tuple | list) else [value])]
-    return shlex.join(words)
+    return words
 
 
-def _film(folder: Path, recording: Recording) -> str:
-    """The film, or a picture where it could not be written, and the replay."""
+def _command(config: RunConfig, preset: RunConfig) -> str:
+    """The command, whose lines do not end within a word: browsers break them after hyphens."""
+    return " ".join(f"<span>{escape(shlex.quote(word))}</span>" for word in command_words(config, preset))
+
+
+def _episode(folder: Path, config: RunConfig, recording: Recording) -> str:
+    """The film, or a picture where it could not be written; beside it the match, and the replay."""
     poster = png(recording.picture(POSTER_TIME * recording.duration))
     write_atomically(folder / "poster.png", lambda file: file.write(poster))
     video = '<video class="film" src="video.mp4" poster="poster.png" controls loop muted></video>'
     shown = video if (folder / "video.mp4").exists() else '<img class="film" src="poster.png" alt="The robot">'
-    link = '<a href="replay.html">Replay of this episode</a>, to step through, with other speeds and colours'
-    return f"{shown}<p>{link}</p>"
+    link = '<a href="replay.html">Replay of this episode</a>, to step through, with other speeds and colours.'
+    about = f"<p>Return of this episode: {sum(recording.rewards):.1f}.</p><p>{link}</p>"
+    return f'<div class="episode">{shown}<div>{_match(config, recording)}{about}</div></div>'
 
 
 def _match(config: RunConfig, recording: Recording) -> str:
@@ -121,7 +129,8 @@ def _match(config: RunConfig, recording: Recording) -> str:
         f"<figcaption>{name}</figcaption></figure>"
         for name, picture in pictures.items()
     ]
-    return f"<h2>Match</h2><p>Intersection over union at the end of this episode: {iou:.2f}</p>{''.join(figures)}"
+    about = f"<p>Intersection over union at the end of this episode: {iou:.2f}. Red lies outside the target.</p>"
+    return f"<h2>Match</h2>{''.join(figures)}{about}"
 
 
 def _training(folder: Path) -> str:
@@ -143,16 +152,24 @@ def _films(folder: Path) -> str:
 
 
 def _about(seconds: float) -> str:
-    time = f"Trained in {timedelta(seconds=round(seconds))} (hours:minutes:seconds), " if seconds else ""
-    return f"{time}{'with' if time else 'With'} torchmpm {torchmpm.__version__}. The command that repeats it:"
+    minutes, rest = divmod(round(seconds), 60)
+    spans = {"h": minutes // 60, "min": minutes % 60, "s": rest}
+    time = " ".join(f"{number} {unit}" for unit, number in spans.items() if number)
+    with_version = f"with torchmpm {torchmpm.__version__}"
+    return f"Trained {f'in {time} ' if time else ''}{with_version}. The command that repeats it:"
 
 
 def _changes(config: RunConfig, preset: RunConfig) -> str:
     changes = changed_options(config, preset)
     if not changes:
         return "<p>All options are those of the preset.</p>"
-    rows = [(name, str(value), str(usual)) for name, (value, usual) in changes.items()]
+    rows = [(name, _value(value), _value(usual)) for name, (value, usual) in changes.items()]
     return f"<p>Options that differ from the preset:</p>{_table(('option', 'this run', 'preset'), rows)}"
+
+
+def _value(value: Any) -> str:
+    """A value as the command line takes it."""
+    return " ".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
 
 
 def _cells(result: Result) -> tuple[str, ...]:
@@ -161,7 +178,7 @@ def _cells(result: Result) -> tuple[str, ...]:
         f"{result.resolution} × {result.resolution}",
         str(len(result.returns)),
         f"{result.mean:.1f}",
-        "–" if result.interval is None else f"± {result.interval:.1f}",
+        "–" if result.interval is None else f"{result.interval:.1f}",
         f"{result.std:.1f}",
         "–" if result.success is None else f"{result.success:.0%}",
     )

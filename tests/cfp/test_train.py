@@ -277,7 +277,7 @@ def test_page_of_a_run_with_a_film_and_a_target(tmp_path, capsys):
     assert page.count("data:image/png") == 3 and "<td>environment.particles</td><td>100</td><td>lite</td>" in page
     assert "environment.dtype</td>" not in page and f"torchmpm {torchmpm.__version__}" in page
     assert (folder / "poster.png").stat().st_size > 1000 and (folder / "replay.html").stat().st_size > 10_000
-    command = html.unescape(re.search(r"<pre>(python .*)</pre>", page)[1])
+    command = html.unescape(re.sub("</?span>", "", re.search("<pre>(<span>python<.*)</pre>", page)[1]))
     again = parse(train.PROGRAM, shlex.split(command)[3:]).run
     assert to_json(again) == json.loads((folder / "config.json").read_text(), object_hook=with_tuples)
 
