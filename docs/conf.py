@@ -18,6 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(Path(__file__).parent))
 
 import architecture  # noqa: E402
+from drawings import write_drawings  # noqa: E402
 from media import write_replays  # noqa: E402
 from result_tables import write_results  # noqa: E402
 from task_pages import write_pages  # noqa: E402
@@ -42,6 +43,7 @@ exclude_patterns = [
     "generated/planning.md",
     "generated/returns*.md",
     "generated/summary.md",
+    "generated/targets.md",
     "sg_execution_times.rst",
     "tasks",
 ]
@@ -174,9 +176,10 @@ def drop_links_back(app: Sphinx, page: str, template: str, context: dict[str, ob
 
 
 def write_generated(app: Sphinx) -> None:
-    """Write the pages of the tasks, the tables of results, and replays."""
+    """Write the pages of the tasks, the tables of results and drawings, and replays."""
     write_pages()
     write_results()
+    write_drawings()
     write_replays(Path(app.outdir) / "replays")
 
 

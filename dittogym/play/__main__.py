@@ -38,7 +38,7 @@ class Command:
     target: str | None = None
     """Target shape of SHAPE MATCH: a name or the path of an image."""
     body: str | None = None
-    """Robot: the path of an image. Bright pixels belong to it."""
+    """Robot: the path of an image in which it is drawn, dark on white, bright on black, or on a transparent ground."""
     seed: int = 0
     """Seed of the particles."""
     port: int = 0

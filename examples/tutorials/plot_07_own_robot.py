@@ -58,7 +58,8 @@ planner = GradientPlanner(env, GradientPlannerConfig(horizon=16, commit=8, itera
 # Watch it
 # --------
 #
-# ``film`` resets the environment, plays an episode, and returns a recording, which a notebook shows as a replay.
+# ``film`` resets the environment, plays an episode, and returns a recording, which a notebook shows as a replay. In a
+# script, ``recording.save("stool.html")`` writes the replay to a file, and ``recording.save("stool.webp")`` a film.
 
 recording = env.film(lambda observation: planner.act())
 recording
