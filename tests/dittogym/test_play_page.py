@@ -186,6 +186,10 @@ def test_small_screens_and_the_end_of_the_program(browser: Any) -> None:
     played = Played(browser, width=390, task="shapematch")
     assert played.page.evaluate("document.documentElement.scrollWidth") <= 390
     assert played.page.locator("#what option").count() == 2 and played.page.input_value("#speed") == "0.1"
+    played.page.click("#draw")
+    assert played.page.evaluate("scrollY") > 0
+    played.page.click("#use")
+    assert played.page.evaluate("scrollY") == 0  # the robot is in sight again
     played.server.stop()
     played.until(lambda: played.page.is_visible("#lost"))
     played.close()

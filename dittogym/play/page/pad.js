@@ -2,8 +2,8 @@
 
 const $ = (id) => document.getElementById(id);
 const HINTS = {
-  body: "The drawing gets the area of the task's robot and stands where it stood.",
-  target: "The drawing gets the area of the robot, and its centre stays on the robot's.",
+  body: "The drawing is scaled to the area of the task's robot and takes its place.",
+  target: "The drawing is scaled to the area of the robot and centred on it.",
 };
 
 export class Pad {
@@ -14,7 +14,7 @@ export class Pad {
     $("what").onchange = () => this.wipe();
     $("wipe").onclick = () => this.wipe();
     $("cancel").onclick = () => $("pad").close();
-    $("use").onclick = () => { use(this.drawing()); $("pad").close(); };
+    $("use").onclick = () => { use(this.drawing()); $("pad").close(); scrollTo(0, 0); };
     $("paper").addEventListener("pointerdown", (event) => { $("paper").setPointerCapture(event.pointerId); this.stroke(event); });
     $("paper").addEventListener("pointermove", (event) => { if (event.buttons) this.stroke(event); });
     $("paper").addEventListener("pointerup", () => { this.last = null; });

@@ -42,7 +42,7 @@ export class Plot {
     const series = this.terms.map((_, k) => last.map((row) => row[k + 1]));
     this.curve(context, series, half + gap, half, COLOURS, `terms, last ${last.length || 200} steps`, faint, ratio);
     const now = rows.at(-1);
-    [...this.list.children].forEach((item, k) => { item.lastChild.textContent = now ? now[k + 1].toFixed(2) : ""; });
+    [...this.list.children].forEach((item, k) => { item.lastChild.textContent = now ? now[k + 1].toFixed(2).replace(/^-0.00$/, "0.00") : ""; });
   }
 
   curve(context, series, top, height, colours, title, faint, ratio) {
