@@ -165,7 +165,7 @@ def main() -> None:
     arguments = parser.parse_args()
     keep_memory()
     print(f"torch {torch.__version__}, {torch.get_num_threads()} threads")
-    config = sac_preset("shapematch", "lean")
+    config = sac_preset("shapematch", "quick")
     if "updates" not in arguments.skip:
         for task in ("run", "shapematch"):
             print(f"{task}, preset paper")

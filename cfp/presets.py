@@ -201,7 +201,7 @@ def _paper(task: str, numbers: TaskNumbers) -> Config:
 
 def _quick(task: str, numbers: TaskNumbers) -> Config:
     """Minutes instead of days: many small robots, small networks with many updates, coarser actions first."""
-    paper, steps = _paper(task, numbers), 25_600
+    paper, steps, horizon = _paper(task, numbers), 25_600, dittogym.make_spec(task).horizon
     coarse = numbers.resolutions[0]
     return replace(
         paper,
@@ -225,8 +225,11 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
             noise_cells=4,
             noise_scale=NOISE_SCALE.get(task, (0.2, 1.0)),
             final_rate=0.1,
+            n_steps=3,
+            weight_average=0.998,
+            max_episode_steps=max(30, horizon // 4),
         ),
-        report=ReportConfig(eval_every=steps // 16, checkpoint_every=steps // 16, log_every=320),
+        report=ReportConfig(eval_every=steps // 8, checkpoint_every=steps // 16, log_every=320),
     )
 
 

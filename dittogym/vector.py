@@ -34,8 +34,8 @@ class AutoresetStep(NamedTuple):
     reset_info: dict[str, Any] | None  # Of all elements after the reset; None if no episode ended
 
 
-def autoreset_step(env: Any, action: Tensor, max_episode_steps: float | None = None) -> AutoresetStep:
-    """Step all elements, and reset those whose episode has ended."""
+def autoreset_step(env: Any, action: Tensor, max_episode_steps: float | Tensor | None = None) -> AutoresetStep:
+    """Step all elements, and reset those whose episode has ended; ``max_episode_steps`` may differ, (B,)."""
     observation, reward, terminated, truncated, info = env.step(action)
     if max_episode_steps is not None:
         truncated = env.env_state.steps >= max_episode_steps

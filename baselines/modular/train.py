@@ -137,7 +137,7 @@ class Modular(SACAlgorithm):
             "kind": config.kind,
             "features": config.nodes.num_features(env.env.spec),
         }
-        monitor = VecMonitor(TorchVecEnv(env, env.spaces))
+        monitor = VecMonitor(TorchVecEnv(env, env.spaces, config.learning.max_episode_steps))
         model = cls.make_model(config, monitor, ModularPolicy, networks, cls.hyperparameters(config, stage, folder))
         return cls(config, stage, model)
 
@@ -146,7 +146,7 @@ class Modular(SACAlgorithm):
         return self._policy({}).attached(env)
 
     def _policy(self, description: dict[str, Any]) -> SegmentPolicy:
-        return SegmentPolicy(cast(ModularActor, self.model.networks()[0]), self.config.nodes, description)
+        return SegmentPolicy(cast(ModularActor, self.model.trained_actor), self.config.nodes, description)
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the actor."""

@@ -81,8 +81,8 @@ def multilayer_perceptrons(perceptrons: Sequence[nn.Sequential], values: Tensor)
         if isinstance(layers[0], nn.Linear):
             weight, bias = map(torch.stack, _parameters(layers))
             values = torch.baddbmm(bias[:, None], values, weight.transpose(1, 2))
-        elif isinstance(layers[0], nn.ELU):
-            values = layers[0](values)
+        elif not isinstance(layers[0], nn.Flatten):
+            values = layers[0](values)  # it has no weights
     return values
 
 

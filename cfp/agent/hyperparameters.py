@@ -43,10 +43,13 @@ class LearningConfig:
     """Standard deviation of that noise before tanh, of the first and of the last robot."""
     n_steps: int = 1
     """Steps whose rewards a critic's target sums up."""
-    actor_every: int = 1
-    """Updates of the critics for one of the actor."""
     final_rate: float = 1.0
     """Fraction of the learning rates at the end of a stage; they fall linearly."""
+    weight_average: float = 0.0
+    """Decay of the average of the actor's weights over updates, which is the policy; 0: the actor itself."""
+    max_episode_steps: int | None = None
+    """Steps after which training episodes are truncated; robots begin at different ages. None: the task's horizon,
+    and all begin together."""
     warm_critic: bool = False
     """Initialise critics and reward statistics of each stage from the previous one, instead of anew."""
 
@@ -58,8 +61,11 @@ class LearningConfig:
         )
         if self.buffer_size < self.batch_size:
             raise ConfigError(f"buffer_size must be at least batch_size, {self.batch_size}, got {self.buffer_size}")
-        check_at_least(1, n_steps=self.n_steps, actor_every=self.actor_every)
+        check_at_least(1, n_steps=self.n_steps)
+        if self.max_episode_steps is not None:
+            check_at_least(1, max_episode_steps=self.max_episode_steps)
         check_fraction(gamma=self.gamma, tau=self.tau, reward_momentum=self.reward_momentum, final_rate=self.final_rate)
+        check_fraction(weight_average=self.weight_average)
         check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
         if self.actor_rate is not None:
             check_positive(actor_rate=self.actor_rate)

@@ -104,6 +104,9 @@ class Trunk(nn.Module):
 class LeanCritics(nn.Module):
     """Two critics of actions (2, A, A) on the features of the shared encoder.
 
+    Layers are normalised, which bounds the values of actions that were never tried (Ball et al., "Efficient Online
+    Reinforcement Learning with Offline Data", ICML 2023).
+
     Args:
         size: A.
     """
@@ -114,7 +117,7 @@ class LeanCritics(nn.Module):
         super().__init__()
         self.size = size
         self.actions = ActionEncoder(size, 2 * WIDTH)  # half of the channels for each critic
-        self.heads = nn.ModuleList(perceptron(LATENT, 256, 256, 1) for _ in range(2))
+        self.heads = nn.ModuleList(perceptron(LATENT, 256, 256, 1, norm=True) for _ in range(2))
         initialise(self)
 
     def forward(self, observation: Encoded, action: Tensor) -> tuple[Tensor, ...]:

@@ -118,11 +118,12 @@ def make_head(resolution: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-def perceptron(*sizes: int) -> nn.Sequential:
-    """Linear layers of these sizes on a flattened input, with ELUs between them."""
+def perceptron(*sizes: int, norm: bool = False) -> nn.Sequential:
+    """Linear layers of these sizes on a flattened input, with ELUs between them, and ``norm`` before each ELU."""
     layers: list[nn.Module] = [nn.Flatten()]
     for before, after in pairwise(sizes[:-1]):
-        layers += [nn.Linear(before, after), nn.ELU(inplace=True)]
+        normalisation = [nn.LayerNorm(after, elementwise_affine=False)] if norm else []
+        layers += [nn.Linear(before, after), *normalisation, nn.ELU(inplace=True)]
     return nn.Sequential(*layers, nn.Linear(sizes[-2], sizes[-1]))
 
 

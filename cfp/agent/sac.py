@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples
 from torch import Tensor, nn
-from torch.optim.swa_utils import get_ema_multi_avg_fn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cfp.agent.actor import Actor
 from cfp.agent.composition import Composition
@@ -77,6 +77,7 @@ class CFP(SAC):
 
     Attributes:
         origin: Actor to stay close to while it is refined, with the same action grid; None otherwise.
+        average: The actor with averaged weights, see `restart_average`; None without ``weight_average``.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CFPPolicy": CFPPolicy}
@@ -113,6 +114,17 @@ class CFP(SAC):
         if own.noise_cells:
             resolution = self.networks()[0].resolution
             self.noise = CellNoise(self.n_envs, resolution, own.noise_cells, own.noise_scale, self.seed)
+        self.restart_average()
+
+    def restart_average(self) -> None:
+        """Let the average of the actor's weights begin with those it has now."""
+        decay, actor = self.hyperparameters.weight_average, self.networks()[0]
+        self.average = AveragedModel(actor, multi_avg_fn=get_ema_multi_avg_fn(decay)) if decay else None
+
+    @property
+    def trained_actor(self) -> Actor:
+        """The actor with averaged weights, or the one in training if there is no average."""
+        return self.networks()[0] if self.average is None else cast(Actor, self.average.module)
 
     def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
         """Actor, critics and target critics."""
@@ -151,9 +163,11 @@ class CFP(SAC):
             obs = obs.detach()  # another encoder would change the policy that is refined, whatever its actor learns
         scalars = self._update_critic(obs, next_obs, batch)
         own = self.hyperparameters
-        if self.num_timesteps >= own.actor_start and (self._n_updates + 1) % own.actor_every == 0:
+        if self.num_timesteps >= own.actor_start:
             scalars |= self._update_actor(obs.detach())
-        _, critic, target = self.networks()
+        actor, critic, target = self.networks()
+        if self.average is not None:
+            self.average.update_parameters(actor)
         get_ema_multi_avg_fn(1 - self.tau)(list(target.parameters()), list(critic.parameters()), 1)
         return scalars | self.reward_statistics.scalars()
 
@@ -255,4 +269,4 @@ class CFP(SAC):
         return [*modules, "reward_statistics"], tensors
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "reward_statistics", "origin", "noise"]
+        return [*super()._excluded_save_params(), "reward_statistics", "origin", "noise", "average"]

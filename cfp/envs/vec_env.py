@@ -29,13 +29,29 @@ class TorchVecEnv(VecEnv):
     Args:
         env: A `dittogym.TorchEnv`, or an environment with its interface; it is stepped without gradients.
         spaces: Spaces of observations and actions; None: those of `dittogym.TorchEnv`.
+        max_episode_steps: Steps after which episodes are truncated; None: the task's. After a reset of all elements,
+            the first episode of element i is truncated after a fraction ``(i + 1) / B`` of them already, so that a
+            batch always holds beginnings and ends of episodes.
     """
 
-    def __init__(self, env: Any, spaces: tuple[Space[Any], Space[Any]] | None = None) -> None:
-        self.torch_env = env
+    def __init__(
+        self,
+        env: Any,
+        spaces: tuple[Space[Any], Space[Any]] | None = None,
+        max_episode_steps: int | None = None,
+    ) -> None:
+        self.torch_env, self.max_episode_steps = env, max_episode_steps
         self.render_mode = "rgb_array"
         super().__init__(env.num_envs, *(spaces or dittogym_env.spaces(env)))
         self._actions: Tensor | None = None
+        self._limits = self._first_limits()
+
+    def _first_limits(self) -> Tensor | None:
+        """Steps (B,) after which the first episodes are truncated."""
+        if self.max_episode_steps is None:
+            return None
+        ages = torch.arange(1, self.num_envs + 1, device=self.torch_env.device) * self.max_episode_steps
+        return (ages // self.num_envs).clamp(min=1)
 
     @torch.no_grad()
     def reset(self) -> VecEnvObs:
@@ -54,6 +70,7 @@ class TorchVecEnv(VecEnv):
         observation, info = self.torch_env.reset(seed=self._seeds[0], options=options or None)
         self._reset_seeds()
         self._reset_options()
+        self._limits = self._first_limits()
         self.reset_infos = self._split_info(info)
         return _to_numpy(observation)
 
@@ -71,8 +88,10 @@ class TorchVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         """Step with these actions; returns observation, reward (B,) float32, done (B,) bool, and infos."""
         assert self._actions is not None, "step_async must be called first"
-        step = autoreset_step(self.torch_env, self._actions)
+        step = autoreset_step(self.torch_env, self._actions, self._limits)
         self._actions = None
+        if self._limits is not None and self.max_episode_steps is not None:
+            self._limits = torch.where(step.done, self.max_episode_steps, self._limits)
         infos, done = self._split_info(step.info), _to_numpy(step.done)
         if done.any():
             finals, timed_out = _to_numpy(step.final_observation), _to_numpy(step.truncated)
@@ -88,7 +107,11 @@ class TorchVecEnv(VecEnv):
 
     def state_dict(self) -> list[Tensor]:
         """Tensors of the episodes in progress, with a leading B; see `load_state_dict`."""
-        return [value.detach().cpu().clone() for value in tree.leaves(self.torch_env.env_state)]
+        return [value.detach().cpu().clone() for value in self._state()]
+
+    def _state(self) -> list[Tensor]:
+        limits = [] if self._limits is None else [self._limits]
+        return [*tree.leaves(self.torch_env.env_state), *limits]
 
     def load_state_dict(self, state: list[Tensor]) -> None:
         """Restore a state of `state_dict`, tensors with a leading B.
@@ -98,12 +121,13 @@ class TorchVecEnv(VecEnv):
         Raises:
             ValueError: The state is not one of this environment.
         """
-        present = self.torch_env.env_state
-        shapes, expected = ([tuple(value.shape) for value in values] for values in (state, tree.leaves(present)))
+        shapes, expected = ([tuple(value.shape) for value in values] for values in (state, self._state()))
         if shapes != expected:
             raise ValueError(f"state must hold tensors of shapes {expected}, got {shapes}")
         values = iter(state)
-        self.torch_env.env_state = tree.map(lambda value: next(values).to(value), present)
+        self.torch_env.env_state = tree.map(lambda value: next(values).to(value), self.torch_env.env_state)
+        if self._limits is not None:
+            self._limits = next(values).to(self._limits)
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """One picture, uint8 (512, 512, 3), per element."""
@@ -150,6 +174,6 @@ def _to_numpy(tensor: Tensor) -> np.ndarray:
     return array
 
 
-def monitored(env: Any) -> VecMonitor:
+def monitored(env: Any, max_episode_steps: int | None = None) -> VecMonitor:
     """Wrap an environment for training or `evaluate_policy`; adds return and length as ``info["episode"]``."""
-    return VecMonitor(TorchVecEnv(env))
+    return VecMonitor(TorchVecEnv(env, max_episode_steps=max_episode_steps))

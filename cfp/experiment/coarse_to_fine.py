@@ -10,9 +10,11 @@ import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecMonitor
 
 from cfp.agent.actor import Actor
+from cfp.agent.actor_policy import image_policy
 from cfp.agent.hyperparameters import Hyperparameters
 from cfp.agent.policies import CFPPolicy, NetworkPolicy
 from cfp.agent.sac import CFP
@@ -110,9 +112,8 @@ class SACAlgorithm(Algorithm):
         return scalars
 
     @property
-    def policy(self) -> NetworkPolicy:
+    def policy(self) -> PolicyPredictor:
         """What has been learned so far."""
-        assert isinstance(self.model.policy, NetworkPolicy)
         return self.model.policy
 
     def state_dict(self) -> dict[str, Any]:
@@ -143,10 +144,12 @@ class CoarseToFine(SACAlgorithm, CoarseToFineStages):
     @classmethod
     def create(cls, config: Config, stage: int, folder: Path, resumed: bool = False) -> CoarseToFine:
         """Networks, replay memory and environment of a stage."""
-        env, spec = make_env(config, config.action_size(stage)), config.actor_spec(stage)
+        limit, spec = config.learning.max_episode_steps, config.actor_spec(stage)
+        env = make_env(config, config.action_size(stage), max_episode_steps=limit)
         model = cls.make_model(config, env, CFPPolicy, {"spec": spec}, cls.hyperparameters(config, stage, folder))
         algorithm = cls(config, stage, model)
-        algorithm.starts_trained = cls.begin(config, stage, folder, algorithm.trained_actor)
+        algorithm.starts_trained = cls.begin(config, stage, folder, model.networks()[0])
+        model.restart_average()
         if refines(config, folder, stage):
             model.origin = load(start_path(folder), str(model.device)).actor
         return algorithm
@@ -166,5 +169,11 @@ class CoarseToFine(SACAlgorithm, CoarseToFineStages):
 
     @property
     def trained_actor(self) -> Actor:
-        """The actor of the model."""
-        return self.model.networks()[0]
+        """The actor that is the policy."""
+        return self.model.trained_actor
+
+    @property
+    def policy(self) -> PolicyPredictor:
+        """What has been learned so far."""
+        deterministic = self.config.report.eval_deterministic
+        return image_policy(self.config.actor_spec(self.stage), self.trained_actor, deterministic)

@@ -49,7 +49,8 @@ def _parts(model: CFP) -> dict[str, Any]:
     actor, critic, _ = model.networks()
     optimizers = {"actor_optimizer": actor.optimizer, "critic_optimizer": critic.optimizer}
     parts = {"policy": model.policy, "reward_statistics": model.reward_statistics, **optimizers}
-    return parts if model.noise is None else parts | {"noise": model.noise}
+    optional = {"noise": model.noise, "average": model.average}
+    return parts | {name: part for name, part in optional.items() if part is not None}
 
 
 def _environment_state(model: CFP) -> dict[str, Any]:

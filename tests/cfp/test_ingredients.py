@@ -116,6 +116,20 @@ def test_encoder_of_a_refined_policy_stays():
     assert not any(same[name] for name in same if name.startswith("mean."))
 
 
+def test_average_of_weights_is_the_policy():
+    model = make_model(LEAN["plain"], FakeEnv(num_envs=2, resolution=8), weight_average=0.9)
+    expected = {name: value.clone() for name, value in model.networks()[0].state_dict().items()}
+    for update in range(3):
+        model.update(make_batch(8))
+        for name, value in model.networks()[0].state_dict().items():
+            expected[name] = value.clone() if update == 0 else 0.9 * expected[name] + 0.1 * value
+    averaged = model.trained_actor.state_dict()
+    assert all(torch.allclose(averaged[name], value, atol=1e-7) for name, value in expected.items())
+    assert not torch.equal(averaged["mean.0.weight"], model.networks()[0].state_dict()["mean.0.weight"])
+    model.restart_average()
+    assert torch.equal(model.trained_actor.state_dict()["mean.0.weight"], model.networks()[0].mean[0].weight)
+
+
 def test_halved_images_are_means_of_four_pixels():
     image = make_batch(8).observations
     expected = F.avg_pool2d(normalise_image(image), 2)
@@ -140,8 +154,8 @@ def test_lean_policy_is_saved_and_loaded(tmp_path):
         ActorSpec((4, 8), (0.0,), patch=18, encoder="lean")
 
 
-def test_actor_is_updated_in_every_third_update_and_rates_fall():
-    options = {"update_start": 4, "batch_size": 4, "actor_every": 3, "final_rate": 0.1, "actor_rate": 1e-4}
+def test_actor_starts_after_the_critics_and_rates_fall():
+    options = {"update_start": 4, "batch_size": 4, "actor_start": 10, "final_rate": 0.1, "actor_rate": 1e-4}
     model = make_model(ActorSpec((8,)), **options)
     actor, critic, _ = model.networks()
     moved, rates = [], []
@@ -150,13 +164,13 @@ def test_actor_is_updated_in_every_third_update_and_rates_fall():
     def watch(batch):
         before = actor.mean[0].weight.clone()
         scalars = update(batch)
-        moved.append(not torch.equal(before, actor.mean[0].weight))
+        moved.append((model.num_timesteps, not torch.equal(before, actor.mean[0].weight)))
         rates.append([each.optimizer.param_groups[0]["lr"] for each in (actor, critic)])
         return scalars
 
     model.update = watch
     model.learn(24)
-    assert moved == [False, False, True] * 3 + [False]
+    assert moved == [(steps, steps >= 10) for steps in range(6, 25, 2)]
     assert rates[-1] == pytest.approx([1e-5, 3e-5], rel=1e-6)
     assert rates == sorted(rates, reverse=True)
 

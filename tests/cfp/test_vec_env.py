@@ -27,6 +27,27 @@ def test_last_observation_of_an_episode_is_kept_and_the_next_one_returned():
     assert before[0, 1].max() == 2  # earlier observations are copies, whatever the environment does with its buffer
 
 
+def test_first_episodes_are_truncated_at_different_ages_and_a_state_continues_them():
+    def lengths(env, steps):
+        ended = [[] for _ in range(env.num_envs)]
+        for step in range(steps):
+            _, _, done, infos = env.step(actions(env))
+            for i in np.flatnonzero(done):
+                ended[i].append(step)
+                assert infos[i]["TimeLimit.truncated"]
+        return ended
+
+    env = TorchVecEnv(FakeEnv(num_envs=2, horizon=50), max_episode_steps=6)
+    env.reset()
+    assert lengths(env, 20) == [[2, 8, 14], [5, 11, 17]]
+    env.reset()
+    lengths(env, 4)
+    other = TorchVecEnv(FakeEnv(num_envs=2, horizon=50), max_episode_steps=6)
+    other.reset()
+    other.load_state_dict(env.state_dict())
+    assert lengths(other, 10) == lengths(env, 10) == [[4], [1, 7]]
+
+
 def test_only_the_element_that_ended_is_reset():
     env = TorchVecEnv(FakeEnv(num_envs=2, horizon=50, end_above=0.15))
     env.reset()
