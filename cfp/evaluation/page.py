@@ -32,7 +32,7 @@ figure img { width: 100%; image-rendering: pixelated; }
 .wide { overflow-x: auto; } table { border-collapse: collapse; }
 th, td { padding: 0.2rem 0.8rem; text-align: right; white-space: nowrap; border-bottom: 1px solid #ccc; }
 th:first-child, td:first-child { text-align: left; }
-@media (max-width: 40rem) { th, td { padding: 0.2rem 0.25rem; font-size: 0.75rem; } }
+@media (max-width: 40rem) { th, td { padding: 0.2rem 0.25rem; font-size: 0.75rem; } th { white-space: normal; } }
 pre { background: #f4f4f4; padding: 1rem; overflow-x: auto; white-space: pre-wrap; } pre span { white-space: nowrap; }
 """
 HEADER = ("policy", "action", "episodes", "mean return", "± 95 %", "std", "success")
