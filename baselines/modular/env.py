@@ -1,6 +1,6 @@
 """An environment whose observations and actions are those of the robot's segments."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -11,6 +11,20 @@ from baselines.modular.kmeans import fit, update
 from baselines.modular.nodes import Nodes, visible_positions
 from dittogym import TorchEnv
 from torchmpm import tree
+
+
+class SegmentedState(NamedTuple):
+    """All that the episodes of a `SegmentedEnv` need to continue."""
+
+    simulation: Any
+    labels: Tensor  # (B, N)
+    observation: Tensor  # the last one, (B, K, columns)
+
+    @property
+    def steps(self) -> Tensor:
+        """Control steps of the episodes (B,)."""
+        steps: Tensor = self.simulation.steps
+        return steps
 
 
 class SegmentedEnv:
@@ -33,12 +47,12 @@ class SegmentedEnv:
         return spaces.Box(-np.inf, np.inf, shape, np.float32), spaces.Box(-1.0, 1.0, (self.nodes.count, 2), np.float32)
 
     @property
-    def env_state(self) -> tuple[Any, Tensor, Tensor]:
-        """State of the simulation, labels (B, N) and last observation: all that an episode needs to continue."""
-        return self.env.env_state, self.labels, self._observation
+    def env_state(self) -> SegmentedState:
+        """State of the simulation, labels and last observation."""
+        return SegmentedState(self.env.env_state, self.labels, self._observation)
 
     @env_state.setter
-    def env_state(self, value: tuple[Any, Tensor, Tensor]) -> None:
+    def env_state(self, value: SegmentedState) -> None:
         self.env.env_state, self.labels, self._observation = value
 
     @property
