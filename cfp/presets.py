@@ -259,7 +259,8 @@ def like_start(base: Options, values: dict[str, Any]) -> Options:
     """A default configuration for the networks of the policy that the JSON ``values`` start from, if any.
 
     Policies with the paper's networks have its action grids. An update takes several times as long, so there are fewer;
-    and strong exploration noise would disturb a policy that can do something already.
+    and strong exploration noise would disturb a policy that can do something already. What else the preset changes was
+    not measured for such policies.
     """
     if not isinstance(base, CoarseToFineConfig) or values.get("start_from") is None or "network" in values:
         return base
@@ -268,5 +269,6 @@ def like_start(base: Options, values: dict[str, Any]) -> Options:
     if not isinstance(base, Config) or spec.encoder == "lean":
         return base
     updates = min(4, base.learning.gradient_steps)
-    learning = replace(base.learning, gradient_steps=updates, noise_cells=0)
+    usual = {name: getattr(LearningConfig(), name) for name in ("n_steps", "weight_average", "max_episode_steps")}
+    learning = replace(base.learning, gradient_steps=updates, noise_cells=0, **usual)
     return replace(base, learning=learning, resolutions=_numbers(base.task).resolutions)

@@ -184,6 +184,29 @@ def figure(path: Path) -> None:
     drawing.savefig(path, metadata={"Date": None})
 
 
+def rewards_figure(path: Path) -> None:
+    """Draw how each change of the learner ``sac`` helps in RUN: the actor in training, and its averaged weights."""
+    rows = read("rewards-run.csv")
+    drawing = Figure(figsize=(7.2, 3.6), layout="constrained")
+    FigureCanvasSVG(drawing)
+    axes = drawing.subplots(1, 2, sharey=True)
+    changes = list(dict.fromkeys(row["change"] for row in rows))
+    for axis, column, title in zip(axes, ("actor", "averaged"), ("actor in training", "averaged weights"), strict=True):
+        axis.axhline(2381, color="0.65", zorder=0)
+        axis.axhline(8650, color="#b03a2e", linestyle="--", zorder=0)
+        for index, change in enumerate(changes):
+            for seed, line in (("0", "-"), ("1", ":")):
+                own = [row for row in rows if (row["change"], row["seed"]) == (change, seed) and row[column]]
+                points = [int(row["steps"]) for row in own], [float(row[column]) for row in own]
+                axis.plot(*points, line, marker="o", ms=4, color=f"C{index}", label=change if seed == "0" else None)
+        axis.set_title(title, fontsize=10)
+        axis.set_xlabel("environment steps")
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[0].set_ylabel("return in RUN")
+    drawing.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    drawing.savefig(path, metadata={"Date": None})
+
+
 def write_results() -> None:
     """Write everything into the folder of the generated pages."""
     PAGES.mkdir(exist_ok=True)
@@ -192,3 +215,4 @@ def write_results() -> None:
     for task in dittogym.TASKS:
         write(PAGES / f"returns-{task}.md", of_task(task))
     figure(PAGES / "returns.svg")
+    rewards_figure(PAGES / "rewards.svg")

@@ -200,6 +200,7 @@ def test_a_policy_with_the_papers_networks_goes_on_with_fewer_updates_and_withou
     quick, started = sac_preset("run"), from_json({"task": "run", "learner": "sac", "start_from": "run"})
     assert (quick.network.encoder, started.network.encoder) == ("lean", "full")
     assert (quick.resolutions, started.resolutions) == ((4, 8), (8, 16))
-    assert started.learning == replace(quick.learning, gradient_steps=4, noise_cells=0)
+    usual = {"n_steps": 1, "weight_average": 0.0, "max_episode_steps": None}
+    assert started.learning == replace(quick.learning, gradient_steps=4, noise_cells=0, **usual)
     asked = {"task": "run", "learner": "sac", "start_from": "run", "learning": {"noise_cells": 2, "gradient_steps": 8}}
     assert (from_json(asked).learning.noise_cells, from_json(asked).learning.gradient_steps) == (2, 8)
