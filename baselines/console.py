@@ -10,6 +10,7 @@ PROGRAMS = {
     "robustness": ("baselines.robustness", "returns of a policy in disturbed simulations"),
     "play": ("dittogym.play.__main__", "play with a robot on a page in the browser"),
     "compare": ("baselines.compare.__main__", "train and evaluate several algorithms, and report about them"),
+    "leaderboard": ("baselines.leaderboard.__main__", "check and rank submissions of policies under a fixed protocol"),
     "teach": ("baselines.distill", "let an image policy learn from a teacher that observes more"),
     "gradlab": ("baselines.gradlab.__main__", "measure up to which horizon gradients are useful"),
 }
@@ -22,7 +23,7 @@ EXAMPLES = """Examples:
 
 def usage() -> str:
     """What ``torchmpm --help`` prints."""
-    rows = "\n".join(f"  {name:<11} {about}" for name, (_, about) in PROGRAMS.items())
+    rows = "\n".join(f"  {name:<12} {about}" for name, (_, about) in PROGRAMS.items())
     return (
         f"usage: torchmpm PROGRAM [OPTIONS]\n\nSoft robots, simulated and differentiated in PyTorch.\n\n"
         f"Programs (torchmpm PROGRAM --help lists the options):\n{rows}\n\n{EXAMPLES}"

@@ -16,6 +16,8 @@ from baselines.compare.jobs import Job, Plan, check_folder, make_jobs
 from baselines.compare.report import write_report
 from baselines.compare.results import RunResult, read_result
 from baselines.compare.worker import Outcome
+from baselines.leaderboard.evaluation import submit
+from baselines.leaderboard.protocol import PROTOCOLS
 from baselines.registry import ALGORITHMS
 from cfp.config import Preset, RunConfig
 from cfp.errors import ConfigError
@@ -82,6 +84,12 @@ class Command:
     """Carry out nothing; write the report about what is there."""
     dry_run: bool = False
     """Only list the runs and their states."""
+    protocol: Literal["v1"] | None = None
+    """Fixed protocol of the leaderboard, under which each finished run is also evaluated; its submission is written to
+    submissions/ in the folder of the report."""
+    policies: tuple[str, ...] = ()
+    """With a protocol: carry out no runs and evaluate these policies instead: names of pretrained ones, run folders,
+    policy files, hf://OWNER/NAME, or zero, random and scripted, which act in each of the tasks."""
 
     def check(self) -> None:
         """Check what the types cannot."""
@@ -91,18 +99,24 @@ class Command:
             raise ConfigError(f"gpus_per_run must be 0 without --executor ray, got {self.gpus_per_run}")
         if self.only is not None and self.report_only:
             raise ConfigError(f"only cannot be combined with --report-only, got {self.only}")
+        if self.policies and (self.protocol is None or self.report_only or self.dry_run or self.only is not None):
+            names = " ".join(self.policies)
+            raise ConfigError(f"policies requires protocol, and none of only, report_only and dry_run, got {names}")
+        if self.protocol is not None:
+            for task in self.tasks:
+                PROTOCOLS[self.protocol].check_task(task)
 
     @property
-    def protocol(self) -> Protocol:
+    def final_protocol(self) -> Protocol:
         """How policies are evaluated."""
         return Protocol(self.episodes, self.tier, self.robustness, self.noise)
 
     def protocol_of(self, config: RunConfig) -> Protocol:
         """How the policy of a run is evaluated: SLOT has more episodes."""
         if config.task != "slot":
-            return self.protocol
+            return self.final_protocol
         runs = 1 if config.algo in REFERENCE_POLICIES else len(self.seeds)
-        return replace(self.protocol, episodes=max(self.episodes, -(-self.slot_episodes // runs)))
+        return replace(self.final_protocol, episodes=max(self.episodes, -(-self.slot_episodes // runs)))
 
     def make_executor(self, signals: StopSignals) -> Executor:
         """What carries out the runs."""
@@ -117,6 +131,9 @@ class Command:
 def compare(command: Command) -> int:
     """Carry out a comparison; returns the exit code."""
     command.check()
+    if command.policies:
+        _submit(command, command.policies)
+        return 0
     plan = Plan.read(command.plan)
     for part, names in plan.unused(command.tasks, command.algos).items():
         print(f"plan: {part} {', '.join(names)} are not in this comparison")
@@ -146,6 +163,9 @@ def compare(command: Command) -> int:
         outcomes = _carry_out(command, chosen, signals)
     if command.only is None:
         _report(command, jobs)
+    if command.protocol and command.only is None and not signals.number:
+        trained = [job for job in jobs if job.trained]
+        _submit(command, [job.config.algo if job.untrained else str(job.folder) for job in trained])
     if signals.number:
         raise Stopped(signals.number, "the same command resumes the comparison")
     return 0 if set(outcomes) == {"finished"} else 1
@@ -165,13 +185,19 @@ def _carry_out(command: Command, jobs: Sequence[Job], signals: StopSignals) -> l
     return outcomes
 
 
+def _submit(command: Command, policies: Sequence[str]) -> None:
+    """Write submissions; a reference policy has a run in each task, and is named several times."""
+    assert command.protocol is not None
+    submit(PROTOCOLS[command.protocol], list(dict.fromkeys(policies)), command.tasks, command.out / "submissions")
+
+
 def _report(command: Command, jobs: Sequence[Job]) -> list[RunResult]:
     description = (
         f"{', '.join(command.algos)} on {', '.join(command.tasks)}, preset {command.preset}, seeds "
         f"{', '.join(map(str, command.seeds))}."
     )
     runs = [read_result(job) for job in jobs]
-    print(f"report: {write_report(command.out, runs, command.protocol, description)}")
+    print(f"report: {write_report(command.out, runs, command.final_protocol, description)}")
     return runs
 
 
@@ -185,6 +211,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--tasks shapematch --algos cfp shac --seeds 0 1",
         "--tasks run kick --algos zero gradient --out runs/reach --workers 2",
         "--out runs/reach --report-only",
+        "--protocol v1 --policies run runs/mine/policy.safetensors --out runs/mine",
     )
     return run_command(lambda: compare(tyro.cli(Command, prog=program, description=description, args=arguments)))
 

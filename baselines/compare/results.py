@@ -93,7 +93,7 @@ def read_result(job: Job) -> RunResult:
         state = "unevaluated"
     if (job.folder / "error.txt").exists():
         error = (job.folder / "error.txt").read_text().strip()
-    return RunResult(job, state, error, _read_curve(job.folder), _read_cost(job.folder), evaluation)
+    return RunResult(job, state, error, _read_curve(job.folder), read_cost(job.folder), evaluation)
 
 
 def group_results(runs: Sequence[RunResult]) -> list[Group]:
@@ -118,7 +118,8 @@ def _read_curve(folder: Path) -> Curve:
     return steps, means
 
 
-def _read_cost(folder: Path) -> Cost | None:
+def read_cost(folder: Path) -> Cost | None:
+    """What the training in a run folder took; None if it has no record of it."""
     sessions = read_sessions(folder)["sessions"]
 
     def total(name: str) -> float:

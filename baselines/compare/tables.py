@@ -21,12 +21,12 @@ GROUP = (
 )
 
 
-def _rank(rows: Iterable[dict[str, Any]], within: tuple[str, ...]) -> None:
-    """Add ``rank`` to rows with an ``iqm``, 1 for the highest, among those that agree in the columns ``within``."""
-    rows = [row for row in rows if row["iqm"] is not None]
+def rank(rows: Iterable[dict[str, Any]], within: tuple[str, ...], score: str = "iqm") -> None:
+    """Add ``rank`` to rows with a ``score``, 1 for the highest, among those that agree in the columns ``within``."""
+    rows = [row for row in rows if row[score] is not None]
     for row in rows:
         rivals = [other for other in rows if all(other[name] == row[name] for name in within)]
-        row["rank"] = 1 + sum(other["iqm"] > row["iqm"] for other in rivals)
+        row["rank"] = 1 + sum(other[score] > row[score] for other in rivals)
 
 
 def _mean(values: Sequence[float]) -> float | None:
@@ -84,7 +84,7 @@ RETURNS = (
 def returns_table(groups: Sequence[Group], episodes: int) -> Table:
     """Interquartile mean of the final evaluation over seeds."""
     rows = [make_row(RETURNS, group) for group in groups]
-    _rank(rows, ("task", "sees"))
+    rank(rows, ("task", "sees"))
     untrained = _labels(group for group in groups if group.job.untrained)
     description = (
         f"Each policy plays the same layouts, which neither trained nor selected it ({episodes}, more in SLOT). "
@@ -118,7 +118,7 @@ def aggregate_table(groups: Sequence[Group]) -> Table:
         scores, (low, high) = [score for scores in by_task for score in scores], score_interval(by_task)
         row = {"sees": observes, "algo": label, "tasks": len(by_task), "runs": len(scores), "low": low, "high": high}
         rows.append(row | {"iqm": float(interquartile_mean(scores)), "all": len(by_task) == len(tasks)})
-    _rank([row for row in rows if row["all"]], ("sees",))
+    rank([row for row in rows if row["all"]], ("sees",))
     description = (
         "Interquartile mean over all runs of all tasks, with a bootstrap of trainings (not of layouts) by task "
         "(Agarwal et al., 2021), of scores on a scale where 0 is the paper's resting robot and 1 the paper's CFP at "

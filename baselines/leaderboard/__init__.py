@@ -1,0 +1,1 @@
+"""The leaderboard: fixed protocols, submissions of single policies, and their ranking."""
