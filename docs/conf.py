@@ -40,6 +40,7 @@ extensions = [
 ]
 exclude_patterns = [
     "_build",
+    "generated/leaderboard.md",
     "generated/planning.md",
     "generated/returns*.md",
     "generated/summary.md",

@@ -1,9 +1,10 @@
-"""Writes the tables and the figure of measured returns from the committed CSV files, next to the paper's."""
+"""Writes the tables and the figure of measured returns from the committed CSV and JSON files, next to the paper's."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -13,6 +14,8 @@ from task_pages import PAGES, headline, write
 
 import dittogym
 from baselines.compare import paper
+from baselines.leaderboard.__main__ import rankings
+from baselines.leaderboard.submission import read_submissions
 
 DOCS = Path(__file__).resolve().parent
 OBSERVES = ("image", "state", "simulator", "nothing")
@@ -151,6 +154,13 @@ def of_task(task: str) -> str:
     )
 
 
+def leaderboard() -> str:
+    """The rankings of the committed submissions."""
+    submissions = read_submissions(sorted((DOCS / "leaderboard").glob("*.json")))
+    tables = (replace(table, title=headline(table.name)[0], description="") for table in rankings(submissions))
+    return "\n\n".join(table.to_markdown() for table in tables) + "\n"
+
+
 def normalised(task: str, name: str, key: str) -> float:
     """A number of the evaluation of a policy on a scale where the paper's resting robot has 0 and its CFP 1."""
     return paper.normalised(task, float(shipped(task, name)[key]))
@@ -212,6 +222,7 @@ def write_results() -> None:
     PAGES.mkdir(exist_ok=True)
     write(PAGES / "returns.md", overview())
     write(PAGES / "planning.md", planning())
+    write(PAGES / "leaderboard.md", leaderboard())
     for task in dittogym.TASKS:
         write(PAGES / f"returns-{task}.md", of_task(task))
     figure(PAGES / "returns.svg")

@@ -50,8 +50,8 @@ V1 = FixedProtocol(
         num_envs=1, particles="lite", substeps=100, dt=1e-4, dtype="float32", parity="clean", resample=False
     ),
     # A run with seed s trains, chooses and evaluates its policy on seeds from s to s + 30,000, where s is at most 2^31.
-    seeds=range(3_000_000_000, 3_000_000_010),
-    counts=tuple(range(2000, 1600, -40)),
+    seeds=range(3_000_000_000, 3_000_000_008),
+    counts=tuple(range(2000, 1680, -40)),
     deterministic=True,  # noise is for exploration; without it an episode depends on the policy and the layout only
     device="cpu",  # there an episode does not depend on those that are played beside it, to the last bit
 )

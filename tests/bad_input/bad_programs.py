@@ -7,6 +7,7 @@ from bad_cases import TINY, Case, Refused, command, prepared
 import baselines.compare.__main__ as compare
 import baselines.distill
 import baselines.evaluate
+import baselines.leaderboard.__main__ as leaderboard
 import baselines.robustness
 import baselines.train
 import cfp.evaluate
@@ -159,6 +160,10 @@ OTHERS = [
     comparing("unknown algorithms", "--algos alchemy", "algo must be one of cfp"),
     comparing("a seed twice", "--seeds 1 1", "seeds must be one or more different values, got 1 1"),
     comparing("parts of a GPU at home", "--gpus-per-run 0.5", "gpus_per_run must be 0 without --executor ray, got 0.5"),
+    comparing("policies without a protocol", "--policies run", "policies requires protocol", "got run"),
+    comparing("under an unknown protocol", "--protocol v9", "--protocol", "'v1'", "'v9'"),
+    comparing("a policy that is not there", "--protocol v1 --policies none", "none.safetensors: there is no policy"),
+    Case("rank a folder", command(leaderboard.main, "{folder}"), ("cannot be read as JSON", "not a file"), Refused),
     comparing("a plan that is not there", "--plan none.json", "plan: none.json cannot be read"),
     planned("of a list", [1], "plan: plan.json cannot be read as JSON (it must hold an object, got list"),
     planned("of other parts", {"colour": 1}, "must hold common, tasks and algos only, got colour"),
