@@ -164,8 +164,8 @@ def compare(command: Command) -> int:
     if command.only is None:
         _report(command, jobs)
     if command.protocol and command.only is None and not signals.number:
-        trained = [job for job in jobs if job.trained]
-        _submit(command, [job.config.algo if job.untrained else str(job.folder) for job in trained])
+        names = [job.config.algo if job.untrained else str(job.folder) for job in jobs if job.trained]
+        _submit(command, list(dict.fromkeys(names)))  # a reference policy has a run in each task
     if signals.number:
         raise Stopped(signals.number, "the same command resumes the comparison")
     return 0 if set(outcomes) == {"finished"} else 1
@@ -186,9 +186,9 @@ def _carry_out(command: Command, jobs: Sequence[Job], signals: StopSignals) -> l
 
 
 def _submit(command: Command, policies: Sequence[str]) -> None:
-    """Write submissions; a reference policy has a run in each task, and is named several times."""
+    """Write the submissions of policies under the protocol."""
     assert command.protocol is not None
-    submit(PROTOCOLS[command.protocol], list(dict.fromkeys(policies)), command.tasks, command.out / "submissions")
+    submit(PROTOCOLS[command.protocol], policies, command.tasks, command.out / "submissions")
 
 
 def _report(command: Command, jobs: Sequence[Job]) -> list[RunResult]:
