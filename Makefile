@@ -14,7 +14,7 @@ TEST_PROCESSES ?= 2
 PYTEST := -m pytest -n $(TEST_PROCESSES) --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all test-gpu-kernels test-oldest coverage lint docs bench wheel clean
+.PHONY: help install demo test test-all test-gpu-kernels test-oldest coverage lint docs bench wheel test-wheel clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1: /p' Makefile
@@ -90,6 +90,9 @@ wheel: $(STAMP)  ## on Linux: build a source distribution, and a wheel with comp
 	TORCHMPM_PROCESSORS="$(PROCESSORS)" $(BIN)/python -m build --outdir dist/unnamed
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/auditwheel repair --wheel-dir dist dist/unnamed/*.whl
 	mv dist/unnamed/*.tar.gz dist && rm -r dist/unnamed
+
+test-wheel: wheel  ## install the wheel elsewhere, train and evaluate without a compiler, compare the speed of its kernels
+	PYTHON=$(BIN)/python .ci/wheel
 
 clean:  ## remove what was built, keep .venv and runs
 	rm -rf build dist docs/_build docs/gallery docs/generated *.egg-info .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache

@@ -62,6 +62,9 @@ def configure(values: dict[str, Any]) -> RunConfig:
     if isinstance(algo, str) and algo in ALIASES:
         algo = ALIASES[algo]
         values = {**values, "algo": algo}
+    if algo == "cfp" and values.get("learner") == "analytic":  # as cfp.train, the program of both learners, writes it
+        algo = "analytic"
+        values = {**values, "algo": algo}
     reference = isinstance(algo, str) and algo in REFERENCE_POLICIES
     if not reference and preset not in (allowed := find(algo).presets):
         raise ConfigError(f"preset must be {' or '.join(allowed)} for {algo}, got {preset!r}")

@@ -35,7 +35,8 @@ class RunConfig:
     algo: str = "cfp"
     """Algorithm."""
     preset: Preset = "quick"
-    """Source of the defaults: quick (minutes), paper (as published); for learner sac also lean and long (a night)."""
+    """Source of the defaults: quick (minutes), paper (as published; not for learner analytic), or long (a night; only for
+    learner sac)."""
     seed: int = 0
     """Seed of everything that is random."""
     device: str = "auto"

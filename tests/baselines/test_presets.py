@@ -8,7 +8,7 @@ import pytest
 from baselines.registry import ALGORITHMS, configure, find
 from cfp.config import to_json
 from cfp.errors import ConfigError
-from cfp.presets import TASKS, sac_preset
+from cfp.presets import TASKS, preset, sac_preset
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -38,3 +38,9 @@ def test_presets_are_valid_survive_json_and_agree_with_that_of_cfp(task, preset)
         if name.startswith(("gnn", "transformer")):
             assert algorithm.sees == "state" and config.segments == int(name[-2:])
             assert (config.alpha, config.random_steps) == (own.alpha[0], own.random_steps[0])
+
+
+def test_a_run_of_the_other_learner_is_the_algorithm_analytic():
+    written = json.loads(json.dumps(to_json(preset("run"))))
+    assert (written["algo"], written["learner"]) == ("cfp", "analytic")  # as cfp.train leaves it
+    assert configure(written) == find("analytic").preset("run", "quick")
