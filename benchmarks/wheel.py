@@ -21,7 +21,7 @@ KINDS, ROUNDS, ROBOTS, STEPS = ("wheel", "compiled"), 2, 4, 5
 
 
 def measure(kind: str) -> tuple[float, float]:
-    """Environment steps per second of processor time, all robots together: forward, and with the gradient for the action."""
+    """Environment steps per second of processor time, of all robots together: forward, and with a gradient."""
     if kind == "compiled":
         library.packaged = lambda *_: None
     torch.set_num_threads(1)

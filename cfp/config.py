@@ -35,8 +35,8 @@ class RunConfig:
     algo: str = "cfp"
     """Algorithm."""
     preset: Preset = "quick"
-    """Source of the defaults: quick (minutes), paper (as published; not for learner analytic), or long (a night; only for
-    learner sac)."""
+    """Source of the defaults: quick (minutes), paper (as published; not for learner analytic), or long (a night; for learner
+    sac alone)."""
     seed: int = 0
     """Seed of everything that is random."""
     device: str = "auto"
@@ -156,6 +156,7 @@ class StagedConfig(RunConfig):
     def with_derived(self, base: RunConfig, given: Collection[str]) -> RunConfig:
         """Scale the handovers with the steps; other numbers of stages are equally long, and repeat the last values."""
         assert isinstance(base, StagedConfig)
+        check_at_least(1, steps=self.steps)
         stages, scale, changes = len(self.resolutions), self.steps / base.steps, dict[str, Any]()
         for name, count in self._counts().items():
             values: tuple[float, ...] = getattr(base, name)

@@ -30,21 +30,21 @@ class Run:
 
     Raises:
         CheckpointError: There is no run.
+        ConfigError: It cannot be the path of a folder.
     """
 
     program: ClassVar[Program] = PROGRAM
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
-        self.folder = Path(folder)
+        self.folder = _folder("folder", folder)
         self.config: RunConfig = read_config(self.folder, self.program.configure)
 
     @classmethod
     def fit(cls, options: dict[str, Any], out: str | os.PathLike[str] | None, resume: bool) -> Run:
         """Train with these ``options``, into the folder ``out``; see `cfp.fit`."""
-        try:
-            folder = None if out is None else parse_folder([os.fspath(out)])
-        except (TypeError, ValueError) as error:
-            raise ConfigError(f"out must be the path of a folder, got {out!r}") from error
+        folder = None if out is None else _folder("out", out)
+        if not isinstance(resume, bool):
+            raise ConfigError(f"resume must be True or False, got {resume!r}")
         command = from_python(cls.program, options, folder, resume)
         keep_memory()
         try:
@@ -103,6 +103,13 @@ class Run:
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self.folder)!r})"
+
+
+def _folder(name: str, given: Any) -> Path:
+    try:
+        return parse_folder([os.fspath(given)])
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{name} must be the path of a folder, got {given!r}") from error
 
 
 def fit(

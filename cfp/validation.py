@@ -6,8 +6,13 @@ from cfp.errors import ConfigError
 
 
 def check_at_least(minimum: float, **values: float) -> None:
-    """Check that each value, given by the name of its option, is at least ``minimum``; NaN is refused."""
+    """Check that each value, given by the name of its option, is at least ``minimum``; NaN is refused.
+
+    So are integers of more than 64 bits, which fit neither tensors nor floats.
+    """
     for name, value in values.items():
+        if isinstance(value, int) and value >= 2**63:
+            raise ConfigError(f"{name} must be below 2**63, got a number of {len(str(value))} digits")
         if not value >= minimum:
             raise ConfigError(f"{name} must be at least {minimum}, got {value}")
 

@@ -85,7 +85,7 @@ def shipped() -> list[str]:
 
 def policy_file(path: str | Path) -> Path:
     """The ``.safetensors`` file of a policy; see `load` for what ``path`` may be."""
-    if not isinstance(path, str | os.PathLike):
+    if not isinstance(path, str | os.PathLike) or not str(path):
         raise CheckpointError(f"path must be a folder, a file or the name of a policy, got {path!r}")
     if is_address(path):
         return download(str(path))
@@ -101,6 +101,10 @@ def policy_file(path: str | Path) -> Path:
 def read_policy(path: str | Path, device: str = "cpu") -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Weights by name and description of a policy that `write_policy` wrote; nothing is unpickled."""
     file = policy_file(path)
+    try:
+        torch.empty(0, device=device)
+    except (AssertionError, RuntimeError, TypeError) as error:  # the first one: torch without CUDA
+        raise ConfigError(f"device must be one that torch finds here, such as 'cpu', got {device!r}") from error
     try:
         with safetensors.safe_open(file, framework="pt", device=device) as content:
             metadata = content.metadata() or {}
@@ -165,6 +169,7 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
 
     Raises:
         CheckpointError: The file is missing, damaged, or not such a policy.
+        ConfigError: There is no such device.
 
     Examples:
         >>> import cfp, dittogym, gymnasium

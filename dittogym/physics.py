@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, TypeAlias
 
@@ -19,6 +20,9 @@ Physics: TypeAlias = Mapping[str, Tensor]
 #: muscle limit of the robot, Pa; gravity, m/s^2; and a factor on the mass of all particles.
 NAMES = ("mu", "lam", "yield_stress", "max_actuation", "gravity", "mass")
 _SIGNS = {"mu": "positive", "mass": "positive", "yield_stress": "not negative", "max_actuation": "not negative"}
+#: Largest amounts, far above any use. With more gravity a particle at rest crosses a cell of the grid within a substep;
+#: sums over much heavier particles overflow in float32.
+_LARGEST = {"gravity": 5e5, "mass": 1e6}
 #: Those that may differ between the particles of a body.
 PER_PARTICLE = ("mu", "lam", "yield_stress", "mass")
 
@@ -40,7 +44,8 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
         like: Gives dtype and device.
 
     Raises:
-        ValueError: Not a mapping, an unknown name, a wrong shape, or values that are not finite or have a wrong sign.
+        ValueError: Not a mapping, an unknown name, a wrong shape, or values that are not finite, have a wrong sign, or
+            are too large (gravity, mass).
     """
     if not isinstance(given, Mapping):
         raise ValueError(f"physics must be a mapping from {', '.join(NAMES)} to values, got {type(given).__name__}")
@@ -59,6 +64,9 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
         if not bool(allowed.all()):
             kind = f"finite, {sign}" if sign else "finite"
             raise ValueError(f"physics[{name!r}] must be {kind}, got {tensor.detach()[~allowed].flatten()[0].item()}")
+        largest = float(tensor.detach().abs().max())
+        if largest > _LARGEST.get(name, math.inf):
+            raise ValueError(f"physics[{name!r}] must be at most {_LARGEST[name]:g} in amount, got {largest:g}")
         values[name] = _expanded(tensor, name, batch)
     return values
 

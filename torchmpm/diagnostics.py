@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from torchmpm import checks
 from torchmpm.boundary import constrain
 from torchmpm.materials.base import broadcast_plane
 from torchmpm.materials.body import per_particle, slices
@@ -13,6 +14,7 @@ from torchmpm.substep import free_velocity, grid_velocity, particles_to_grid
 
 def masses(solver: Solver, state: ParticleState) -> Tensor:
     """Mass of every particle, (B, N), kg."""
+    _check(solver, state)
     return per_particle(solver.bodies, "mass", state.Jp) * torch.ones_like(state.Jp)
 
 
@@ -28,6 +30,7 @@ def momentum(solver: Solver, state: ParticleState) -> Tensor:
 
 def angular_momentum(solver: Solver, state: ParticleState) -> Tensor:
     """Angular momentum about the world's origin, (B,), kg m^2/s, with the spin in the affine matrices (h^2/4 each)."""
+    _check(solver, state)
     orbit = state.x[..., 0] * state.v[..., 1] - state.x[..., 1] * state.v[..., 0]
     spin = 0.25 * solver.grid.h**2 * (state.C[..., 1, 0] - state.C[..., 0, 1])
     return (masses(solver, state) * (orbit + spin)).sum(-1)
@@ -40,6 +43,7 @@ def kinetic_energy(solver: Solver, state: ParticleState) -> Tensor:
 
 def elastic_energy(solver: Solver, state: ParticleState) -> Tensor:
     """Energy stored in deformation, (B,), J; muscles are not counted."""
+    _check(solver, state)
     total = torch.zeros_like(state.Jp[:, 0])
     for body, part in slices(solver.bodies):
         (a, b, c, d), Jp = state.F[:, part].flatten(-2).unbind(-1), state.Jp[:, part]
@@ -49,12 +53,14 @@ def elastic_energy(solver: Solver, state: ParticleState) -> Tensor:
 
 def potential_energy(solver: Solver, state: ParticleState) -> Tensor:
     """Energy of position under gravity relative to the world's origin, (B,), J."""
+    _check(solver, state)
     gravity = torch.as_tensor(solver.gravity, dtype=state.dtype, device=state.device).reshape(-1, 1, 2)
     return -(masses(solver, state) * (state.x * gravity).sum(-1)).sum(-1)
 
 
 def finite(state: ParticleState) -> Tensor:
     """Which simulations hold finite numbers only, (B,) bool."""
+    checks.instance("state", state, ParticleState)
     # Zero times a finite number is zero and zero times anything else is NaN, which the sum keeps.
     return (state.stack().detach() * 0.0).sum((0, 2)) == 0.0
 
@@ -74,9 +80,15 @@ def impulses(
         ``"gravity"``, ``"damping"`` and ``"boundary"``, each (B, 2), kg m/s. Their sum is the change of
         :func:`momentum` over the substep while all particles are in the window. Internal forces and muscles cancel.
     """
+    _check(solver, state)
     scene = solver.scene(state, actuation, origin)
     momentum = particles_to_grid(scene, state.planes()).momentum
     before, damped = free_velocity(scene, momentum), grid_velocity(scene, momentum)
     accelerated, after = before + scene.gravity, constrain(scene.faces, damped)
     stages = {"gravity": (before, accelerated), "damping": (accelerated, damped), "boundary": (damped, after)}
     return {name: (momentum[0] * (new - old)).sum(-1).T for name, (old, new) in stages.items()}
+
+
+def _check(solver: Solver, state: ParticleState) -> None:
+    checks.instance("solver", solver, Solver)
+    checks.instance("state", state, ParticleState)

@@ -78,9 +78,9 @@ class ParticleState:
 
         Raises:
             ValueError: They have another shape, or are neither float32 nor float64.
-            TypeError: They are not a tensor.
+            TypeError: They are not a dense tensor.
         """
-        checks.instance("x", x, Tensor)
+        checks.tensor("x", x)
         if x.ndim not in (2, 3) or x.shape[-1] != 2:
             raise ValueError(f"x must have shape (B, N, 2) or (N, 2), got {tuple(x.shape)}")
         x = x[None] if x.ndim == 2 else x

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import tyro
-
 from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare.executor import Executor, InProcessExecutor, LocalExecutor, RayExecutor, Resources, execute
 from baselines.compare.final_evaluation import Noise, Protocol, Robustness
@@ -21,12 +19,14 @@ from baselines.leaderboard.protocol import PROTOCOLS
 from baselines.registry import ALGORITHMS
 from cfp.config import Preset, RunConfig
 from cfp.errors import ConfigError
-from cfp.experiment.cli import program_name, run_command, with_examples
+from cfp.experiment.cli import program_name, read_options, run_command, with_examples
 from cfp.experiment.folder import Folder, make_folder
 from cfp.experiment.process import Stopped, StopSignals
 from cfp.sections import Particles
 from cfp.validation import check_at_least
 
+BASIC = ("tasks", "algos", "seeds", "preset", "steps", "device", "workers", "episodes", "out", "report_only")
+"""Options that the help shows first."""
 LOCK_TIMEOUT, CLUSTER_LOCK_TIMEOUT = 30.0, 300.0
 """Seconds to wait for another process that holds a run folder; file servers take a while to give up a lost machine."""
 
@@ -213,7 +213,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--out runs/reach --report-only",
         "--protocol v1 --policies run runs/mine/policy.safetensors --out runs/mine",
     )
-    return run_command(lambda: compare(tyro.cli(Command, prog=program, description=description, args=arguments)))
+    about = {"prog": program, "description": description}
+    return run_command(lambda: compare(read_options(Command(), BASIC, args=arguments, **about)))
 
 
 if __name__ == "__main__":

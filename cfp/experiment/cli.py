@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import ast
+import dataclasses
 import inspect
 import signal
 import sys
+import textwrap
+import typing
 from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Annotated, Any
+
+import tyro
 
 from cfp.errors import CFPError, NonFiniteError
 from cfp.experiment.process import Stopped, keep_memory
@@ -50,3 +58,47 @@ def with_examples(about: str, program: str, *examples: str) -> str:
     """The description of a ``program`` for its help, followed by ``examples`` of its options."""
     lines = "\n".join(f"  {program} {example}" for example in examples)
     return f"{inspect.cleandoc(about)}\n\nExamples:\n{lines}"
+
+
+def read_options(default: Any, basic: Sequence[str], *, args: Sequence[str] | None, **about: Any) -> Any:
+    """Read a command line into a dataclass like ``default``; its help shows the options ``basic`` before the others."""
+    if {"-h", "--help"} & set(sys.argv[1:] if args is None else args):
+        default = _basic_first(default, basic)  # the help ends the program, so that nothing is read into it
+    return tyro.cli(type(default), default=default, args=args, config=(tyro.conf.OmitArgPrefixes,), **about)
+
+
+def _basic_first(options: Any, basic: Sequence[str]) -> Any:
+    """The same options with those named ``basic`` in front and all others, in their groups, under ``advanced``."""
+    first: list[Any] = []
+    annotated: Any = Annotated  # type checkers know no types that are made at run time
+
+    def remaining(group: Any) -> Any:
+        hints, texts, others = typing.get_type_hints(type(group), include_extras=True), _descriptions(type(group)), []
+        for field in dataclasses.fields(group):
+            value = getattr(group, field.name)
+            if dataclasses.is_dataclass(value):
+                others.append(_option(field.name, type(nested := remaining(value)), nested))
+            else:
+                hint = annotated[hints[field.name], tyro.conf.arg(help=texts[field.name])]
+                (first if field.name in basic else others).append(_option(field.name, hint, value))
+        return dataclasses.make_dataclass(type(group).__name__, others, namespace={"__doc__": type(group).__doc__})()
+
+    advanced = remaining(options)
+    first.sort(key=lambda option: basic.index(option[0]))
+    return dataclasses.make_dataclass("Options", [*first, _option("advanced", type(advanced), advanced)])()
+
+
+def _option(name: str, hint: Any, value: Any) -> tuple[str, Any, Any]:
+    return name, hint, dataclasses.field(default_factory=lambda: value)
+
+
+def _descriptions(kind: type) -> dict[str, str]:
+    """The strings below the fields of a dataclass and of those that it extends."""
+    texts = {}
+    for base in reversed(kind.__mro__[:-1]):
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        assert isinstance(definition, ast.ClassDef)
+        for field, text in pairwise(definition.body):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+                texts[ast.unparse(field.target)] = inspect.cleandoc(str(text.value.value))
+    return texts

@@ -17,7 +17,7 @@ import tyro
 from cfp.config import RunConfig, to_json
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm
-from cfp.experiment.cli import program_name, run_command, with_examples
+from cfp.experiment.cli import program_name, read_options, run_command, with_examples
 from cfp.experiment.folder import Folder, holds_run, read_config
 from cfp.experiment.process import Stopped, StopSignals
 from cfp.experiment.run import TrainingRun, check_options
@@ -25,6 +25,9 @@ from cfp.experiment.run_lock import run_lock
 from cfp.files import read_json
 from cfp.from_dict import flatten, update_from_dict
 from cfp.policy_protocols import Policy
+
+BASIC = ("task", "target", "algo", "preset", "learner", "steps", "seed", "device", "out", "resume")
+"""Options that the help shows first."""
 
 
 @dataclass(frozen=True)
@@ -80,13 +83,12 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
 
     def read(defaults: RunConfig) -> Command:
         prog = started or program_name(f"{program.package}.train", arguments)
-        command = tyro.cli(
-            Command,
+        command: Command = read_options(
+            Command(defaults),
+            BASIC,
             prog=prog,
             description=with_examples(f"{program.about}\n\n{inspect.getdoc(Command)}", prog, *program.examples),
             args=list(arguments),
-            default=Command(defaults),
-            config=(tyro.conf.OmitArgPrefixes,),
         )
         # the command line may spell the name of the algorithm in another way
         return command if choice.algo is None else replace(command, run=replace(command.run, algo=defaults.algo))

@@ -137,6 +137,8 @@ class InitialPositions:
         return positions.expand(self.num_envs, *shape).contiguous()
 
     def _check_inside(self, positions: Tensor) -> None:
+        if not bool((finite := torch.isfinite(positions)).all()):
+            raise ValueError(f"positions must be finite, got {positions[~finite][0].item()}")
         origin = self.spec.window.origin(positions[:, : self.counts[0]].mean(1))
         inside = contains(positions, origin)
         if not bool(inside.all()):

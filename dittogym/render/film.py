@@ -46,6 +46,7 @@ def write_film(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
+        aside.touch()  # names the file where it cannot be written; what ffmpeg says is a page long
         if path.suffix == ".mp4":
             _write_mp4(aside, frames, rate)
         else:

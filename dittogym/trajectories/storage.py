@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 
 from dittogym.trajectories.episode import Episode
+from torchmpm import checks
 
 FORMAT, VERSION = "dittogym-episodes", 1
 ARRAYS = ("observations", "actions", "rewards", "terminations", "truncations")
@@ -30,10 +31,12 @@ def save_episodes(path: str | os.PathLike[str], episodes: Sequence[Episode]) -> 
 
     Raises:
         ValueError: The file has another suffix, or there is no episode.
+        TypeError: One of them is none.
     """
     file = check_archive(path)
     if not episodes:
         raise ValueError("episodes must hold at least 1 episode, got 0")
+    checks.instances("episodes", episodes, Episode)
     arrays: dict[str, Any] = {}
     for i, episode in enumerate(episodes):
         arrays |= {f"{i}/{name}": getattr(episode, name) for name in ARRAYS}

@@ -99,7 +99,22 @@ POLICIES = [
             ("path must be a folder, a file or the name of a policy", repr(path)),
             CheckpointError,
         )
-        for path in (None, 5, b"run")
+        for path in (None, 5, b"run", "")
+    ),
+    *(
+        Case(
+            f"policy onto {device!r}",
+            lambda desk, device=device: cfp.load("run", device=device),
+            ("device must be one that torch finds here", repr(device)),
+        )
+        for device in ("abacus", 1.5)
+    ),
+    Case("run of nothing", lambda desk: cfp.Run(None), ("folder must be the path of a folder, got None",)),
+    Case("run in an unset variable", lambda desk: cfp.Run(""), ("folder must be the path of a folder, got ''",)),
+    Case(
+        "run resumed perhaps",
+        lambda desk: cfp.fit("run", resume="x", out=desk.folder / "new"),
+        ("resume must be True or False, got 'x'",),
     ),
     policy("of text", "damaged", content="hello, I am a policy"),
     policy("cut short", "damaged", content=SHIPPED[: len(SHIPPED) // 2]),

@@ -52,10 +52,20 @@ TRAIN = [
         "preset must be one of quick, long, paper for shapematch, got 'slow'",
     ),
     training("an unknown option", "--colour red", "Unrecognized options: --colour"),
+    training(
+        "handovers of 401 digits",
+        f"--handover 1{'0' * 400}",
+        "handover must increase between 0 and the number of steps",
+    ),
     training("a seed by name", "--seed x", "Error parsing --seed: invalid literal for int()", "'x'"),
     training("seed -1", "--seed -1", "seed must be between 0 and 2147483647, got -1"),
     training("no particles", "--particles 0", "particles must be at least 1 for every body, got 0"),
     training("batches of one", "--batch-size 1", "batch_size must be at least 2, got 1"),
+    training(
+        "steps of 401 digits",
+        f"--steps 1{'0' * 400}",
+        "steps must be below 2**63, got a number of 401 digits",
+    ),
     training("steps and a half", "--steps 1.5", "Error parsing --steps", "'1.5'"),
     training(
         "a late handover",
@@ -138,6 +148,11 @@ OTHERS = [
     evaluating("a folder that is not there", "{folder}/none", "none: there is no run (no config.json)"),
     evaluating("an unknown policy", "--policy alchemy", "no shipped one has that name (catch, dig, grow, kick, "),
     evaluating("no episodes", "--policy run --episodes 0", "episodes must be at least 1, got 0"),
+    evaluating(
+        "episodes of 401 digits",
+        f"--policy run --episodes 1{'0' * 400}",
+        "episodes must be below 2**63, got a number of 401 digits",
+    ),
     evaluating("a policy and a folder", "{folder} --policy run", "either policy or a folder must be given"),
     evaluating(
         "a policy on an abacus", "--policy run --device abacus", "device must be auto, cpu or cuda, got 'abacus'"

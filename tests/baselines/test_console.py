@@ -1,5 +1,6 @@
 """The console command ``torchmpm``."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -40,6 +41,23 @@ def test_every_program_is_started_under_its_name_with_examples(name, capsys):
     started = f"torchmpm {name.split()[0]}"
     assert code == 0 and text.startswith(f"usage: {started} ") and f"Examples:\n  {started} " in text
     assert ("--learner" in text) == (name == "train") and ("--td-lambda" in text) == name.startswith("train")
+
+
+@pytest.mark.parametrize(
+    ("words", "basic"),
+    [
+        ("train", "task target algo preset learner steps seed device out resume"),
+        ("teach", "task target algo preset steps seed device out resume"),
+        ("compare", "tasks algos seeds preset steps device workers episodes out report-only"),
+    ],
+)
+def test_help_shows_basic_options_first(words, basic, capsys):
+    _, text, _ = output_of(capsys, words, "--help")
+    first, _, advanced = text.partition("advanced")
+    shown = re.findall(r"^[│ ] --([a-z-]+)", first, re.MULTILINE)
+    assert shown == basic.split()
+    assert "--dry-run" in advanced and not set(re.findall(r"^[│ ] --([a-z-]+)", advanced, re.MULTILINE)) & set(shown)
+    assert "Environment steps" in first and "Only " in advanced  # with their descriptions
 
 
 def test_options_and_exit_codes_reach_the_program_and_the_shell(tmp_path, capsys):

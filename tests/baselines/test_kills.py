@@ -44,8 +44,8 @@ def check_whole(folder):
         json.loads(path.read_text())
     for path in folder.glob("*.safetensors"):
         baselines.load(path)
-    if (checkpoint := Checkpoint(folder / "checkpoint")).exists():
-        checkpoint.read()
+    if (folder / "checkpoint" / "state.pt").exists():
+        Checkpoint(folder / "checkpoint").read()
     return [row["step"] for row in read_table(folder / "evaluations.csv")]
 
 
