@@ -52,11 +52,6 @@ TRAIN = [
         "preset must be one of quick, long, paper for shapematch, got 'slow'",
     ),
     training("an unknown option", "--colour red", "Unrecognized options: --colour"),
-    training(
-        "handovers of 401 digits",
-        f"--handover 1{'0' * 400}",
-        "handover must increase between 0 and the number of steps",
-    ),
     training("a seed by name", "--seed x", "Error parsing --seed: invalid literal for int()", "'x'"),
     training("seed -1", "--seed -1", "seed must be between 0 and 2147483647, got -1"),
     training("no particles", "--particles 0", "particles must be at least 1 for every body, got 0"),
