@@ -35,8 +35,8 @@ class RunConfig:
     algo: str = "cfp"
     """Algorithm."""
     preset: Preset = "quick"
-    """Source of the defaults: quick (minutes), paper (as published; not for learner analytic), or long (a night; learner
-    sac alone)."""
+    """Source of the defaults: quick (minutes), paper (as published; not for learner analytic), or long (a night;
+    learner sac alone)."""
     seed: int = 0
     """Seed of everything that is random."""
     device: str = "auto"
