@@ -83,7 +83,7 @@ def test_positions_option() -> None:
     ("positions", "message"),
     [
         (np.zeros((299, 2)), r"positions must have shape \(300, 2\)"),
-        (np.full((300, 2), np.nan), "inside the window"),
+        (np.full((300, 2), np.nan), "positions must be finite, got nan"),
         (np.linspace((0.0, 0.5), (2.0, 0.5), 300), "inside the window"),
         (np.linspace((0.4, -0.5), (0.5, 0.5), 300), "inside the window"),
     ],
