@@ -107,6 +107,8 @@ ANALYTIC: dict[str, AnalyticNumbers] = {
 
 NOISE_SCALE: dict[str, tuple[float, float]] = {"shapematch": (0.1, 0.4)}
 """Exploration noise of the presets ``quick`` and ``long`` where it is weaker: without gravity it tears robots."""
+FINE_ALPHA: dict[str, float] = {"shapematch": 1e-4}
+"""Temperature of stage 2 of these presets where its grid is much finer: entropy grows with the number of entries."""
 DEFAULT_TASK = "shapematch"
 """Task of a command line that names none."""
 CUSTOM_TASK = TASKS["run"]
@@ -211,7 +213,7 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
         handover=(steps // 2,),
         resolutions=(4, coarse) if coarse > 4 else numbers.resolutions,
         random_steps=(480, 100),
-        alpha=(0.5 * numbers.alpha[0], 0.5 * numbers.alpha[0]),
+        alpha=(0.5 * numbers.alpha[0], FINE_ALPHA.get(task, 0.5 * numbers.alpha[0])),
         environment=EnvironmentConfig(),
         network=replace(paper.network, interpolation="half_pixel", encoder="lean"),
         learning=LearningConfig(
