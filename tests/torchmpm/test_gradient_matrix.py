@@ -147,7 +147,7 @@ def test_soil_against_central_differences(factor: float, name: str) -> None:
     direction = normal(*given[name].shape, seed=20)
     leaf = given[name].clone().requires_grad_()
     slope = (torch.autograd.grad(soil_loss(given | {name: leaf}), leaf)[0] * direction).sum().item()
-    step = 1e-6 * max(given[name].abs().max().item(), 1.0)
+    step = (1e-6 if name == "F" else 1e-5) * max(given[name].abs().max().item(), 1.0)  # hardened soil curves in F
     ahead, behind = (soil_loss(given | {name: given[name] + side * step * direction}).item() for side in (1, -1))
     difference = (ahead - behind) / (2 * step)
     assert abs(slope - difference) <= 1e-5 * abs(difference) + 1e-15 * max(abs(ahead), 1.0) / step
