@@ -139,7 +139,7 @@ def test_critics_of_a_level_begin_with_those_before_if_asked_to(tmp_path, monkey
 
 
 def test_refining_goes_on_with_the_weights_of_a_policy(coarse, tmp_path):
-    options = "--refine --actor-start 100 --random-steps 50 50 --eval-every 10".split()
+    options = "--refine --actor-start 100 --random-steps 50 50 --eval-every 10 --steps 90".split()
     assert run(tmp_path / "a", "--start-from", str(coarse), *options) == 0
     assert all(not row.get("train/drift") for row in read_table(tmp_path / "a" / "progress.csv"))
     rows = read_table(tmp_path / "a" / "evaluations.csv")
@@ -148,7 +148,7 @@ def test_refining_goes_on_with_the_weights_of_a_policy(coarse, tmp_path):
     assert [row["mean"] for row in rows[:4]] == [rows[0]["mean"]] * 4
     begun, given = (PROGRAM.load(place).actor.state_dict() for place in (tmp_path / "a" / "stage1.json", coarse))
     assert all(torch.equal(begun[key], value) for key, value in given.items())
-    again = ["--refine", "--start-from", str(tmp_path / "a"), "--eval-every", "10"]
+    again = ["--refine", "--start-from", str(tmp_path / "a")]
     assert run(tmp_path / "b", *again) == 0
     assert float(read_table(tmp_path / "b" / "progress.csv")[-1]["train/drift"]) > 0
     assert {row["stage"] for row in read_table(tmp_path / "b" / "progress.csv")} == {"2"}
