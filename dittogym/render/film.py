@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Iterable, Iterator
 from contextlib import closing
 from importlib.util import find_spec
@@ -12,6 +11,8 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+
+from dittogym.render.files import replacing
 
 #: The unit in which a format counts the time of a picture, s; a film has the nearest rate that is possible.
 UNITS = {".gif": 0.01, ".webp": 0.001, ".mp4": None}
@@ -43,10 +44,7 @@ def write_film(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     Raises:
         VideoUnavailable: MP4 without imageio and its ffmpeg.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".{path.stem}.part{path.suffix}")
-    try:
-        aside.touch()  # names the file where it cannot be written; what ffmpeg says is a page long
+    with replacing(path) as aside:
         if path.suffix == ".mp4":
             _write_mp4(aside, frames, rate)
         else:
@@ -54,10 +52,6 @@ def write_film(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
             quality: Any = {"quality": 75, "method": 3} if path.suffix == ".webp" else {}
             first, duration = next(pictures), round(1000 / rate)
             first.save(aside, save_all=True, append_images=pictures, duration=duration, loop=0, **quality)
-        os.replace(aside, path)
-    except BaseException:  # a simulation that fails, a second Ctrl-C
-        aside.unlink(missing_ok=True)
-        raise
 
 
 def _held(frames: Iterable[np.ndarray], times: int) -> Iterator[np.ndarray]:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from dittogym.render.files import replacing
 from dittogym.render.film import UNITS, possible_rate, write_film
 from dittogym.render.frame import frame, pace
 from dittogym.render.replay import replay_page
@@ -128,11 +129,11 @@ class Recording:
         """
         path = check_film(path, size, rate, speed, zoom, muscles, pictures)
         if path.suffix == ".html":
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(self.page(speed))
+            with replacing(path) as aside:
+                aside.write_text(self.page(speed))
         elif path.suffix == ".png":
-            path.parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(self._strip(size, zoom, muscles, pictures)).save(path)
+            with replacing(path) as aside:
+                Image.fromarray(self._strip(size, zoom, muscles, pictures)).save(aside)
         else:
             rate = possible_rate(path.suffix, rate)
             write_film(path, self.frames(size=size, rate=rate, speed=speed, zoom=zoom, muscles=muscles), rate)

@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from dittogym.render.files import replacing
 from dittogym.trajectories.episode import Episode
 from torchmpm import checks
 
@@ -43,8 +44,8 @@ def save_episodes(path: str | os.PathLike[str], episodes: Sequence[Episode]) -> 
         arrays |= {f"{i}/particles/{name}": values for name, values in episode.particles.items()}
     listed = [{"seed": episode.seed, "task": episode.task, "fields": list(episode.particles)} for episode in episodes]
     about = json.dumps({"format": FORMAT, "version": VERSION, "episodes": listed})
-    file.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(file, about=np.array(about), **arrays)
+    with replacing(file) as aside:
+        np.savez_compressed(aside, about=np.array(about), **arrays)
     return file
 
 

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import zlib
 from dataclasses import replace
+from unittest.mock import Mock
 
 import cv2
 import gymnasium
@@ -17,6 +18,7 @@ from PIL import Image
 from tiny import SMALL
 
 import dittogym
+from dittogym.render import files
 from dittogym.render.film import write_film
 from dittogym.render.frame import pace
 from dittogym.render.recording import Recording, as_function
@@ -85,6 +87,19 @@ def test_a_film_that_fails_leaves_the_old_file(tmp_path, suffix: str) -> None:
     with pytest.raises(ValueError, match="the robot is gone"):
         write_film(path, frames(), 10)
     assert [each.name for each in tmp_path.iterdir()] == [path.name] and path.read_bytes() == b"old"
+
+
+@pytest.mark.parametrize("suffix", [".html", ".png", ".webp"])
+def test_a_program_that_is_stopped_leaves_the_old_file(
+    recording: Recording, tmp_path, monkeypatch, suffix: str
+) -> None:
+    """Up to the last moment, in which the new file takes its place."""
+    path = tmp_path / f"film{suffix}"
+    path.write_text("old")
+    monkeypatch.setattr(files.os, "replace", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        recording.save(path, size=16, rate=5)
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
 def test_pictures_of_a_film(recording: Recording) -> None:

@@ -1,6 +1,7 @@
 """Recorded episodes: they are what happened, and files give them back."""
 
 import sys
+from unittest.mock import Mock
 
 import gymnasium
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 
 import dittogym
 from dittogym import trajectories
+from dittogym.render import files
 from dittogym.trajectories.storage import ARRAYS
 
 OPTIONS = {"particles": 100, "substeps": 1}
@@ -65,6 +67,15 @@ def test_archive_gives_the_same_back(episodes, tmp_path):
     path = trajectories.save_episodes(tmp_path / "new" / "episodes.npz", episodes)
     for episode, again in zip(episodes, trajectories.load_episodes(path), strict=True):
         assert_same(again, episode)
+
+
+def test_archive_is_replaced_when_all_of_it_is_written(episodes, tmp_path, monkeypatch):
+    path = tmp_path / "episodes.npz"
+    path.write_text("old")
+    monkeypatch.setattr(files.os, "replace", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        trajectories.save_episodes(path, episodes)
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
 def test_minari_gives_the_same_back(env, episodes, tmp_path, monkeypatch):
