@@ -10,6 +10,7 @@ from torch import Tensor
 from baselines.modular.kmeans import fit, update
 from baselines.modular.nodes import Nodes, visible_positions
 from dittogym import TorchEnv
+from dittogym.spec import TaskSpec
 from torchmpm import tree
 
 
@@ -45,6 +46,11 @@ class SegmentedEnv:
         """Spaces of observations (K, columns) and actions (K, 2)."""
         shape = tuple(self._observation.shape[1:])
         return spaces.Box(-np.inf, np.inf, shape, np.float32), spaces.Box(-1.0, 1.0, (self.nodes.count, 2), np.float32)
+
+    @property
+    def spec(self) -> TaskSpec:
+        """The task."""
+        return self.env.spec
 
     @property
     def env_state(self) -> SegmentedState:

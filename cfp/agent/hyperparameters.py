@@ -48,8 +48,8 @@ class LearningConfig:
     weight_average: float = 0.0
     """Decay of the average of the actor's weights over updates, which is the policy; 0: the actor itself."""
     max_episode_steps: int | None = None
-    """Steps after which training episodes are truncated; robots begin at different ages. None: the task's horizon,
-    and all begin together."""
+    """Steps after which training episodes are truncated, if the task's horizon is not shorter; robots begin at
+    different ages. None: the horizon, and all begin together."""
     warm_critic: bool = False
     """Initialise critics and reward statistics of each stage from the previous one, instead of anew."""
 

@@ -54,7 +54,7 @@ class AnalyticConfig(CoarseToFineConfig):
     max_grad_norm: float = 1.0
     """Largest norm of a gradient of the networks, of actor and critic each."""
     max_episode_steps: int = 10_000
-    """Control steps after which a training episode is truncated, if the task does not do so earlier."""
+    """Control steps after which a training episode is truncated, if the task's horizon is not shorter."""
     num_layouts: int = 256
     """Particle layouts that training episodes start from in turn."""
     displacement: bool = True

@@ -29,9 +29,9 @@ class TorchVecEnv(VecEnv):
     Args:
         env: A `dittogym.TorchEnv`, or an environment with its interface; it is stepped without gradients.
         spaces: Spaces of observations and actions; None: those of `dittogym.TorchEnv`.
-        max_episode_steps: Steps after which episodes are truncated; None: the task's. After a reset of all elements,
-            the first episode of element i is truncated after a fraction ``(i + 1) / B`` of them already, so that a
-            batch always holds beginnings and ends of episodes.
+        max_episode_steps: Steps after which episodes are truncated, at most the task's horizon; None: the horizon.
+            After a reset of all elements, the first episode of element i is truncated after a fraction
+            ``(i + 1) / B`` of them already, so that a batch always holds beginnings and ends of episodes.
     """
 
     def __init__(
@@ -40,7 +40,8 @@ class TorchVecEnv(VecEnv):
         spaces: tuple[Space[Any], Space[Any]] | None = None,
         max_episode_steps: int | None = None,
     ) -> None:
-        self.torch_env, self.max_episode_steps = env, max_episode_steps
+        self.torch_env = env
+        self.max_episode_steps = None if max_episode_steps is None else min(max_episode_steps, env.spec.horizon)
         self.render_mode = "rgb_array"
         super().__init__(env.num_envs, *(spaces or dittogym_env.spaces(env)))
         self._actions: Tensor | None = None

@@ -1,6 +1,7 @@
 """A tiny environment with the interface of `dittogym.TorchEnv`, for tests of what lies above the physics."""
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -32,7 +33,7 @@ class FakeEnv:
     """
 
     def __init__(self, num_envs=2, resolution=8, horizon=5, end_above=10.0, start=0.0, push=0.1, faults=None):
-        self.num_envs, self.action_resolution, self.horizon = num_envs, resolution, horizon
+        self.num_envs, self.action_resolution, self.spec = num_envs, resolution, SimpleNamespace(horizon=horizon)
         self.end_above, self.faults, self.device = end_above, faults or {}, torch.device("cpu")
         self.start, self.push = start, push
         self.observation_shape, self.action_shape = (3, 64, 64), (2, resolution, resolution)
@@ -68,7 +69,8 @@ class FakeEnv:
             "is_success": height > 0.4,
             "reward_terms": {"near": reward - 1, "alive": reward * 0 + 1},
         }
-        return self._observe(), reward, (height > self.end_above) | ~finite, self.env_state.steps >= self.horizon, info
+        terminated, truncated = (height > self.end_above) | ~finite, self.env_state.steps >= self.spec.horizon
+        return self._observe(), reward, terminated, truncated, info
 
     def render(self, index=0):
         return np.full((512, 512, 3), index, np.uint8)

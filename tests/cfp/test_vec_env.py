@@ -48,6 +48,13 @@ def test_first_episodes_are_truncated_at_different_ages_and_a_state_continues_th
     assert lengths(other, 10) == lengths(env, 10) == [[4], [1, 7]]
 
 
+def test_episodes_are_never_longer_than_the_horizon():
+    env = TorchVecEnv(FakeEnv(num_envs=2, horizon=6), max_episode_steps=10)
+    env.reset()
+    ends = [step for step in range(13) if env.step(actions(env))[2][1]]
+    assert ends == [5, 11]
+
+
 def test_only_the_element_that_ended_is_reset():
     env = TorchVecEnv(FakeEnv(num_envs=2, horizon=50, end_above=0.15))
     env.reset()
@@ -132,12 +139,12 @@ def test_episode_in_progress_can_be_put_back():
 
 def test_elements_share_attributes_and_pictures_come_one_by_one():
     env = TorchVecEnv(FakeEnv(num_envs=2))
-    assert env.get_attr("horizon") == [5, 5]
-    assert env.get_attr("horizon", 1) == [5]
-    env.set_attr("horizon", 7)
+    assert env.get_attr("push") == [0.1, 0.1]
+    assert env.get_attr("push", 1) == [0.1]
+    env.set_attr("push", 7)
     assert env.env_method("render", 1)[0].max() == 1
     with pytest.raises(ValueError, match="indices"):
-        env.set_attr("horizon", 7, indices=[0])
+        env.set_attr("push", 7, indices=[0])
     assert [int(image.max()) for image in env.get_images()] == [0, 1]
     assert env.env_is_wrapped(object) == [False, False]
 
