@@ -26,9 +26,9 @@ from cfp.weights import describe_run
 from dittogym.contract import Outcome
 
 TINY = (
-    "--task shapematch --learner analytic --particles 300 --train-particles 300 --substeps 4 --num-envs 2 --resolutions 4 8 "
-    "--window 4 --steps 96 --handover 48 --minibatches 4 --minibatch-size 8 --windows-kept 3 --num-layouts 4 "
-    "--eval-every 48 --eval-episodes 1 --checkpoint-every 16 --log-every 8 --no-video --device cpu"
+    "--task shapematch --learner analytic --particles 300 --train-particles 300 --substeps 4 --num-envs 2 "
+    "--resolutions 4 8 --window 4 --steps 96 --handover 48 --minibatches 4 --minibatch-size 8 --windows-kept 3 "
+    "--num-layouts 4 --eval-every 48 --eval-episodes 1 --checkpoint-every 16 --log-every 8 --no-video --device cpu"
 ).split()
 
 
