@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from task_pages import headline
 
 import cfp
 import dittogym
 from cfp.weights import SHIPPED
 from dittogym.render.film import write_film
 from dittogym.render.recording import Recording
+from dittogym.tasks import headline
 
 IMAGES = Path(__file__).resolve().parent / "images"
 FILMS = IMAGES / "films"

@@ -10,12 +10,16 @@ from pathlib import Path
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from task_pages import PAGES, headline, write
+from task_pages import PAGES, write
 
 import dittogym
 from baselines.compare import paper
+from baselines.compare.final_evaluation import FinalEvaluation
+from baselines.compare.plots import final_returns
+from baselines.compare.results import Group
 from baselines.leaderboard.__main__ import rankings
 from baselines.leaderboard.submission import read_submissions
+from dittogym.tasks import headline
 
 DOCS = Path(__file__).resolve().parent
 OBSERVES = ("image", "state", "simulator", "nothing")
@@ -154,6 +158,20 @@ def of_task(task: str) -> str:
     )
 
 
+def comparison_figure(path: Path) -> None:
+    """Draw the final returns of all algorithms on SHAPE MATCH, as the report of a comparison does."""
+    rows = sorted(read("compare-shapematch.csv"), key=lambda row: OBSERVES.index(row["sees"]))
+    groups = []
+    for row in rows:
+        both = row["lowest seed"], row["highest seed"]
+        scores = both if all(both) else (row["return, lite (mean of seeds)"],)
+        found = [FinalEvaluation((float(score),), None, None, {}, True) for score in scores]
+        groups.append(Group(headline("shapematch")[0], row["sees"], row["algorithm"], None, found, [], []))
+    drawing = final_returns(groups)
+    FigureCanvasSVG(drawing)
+    drawing.savefig(path, metadata={"Date": None})
+
+
 def leaderboard() -> str:
     """The rankings of the committed submissions."""
     submissions = read_submissions(sorted((DOCS / "leaderboard").glob("*.json")))
@@ -226,4 +244,5 @@ def write_results() -> None:
     for task in dittogym.TASKS:
         write(PAGES / f"returns-{task}.md", of_task(task))
     figure(PAGES / "returns.svg")
+    comparison_figure(PAGES / "comparison.svg")
     rewards_figure(PAGES / "rewards.svg")

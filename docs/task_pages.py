@@ -14,6 +14,7 @@ import dittogym
 from dittogym.bodies.positions import particle_counts
 from dittogym.geometry import Obstacle
 from dittogym.spec import BodySpec, TaskSpec
+from dittogym.tasks import headline
 from torchmpm import Snow, VelocityRule
 
 DOCS = Path(__file__).resolve().parent
@@ -139,12 +140,6 @@ def summary() -> str:
             f"| [`{name}`](generated/{name}.md) | {what} | {spec.horizon} | {spec.coarse}, {spec.fine} | {objects} |"
         )
     return "\n".join(lines) + "\n"
-
-
-def headline(name: str) -> tuple[str, str]:
-    """Title and goal of a task, from its module's docstring."""
-    title, _, what = (importlib.import_module(f"dittogym.tasks.{name}").__doc__ or "").strip().partition(": ")
-    return title, what[:1].upper() + what[1:]
 
 
 def numbers(spec: TaskSpec) -> list[tuple[str, str]]:

@@ -34,26 +34,34 @@ def _styles(groups: Sequence[Group]) -> Styles:
     return styles
 
 
-def _panels(tasks: Sequence[str], height: float, styles: Styles) -> tuple[Figure, dict[str, Axes]]:
-    """A figure with a panel of some height in inches for each task, and a legend below."""
-    handles = [Line2D([], [], **style, label=f"{label} (observes {seen})") for (label, seen), style in styles.items()]
+def _panels(tasks: Sequence[str], height: float) -> tuple[Figure, dict[str, Axes]]:
+    """A figure with a panel of some height in inches for each task."""
     columns = min(len(tasks), 3)
-    rows, legend_columns = math.ceil(len(tasks) / columns), max(3, 2 * columns)
-    size = (max(6.5, 4.6 * columns), height * rows + 0.3 * math.ceil(len(handles) / legend_columns) + 0.2)
+    rows = math.ceil(len(tasks) / columns)
+    size = (max(6.5, 4.6 * columns), height * rows + 0.2)
     figure = Figure(figsize=size, dpi=130, layout="constrained")
     panels = {task: figure.add_subplot(rows, columns, index + 1) for index, task in enumerate(tasks)}
     for task, axes in panels.items():
         axes.set_title(task)
         axes.grid(alpha=0.3)
-    figure.legend(handles=handles, loc="outside lower center", ncols=legend_columns, fontsize=8, frameon=False)
     return figure, panels
+
+
+def _add_legend(figure: Figure, styles: Styles) -> None:
+    """Let the figure grow by a legend below its panels, whose lines are long enough to tell dashes apart."""
+    handles = [Line2D([], [], **style, label=f"{label} (observes {seen})") for (label, seen), style in styles.items()]
+    columns = max(2, int(figure.get_figwidth() / 2.6))
+    figure.set_figheight(figure.get_figheight() + 0.3 * math.ceil(len(handles) / columns))
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=columns, fontsize=9, frameon=False, handlelength=3.5
+    )
 
 
 def learning_curves(groups: Sequence[Group], *, minutes: bool = False) -> Figure:
     """Evaluations during training: interquartile mean over seeds and its 95 % band, over steps or time."""
     styles = _styles(groups)
     shown = [group for group in groups if group.curves and (group.speed or not minutes)]
-    figure, panels = _panels(list(dict.fromkeys(group.task for group in shown)), 3.4, styles)
+    figure, panels = _panels(list(dict.fromkeys(group.task for group in shown)), 3.4)
     for group in shown:
         axes, style = panels[group.task], styles[group.label, group.observes]
         steps, values = align_curves(group.curves)
@@ -64,6 +72,7 @@ def learning_curves(groups: Sequence[Group], *, minutes: bool = False) -> Figure
             axes.fill_between(steps, *band, color=style["color"], alpha=0.15, linewidth=0)
     for axes in panels.values():
         axes.set(xlabel="minutes of training" if minutes else "environment steps", ylabel="return of an evaluation")
+    _add_legend(figure, styles)
     return figure
 
 
@@ -74,7 +83,7 @@ def final_returns(groups: Sequence[Group]) -> Figure:
     for group in groups:
         if group.scores:
             members.setdefault(group.task, []).append(group)
-    figure, panels = _panels(list(members), 1.2 + 0.3 * max(map(len, members.values())), styles)
+    figure, panels = _panels(list(members), 1.2 + 0.3 * max(map(len, members.values())))
     for task, axes in panels.items():
         shown = members[task]
         for place, group in enumerate(shown):

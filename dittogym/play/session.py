@@ -22,7 +22,7 @@ from dittogym.play import protocol
 from dittogym.play.hand import Grip, press, wave
 from dittogym.render.recording import Recording
 from dittogym.render.scene import Shot, describe
-from dittogym.tasks import TASKS, task_name
+from dittogym.tasks import TASKS, headline, task_name
 from dittogym.torch_env import TorchEnv
 from dittogym.window import centre_in_window
 
@@ -90,6 +90,7 @@ class Session:
         spec, known = self.env.spec, inspect.signature(TASKS[task_name(self.task)]).parameters
         boxes = [(*body.shape.corner, *np.add(body.shape.corner, body.shape.size).tolist()) for body in spec.bodies]
         about = {
+            "title": headline(self.task)[0],
             "horizon": spec.horizon,
             "follow": spec.window.moves,
             "boxes": boxes,

@@ -34,6 +34,15 @@ def task_name(task: str) -> str:
     return task.rpartition(":")[2]
 
 
+def headline(task: str) -> tuple[str, str]:
+    """Title and goal of a task of the library, from its module's docstring; a custom task has its name and no goal."""
+    name = task_name(task)
+    if getattr(TASKS[name], "__module__", None) != f"{__name__}.{name}":
+        return name, ""
+    title, _, goal = (inspect.getdoc(inspect.getmodule(TASKS[name])) or "").partition(": ")
+    return title, goal[:1].upper() + goal[1:]
+
+
 def fingerprint(task: str) -> str | None:
     """SHA-256 of the file that defines a custom task; ``None`` for a task of the library, or if there is no file."""
     try:

@@ -19,7 +19,7 @@ from dittogym.bodies.shapes import Disc, Rectangle
 from dittogym.contract import Moment, Outcome
 from dittogym.geometry import ceiling, floor, solid
 from dittogym.spec import BodySpec, TaskSpec
-from dittogym.tasks import fingerprint
+from dittogym.tasks import fingerprint, headline
 from dittogym.window import Window
 from torchmpm import Elastic, VelocityRule
 
@@ -437,3 +437,9 @@ def test_an_environment_is_made_again_from_the_json_of_its_specification(task: s
     assert models[0].constants == models[1].constants
     assert np.array_equal(env.reset(seed=0)[0], same.reset(seed=0)[0])
     gymnasium.make_vec(f"dittogym/{task}-coarse-v0", 2, **SMALL, **options).spec.to_json()
+
+
+def test_its_title_is_its_name() -> None:
+    dittogym.register("hop", hop)
+    assert headline("hop") == headline("module:hop") == ("hop", "")
+    assert headline("shapematch") == ("SHAPE MATCH", "Take the shape of a picture, without gravity.")

@@ -112,7 +112,7 @@ def test_the_robot_is_drawn_where_it_is(played: Played) -> None:
 def test_keys_and_brush(played: Played) -> None:
     page, session = played.page, played.session
     page.keyboard.press(" ")
-    played.until(lambda: not session.playing)
+    played.until(lambda: page.inner_text("#play") == "Play")  # the session itself says so within each step, too
     before = int(session.env.env_state.steps[0])
     page.keyboard.press(".")
     played.until(lambda: int(session.env.env_state.steps[0]) == before + 1)
@@ -185,6 +185,7 @@ def test_a_drawn_robot(played: Played) -> None:
 def test_small_screens_and_the_end_of_the_program(browser: Any) -> None:
     played = Played(browser, width=390, task="shapematch")
     assert played.page.evaluate("document.documentElement.scrollWidth") <= 390
+    assert played.page.inner_text("#task") == "SHAPE MATCH" and played.page.title() == "SHAPE MATCH · dittogym"
     assert played.page.locator("#what option").count() == 2 and played.page.input_value("#speed") == "0.1"
     played.page.click("#draw")
     assert played.page.evaluate("scrollY") > 0

@@ -19,8 +19,8 @@ const stats = window.stats = { frames: 0, latencies: [], place: (x, y) => scene.
 const link = new Link({
   hello(message) {
     task = message;
-    document.title = `${task.task} · dittogym`;
-    $("task").textContent = task.task;
+    document.title = `${task.title} · dittogym`;
+    $("task").textContent = task.title;
     $("speed").value = task.speed;
     ui.colour = task.colour;
     $("horizon").textContent = ` / ${task.horizon}`;
