@@ -107,18 +107,16 @@ class ModularPolicy(NetworkPolicy):
 
 
 class Modular(SACAlgorithm):
-    """A modular policy, trained by soft actor-critic; a subclass names its network and number of segments."""
+    """A modular policy, trained by soft actor-critic."""
 
-    algo: ClassVar[str]
     sees: ClassVar[Sees] = "state"
     config: ModularConfig
 
-    @classmethod
-    def preset(cls, task: str, name: str) -> ModularConfig:
+    @staticmethod
+    def preset(task: str, name: str) -> ModularConfig:
         """The environment, learning and temperature of the first stage of `cfp.preset`, for all its steps."""
         base = sac_preset(task, name)
         return ModularConfig(
-            algo=cls.algo,
             task=task,
             preset=base.preset,
             environment=base.environment,
@@ -133,10 +131,7 @@ class Modular(SACAlgorithm):
     def create(cls, config: ModularConfig, stage: int, folder: Path, resumed: bool = False) -> Modular:
         """The algorithm at the beginning of its only stage."""
         env = SegmentedEnv(make_torch_env(config, config.resolution(stage)), config.nodes)
-        networks = {
-            "kind": config.kind,
-            "features": config.nodes.num_features(env.env.spec),
-        }
+        networks = {"kind": config.kind, "features": config.nodes.num_features(env.env.spec)}
         monitor = VecMonitor(TorchVecEnv(env, env.spaces, config.learning.max_episode_steps))
         model = cls.make_model(config, monitor, ModularPolicy, networks, cls.hyperparameters(config, stage, folder))
         return cls(config, stage, model)
@@ -156,27 +151,3 @@ class Modular(SACAlgorithm):
     def load(cls, path: Path, device: str = "cpu") -> SegmentPolicy:
         """Load a policy."""
         return SegmentPolicy.load(path, device)
-
-
-class GNN16(Modular):
-    """A graph network over 16 segments."""
-
-    algo = "gnn-16"
-
-
-class GNN64(Modular):
-    """A graph network over 64 segments."""
-
-    algo = "gnn-64"
-
-
-class Transformer16(Modular):
-    """A Transformer over 16 segments."""
-
-    algo = "transformer-16"
-
-
-class Transformer64(Modular):
-    """A Transformer over 64 segments."""
-
-    algo = "transformer-64"

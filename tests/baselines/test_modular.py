@@ -12,8 +12,8 @@ import baselines
 from baselines.modular.kmeans import fit, update
 from baselines.modular.networks import ModularActor, ModularCritics, SegmentPolicy
 from baselines.modular.nodes import Nodes, pack, visible_positions
-from baselines.modular.train import GNN16, ModularConfig
-from baselines.registry import find
+from baselines.modular.train import Modular, ModularConfig
+from baselines.registry import configure, find
 from cfp.envs.disturbances import Case
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import CheckpointError, ConfigError
@@ -80,7 +80,7 @@ def test_networks_have_the_documented_sizes(kind, actor, critics):
 
 
 def config(algo, **changes):
-    base = find(algo).preset("run", "quick")
+    base = configure({"algo": algo, "task": "run"})
     return replace(
         base,
         device="cpu",
@@ -127,7 +127,7 @@ def test_policy_of_a_file_acts_like_the_one_in_training(tmp_path):
     """In the training environment and attached to one of its own, step by step."""
     model = model_of("gnn-16", tmp_path / "run")
     nodes = Nodes(16, True)
-    description = describe_run(GNN16.preset("run", "quick"), "gnn-16", 1, 0)
+    description = describe_run(Modular.preset("run", "quick"), "gnn-16", 1, 0)
     SegmentPolicy(model.networks()[0], nodes, description).save(tmp_path / "a.safetensors")
     policy = baselines.load(tmp_path / "a.safetensors")
     env = TorchEnv("run", 2, 64, particles=200, substeps=2)

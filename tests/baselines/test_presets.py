@@ -21,7 +21,7 @@ def test_presets_are_valid_survive_json_and_agree_with_that_of_cfp(task, preset)
             with pytest.raises(ConfigError, match=f"preset must be .* for {name}, got '{preset}'"):
                 configure({"algo": name, "task": task, "preset": preset})
             continue
-        config = algorithm.preset(task, preset)
+        config = configure({"algo": name, "task": task, "preset": preset})
         config.check()
         assert configure(json.loads(json.dumps(to_json(config)))) == config, name
         if algorithm.sees in ("image", "state"):  # the others have no noise
