@@ -6,12 +6,12 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from baselines.common.policies import StateBasedPolicy, load_network
 from cfp.agent.actor import Actor
+from cfp.agent.actor_policy import Memory
 from cfp.agent.networks import LATENT, Encoder, initialise
 from cfp.agent.spec import ActorSpec
 from cfp.analytic.critic import mlp
@@ -51,11 +51,6 @@ class ImageActor(nn.Module):
         return mean
 
 
-def state_critic(inputs: int) -> nn.Module:
-    """Value (B, 1) of features (B, D)."""
-    return mlp(inputs, 1)
-
-
 def image_critic() -> nn.Module:
     """Value (B, 1) of images (B, 3, 64, 64) in [-1, 1], with an encoder like the actor's."""
     return initialise(nn.Sequential(Encoder(3, 32), nn.Flatten(), mlp(LATENT, 1)))
@@ -88,9 +83,7 @@ class StatePolicy(StateBasedPolicy):
         """Number of features of a task."""
         return self.features.size(len(spec.bodies) - 1)
 
-    def _act(
-        self, env: TorchEnv, state: tuple[np.ndarray, ...] | None, deterministic: bool
-    ) -> tuple[Tensor, tuple[np.ndarray, ...] | None]:
+    def _act(self, env: TorchEnv, state: Memory, deterministic: bool) -> tuple[Tensor, Memory]:
         mean = self.actor(self.features(env).float().to(next(self.actor.parameters()).device))
         if not deterministic:
             mean = mean + self.noise * torch.randn_like(mean)

@@ -1,7 +1,7 @@
 """Short-horizon actor-critic: a policy trained by gradients through the simulation (Xu et al., ICLR 2022)."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -10,9 +10,10 @@ from torch import Tensor, nn
 
 from baselines.common.grid import GridConfig
 from baselines.common.policies import StateBasedPolicy
-from baselines.shac.networks import ImageActor, StateActor, StatePolicy, image_critic, state_critic
+from baselines.shac.networks import ImageActor, StateActor, StatePolicy, image_critic
 from cfp.agent.actor_policy import ActorPolicy, image_policy
-from cfp.analytic.critic import BETAS, Critic
+from cfp.analytic.config import WindowConfig
+from cfp.analytic.critic import BETAS, Critic, mlp
 from cfp.analytic.episodes import Episodes
 from cfp.analytic.features import StateFeatures
 from cfp.analytic.reward import RewardConfig
@@ -24,9 +25,9 @@ from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.algorithm import Algorithm, Scalars, Sees
 from cfp.experiment.schedules import linear_decay, stage_progress
 from cfp.policy_protocols import Policy
-from cfp.presets import sac_preset
-from cfp.sections import Particles, ReportConfig
-from cfp.validation import check_at_least, check_fraction, check_positive
+from cfp.presets import ON_SPEED, sac_preset
+from cfp.sections import ReportConfig
+from cfp.validation import check_at_least
 from cfp.weights import KIND, load, policy_for, read_policy, save_policy
 
 PATIENCE = 10
@@ -50,7 +51,7 @@ METRICS: dict[str, str] = {
 
 
 @dataclass(frozen=True)
-class ShacConfig(GridConfig):
+class ShacConfig(WindowConfig, GridConfig):
     """A run of short-horizon actor-critic; num_envs robots learn side by side.
 
     The environment options say where the policy is evaluated; train_particles, where it is trained.
@@ -64,25 +65,9 @@ class ShacConfig(GridConfig):
     """Input of the policy: the privileged state (matter, deformation, clock), or the image like CFP's."""
     start_from: str | None = None
     """Policy of the image with one stage from which the actor starts, except for its standard deviation."""
-    train_particles: Particles = "lite"
-    """Particles of the simulations in training."""
     train_dt: float | None = None
     """Duration of a substep in training, s; None: 2e-4 in tasks where this changes little, unless substeps or
     dt are given."""
-    window: int = 16
-    """Control steps that a gradient reaches back."""
-    gamma: float = 0.98
-    """Discount factor."""
-    td_lambda: float = 0.95
-    """Lambda of the critic's TD(lambda) targets: 0 for single steps, 1 for the whole window."""
-    learning_rate: float = 1e-3
-    """Adam's step size for actor and critic at the beginning; it falls to a tenth."""
-    critic_updates: int = 16
-    """Updates of the critic after each window."""
-    tau: float = 0.4
-    """Fraction of the critic that goes into its target after each window."""
-    max_grad_norm: float = 1.0
-    """Largest norm of a gradient, of actor and critic each."""
     noise: float = 0.1
     """Standard deviation of actions before tanh (an image policy keeps its network's own, about 0.1)."""
     max_episode_steps: int = 400
@@ -95,7 +80,6 @@ class ShacConfig(GridConfig):
     """A policy of the state sees a clock."""
     displacement: bool = False
     """A policy of the state sees the robot's displacement since the reset."""
-    reward: RewardConfig = field(default_factory=RewardConfig)
 
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
 
@@ -111,13 +95,11 @@ class ShacConfig(GridConfig):
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
-        check_at_least(1, steps=self.steps, window=self.window, critic_updates=self.critic_updates)
-        check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
+        self.check_window()
+        check_at_least(1, steps=self.steps, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
         if self.start_from is not None and self.sees != "image":
             raise ConfigError(f"start_from is allowed with sees 'image' only, got sees {self.sees!r}")
         check_training_layouts("num_layouts", self.num_layouts, self.environment.num_envs)
-        check_fraction(gamma=self.gamma, td_lambda=self.td_lambda, tau=self.tau)
-        check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
         check_at_least(0, noise=self.noise)
 
 
@@ -154,11 +136,11 @@ class Shac(Stateful, Algorithm):
         self.collector = WindowCollector(episodes, self.observe, config.reward, config.window, config.gamma)
 
     def _make_networks(self) -> tuple[StateActor | ImageActor, nn.Module, nn.Module]:
-        size, device = self.features.size(len(self.env.spec.bodies) - 1), self.env.device
-        if self.config.sees == "state":
-            actor = StateActor(size, self.env.action_resolution).to(device)
-            return actor, state_critic(size).to(device), state_critic(size).to(device)
-        return ImageActor(self.env.action_resolution).to(device), image_critic().to(device), image_critic().to(device)
+        grid, device = self.env.action_resolution, self.env.device
+        if self.config.sees == "image":
+            return ImageActor(grid).to(device), image_critic().to(device), image_critic().to(device)
+        size = self.features.size(len(self.env.spec.bodies) - 1)
+        return StateActor(size, grid).to(device), mlp(size, 1).to(device), mlp(size, 1).to(device)
 
     def observe(self) -> Tensor:
         """Inputs (B, ...) of the networks in the present state."""
@@ -237,7 +219,7 @@ class Shac(Stateful, Algorithm):
         the lite tier. RUN and OBSTACLE are trained on speed, the others on their own smooth reward.
         """
         base = sac_preset(task, name)
-        quick, on_speed = name == "quick", task in ("run", "obstacle")
+        quick, on_speed = name == "quick", task in ON_SPEED
         return ShacConfig(
             task=task,
             preset="quick" if quick else "paper",

@@ -1,4 +1,4 @@
-"""The options of the learner ``analytic``."""
+"""The options of the learner ``analytic``, and of learners on windows of simulation in general."""
 
 from __future__ import annotations
 
@@ -12,21 +12,44 @@ from cfp.validation import check_at_least, check_fraction, check_positive
 
 
 @dataclass(frozen=True, kw_only=True)
-class AnalyticConfig(CoarseToFineConfig):
+class WindowConfig:
+    """Options of all learners that differentiate windows of simulation and value their ends by a critic."""
+
+    train_particles: Particles = "lite"
+    """Particles of the simulations in training."""
+    window: int = 16
+    """Control steps that a gradient reaches back."""
+    gamma: float = 0.98
+    """Discount factor."""
+    learning_rate: float = 1e-3
+    """Adam's step size for actor and critic at the beginning of a stage; it falls to a tenth."""
+    td_lambda: float = 0.95
+    """Lambda of the critic's TD(lambda) targets: 0 for single steps, 1 for the whole window."""
+    critic_updates: int = 16
+    """Updates of the critic after each window."""
+    tau: float = 0.4
+    """Fraction of the critic that goes into its target after each window."""
+    max_grad_norm: float = 1.0
+    """Largest norm of a gradient of the networks, of actor and critic each."""
+    reward: RewardConfig = field(default_factory=RewardConfig)
+
+    def check_window(self) -> None:
+        """Check these options."""
+        check_at_least(1, window=self.window, critic_updates=self.critic_updates)
+        check_fraction(gamma=self.gamma, td_lambda=self.td_lambda, tau=self.tau)
+        check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnalyticConfig(WindowConfig, CoarseToFineConfig):
     """A run of the coarse-to-fine policy that learns by gradients through the simulation.
 
     The environment options say where the policy is evaluated; train_particles and train_dt, where it is trained.
     """
 
     learner: Learner = "analytic"
-    train_particles: Particles = "lite"
-    """Particles of the simulations in training."""
     train_dt: float | None = None
     """Duration of a substep in training, s; None: as in the environment."""
-    window: int = 16
-    """Control steps that a gradient reaches back."""
-    gamma: float = 0.98
-    """Discount factor."""
     iterations: int = 1
     """Gradient steps on the actions of a window; for each one the window is simulated anew, and its steps count."""
     action_step: tuple[float, ...]
@@ -41,46 +64,26 @@ class AnalyticConfig(CoarseToFineConfig):
     """Latest windows that the regression draws from."""
     weight_average: float = 0.995
     """Decay of the average of the actor's weights, which is the policy; 0: the actor itself."""
-    learning_rate: float = 1e-3
-    """Adam's step size for actor and critic at the beginning of a stage; it falls to a tenth."""
     warmup: int = 15
     """Windows at the beginning of a stage that starts from a trained policy, in which only the critic learns."""
-    td_lambda: float = 0.95
-    """Lambda of the critic's TD(lambda) targets: 0 for single steps, 1 for the whole window."""
-    critic_updates: int = 16
-    """Updates of the critic after each window."""
-    tau: float = 0.4
-    """Fraction of the critic that goes into its target after each window."""
-    max_grad_norm: float = 1.0
-    """Largest norm of a gradient of the networks, of actor and critic each."""
     max_episode_steps: int = 10_000
     """Control steps after which a training episode is truncated, if the task's horizon is not shorter."""
     num_layouts: int = 256
     """Particle layouts that training episodes start from in turn."""
     displacement: bool = True
     """The critic sees the robot's displacement since the reset."""
-    reward: RewardConfig = field(default_factory=RewardConfig)
 
     per_stage: ClassVar[tuple[str, ...]] = ("action_step",)
 
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
+        self.check_window()
         check_at_least(0, warmup=self.warmup)
-        check_at_least(
-            1,
-            window=self.window,
-            iterations=self.iterations,
-            minibatches=self.minibatches,
-            minibatch_size=self.minibatch_size,
-            windows_kept=self.windows_kept,
-            critic_updates=self.critic_updates,
-            max_episode_steps=self.max_episode_steps,
-            num_layouts=self.num_layouts,
-        )
+        check_at_least(1, iterations=self.iterations, minibatches=self.minibatches, minibatch_size=self.minibatch_size)
+        check_at_least(1, windows_kept=self.windows_kept, max_episode_steps=self.max_episode_steps)
+        check_at_least(1, num_layouts=self.num_layouts)
         check_training_layouts("num_layouts", self.num_layouts, self.environment.num_envs)
-        check_fraction(gamma=self.gamma, td_lambda=self.td_lambda, tau=self.tau, final_step=self.final_step)
-        check_fraction(weight_average=self.weight_average)
-        check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
+        check_fraction(final_step=self.final_step, weight_average=self.weight_average)
         for size in self.action_step:
             check_positive(action_step=size)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
+from cfp.analytic.config import WindowConfig
 from cfp.analytic.stateful import Stateful
 from cfp.analytic.window import Window, td_lambda_targets
 
@@ -29,23 +28,6 @@ def mlp(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(*layers, last)
 
 
-class CriticOptions(Protocol):
-    """The options of a run that concern its critic, see `cfp.analytic.config.AnalyticConfig`."""
-
-    @property
-    def gamma(self) -> float: ...  # noqa: D102
-    @property
-    def td_lambda(self) -> float: ...  # noqa: D102
-    @property
-    def learning_rate(self) -> float: ...  # noqa: D102
-    @property
-    def critic_updates(self) -> int: ...  # noqa: D102
-    @property
-    def tau(self) -> float: ...  # noqa: D102
-    @property
-    def max_grad_norm(self) -> float: ...  # noqa: D102
-
-
 class Critic(Stateful):
     """A value network, its slowly following target, and their training on TD(lambda) targets.
 
@@ -57,7 +39,7 @@ class Critic(Stateful):
 
     parts = ("network", "target", "adam")
 
-    def __init__(self, network: nn.Module, target: nn.Module, options: CriticOptions) -> None:
+    def __init__(self, network: nn.Module, target: nn.Module, options: WindowConfig) -> None:
         self.network, self.target, self.options = network, target, options
         target.load_state_dict(network.state_dict())
         target.requires_grad_(False)
