@@ -8,6 +8,7 @@ from typing import Any, cast
 import numpy as np
 from torch import Tensor
 
+from cfp.agent.actor_policy import Memory, Observation, Start
 from cfp.experiment.algorithm import Algorithm
 from cfp.files import write_policy
 from cfp.hub import Shareable
@@ -40,12 +41,8 @@ class OpenLoop(Shareable):
         return self.actions.shape[-1]
 
     def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        self, observation: Observation, state: Memory = None, episode_start: Start = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Memory]:
         """Actions for the next step, as stable-baselines3's ``predict`` of a policy with memory.
 
         Args:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from cfp.agent.actor_policy import Memory, Observation, Start
 from cfp.hub import Shareable
 from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
@@ -58,12 +59,8 @@ class StateBasedPolicy(Shareable, ABC):
 
     @torch.no_grad()
     def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        self, observation: Observation, state: Memory = None, episode_start: Start = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Memory]:
         """Choose actions for the present state of the attached environment, as stable-baselines3's ``predict``.
 
         Args:
@@ -89,9 +86,7 @@ class StateBasedPolicy(Shareable, ABC):
         return array[0] if single else array, state
 
     @abstractmethod
-    def _act(
-        self, env: TorchEnv, state: tuple[np.ndarray, ...] | None, deterministic: bool
-    ) -> tuple[Tensor, tuple[np.ndarray, ...] | None]:
+    def _act(self, env: TorchEnv, state: Memory, deterministic: bool) -> tuple[Tensor, Memory]:
         """Actions (B, 2, R, R) for the state of an environment, and the memory for the next step."""
 
 

@@ -18,6 +18,7 @@ from baselines.modular.env import segment
 from baselines.modular.kmeans import fit, update
 from baselines.modular.nodes import Nodes, unpack, visible_positions
 from cfp.agent.actor import Sample, SquashedActor, sample_squashed_gaussian
+from cfp.agent.actor_policy import Memory
 from cfp.agent.networks import initialise, perceptron
 from cfp.files import write_policy
 from cfp.weights import read_policy, report_mismatch
@@ -155,9 +156,7 @@ class SegmentPolicy(StateBasedPolicy):
         policy.change = change
         return policy
 
-    def _act(
-        self, env: TorchEnv, state: tuple[np.ndarray, ...] | None, deterministic: bool
-    ) -> tuple[Tensor, tuple[np.ndarray, ...] | None]:
+    def _act(self, env: TorchEnv, state: Memory, deterministic: bool) -> tuple[Tensor, Memory]:
         """Actions (B, 2, P, P), and the segment of every particle, (B, N)."""
         x, count = visible_positions(env), self.nodes.count
         if state is None:
