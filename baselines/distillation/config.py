@@ -1,9 +1,8 @@
 """Options of a distillation."""
 
 from dataclasses import dataclass, field
-from typing import Literal
 
-from baselines.common.grid import SEEDED
+from baselines.common.grid import SEEDED, Grid
 from baselines.planning.gradient import GradientPlannerConfig
 from cfp.config import StagedConfig, check_training_layouts
 from cfp.sections import Particles
@@ -49,7 +48,7 @@ class DistillConfig(StagedConfig):
     num_layouts: int = 64
     """Particle layouts that training episodes start from in turn."""
     planner: GradientPlannerConfig = field(default_factory=GradientPlannerConfig)
-    planner_grid: int | Literal["coarse", "fine"] = "coarse"
+    planner_grid: Grid = "coarse"
     """Action grid of the teacher mpc."""
 
     def ineffective(self) -> dict[str, str]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,20 +20,21 @@ from baselines.distillation.config import DistillConfig
 from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entries
 from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
 from baselines.planning.gradient import GradientPlannerConfig
-from cfp.agent.actor import build_actor
-from cfp.agent.actor_policy import ActorPolicy, image_policy
+from cfp.agent.actor import Actor, build_actor
+from cfp.agent.actor_policy import ActorPolicy
 from cfp.analytic.episodes import Episodes
 from cfp.analytic.stateful import Stateful
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device, make_torch_env
 from cfp.errors import NonFiniteError
-from cfp.experiment.algorithm import Algorithm, Position, Scalars, Sees
+from cfp.experiment.algorithm import Position, Scalars
 from cfp.experiment.folder import policy_path
 from cfp.experiment.process import StopSignals
 from cfp.experiment.schedules import linear_decay, stage_progress
+from cfp.experiment.stages import CoarseToFineStages
 from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
-from cfp.weights import KIND, load, save_policy
+from cfp.weights import load
 from dittogym import make_spec
 
 METRICS: dict[str, str] = {
@@ -50,7 +51,7 @@ METRICS: dict[str, str] = {
 """Every scalar that `Distill.update` logs, and what it means."""
 
 
-class Distill(Stateful, Algorithm):
+class Distill(Stateful, CoarseToFineStages):
     """Supervised learning of the teacher's actions in the states that the student visits, by DAgger.
 
     The mean action is learned, by least squares after tanh: small differences in the muscles cost little. The standard
@@ -63,7 +64,6 @@ class Distill(Stateful, Algorithm):
         teacher: File of the teacher's policy, if it is not the one that the options name.
     """
 
-    sees: ClassVar[Sees] = "image"
     parts, values = ("actor", "adam", "dataset", "collector"), ("rounds",)
 
     def __init__(
@@ -79,8 +79,7 @@ class Distill(Stateful, Algorithm):
         if start is not None:
             self.actor.get_submodule("coarse").load_state_dict(start.actor.state_dict())
         self.actor.to(self.env.device)
-        trained = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
-        self.adam = torch.optim.Adam(trained, config.student_learning_rate)
+        self.adam = torch.optim.Adam(self.actor.trainable_parameters(), config.student_learning_rate)
         seed = config.seed + (stage - 1) * config.num_layouts
         episodes = Episodes(self.env, seed, config.max_episode_steps, config.num_layouts)
         guide, grid = self._make_teacher(training, teacher), self.spec.resolutions[-1]
@@ -166,9 +165,9 @@ class Distill(Stateful, Algorithm):
         return value
 
     @property
-    def policy(self) -> ActorPolicy:
-        """What has been learned so far."""
-        return image_policy(self.spec, self.actor, self.config.report.eval_deterministic)
+    def trained_actor(self) -> Actor:
+        """The student."""
+        return self.actor
 
     def attached(self, env: Any) -> ActorPolicy:
         """The present policy, copied once for an evaluation instead of in every step; it ignores ``env``."""
@@ -237,10 +236,4 @@ class Distill(Stateful, Algorithm):
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the policy, as one of CFP."""
-        own = {"kind": KIND, "network": asdict(self.spec), "trained_by": self.config.algo}
-        save_policy(path, self.actor, description | own)
-
-    @classmethod
-    def load(cls, path: Path, device: str = "cpu") -> ActorPolicy:
-        """Load a policy."""
-        return load(path, device)
+        super().save_policy(path, description | {"trained_by": self.config.algo})

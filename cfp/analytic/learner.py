@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from cfp.agent.actor import Actor, build_actor
-from cfp.agent.actor_policy import ActorPolicy, image_policy
 from cfp.analytic.action_step import BOUND, ActionStep
 from cfp.analytic.config import AnalyticConfig
 from cfp.analytic.critic import Critic, mlp
@@ -187,12 +186,6 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
     def trained_actor(self) -> Actor:
         """The actor with averaged weights."""
         return cast(Actor, self.regression.average.module)
-
-    @property
-    def policy(self) -> ActorPolicy:
-        """What has been learned so far."""
-        deterministic = self.config.report.eval_deterministic
-        return image_policy(self.config.actor_spec(self.stage), self.trained_actor, deterministic)
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the actor with averaged weights."""

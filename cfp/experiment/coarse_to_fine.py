@@ -14,7 +14,6 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecMonitor
 
 from cfp.agent.actor import Actor
-from cfp.agent.actor_policy import image_policy
 from cfp.agent.hyperparameters import Hyperparameters
 from cfp.agent.policies import CFPPolicy, NetworkPolicy
 from cfp.agent.sac import CFP
@@ -125,7 +124,7 @@ class SACAlgorithm(Algorithm):
         load_model_state_dict(self.model, state)
 
 
-class CoarseToFine(SACAlgorithm, CoarseToFineStages):
+class CoarseToFine(CoarseToFineStages, SACAlgorithm):
     """The stages of the coarse-to-fine policy, each over the frozen policy of the coarser one (paper, Section 4.2)."""
 
     config: Config
@@ -171,9 +170,3 @@ class CoarseToFine(SACAlgorithm, CoarseToFineStages):
     def trained_actor(self) -> Actor:
         """The actor that is the policy."""
         return self.model.trained_actor
-
-    @property
-    def policy(self) -> PolicyPredictor:
-        """What has been learned so far."""
-        deterministic = self.config.report.eval_deterministic
-        return image_policy(self.config.actor_spec(self.stage), self.trained_actor, deterministic)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cfp.agent.actor import Actor
-from cfp.agent.actor_policy import ActorPolicy
+from cfp.agent.actor_policy import ActorPolicy, image_policy
 from cfp.config import StagedConfig
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm, Position
@@ -49,6 +49,12 @@ class CoarseToFineStages(Algorithm):
     @abstractmethod
     def trained_actor(self) -> Actor:
         """The actor that is the policy."""
+
+    @property
+    def policy(self) -> ActorPolicy:
+        """What has been learned so far."""
+        spec, deterministic = self.config.actor_spec(self.stage), self.config.report.eval_deterministic
+        return image_policy(spec, self.trained_actor, deterministic)
 
     @classmethod
     def begin(cls, config: Any, stage: int, folder: Path, actor: Actor) -> bool:
