@@ -16,6 +16,7 @@ from cfp.from_dict import flatten
 from cfp.sections import EnvironmentConfig, NetworkConfig, ReportConfig
 from cfp.validation import check_at_least
 from dittogym import make_spec
+from dittogym.spec import TaskSpec
 from dittogym.tasks import allowed_instead, task_name
 
 Preset = Literal["quick", "long", "paper"]
@@ -51,6 +52,10 @@ class RunConfig:
     def name(self) -> str:
         """Name of the run, used for its folder."""
         return f"{self.algo}-{task_name(self.task)}-{self.preset}-{self.seed}"
+
+    def make_spec(self) -> TaskSpec:
+        """The task, with its options."""
+        return make_spec(self.task, **self.environment.task_options())
 
     def ends(self) -> tuple[int, ...]:
         """Environment steps since the beginning of the run after which each stage ends."""

@@ -18,7 +18,7 @@ from cfp.errors import CheckpointError, ConfigError
 from cfp.evaluation.evaluate import Noise, compare, evaluation_seed, without_noise
 from cfp.evaluation.tables import format_table, to_rows
 from cfp.evaluation.video import check_files, record_episode, record_policy, save_media
-from cfp.experiment.cli import program_name, run_command, with_examples
+from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import policy_files, read_config
 from cfp.experiment.training import Program
 from cfp.from_dict import update_from_dict
@@ -29,6 +29,13 @@ from cfp.validation import check_at_least
 from cfp.weights import policy_file
 from dittogym.trajectories import Episode, save_episodes
 from dittogym.trajectories.episode import record_batch
+
+EXAMPLES = (
+    "runs/run --episodes 10 --video run.mp4",
+    "--policy run --particles full --json",
+    "runs/run --noise both --replay run.html",
+    "runs/run --episodes 20 --record run.npz",
+)
 
 
 @dataclass(frozen=True)
@@ -168,16 +175,8 @@ def _record(command: Command, config: RunConfig, policy: Policy) -> list[Episode
 
 def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:
     """Command line entry; returns the exit code."""
-    started = program_name(f"{program.package}.evaluate", arguments)
-    about = with_examples(
-        Command.__doc__ or "",
-        started,
-        "runs/run --episodes 10 --video run.mp4",
-        "--policy run --particles full --json",
-        "runs/run --noise both --replay run.html",
-        "runs/run --episodes 20 --record run.npz",
-    )
-    return run_command(lambda: print(run(program, tyro.cli(Command, prog=started, description=about, args=arguments))))
+    module = f"{program.package}.evaluate"
+    return run_command(lambda: print(run(program, read_command(Command, module, EXAMPLES, arguments))))
 
 
 if __name__ == "__main__":

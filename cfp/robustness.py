@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import tyro
 from matplotlib.figure import Figure
 
 from cfp.config import RunConfig
@@ -21,7 +20,7 @@ from cfp.evaluation.episodes import Trial
 from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
 from cfp.evaluation.plots import write_figure
 from cfp.evaluation.tables import numbers
-from cfp.experiment.cli import program_name, run_command, with_examples
+from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import Folder, make_folder
 from cfp.experiment.training import Program
 from cfp.files import write_json, write_text
@@ -29,9 +28,9 @@ from cfp.policy_protocols import DisturbablePolicy, Policy
 from cfp.tables import csv_text
 from cfp.train import PROGRAM
 from cfp.validation import check_at_least
-from dittogym import make_spec
 from dittogym.spec import TaskSpec
 
+EXAMPLES = ("runs/run", "--policy run --cases noise shift --out runs/noise")
 COLUMNS = ("case", "episodes", "mean", "std", "interval", "ratio", "success")
 
 
@@ -97,7 +96,7 @@ def report(
     """Evaluate a policy in every case that changes something for it, on the same layouts with the same noise."""
     if deterministic is None:
         deterministic = policy.deterministic_by_default
-    spec, seed = make_spec(config.task, **config.environment.task_options()), evaluation_seed(config)
+    spec, seed = config.make_spec(), evaluation_seed(config)
     decides = policy.description.get("resolution", policy.resolution)
     grid = 0 if isinstance(policy, DisturbablePolicy) else decides
     trials = [
@@ -169,7 +168,7 @@ def run(program: Program, command: Command) -> str:
     config, policies = command.open(program)
     policy, folder = list(policies.values())[-1], command.out or command.folder
     assert folder is not None
-    cases = choose(cases, command.cases, make_spec(config.task, **config.environment.task_options()), policy)
+    cases = choose(cases, command.cases, config.make_spec(), policy)
     make_folder(folder)
     results = report(config, policy, cases, command.episodes, progress=True)
     rows, path = to_rows(results), folder / "robustness"
@@ -183,11 +182,8 @@ def run(program: Program, command: Command) -> str:
 
 def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:
     """Command line entry; returns the exit code."""
-    started = program_name(f"{program.package}.robustness", arguments)
-    about = with_examples(
-        Command.__doc__ or "", started, "runs/run", "--policy run --cases noise shift --out runs/noise"
-    )
-    return run_command(lambda: print(run(program, tyro.cli(Command, prog=started, description=about, args=arguments))))
+    module = f"{program.package}.robustness"
+    return run_command(lambda: print(run(program, read_command(Command, module, EXAMPLES, arguments))))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from cfp.hub import is_address
 from cfp.policy_protocols import Policy, SeesState
 from cfp.sections import TASK_OPTIONS, EnvironmentConfig
 from cfp.weights import check_trained_for, read_policy, shipped
-from dittogym import TorchEnv, make_spec
+from dittogym import TorchEnv
 from dittogym.action import ActionIndexing, bicubic_matrix, from_grid_indexing, to_grid_indexing
 
 TRAINED = ("shac", "gradient")
@@ -130,10 +130,9 @@ def copy_teacher(config: DistillConfig, folder: Path) -> None:
 
 def warnings(config: DistillConfig, folder: Path) -> list[str]:
     """A warning if the teacher is the record of one episode, in a task whose episodes start differently."""
-    if config.teacher in ("mpc", *TRAINED):
+    if config.teacher in ("mpc", *TRAINED) or "layout" not in read_policy(teacher_path(folder))[1]:
         return []
-    spec = make_spec(config.task, **config.environment.task_options())
-    if not any(body.shape.draws for body in spec.bodies) or "layout" not in read_policy(teacher_path(folder))[1]:
+    if not any(body.shape.draws for body in config.make_spec().bodies):
         return []
     return [
         f"teacher: the record of one planned episode, while every episode of {config.task} starts differently; "

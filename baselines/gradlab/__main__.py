@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-import tyro
 from torch import Tensor
 
 from baselines.gradlab.measure import ReturnFunction, measure
 from baselines.gradlab.report import write
 from cfp.envs.make import choose_device
 from cfp.errors import ConfigError
-from cfp.experiment.cli import program_name, run_command, with_examples
+from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import Folder, make_folder
 from cfp.validation import check_at_least
 from dittogym import TorchEnv
@@ -77,10 +76,9 @@ QUICK = GradLabConfig(quick=True, particles=200, substeps=5, horizons=(1, 2, 4),
 
 def parse(given: Sequence[str] | None) -> GradLabConfig:
     """Read a command line; ``--quick`` chooses other defaults."""
-    arguments, program = sys.argv[1:] if given is None else list(given), program_name("baselines.gradlab", given)
-    default = QUICK if "--quick" in arguments else GradLabConfig()
-    about = with_examples(GradLabConfig.__doc__ or "", program, "--task run", "--task kick --quick")
-    config = tyro.cli(GradLabConfig, prog=program, description=about, args=arguments, default=default)
+    default = QUICK if "--quick" in (sys.argv if given is None else given) else GradLabConfig()
+    examples = ("--task run", "--task kick --quick")
+    config = read_command(GradLabConfig, "baselines.gradlab", examples, given, default=default)
     config.check()
     return replace(config, out=config.out or Path("runs") / f"gradlab-{task_name(config.task)}")
 

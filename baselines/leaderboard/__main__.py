@@ -12,7 +12,7 @@ from baselines.compare.table import Table, columns
 from baselines.compare.tables import rank
 from baselines.leaderboard.protocol import PROTOCOLS
 from baselines.leaderboard.submission import Submission, read_submissions
-from cfp.experiment.cli import program_name, run_command, with_examples
+from cfp.experiment.cli import read_command, run_command
 
 COLUMNS = (
     *columns("d", rank="rank"),
@@ -23,6 +23,7 @@ COLUMNS = (
     *columns(",.0f", minutes="minutes"),
     *columns(library="version"),
 )
+EXAMPLES = ("docs/leaderboard/*.json runs/compare/submissions/*.json",)
 
 
 @dataclass(frozen=True)
@@ -59,9 +60,7 @@ def run(command: Command) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry; returns the exit code."""
-    started = program_name("baselines.leaderboard", arguments)
-    about = with_examples(Command.__doc__ or "", started, "docs/leaderboard/*.json runs/compare/submissions/*.json")
-    return run_command(lambda: run(tyro.cli(Command, prog=started, description=about, args=arguments)))
+    return run_command(lambda: run(read_command(Command, "baselines.leaderboard", EXAMPLES, arguments)))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ from baselines.registry import configure, load, reference_policy, sees
 from cfp.envs.make import make_env
 from cfp.errors import ConfigError
 from cfp.evaluation.episodes import Trial, play
-from cfp.evaluation.evaluate import horizon
 from cfp.experiment.folder import make_folder
 from cfp.files import write_json
 from cfp.from_dict import update_from_dict
@@ -119,7 +118,7 @@ def evaluate(protocol: FixedProtocol, candidate: Candidate) -> Submission:
         deterministic=protocol.deterministic,
         seed=seeds[0],
     )
-    (episodes,) = play([trial], horizon(configs[seeds[0]]))
+    (episodes,) = play([trial], configs[seeds[0]].make_spec().horizon)
     returns = tuple(round(episode.total, 3) for episode in episodes)
     successes = tuple(bool(episode.success) for episode in episodes)
     return replace(candidate.submission, returns=returns, successes=successes, scores=Scores.of(returns, successes))

@@ -16,7 +16,6 @@ from torch import Tensor
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import monitored
-from dittogym import make_spec
 from dittogym.action import bicubic
 from dittogym.geometry import floor
 from dittogym.spec import TaskSpec
@@ -62,7 +61,7 @@ def disturbed_env(
     config: RunConfig, resolution: int, case: Case, grid: int | None, seed: int, num_envs: int
 ) -> Disturbed:
     """Create the environment of a run with a disturbance; a first reset sets the constants of the physics."""
-    spec = make_spec(config.task, **config.environment.task_options())
+    spec = config.make_spec()
     obstacles = spec.obstacles
     if case.friction is not None:
         obstacles = tuple(item.with_friction(case.friction) if item.name == FLOOR else item for item in obstacles)

@@ -20,7 +20,6 @@ import torchmpm
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
 from cfp.files import read_json, write_json
-from dittogym import make_spec
 from dittogym.tasks import fingerprint
 from torchmpm.native.cpu.library import cache_folder, processor, provenance
 
@@ -75,7 +74,7 @@ def _conditions(config: RunConfig) -> dict[str, Any]:
     """All that an episode of a policy that does not learn depends on, beside its layout."""
     environment = dataclasses.asdict(config.environment)
     del environment["num_envs"]
-    target = make_spec(config.task, **config.environment.task_options()).target  # may be drawn, or read from a file
+    target = config.make_spec().target  # may be drawn, or read from a file
     return {
         "task": config.task,
         "environment": environment,

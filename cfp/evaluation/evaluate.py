@@ -17,7 +17,6 @@ from cfp.evaluation.cache import EpisodeCache
 from cfp.evaluation.episodes import Trial, play
 from cfp.evaluation.untrained import UntrainedPolicy
 from cfp.policy_protocols import Policy
-from dittogym import make_spec
 
 Noise = Literal["default", "with", "without", "both"]
 """With action noise or without; default: as the run that trained a policy evaluates it."""
@@ -109,14 +108,9 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, no
         if "layout" in trained.description:
             own = trained.description["layout"]
             trials.append(make_trial(config, "  own layout", trained, size, 1, deterministic=deterministic, seed=own))
-    return evaluate(trials, horizon(config))
+    return evaluate(trials, config.make_spec().horizon)
 
 
 def without_noise(policy: Policy, noise: Noise) -> bool:
     """Whether a policy acts without noise."""
     return policy.deterministic_by_default if noise == "default" else noise == "without"
-
-
-def horizon(config: RunConfig) -> int:
-    """Steps of an episode at most."""
-    return make_spec(config.task, **config.environment.task_options()).horizon

@@ -17,7 +17,6 @@ from cfp.evaluation.pictures import match_pictures
 from cfp.files import write_atomically, write_text
 from cfp.from_dict import flatten
 from cfp.tables import read_table
-from dittogym import make_spec
 from dittogym.render.frame import png
 from dittogym.render.recording import Recording
 
@@ -120,7 +119,7 @@ def _episode(folder: Path, config: RunConfig, recording: Recording) -> str:
 
 def _match(config: RunConfig, recording: Recording) -> str:
     """Target, result and overlap, in a task that has a target."""
-    target = make_spec(config.task, **config.environment.task_options()).target
+    target = config.make_spec().target
     if target is None or recording.observation is None:
         return ""
     pictures, iou = match_pictures(target, recording.observation)

@@ -11,12 +11,14 @@ import textwrap
 import typing
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import tyro
 
 from cfp.errors import CFPError, NonFiniteError
 from cfp.experiment.process import Stopped, keep_memory
+
+Command = TypeVar("Command")
 
 
 def run_command(command: Callable[[], int | None]) -> int:
@@ -58,6 +60,15 @@ def with_examples(about: str, program: str, *examples: str) -> str:
     """The description of a ``program`` for its help, followed by ``examples`` of its options."""
     lines = "\n".join(f"  {program} {example}" for example in examples)
     return f"{inspect.cleandoc(about)}\n\nExamples:\n{lines}"
+
+
+def read_command(
+    kind: Callable[..., Command], module: str, examples: Sequence[str], args: Sequence[str] | None, **options: Any
+) -> Command:
+    """Read the command line of ``python -m MODULE`` into a dataclass; ``options`` are further ones of `tyro.cli`."""
+    program = program_name(module, args)
+    about = with_examples(kind.__doc__ or "", program, *examples)
+    return tyro.cli(kind, prog=program, description=about, args=args, **options)
 
 
 def read_options(default: Any, basic: Sequence[str], *, args: Sequence[str] | None, **about: Any) -> Any:

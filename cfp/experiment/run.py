@@ -37,7 +37,6 @@ from cfp.experiment.process import StopSignals
 from cfp.files import write_atomically, write_json
 from cfp.tables import Table
 from cfp.weights import is_of_another_task, read_policy
-from dittogym import make_spec
 from dittogym.render.frame import png
 
 
@@ -87,9 +86,9 @@ class TrainingRun:
     def _save_target(self) -> None:
         """Show the target that the user has chosen as it is used."""
         target, path = self.config.environment.target, self.folder / "target.png"
-        spec = make_spec(self.config.task, **self.config.environment.task_options())
-        if target is not None and spec.target is not None:
-            pixels = np.where(spec.target, 0, 255).astype(np.uint8).repeat(8, 0).repeat(8, 1)
+        used = self.config.make_spec().target
+        if target is not None and used is not None:
+            pixels = np.where(used, 0, 255).astype(np.uint8).repeat(8, 0).repeat(8, 1)
             picture = png(np.dstack([pixels] * 3))
             write_atomically(path, lambda file: file.write(picture))
             print(f"target: {path}")
