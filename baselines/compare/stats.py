@@ -16,7 +16,7 @@ def interquartile_mean(scores: np.ndarray | Sequence[float], axis: int = 0) -> n
 
 
 def bootstrap_interval(
-    strata: Sequence[np.ndarray | Sequence[float]], resamples: int = 10_000, seed: int = 0
+    strata: Sequence[np.ndarray | Sequence[float]], resamples: int = 10_000
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Percentile 95 % interval of the interquartile mean, by stratified bootstrap; None without a task of two runs.
 
@@ -32,9 +32,8 @@ def bootstrap_interval(
         constant = np.broadcast_to(np.array(single), (*samples[0].shape[:-1], len(single)))
         return interquartile_mean(np.concatenate([*samples, constant], axis=-1), axis=axis)
 
-    generator = np.random.default_rng(seed)
     result = scipy.stats.bootstrap(
-        resampled, statistic, n_resamples=resamples, method="percentile", vectorized=True, rng=generator
+        resampled, statistic, n_resamples=resamples, method="percentile", vectorized=True, rng=np.random.default_rng(0)
     )
     low, high = result.confidence_interval
     return low, high

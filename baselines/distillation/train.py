@@ -64,6 +64,7 @@ class Distill(Stateful, CoarseToFineStages):
         teacher: File of the teacher's policy, if it is not the one that the options name.
     """
 
+    config: DistillConfig
     parts, values = ("actor", "adam", "dataset", "collector"), ("rounds",)
 
     def __init__(

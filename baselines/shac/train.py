@@ -122,25 +122,25 @@ class Shac(Stateful, Algorithm):
         self.features = StateFeatures(config.deformation, config.clock, config.displacement)
         with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             torch.manual_seed(config.seed)
-            self.actor, critic, target = self._make_networks()
+            self.actor, critic = self._make_networks()
         if start is not None:
             assert isinstance(self.actor, ImageActor) and isinstance(start, ActorPolicy)
             self.actor.actor.load_state_dict(start.actor.state_dict())
             self.actor.actor.fix_std()
-        self.critic = Critic(critic, target, config)
+        self.critic = Critic(critic, config)
         trained = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
         self.actor_adam = torch.optim.Adam(trained, config.learning_rate, BETAS)
         self.skipped, self.skipped_in_a_row = 0, 0
         self.generator = torch.Generator().manual_seed(config.seed)
         episodes = Episodes(self.env, config.seed, config.max_episode_steps, config.num_layouts)
-        self.collector = WindowCollector(episodes, self.observe, config.reward, config.window, config.gamma)
+        self.collector = WindowCollector(episodes, self.observe, config)
 
-    def _make_networks(self) -> tuple[StateActor | ImageActor, nn.Module, nn.Module]:
+    def _make_networks(self) -> tuple[StateActor | ImageActor, nn.Module]:
         grid, device = self.env.action_resolution, self.env.device
         if self.config.sees == "image":
-            return ImageActor(grid).to(device), image_critic().to(device), image_critic().to(device)
+            return ImageActor(grid).to(device), image_critic().to(device)
         size = self.features.size(len(self.env.spec.bodies) - 1)
-        return StateActor(size, grid).to(device), mlp(size, 1).to(device), mlp(size, 1).to(device)
+        return StateActor(size, grid).to(device), mlp(size, 1).to(device)
 
     def observe(self) -> Tensor:
         """Inputs (B, ...) of the networks in the present state."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
@@ -33,16 +35,14 @@ class Critic(Stateful):
 
     Args:
         network: Maps observations (B, ...) to (B, 1).
-        target: A network of the same structure.
         options: Of the run.
     """
 
     parts = ("network", "target", "adam")
 
-    def __init__(self, network: nn.Module, target: nn.Module, options: WindowConfig) -> None:
-        self.network, self.target, self.options = network, target, options
-        target.load_state_dict(network.state_dict())
-        target.requires_grad_(False)
+    def __init__(self, network: nn.Module, options: WindowConfig) -> None:
+        self.network, self.options = network, options
+        self.target = copy.deepcopy(network).requires_grad_(False)
         self.adam = torch.optim.Adam(network.parameters(), options.learning_rate, BETAS)
 
     def __call__(self, observations: Tensor) -> Tensor:

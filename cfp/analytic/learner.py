@@ -71,15 +71,12 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         self.actor = actor
         self.regression = Regression(actor, config.learning_rate, config.weight_average, config.max_grad_norm)
         features = StateFeatures(displacement=config.displacement)
-        size = features.size(len(self.env.spec.bodies) - 1)
         with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             torch.manual_seed(config.seed)
-            critic, target = (mlp(size, 1).to(self.env.device) for _ in range(2))
-        self.critic = Critic(critic, target, config)
+            critic = mlp(features.size(len(self.env.spec.bodies) - 1), 1).to(self.env.device)
+        self.critic = Critic(critic, config)
         episodes = Episodes(self.env, config.seed, config.max_episode_steps, config.num_layouts)
-        self.collector = WindowCollector(
-            episodes, lambda: features(self.env).float(), config.reward, config.window, config.gamma
-        )
+        self.collector = WindowCollector(episodes, lambda: features(self.env).float(), config)
         self.action_step = ActionStep()
         self.generator = torch.Generator(self.env.device).manual_seed(config.seed)
         image = self._image()

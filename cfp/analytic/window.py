@@ -8,8 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from cfp.analytic.config import WindowConfig
 from cfp.analytic.episodes import Episodes
-from cfp.analytic.reward import Neighbours, RewardConfig, training_reward
+from cfp.analytic.reward import Neighbours, training_reward
 from cfp.analytic.stateful import Stateful
 from cfp.errors import NonFiniteError
 from torchmpm import tree
@@ -33,18 +34,15 @@ class WindowCollector(Stateful):
     Args:
         episodes: Of the environment.
         observe: Inputs (B, ...) of the critic in the present state.
-        reward: The training reward.
-        steps: T, control steps of a window.
-        gamma: Discount factor.
+        config: Training reward, control steps T of a window, and discount factor.
     """
 
     parts = ("episodes",)
 
-    def __init__(
-        self, episodes: Episodes, observe: Callable[[], Tensor], reward: RewardConfig, steps: int, gamma: float
-    ) -> None:
+    def __init__(self, episodes: Episodes, observe: Callable[[], Tensor], config: WindowConfig) -> None:
         self.env, self.episodes, self.observe = episodes.env, episodes, observe
-        self.reward, self.steps, self.success_value = reward, steps, reward.success_value(gamma)
+        self.reward, self.steps = config.reward, config.window
+        self.success_value = config.reward.success_value(config.gamma)
         self.episodes.counts["dropped"] = 0
 
     def collect(self, act: Callable[[Tensor], Tensor], value: Callable[[Tensor], Tensor]) -> Window:

@@ -14,6 +14,7 @@ from cfp import train
 from cfp.agent.actor import build_actor
 from cfp.agent.spec import ActorSpec
 from cfp.analytic.action_step import ActionStep
+from cfp.analytic.config import WindowConfig
 from cfp.analytic.episodes import Episodes
 from cfp.analytic.learner import METRICS, AnalyticLearner
 from cfp.analytic.regression import ImageMemory, Regression
@@ -220,6 +221,6 @@ def test_an_episode_that_ends_in_success_has_the_value_of_the_option(success, ex
     env = dittogym.TorchEnv(spec, 2, particles=300, substeps=4)
     episodes = Episodes(env, seed=0, max_episode_steps=10, num_layouts=2)
     reward = RewardConfig(success_reward=2.0)  # times the scale 0.05, for 1 / (1 - gamma) = 10 steps
-    collector = WindowCollector(episodes, lambda: torch.zeros(2, 1), reward, steps=1, gamma=0.9)
+    collector = WindowCollector(episodes, lambda: torch.zeros(2, 1), WindowConfig(reward=reward, window=1, gamma=0.9))
     window = collector.collect(lambda _: torch.zeros(2, *env.action_shape), lambda seen: seen[:, 0] + 7.0)
     assert window.next_values.tolist() == [[pytest.approx(expected)] * 2]
