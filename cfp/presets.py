@@ -75,8 +75,6 @@ ON_SPEED = ("run", "obstacle")
 
 NOISE_SCALE: dict[str, tuple[float, float]] = {"shapematch": (0.1, 0.4)}
 """Exploration noise of the presets ``quick`` and ``long`` where it is weaker: without gravity it tears robots."""
-FINE_ALPHA: dict[str, float] = {"shapematch": 1e-4}
-"""Temperature of stage 2 of these presets where its grid is much finer: entropy grows with the number of entries."""
 DEFAULT_TASK = "shapematch"
 """Task of a command line that names none."""
 CUSTOM_TASK = TASKS["run"]
@@ -176,9 +174,9 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
         seed=0,
         steps=steps,
         handover=(steps // 2,),
-        resolutions=(4, coarse) if coarse > 4 else numbers.resolutions,
+        resolutions=(coarse // 2, coarse) if coarse > 4 else numbers.resolutions,
         random_steps=(480, 100),
-        alpha=(0.5 * numbers.alpha[0], FINE_ALPHA.get(task, 0.5 * numbers.alpha[0])),
+        alpha=(0.5 * numbers.alpha[0],) * 2,
         environment=EnvironmentConfig(),
         network=replace(paper.network, interpolation="half_pixel", encoder="lean"),
         learning=LearningConfig(
