@@ -235,6 +235,36 @@ def rewards_figure(path: Path) -> None:
     drawing.savefig(path, metadata={"Date": None})
 
 
+def ablation_figure(path: Path) -> None:
+    """Draw learning curves of the learner ``analytic`` on SHAPE MATCH, one panel for each option that is changed."""
+    rows = read("analytic-shapematch.csv")
+    parts = list(dict.fromkeys(row["part"] for row in rows if row["part"] != "default"))
+    drawing = Figure(figsize=(7.2, 4.8), layout="constrained")
+    FigureCanvasSVG(drawing)
+    for axis, part in zip(drawing.subplots(2, 3, sharex=True, sharey=True).flat, parts, strict=True):
+        for value in dict.fromkeys(row["value"] for row in rows if row["part"] in (part, "default")):
+            own = [row for row in rows if row["value"] == value and row["part"] in (part, "default")]
+            points = [int(row["steps"]) for row in own], [float(row["evaluated"]) for row in own]
+            colour = {"color": "0.3"} if value == "default" else {}
+            axis.plot(*points, marker="o", ms=3, lw=1.2, label=value, **colour)
+        axis.set_title(part, fontsize=10)
+        axis.set_ylim(0, 420)
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.legend(loc="lower right", fontsize=7, frameon=False)
+    drawing.supxlabel("environment steps", fontsize=10)
+    drawing.supylabel("return in SHAPE MATCH", fontsize=10)
+    drawing.savefig(path, metadata={"Date": None})
+
+
+def ablation() -> str:
+    """Final returns of the same runs."""
+    rows = sorted((row for row in read("analytic-shapematch.csv") if row["final"]), key=lambda row: -int(row["final"]))
+    return markdown(
+        ("Changed", "To", "Return", "Lowest and highest layout"),
+        ([row["part"], row["value"], row["final"], f"{row['lowest']}, {row['highest']}"] for row in rows),
+    )
+
+
 def write_results() -> None:
     """Write everything into the folder of the generated pages."""
     PAGES.mkdir(exist_ok=True)
@@ -246,3 +276,5 @@ def write_results() -> None:
     figure(PAGES / "returns.svg")
     comparison_figure(PAGES / "comparison.svg")
     rewards_figure(PAGES / "rewards.svg")
+    ablation_figure(PAGES / "ablation.svg")
+    write(PAGES / "ablation.md", ablation())
