@@ -14,6 +14,8 @@ from torchmpm import checks
 from torchmpm.backends import transforming
 
 Points = NDArray[np.float64]
+#: Most points that are made at once; a Sobol sequence of torch has no more.
+LARGEST = 2**30
 
 
 def uniform(count: int, generator: np.random.Generator) -> Points:
@@ -30,7 +32,7 @@ def sobol(count: int, seed: int) -> Points:
     """Points (N, 2) of a scrambled Sobol sequence in the unit square: far fewer clumps and holes than random ones.
 
     Args:
-        count: N, at least 1.
+        count: N, from 1 to 2**30.
         seed: Of the scrambling, a whole number from 0 to 2**63 - 1.
 
     Raises:
@@ -39,8 +41,9 @@ def sobol(count: int, seed: int) -> Points:
     checks.whole("seed", seed, 0, 2**63 - 1)
     if transforming():
         raise RuntimeError("sobol must not be called under a transform of torch.func: draw the points before it")
+    checks.whole("count", count, 1, LARGEST)
     engine = torch.quasirandom.SobolEngine(2, scramble=True, seed=seed)
-    return engine.draw(checks.whole("count", count, 1), dtype=torch.float64).numpy()
+    return engine.draw(count, dtype=torch.float64).numpy()
 
 
 def box(numbers: Points, corner: tuple[float, float], size: tuple[float, float]) -> Points:
@@ -96,12 +99,13 @@ def lattice(cells: tuple[int, int], corner: tuple[float, float], size: tuple[flo
     """Positions (N, 2), m, in the middle of the N cells of a box; rows from the bottom up.
 
     Args:
-        cells: Number of cells in x and y.
+        cells: Number of cells in x and y, N at most 2**30.
         corner: Lower left corner, m.
         size: Width and height, m.
     """
     for axis, count in zip("xy", cells, strict=True):
         checks.whole(f"cells in {axis}", count, 1)
+    checks.whole("number of cells", math.prod(cells), 1, LARGEST)
     columns, rows = np.meshgrid((np.arange(cells[0]) + 0.5) / cells[0], (np.arange(cells[1]) + 0.5) / cells[1])
     return box(np.stack((columns.ravel(), rows.ravel()), axis=1), corner, size)
 

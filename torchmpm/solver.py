@@ -41,7 +41,8 @@ class Solver:
         backend: ``"native"`` (fused kernels, ``torchmpm.native``: C++ on the CPU, Triton on CUDA), ``"eager"``
             (operator by operator), ``"compile"`` (the same through ``torch.compile``, for devices without native
             kernels), or ``"auto"``: native on a CPU where it works, else eager.
-        allow_unstable: Accept a ``dt`` above :meth:`stable_dt`.
+        allow_unstable: Accept a ``dt`` above :meth:`stable_dt`, and gravity with which a particle at rest crosses a
+            cell of the grid within a substep.
 
     Raises:
         ValueError: No bodies, ``dt`` not positive or above :meth:`stable_dt`, ``damping`` not from 0 to 1, gravity not
@@ -106,6 +107,10 @@ class Solver:
             self._check_stability()
         for name, tensor in self.constants.items():
             checks.entries(name, tensor, above=0.0 if name.endswith(("mass", "volume")) else None)
+        if not self.allow_unstable:
+            largest = self.grid.h / self.dt**2  # with it, a particle at rest crosses a cell within a substep
+            for part in (self.gravity,) if isinstance(self.gravity, Tensor) else self.gravity:
+                checks.entries("gravity", part, above=-largest, below=largest)
 
     def _check_stability(self) -> None:
         try:
