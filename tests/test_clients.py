@@ -10,19 +10,20 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-#: What each script prints, and the package that it needs.
+#: What each script prints, and the modules that it needs.
 SCRIPTS = {
     "sb3_ppo": (r"64 steps, actions \(2, 2, 8, 8\)", "stable_baselines3"),
     "sb3_contrib_tqc": (r"16 steps, [1-9]\d* updates, actions \(2, 2, 8, 8\)", "sb3_contrib"),
     "ppo_torch": (r"iteration 2: mean reward -?\d", "torch"),
     "torchrl_gym_env": (r"5 steps, images \(5, 3, 64, 64\), actions \(5, 2, 8, 8\)", "torchrl"),
+    "rllib_ppo": (r"64 steps, loss of the policy -?\d", "ray tree"),
     "optuna_study": (r"0\.\d+ m with \{'frequency'", "optuna"),
     "async_vector_env": (r"fork: rewards (.*)\nforkserver: rewards \1\nspawn: rewards \1", "torch"),
     "func_transforms": (r"width per Pa: -\d", "torch"),
     "checkpoint_steps": (r"gradients \(4, 1, 2, 8, 8\) are equal, norm \d", "torch"),
 }
 #: They start many processes, or import much.
-SLOW = {"async_vector_env", "sb3_contrib_tqc", "torchrl_gym_env", "optuna_study"}
+SLOW = {"async_vector_env", "rllib_ppo", "sb3_contrib_tqc", "torchrl_gym_env", "optuna_study"}
 
 
 def test_every_script_is_tested_and_shown() -> None:
@@ -33,9 +34,10 @@ def test_every_script_is_tested_and_shown() -> None:
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in SCRIPTS])
 def test_script_runs(name: str, tmp_path: Path) -> None:
-    expected, package = SCRIPTS[name]
-    if importlib.util.find_spec(package) is None:
-        pytest.skip(f"{package} is not installed")
+    expected, modules = SCRIPTS[name]
+    for module in modules.split():
+        if importlib.util.find_spec(module) is None:
+            pytest.skip(f"{module} is not installed")
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(ROOT / f"examples/clients/{name}.py")]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
