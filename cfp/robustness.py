@@ -19,19 +19,27 @@ from cfp.evaluate import Selection
 from cfp.evaluation.episodes import Trial
 from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
 from cfp.evaluation.plots import write_figure
-from cfp.evaluation.tables import numbers
+from cfp.evaluation.results import numbers
+from cfp.evaluation.table import Column, Table
 from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import Folder, make_folder
 from cfp.experiment.training import Program
 from cfp.files import write_json, write_text
 from cfp.policy_protocols import DisturbablePolicy, Policy
-from cfp.tables import csv_text
 from cfp.train import PROGRAM
 from cfp.validation import check_at_least
 from dittogym.spec import TaskSpec
 
 EXAMPLES = ("runs/run", "--policy run --cases noise shift --out runs/noise")
-COLUMNS = ("case", "episodes", "mean", "std", "interval", "ratio", "success")
+COLUMNS = (
+    Column("case", "case"),
+    Column("episodes"),
+    Column("mean", "return", ".1f"),
+    Column("std"),
+    Column("interval", "± 95 %", ".1f"),
+    Column("ratio", "ratio", ".3f"),
+    Column("success", "success", ".0%"),
+)
 
 
 @dataclass(frozen=True)
@@ -125,23 +133,15 @@ def to_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
     ]
 
 
-def to_markdown(config: RunConfig, rows: Sequence[dict[str, Any]]) -> str:
-    """The table as Markdown."""
-    lines = [
-        f"Robustness of {config.name}: mean return of {rows[0]['episodes']} episodes, "
-        f"particles {config.environment.particles}, and ratio to the unperturbed.",
-        "",
-        "| case | return | 95 % interval | ratio | success |",
-        "| --- | ---: | ---: | ---: | ---: |",
-    ]
-    for row in rows:
-        interval = "–" if row["interval"] is None else f"± {row['interval']:.1f}"
-        ratio = "–" if row["ratio"] is None else f"{row['ratio']:.3f}"
-        success = "–" if row["success"] is None else f"{row['success']:.0%}"
-        lines.append(f"| {row['case']} | {row['mean']:.1f} | {interval} | {ratio} | {success} |")
+def make_table(config: RunConfig, rows: Sequence[dict[str, Any]]) -> Table:
+    """The table of the report."""
+    description = (
+        f"Mean return of {rows[0]['episodes']} episodes, particles {config.environment.particles}, "
+        "and ratio to the unperturbed."
+    )
     if rows[0]["ratio"] is None:
-        lines += ["", "The unperturbed return is not positive, so that there are no ratios to it."]
-    return "\n".join(lines) + "\n"
+        description += " The unperturbed return is not positive, so that there are no ratios to it."
+    return Table("robustness", f"Robustness of {config.name}", description, COLUMNS, rows)
 
 
 def draw(config: RunConfig, results: Sequence[Result]) -> Figure:
@@ -172,12 +172,12 @@ def run(program: Program, command: Command) -> str:
     make_folder(folder)
     results = report(config, policy, cases, command.episodes, progress=True)
     rows, path = to_rows(results), folder / "robustness"
-    table = to_markdown(config, rows)
+    table = make_table(config, rows)
     write_json(path.with_suffix(".json"), rows)
-    write_text(path.with_suffix(".csv"), csv_text(rows, COLUMNS))
-    write_text(path.with_suffix(".md"), table)
+    write_text(path.with_suffix(".csv"), table.to_csv())
+    write_text(path.with_suffix(".md"), table.to_markdown() + "\n")
     write_figure(path.with_suffix(".png"), draw(config, results))
-    return f"{table}\nbar plot: {path.with_suffix('.png')}"
+    return f"{table.to_markdown()}\n\nbar plot: {path.with_suffix('.png')}"
 
 
 def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:

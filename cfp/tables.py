@@ -21,7 +21,7 @@ def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> str:
     return text.getvalue()
 
 
-class Table:
+class CSVTable:
     """A CSV file that grows row by row, also over several sessions, and can take new columns on the way."""
 
     def __init__(self, path: Path, last_step: int | None = None, numbers: Sequence[str] = ("step",)) -> None:

@@ -10,15 +10,15 @@ from matplotlib.figure import Figure
 from baselines.compare import paper, plots, tables
 from baselines.compare.final_evaluation import Protocol
 from baselines.compare.results import Group, RunResult, group_results
-from baselines.compare.table import Table
 from cfp.evaluation.page import STYLE
 from cfp.evaluation.plots import write_figure
+from cfp.evaluation.table import Table
 from cfp.files import write_text
 from cfp.sections import Particles
 
 TABLE_STYLE = """
-body { max-width: 76rem; } .wide { overflow-x: auto; } table { font-size: 14px; } th { vertical-align: bottom; }
-th.text, td.text { text-align: left; } td { font-variant-numeric: tabular-nums; white-space: nowrap; }
+body { max-width: 76rem; } table { font-size: 14px; } th { vertical-align: bottom; }
+td { font-variant-numeric: tabular-nums; white-space: nowrap; }
 """
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import tyro
 
 from baselines.compare.results import OBSERVATIONS
-from baselines.compare.table import Table, columns
 from baselines.compare.tables import rank
 from baselines.leaderboard.protocol import PROTOCOLS
 from baselines.leaderboard.submission import Submission, read_submissions
+from cfp.evaluation.table import Table, columns
 from cfp.experiment.cli import read_command, run_command
 
 COLUMNS = (

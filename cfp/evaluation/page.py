@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from base64 import b64encode
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,8 @@ import torchmpm
 from cfp.config import RunConfig, to_json
 from cfp.evaluation.evaluate import Result
 from cfp.evaluation.pictures import match_pictures
+from cfp.evaluation.results import to_rows
+from cfp.evaluation.table import Table, columns
 from cfp.files import write_atomically, write_text
 from cfp.from_dict import flatten
 from cfp.tables import read_table
@@ -30,11 +32,17 @@ figure { display: inline-block; margin: 0 1rem 1rem 0; vertical-align: top; widt
 figure img { width: 100%; image-rendering: pixelated; }
 .wide { overflow-x: auto; } table { border-collapse: collapse; }
 th, td { padding: 0.2rem 0.8rem; text-align: right; white-space: nowrap; border-bottom: 1px solid #ccc; }
-th:first-child, td:first-child { text-align: left; }
+th.text, td.text { text-align: left; }
 @media (max-width: 40rem) { th, td { padding: 0.2rem 0.25rem; font-size: 0.75rem; } th { white-space: normal; } }
 pre { background: #f4f4f4; padding: 1rem; overflow-x: auto; white-space: pre-wrap; } pre span { white-space: nowrap; }
 """
-HEADER = ("policy", "action", "episodes", "mean return", "± 95 %", "std", "success")
+RESULTS = (
+    *columns(policy="policy", action="action"),
+    *columns("d", episodes="episodes"),
+    *columns(".1f", mean="mean return", interval="± 95 %", std="std"),
+    *columns(".0%", success="success"),
+)
+OPTIONS = columns(option="option", own="this run", preset="preset")
 #: When the picture that a film shows before it plays was taken, as a share of the episode.
 POSTER_TIME = 0.6
 
@@ -64,7 +72,7 @@ def write_page(
         f"<title>{title}</title><style>{STYLE}</style></head><body>",
         f"<h1>{title}</h1>",
         _episode(folder, config, recording) if recording else "",
-        f"<h2>Final evaluation</h2>{_table(HEADER, map(_cells, results))}",
+        Table("results", "Final evaluation", "", RESULTS, to_rows(results)).to_html(),
         f'<h2>Learning curve</h2><img src="curve.png" alt="Return over environment steps"><p>{_training(folder)}</p>',
         _films(folder),
         f"<h2>This run</h2><p>{_about(seconds)}</p><pre>{_command(config, preset)}</pre>",
@@ -162,28 +170,10 @@ def _changes(config: RunConfig, preset: RunConfig) -> str:
     changes = changed_options(config, preset)
     if not changes:
         return "<p>All options are those of the preset.</p>"
-    rows = [(name, _value(value), _value(usual)) for name, (value, usual) in changes.items()]
-    return f"<p>Options that differ from the preset:</p>{_table(('option', 'this run', 'preset'), rows)}"
+    rows = [{"option": name, "own": _value(own), "preset": _value(usual)} for name, (own, usual) in changes.items()]
+    return Table("options", "Options that differ from the preset", "", OPTIONS, rows).to_html()
 
 
 def _value(value: Any) -> str:
     """A value as the command line takes it."""
     return " ".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
-
-
-def _cells(result: Result) -> tuple[str, ...]:
-    return (
-        result.name,
-        f"{result.resolution} × {result.resolution}",
-        str(len(result.returns)),
-        f"{result.mean:.1f}",
-        "–" if result.interval is None else f"{result.interval:.1f}",
-        f"{result.std:.1f}",
-        "–" if result.success is None else f"{result.success:.0%}",
-    )
-
-
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = ["<tr>" + "".join(f"<th>{escape(name)}</th>" for name in header) + "</tr>"]
-    lines += ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
-    return '<div class="wide"><table>' + "".join(lines) + "</table></div>"

@@ -18,7 +18,7 @@ from cfp.experiment.checkpoint import Checkpoint
 from cfp.experiment.folder import policy_path
 from cfp.experiment.loggers import Tracker
 from cfp.experiment.process import Stopped, StopSignals
-from cfp.tables import Table
+from cfp.tables import CSVTable
 from cfp.weights import describe_run
 from dittogym.render.recording import record
 
@@ -159,7 +159,7 @@ class LogCallback(StageCallback):
 class EvaluationCallback(StageCallback):
     """Evaluates the policy, a trained one also before its first step, and keeps the best of the stage."""
 
-    def __init__(self, stage: Stage, table: Table, tracker: Tracker, bar: ProgressBarCallback) -> None:
+    def __init__(self, stage: Stage, table: CSVTable, tracker: Tracker, bar: ProgressBarCallback) -> None:
         super().__init__(stage, stage.config.report.eval_every)
         self.table, self.tracker, self.bar = table, tracker, bar
         rows = [row for row in table.rows if int(row["stage"]) == stage.number]

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import inspect
 import signal
 import sys
-import textwrap
 import typing
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from typing import Annotated, Any, TypeVar
 
+import docstring_parser
 import tyro
 
 from cfp.errors import CFPError, NonFiniteError
@@ -105,11 +103,5 @@ def _option(name: str, hint: Any, value: Any) -> tuple[str, Any, Any]:
 
 def _descriptions(kind: type) -> dict[str, str]:
     """The strings below the fields of a dataclass and of those that it extends."""
-    texts = {}
-    for base in reversed(kind.__mro__[:-1]):
-        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
-        assert isinstance(definition, ast.ClassDef)
-        for field, text in pairwise(definition.body):
-            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
-                texts[ast.unparse(field.target)] = inspect.cleandoc(str(text.value.value))
-    return texts
+    bases = map(docstring_parser.parse_from_object, reversed(kind.__mro__[:-1]))
+    return {each.arg_name: inspect.cleandoc(each.description or "") for base in bases for each in base.params}

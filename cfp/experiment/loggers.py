@@ -15,7 +15,7 @@ from torch.utils.tensorboard import SummaryWriter
 from cfp.config import RunConfig, to_json
 from cfp.errors import ConfigError
 from cfp.files import write_text
-from cfp.tables import Table
+from cfp.tables import CSVTable
 from dittogym.render.film import available
 
 EVALUATION_METRICS: dict[str, str] = {
@@ -29,7 +29,7 @@ EVALUATION_METRICS: dict[str, str] = {
 class ProgressTable(KVWriter):
     """A logger output that appends to ``progress.csv``; stable-baselines3's own starts the file anew."""
 
-    def __init__(self, table: Table) -> None:
+    def __init__(self, table: CSVTable) -> None:
         self.table = table
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:

@@ -17,7 +17,7 @@ from cfp.errors import CFPError, ConfigError
 from cfp.evaluation.evaluate import Result, compare
 from cfp.evaluation.page import write_page
 from cfp.evaluation.plots import plot_curve
-from cfp.evaluation.tables import format_table, to_rows
+from cfp.evaluation.results import format_table, to_rows
 from cfp.evaluation.video import record_policy, save_media
 from cfp.experiment.algorithm import Algorithm, Position
 from cfp.experiment.callbacks import (
@@ -35,7 +35,7 @@ from cfp.experiment.folder import copy_policy, holds_progress, holds_run, policy
 from cfp.experiment.loggers import ProgressTable, Tracker, check_trackers
 from cfp.experiment.process import StopSignals
 from cfp.files import write_atomically, write_json
-from cfp.tables import Table
+from cfp.tables import CSVTable
 from cfp.weights import is_of_another_task, read_policy
 from dittogym.render.frame import png
 
@@ -78,9 +78,9 @@ class TrainingRun:
             self.step = self.position.offset
         write_json(folder / "config.json", to_json(config))
         self._save_target()
-        self.evaluations = Table(folder / "evaluations.csv", self.step, ("step", "stage", "mean"))
+        self.evaluations = CSVTable(folder / "evaluations.csv", self.step, ("step", "stage", "mean"))
         self.tracker = Tracker(config, folder, self.step)
-        progress = ProgressTable(Table(folder / "progress.csv", self.step))
+        progress = ProgressTable(CSVTable(folder / "progress.csv", self.step))
         self.logger = Logger(str(folder), [progress, *self.tracker.writers])
 
     def _save_target(self) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from cfp.errors import CheckpointError
 from cfp.files import write_atomically, write_json
-from cfp.tables import Table, read_table
+from cfp.tables import CSVTable, read_table
 
 
 def test_interrupted_write_leaves_the_old_file(tmp_path):
@@ -27,7 +27,7 @@ def test_interrupted_write_leaves_the_old_file(tmp_path):
 
 
 def test_table_grows_rows_and_columns(tmp_path):
-    table = Table(tmp_path / "t.csv")
+    table = CSVTable(tmp_path / "t.csv")
     table.add({"step": 1, "a": 0.5})
     table.add({"step": 2, "a": None})
     table.add({"step": 3, "a": 1, "b": "x,y"})
@@ -35,10 +35,10 @@ def test_table_grows_rows_and_columns(tmp_path):
 
 
 def test_resumed_table_drops_rows_past_the_checkpoint(tmp_path):
-    table = Table(tmp_path / "t.csv")
+    table = CSVTable(tmp_path / "t.csv")
     for step in (10, 20, 30):
         table.add({"step": step, "a": step})
-    again = Table(tmp_path / "t.csv", last_step=20)
+    again = CSVTable(tmp_path / "t.csv", last_step=20)
     again.add({"step": 25, "a": 1})
     assert [row["step"] for row in read_table(tmp_path / "t.csv")] == ["10", "20", "25"]
 
@@ -47,7 +47,7 @@ def test_line_cut_short_by_a_crash_is_left_out(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("step,a\r\n10,1\r\n20,")
     assert read_table(path) == [{"step": "10", "a": "1"}]
-    Table(path, last_step=30).add({"step": 20, "a": 2})
+    CSVTable(path, last_step=30).add({"step": 20, "a": 2})
     assert [row["a"] for row in read_table(path)] == ["1", "2"]
 
 
@@ -58,7 +58,7 @@ def test_damaged_table_is_named(tmp_path, content):
     with pytest.raises(
         CheckpointError, match=r"evaluations\.csv: (column step must hold numbers, got 'abc'|cannot be read)"
     ):
-        Table(path, last_step=30)
+        CSVTable(path, last_step=30)
 
 
 def test_links_in_a_folder_of_a_stranger_are_not_written_through(tmp_path):
@@ -73,7 +73,7 @@ def test_links_in_a_folder_of_a_stranger_are_not_written_through(tmp_path):
 
 
 def test_row_that_no_longer_fits_names_the_file(tmp_path, monkeypatch):
-    table = Table(tmp_path / "t.csv")
+    table = CSVTable(tmp_path / "t.csv")
     table.add({"step": 1})
     table.path = Path("/dev/full")
     with pytest.raises(OSError, match="No space left on device: '/dev/full'"):

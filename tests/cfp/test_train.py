@@ -257,7 +257,7 @@ def test_page_shows_the_run_and_opens_from_disk(finished):
     assert 'src="curve.png"' in page and "http" not in page and "<video" not in page  # filmed nothing
     for row in json.loads((finished / "results.json").read_text()):
         means = {f"<td>{row['mean'] + rounding:.1f}</td>" for rounding in (-5e-4, 5e-4)}  # the file has three digits
-        assert f"<td>{row['policy']}</td>" in page and any(mean in page for mean in means)
+        assert f'<td class="text">{row["policy"]}</td>' in page and any(mean in page for mean in means)
     assert html.escape((finished / "config.json").read_text().strip()) in page
 
 
@@ -274,7 +274,8 @@ def test_page_of_a_run_with_a_film_and_a_target(tmp_path, capsys):
     page = (folder / "index.html").read_text()
     for part in ('poster="poster.png"', 'href="replay.html"', "Intersection over union", "No evaluation was made"):
         assert part in page
-    assert page.count("data:image/png") == 3 and "<td>environment.particles</td><td>100</td><td>lite</td>" in page
+    cells = "".join(f'<td class="text">{cell}</td>' for cell in ("environment.particles", "100", "lite"))
+    assert page.count("data:image/png") == 3 and cells in page
     assert "environment.dtype</td>" not in page and f"torchmpm {torchmpm.__version__}" in page
     assert (folder / "poster.png").stat().st_size > 1000 and (folder / "replay.html").stat().st_size > 10_000
     command = html.unescape(re.sub("</?span>", "", re.search("<pre>(<span>python<.*)</pre>", page)[1]))

@@ -69,7 +69,8 @@ class Table:
 
     def to_html(self) -> str:
         """Heading, description and visible columns."""
-        head = f"<h2>{escape(self.title)}</h2>\n<p>{escape(self.description)}</p>\n"
+        head = f"<h2>{escape(self.title)}</h2>\n"
+        head += f"<p>{escape(self.description)}</p>\n" if self.description else ""
         if not self.rows:
             return head
         rows = ["".join(_html_cell("th", column, column.title) for column in self.visible)]
