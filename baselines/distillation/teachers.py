@@ -45,8 +45,8 @@ class Teacher(Stateful, ABC):
 class PolicyTeacher(Teacher):
     """A trained policy without noise; an open-loop one plays the action of the step that each episode is at."""
 
-    def __init__(self, policy: Policy, policy_layout: ActionIndexing, layout: ActionIndexing) -> None:
-        self.policy, self.policy_layout, self.layout = policy, policy_layout, layout
+    def __init__(self, policy: Policy, policy_indexing: ActionIndexing, indexing: ActionIndexing) -> None:
+        self.policy, self.policy_indexing, self.indexing = policy, policy_indexing, indexing
         self._memory: tuple[np.ndarray, ...] | None = None
 
     @torch.no_grad()
@@ -57,7 +57,7 @@ class PolicyTeacher(Teacher):
         memory = (steps,) if isinstance(policy, OpenLoop) else self._memory
         array, self._memory = policy.predict(observation.cpu().numpy(), memory, steps == 0, deterministic=True)
         action = torch.as_tensor(array, device=env.device)
-        return from_grid_indexing(to_grid_indexing(action, self.policy_layout), self.layout)
+        return from_grid_indexing(to_grid_indexing(action, self.policy_indexing), self.indexing)
 
     def state_dict(self) -> dict[str, Any]:
         """The policy's memory."""

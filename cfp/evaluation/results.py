@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from cfp.config import RunConfig
 from cfp.evaluation.evaluate import Result
 
 
-def to_rows(results: list[Result]) -> list[dict[str, Any]]:
+def to_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
     """Results as JSON values."""
     return [
         {"policy": result.name, "action": f"{result.resolution}x{result.resolution}", **numbers(result)}
@@ -28,7 +29,7 @@ def numbers(result: Result) -> dict[str, Any]:
     }
 
 
-def format_table(config: RunConfig, results: list[Result]) -> str:
+def format_table(config: RunConfig, results: Sequence[Result]) -> str:
     """Results as a plain text table: mean return, its 95 % confidence interval, and the spread of the episodes."""
     counts = {len(result.returns) for result in results}
     title = f"{config.task}, return over {'/'.join(map(str, sorted(counts)))} episodes"

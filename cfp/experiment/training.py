@@ -62,7 +62,7 @@ class Command:
 
 @dataclass(frozen=True)
 class _Choice:
-    """What must be known before the defaults are: the same options, read first."""
+    """Options that are read first, because they choose the preset, and so the default values of all others."""
 
     decisive: ClassVar[tuple[str, ...]] = ("algo", "task", "preset", "learner", "start_from")
     """Those that choose the defaults."""
