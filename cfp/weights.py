@@ -16,12 +16,11 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from cfp.agent.actor import Actor
 from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.spec import RESOLUTIONS, ActorSpec
-from cfp.config import LARGEST_SEED, Config, RunConfig
+from cfp.config import LARGEST_SEED, RunConfig
 from cfp.errors import CheckpointError, ConfigError
-from cfp.files import FORMAT, parse_json, write_policy
+from cfp.files import FORMAT, parse_json
 from cfp.from_dict import type_name, update_from_dict
 from cfp.hub import download, is_address
 from cfp.sections import TASK_OPTIONS, EnvironmentConfig
@@ -71,11 +70,6 @@ def is_of_another_task(description: Mapping[str, Any], task: str) -> bool:
     """Whether the file of a custom task has changed since a policy was trained."""
     then, now = description.get("task_file"), fingerprint(task)
     return then is not None and now is not None and then != now
-
-
-def describe(config: Config, stage: int, steps: int) -> dict[str, Any]:
-    """Description of an actor, see `describe_run`."""
-    return describe_run(config, KIND, stage, steps) | {"network": dataclasses.asdict(config.actor_spec(stage))}
 
 
 def shipped() -> list[str]:
@@ -147,11 +141,6 @@ def report_mismatch(path: str | Path) -> Iterator[None]:
     except (KeyError, TypeError, ValueError, RuntimeError, MemoryError) as error:
         reason = " ".join(str(error).split())[:MAX_REASON] or type(error).__name__
         raise CheckpointError(f"{policy_file(path)}: weights and description do not match ({reason})") from error
-
-
-def save_policy(path: Path, actor: Actor, description: dict[str, Any]) -> None:
-    """Write an actor with its frozen coarser stages."""
-    write_policy(path, actor.state_dict(), description)
 
 
 def load(path: str | Path, device: str = "cpu") -> ActorPolicy:

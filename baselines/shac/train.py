@@ -28,7 +28,7 @@ from cfp.policy_protocols import Policy
 from cfp.presets import ON_SPEED, sac_preset
 from cfp.sections import ReportConfig
 from cfp.validation import check_at_least
-from cfp.weights import KIND, load, policy_for, read_policy, save_policy
+from cfp.weights import KIND, load, policy_for, read_policy
 
 PATIENCE = 10
 """Updates in a row without a finite gradient after which training gives up."""
@@ -247,11 +247,10 @@ class Shac(Stateful, Algorithm):
         """Write the policy; one of the image becomes a policy of CFP."""
         policy = self.policy
         policy.description = {**description, "sees": self.config.sees}
-        if isinstance(policy, StatePolicy):
-            policy.save(path)
-        else:
-            own = {"kind": KIND, "network": {"resolutions": [policy.resolution]}, "trained_by": self.config.algo}
-            save_policy(path, policy.actor, policy.description | own)
+        if isinstance(policy, ActorPolicy):
+            network = {"resolutions": [policy.resolution]}
+            policy.description |= {"kind": KIND, "network": network, "trained_by": self.config.algo}
+        policy.save(path)
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu") -> StatePolicy | ActorPolicy:

@@ -14,7 +14,7 @@ from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm, Position
 from cfp.experiment.folder import policy_path
 from cfp.files import write_policy
-from cfp.weights import KIND, load, policy_for, read_policy, report_mismatch, save_policy
+from cfp.weights import KIND, load, policy_for, read_policy, report_mismatch
 
 
 class CoarseToFineStages(Algorithm):
@@ -71,9 +71,9 @@ class CoarseToFineStages(Algorithm):
         return True
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
-        """Write the actor."""
+        """Write the actor with its frozen coarser stages."""
         network = asdict(self.config.actor_spec(self.stage))
-        save_policy(path, self.trained_actor, description | {"kind": KIND, "network": network})
+        write_policy(path, self.trained_actor.state_dict(), description | {"kind": KIND, "network": network})
 
 
 def start_path(folder: Path) -> Path:

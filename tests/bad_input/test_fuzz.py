@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from policy_files import describe_actor
 
 import baselines
 from baselines.registry import ALGORITHMS, configure, find
@@ -15,8 +16,8 @@ from cfp.agent.actor import build_actor
 from cfp.config import to_json
 from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.process import peak_memory
+from cfp.files import write_policy
 from cfp.presets import sac_preset
-from cfp.weights import describe, save_policy
 from dittogym.tasks.targets import load_target
 
 LARGEST_GROWTH = 2**30
@@ -110,7 +111,7 @@ def test_pictures_of_any_bytes(kind, tmp_path_factory, cuts, changes):
 
 CONFIG = replace(sac_preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,))
 OF_OTHERS = {"inputs": 10, "noise": 0.1, "features": {}, "nodes": {"count": 16, "graph": True}}
-DESCRIPTION = json.loads(json.dumps(describe(CONFIG, 1, 7))) | OF_OTHERS
+DESCRIPTION = json.loads(json.dumps(describe_actor(CONFIG, 1, 7))) | OF_OTHERS
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +119,7 @@ def policy(tmp_path_factory):
     """A valid policy: path, bytes, weights."""
     actor = build_actor(CONFIG.actor_spec(1))
     path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
-    save_policy(path, actor, DESCRIPTION)
+    write_policy(path, actor.state_dict(), DESCRIPTION)
     return path, path.read_bytes(), actor
 
 
@@ -148,5 +149,5 @@ def test_policies_of_any_bytes(policy, cuts, changes):
 @example(kind="cfp", place=("network",), value=[])
 def test_policies_of_any_description(policy, kind, place, value):
     path, _, actor = policy
-    save_policy(path, actor, replaced(DESCRIPTION | {"kind": kind}, place, value))
+    write_policy(path, actor.state_dict(), replaced(DESCRIPTION | {"kind": kind}, place, value))
     loaded(path)

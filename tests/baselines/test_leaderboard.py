@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from policy_files import save_actor
 
 import dittogym
 from baselines import leaderboard
@@ -22,7 +23,7 @@ from cfp.errors import ConfigError
 from cfp.evaluation.cache import Episode
 from cfp.files import write_json
 from cfp.presets import preset
-from cfp.weights import SHIPPED, describe, save_policy, shipped
+from cfp.weights import SHIPPED, shipped
 
 COMMITTED = Path(__file__).resolve().parents[2] / "docs" / "leaderboard"
 RETURNS = tuple(float(value) for value in range(100, 108))
@@ -119,7 +120,7 @@ def test_all_layouts_of_a_task_differ(task):
 def test_policies_are_evaluated_and_ranked(tiny, tmp_path, capsys):
     config = replace(preset("shapematch", "quick"), environment=replace(tiny, action_layout="grid"))
     policy = tmp_path / "my policy.safetensors"
-    save_policy(policy, build_actor(config.actor_spec(1)), describe(config, 1, 1234))
+    save_actor(policy, build_actor(config.actor_spec(1)), config, 1, 1234)
     words = f"--protocol v1 --tasks shapematch --out {tmp_path} --policies zero random".split()
     assert compare([*words, str(policy)]) == 0
     files = {path.name: path for path in (tmp_path / "submissions").iterdir()}
@@ -187,7 +188,7 @@ def test_policies_of_other_tasks_are_refused(tmp_path, capsys):
         ({"substeps": 50}, "policies must be a policy for environment steps of 0.01 s, got 0.005"),
     ):
         there = replace(config, environment=replace(config.environment, **changes))
-        save_policy(tmp_path / "a.safetensors", build_actor(config.actor_spec(1)), describe(there, 1, 0))
+        save_actor(tmp_path / "a.safetensors", build_actor(config.actor_spec(1)), there, 1, 0)
         assert expected in error(*protocol, str(tmp_path / "a.safetensors"))
     assert "there is no policy" in error(*protocol, "none")
     assert "got several for run-pretrained.json" in error(*protocol, "run", "run")

@@ -5,6 +5,7 @@ import signal
 
 import numpy as np
 import pytest
+from policy_files import save_actor
 
 import baselines
 import cfp.evaluate
@@ -18,7 +19,6 @@ from cfp.experiment.callbacks import EvaluationCallback
 from cfp.experiment.training import parse
 from cfp.policy_protocols import SeesState
 from cfp.tables import read_table
-from cfp.weights import describe, save_policy
 
 COMMON = "--particles 100 --substeps 1 --eval-episodes 2 --no-video --device cpu".split()
 MODULAR = (
@@ -207,7 +207,7 @@ def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, mon
         {"algo": "coarse", "resolutions": [8], "environment": {"substeps": 1}, "network": {"encoder": "full"}}
     )
     start = tmp_path / "start.safetensors"
-    save_policy(start, build_actor(config.actor_spec(1)), describe(config, 1, 5))
+    save_actor(start, build_actor(config.actor_spec(1)), config, 1, 5)
     words = ["--sees", "image", "--start-from", str(start), "--steps", "24", "--eval-every", "24"]
     stop_at(12)
     assert run("shac", tmp_path / "run", *words) == 128 + signal.SIGINT

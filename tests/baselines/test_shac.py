@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from policy_files import save_actor
 from updates import EachUpdate
 
 import baselines
@@ -23,7 +24,7 @@ from cfp.evaluation.episodes import attached
 from cfp.evaluation.evaluate import evaluate, make_trial
 from cfp.evaluation.video import record_policy
 from cfp.sections import EnvironmentConfig
-from cfp.weights import describe, describe_run, save_policy
+from cfp.weights import describe_run
 from dittogym import TorchEnv
 
 
@@ -283,7 +284,7 @@ def test_actor_on_the_image_begins_with_a_policy_of_any_algorithm(tmp_path):
     actor, path = build_actor(ActorSpec((config.resolution(1),))), tmp_path / "policy.safetensors"
     trained = configure({"algo": "coarse", "task": "run", "network": {"encoder": "full"}})
     origins = replace(trained, environment=config.environment, resolutions=(config.resolution(1),))
-    save_policy(path, actor, describe(origins, 1, 5))
+    save_actor(path, actor, origins, 1, 5)
     warm = replace(config, start_from=str(path))
     algorithm = Shac(warm, 1, Shac.initial_policy(warm))
     for name, value in actor.state_dict().items():

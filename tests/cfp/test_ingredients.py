@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from fakes import FakeEnv
+from policy_files import save_actor
 from test_algorithm import make_batch, make_model
 from tiny_runs import assert_same_run, at_step, run
 from torch.nn import functional as F
@@ -20,7 +21,7 @@ from cfp.agent.replay import ReplayRing
 from cfp.agent.spec import ActorSpec
 from cfp.errors import ConfigError
 from cfp.presets import from_json, sac_preset
-from cfp.weights import describe, load, save_policy
+from cfp.weights import load
 
 LEAN = {"plain": ActorSpec((8,), encoder="lean"), "residual": ActorSpec((4, 8), (-1.0,), patch=16, encoder="lean")}
 
@@ -143,7 +144,7 @@ def test_lean_policy_is_saved_and_loaded(tmp_path):
     spec = config.actor_spec(2)
     assert spec.encoder == "lean"
     actor, images = build_actor(spec), make_batch(8).observations
-    save_policy(tmp_path / "policy.safetensors", actor, describe(config, 2, 5))
+    save_actor(tmp_path / "policy.safetensors", actor, config, 2, 5)
     loaded = load(tmp_path)
     assert loaded.spec == spec
     assert torch.equal(loaded(images, deterministic=True), actor(images, deterministic=True))

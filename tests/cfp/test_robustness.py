@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from fakes import FakeEnv
+from policy_files import save_actor
 from scipy import stats
 
 from cfp import robustness
@@ -21,7 +22,6 @@ from cfp.evaluation.evaluate import Result
 from cfp.files import write_json
 from cfp.presets import sac_preset
 from cfp.train import PROGRAM
-from cfp.weights import describe, save_policy
 from dittogym import make_spec
 from dittogym.action import bicubic
 from dittogym.tasks import TASKS
@@ -128,7 +128,7 @@ def folder(tmp_path):
     config = replace(config, environment=environment)
     write_json(tmp_path / "config.json", to_json(config))
     torch.manual_seed(0)  # of a policy with a positive return, which ratios refer to
-    save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(2)), describe(config, 2, 0))
+    save_actor(tmp_path / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 0)
     return tmp_path
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from policy_files import save_actor
 from tiny_runs import TINY, assert_same_run, at_step, run
 
 import cfp
@@ -29,7 +30,7 @@ from cfp.experiment.training import parse
 from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
 from cfp.tables import read_table
-from cfp.weights import describe, policy_file, save_policy, shipped
+from cfp.weights import policy_file, shipped
 from dittogym.render.frame import png
 from dittogym.tasks.targets import load_target
 
@@ -191,7 +192,7 @@ def test_single_policy_need_not_have_the_grids_of_its_task(tmp_path, monkeypatch
     dittogym.register("tens", lambda: tens)
     environment = EnvironmentConfig(particles=60, substeps=1)
     config = replace(sac_preset("tens"), resolutions=(4, 8, 16), gate_bias=(-1.0, -2.0), environment=environment)
-    save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(3)), describe(config, 3, 0))
+    save_actor(tmp_path / "policy.safetensors", build_actor(config.actor_spec(3)), config, 3, 0)
     command = evaluate.Command(policy=str(tmp_path), episodes=1, device="cpu")
     opened, _ = command.open(train.PROGRAM)
     assert (opened.resolutions, opened.gate_bias) == (config.resolutions, config.gate_bias)
@@ -200,7 +201,7 @@ def test_single_policy_need_not_have_the_grids_of_its_task(tmp_path, monkeypatch
 
 def test_other_particles_are_not_those_of_the_reference_s_faults(tmp_path):
     config = sac_preset("shapematch", "paper")
-    save_policy(tmp_path / "policy.safetensors", build_actor(config.actor_spec(1)), describe(config, 1, 0))
+    save_actor(tmp_path / "policy.safetensors", build_actor(config.actor_spec(1)), config, 1, 0)
     for particles, parity in ((None, "reference"), ("full", "reference"), ("lite", "clean"), (60, "clean")):
         chosen = evaluate.Selection(policy=str(tmp_path), particles=particles)
         environment = chosen.open(train.PROGRAM)[0].environment

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from policy_files import save_actor
 
 import cfp
 from cfp.agent.actor import build_actor
@@ -16,14 +17,14 @@ from cfp.agent.spec import ActorSpec
 from cfp.errors import ConfigError
 from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
-from cfp.weights import check_trained_for, describe, save_policy
+from cfp.weights import check_trained_for
 
 
 @pytest.fixture
 def saved(tmp_path):
     config = replace(sac_preset("shapematch"), resolutions=(8, 16), gate_bias=(-1.0,))
     actor = build_actor(config.actor_spec(2))
-    save_policy(tmp_path / "policy.safetensors", actor, describe(config, 2, 123))
+    save_actor(tmp_path / "policy.safetensors", actor, config, 2, 123)
     return tmp_path, actor
 
 

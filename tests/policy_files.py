@@ -1,0 +1,14 @@
+"""Policy files as a training of the coarse-to-fine policy writes them."""
+
+from dataclasses import asdict
+
+from cfp.files import write_policy
+from cfp.weights import KIND, describe_run
+
+
+def describe_actor(config, stage, steps):
+    return describe_run(config, KIND, stage, steps) | {"network": asdict(config.actor_spec(stage))}
+
+
+def save_actor(path, actor, config, stage, steps):
+    write_policy(path, actor.state_dict(), describe_actor(config, stage, steps))
