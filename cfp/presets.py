@@ -138,10 +138,8 @@ def analytic_preset(task: str, name: str = "quick") -> AnalyticConfig:
 
 
 def _numbers(task: str) -> TaskNumbers:
-    return TASKS[task] if task in TASKS else _custom_numbers(task)
-
-
-def _custom_numbers(task: str) -> TaskNumbers:
+    if task in TASKS:
+        return TASKS[task]
     spec = dittogym.make_spec(task)
     return replace(CUSTOM_TASK, resolutions=(spec.coarse, spec.fine))
 
