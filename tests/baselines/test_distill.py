@@ -350,9 +350,7 @@ def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, kind, targ
     assert not folder.exists()
 
 
-@pytest.mark.parametrize(
-    ("task", "alike"), [pytest.param("grow", True, marks=pytest.mark.slow), ("shapematch", False)]
-)
+@pytest.mark.parametrize(("task", "alike"), [pytest.param("grow", True, marks=pytest.mark.slow), ("shapematch", False)])
 def test_record_of_one_episode_teaches(tmp_path, capsys, task, alike):
     config = replace(Distill.preset(task, "quick"), environment=EnvironmentConfig(1, 100, 1))
     path, size = tmp_path / "record.safetensors", config.resolution(1)
