@@ -35,11 +35,11 @@ def as_tensor(action: Any, env: TorchEnv, single: bool = False) -> torch.Tensor:
     """An array of actions as a tensor; ``single``: one action, which becomes a batch of one."""
     if np.ma.is_masked(action):
         raise ValueError(f"action must be numbers, got a masked array with {np.ma.count_masked(action)} masked entries")
+    expected = env.action_shape if single else (env.num_envs, *env.action_shape)
     try:
         array = np.asarray(action)
-    except ValueError:  # rows of different lengths
-        array = np.empty((), object)
-    expected = env.action_shape if single else (env.num_envs, *env.action_shape)
+    except (RuntimeError, TypeError, ValueError) as error:  # rows of different lengths, sparse tensors
+        raise ValueError(f"action must be numbers of shape {expected}, got {type(action).__name__}: {error}") from error
     if array.dtype.kind not in "fiu" or array.shape != expected:
         raise ValueError(f"action must be numbers of shape {expected}, got {array.dtype} of shape {array.shape}")
     # A copy: torch takes neither negative strides nor foreign byte orders.

@@ -25,6 +25,7 @@ def uniform(count: int, generator: np.random.Generator) -> Points:
         count: N, at least 1.
         generator: Where they are drawn from.
     """
+    checks.instance("generator", generator, np.random.Generator)
     return generator.random((checks.whole("count", count, 1), 2))
 
 
@@ -103,6 +104,7 @@ def lattice(cells: tuple[int, int], corner: tuple[float, float], size: tuple[flo
         corner: Lower left corner, m.
         size: Width and height, m.
     """
+    checks.pair("cells", cells)
     for axis, count in zip("xy", cells, strict=True):
         checks.whole(f"cells in {axis}", count, 1)
     checks.whole("number of cells", math.prod(cells), 1, LARGEST)
@@ -126,8 +128,9 @@ def image(numbers: Points, mask: NDArray[np.bool_], corner: tuple[float, float],
         ValueError: The mask has no pixel set, or another shape.
     """
     checks.points("numbers", numbers)
-    if not isinstance(mask, np.ndarray) or mask.ndim != 2:
-        raise ValueError(f"mask must be an array (H, W), got {type(mask).__name__} of shape {np.shape(mask)}")
+    if not isinstance(mask, np.ndarray) or mask.ndim != 2 or mask.dtype.kind not in "biu":
+        kind = mask.dtype if isinstance(mask, np.ndarray) else type(mask).__name__
+        raise ValueError(f"mask must be an array (H, W) of bool, got {kind} of shape {np.shape(mask)}")
     pixels = np.flipud(mask.astype(bool)).T  # (column, row from below)
     counts = pixels.sum(1)
     if not counts.any():

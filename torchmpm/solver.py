@@ -189,7 +189,7 @@ class Solver:
                 indices (i, j) rightwards and upwards; acts on bodies with ``muscle=True``. ``None`` for none.
             substeps: Number of substeps.
             origin: (B, 2) lower left corner of the window in the world, m; ``None`` for (0, 0). An element whose origin
-                is not finite does not move the others.
+                is not finite, or far from its matter, does not move and harms no other.
             segment: Substeps between checkpoints when gradients are enabled, see :func:`torchmpm.repeated` and
                 :func:`torchmpm.segment_for`. The native backend keeps the start of a segment and replays its substeps
                 onto a tape; ``"auto"`` and ``None`` make its segments as long as the memory that it keeps for tapes.

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from tyro.constructors import PrimitiveConstructorSpec
 
 from cfp.config import RunConfig
-from cfp.errors import CheckpointError, ConfigError
+from cfp.errors import CFPError, CheckpointError, ConfigError
 from cfp.files import copy_atomically, read_json
 from cfp.weights import read_policy
 
@@ -18,12 +18,19 @@ def parse_folder(words: list[str]) -> Path:
     """The folder that an option names; a ``ValueError`` if it cannot be the name of one."""
     word = words[0]
     if not word:  # a shell's variable that is not set; it would stand for the current folder
-        raise ValueError("it must name a folder, got ''")
+        raise ValueError("must name a folder, got ''")
     try:
         word.encode()
     except UnicodeEncodeError as error:
-        raise ValueError(f"it must be text in UTF-8, got {word!r}") from error
+        raise ValueError(f"must be text in UTF-8, got {word!r}") from error
     return Path(word)
+
+
+def _parse_option(words: list[str]) -> Path:
+    try:
+        return parse_folder(words)
+    except ValueError as error:  # which tyro would bury under its own words
+        raise CFPError(f"out {error}") from error
 
 
 #: A folder to write into, as an option of a command line.
@@ -32,7 +39,7 @@ Folder = Annotated[
     PrimitiveConstructorSpec(
         nargs=1,
         metavar="PATH",
-        instance_from_str=parse_folder,
+        instance_from_str=_parse_option,
         is_instance=lambda value: isinstance(value, Path),
         str_from_instance=lambda folder: [str(folder)],
     ),

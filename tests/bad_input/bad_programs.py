@@ -114,9 +114,9 @@ TRAIN = [
         ("out: loop cannot be created as a folder (File exists)",),
         Refused,
     ),
-    training("a folder that is not text", "--out run\udcff", "out", "text in UTF-8", "'run\\udcff'"),
-    training("an unset variable as its folder", "--out ''", "--out", "must name a folder, got ''"),
-    training("a variable that is not set", "--out=", "--out", "must name a folder, got ''"),
+    training("a folder that is not text", "--out run\udcff", "error: out must be text in UTF-8, got 'run\\udcff'"),
+    training("an unset variable as its folder", "--out ''", "error: out must name a folder, got ''"),
+    training("a variable that is not set", "--out=", "error: out must name a folder, got ''"),
 ]
 
 OTHERS = [
