@@ -63,8 +63,8 @@ PAGES = {
 }
 
 
-SLOW = {"docs/own.md", "docs/concepts/planning.md", "docs/develop/adding.md"}
-"""Pages whose samples take up to a minute."""
+SLOW = {"docs/start.md", "docs/own.md", "docs/concepts/planning.md", "docs/develop/adding.md"}
+"""Pages whose samples take up to a minute; docs/start.md does for longer what README.md and docs/films.md do."""
 
 
 @pytest.mark.parametrize("page", [pytest.param(p, marks=[pytest.mark.slow] * (p in SLOW)) for p in PAGES])

@@ -284,7 +284,7 @@ def test_loss_that_is_not_finite_ends_the_training():
 
 TINY = (
     "--task shapematch --particles 100 --substeps 4 --num-envs 2 --resolutions 4 8 --eval-episodes 2 "
-    "--no-video --device cpu --backend eager --checkpoint-every 20"
+    "--no-video --device cpu --checkpoint-every 20"
 ).split()
 LESSONS = (
     "--train-particles 100 --steps 32 --handover 16 --rollout-steps 4 --updates 2 --batch-size 4 --eval-every 0".split()
@@ -357,7 +357,7 @@ def test_record_of_one_episode_teaches(tmp_path, capsys, task, alike):
     write_policy(path, {"actions": torch.ones(3, 2, size, size)}, describe_run(config, "mpc", 1, 0) | {"layout": 0})
     teacher = read_teacher(path, task, config.environment)
     assert isinstance(teacher, OpenLoop) and len(teacher.actions) == 3
-    student = ["--task", task, "--teacher", str(path), "--substeps", "1", "--backend", "auto"]
+    student = ["--task", task, "--teacher", str(path), "--substeps", "1"]
     assert distill.main([*TINY, *LESSONS, *student, "--out", str(tmp_path / "run")]) == 0
     remark = f"teacher: the record of one planned episode, while every episode of {task} starts differently"
     assert (remark in capsys.readouterr().out) != alike

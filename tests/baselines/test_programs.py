@@ -25,11 +25,11 @@ MODULAR = (
     "--num-envs 2 --steps 60 --random-steps 10 --batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 "
     "--eval-every 20 --checkpoint-every 10 --log-every 10"
 )
-SINGLE = f"{MODULAR} --resolutions 8 --backend eager"
+SINGLE = f"{MODULAR} --resolutions 8"
 # A tiny run of each algorithm: options, a step at which it is stopped, its policies.
 TINY = {
     "cfp": (
-        f"{MODULAR} --resolutions 4 8 --handover 30 --random-steps 10 4 --backend eager",
+        f"{MODULAR} --resolutions 4 8 --handover 30 --random-steps 10 4",
         44,
         ["stage 1", "stage 2"],
     ),
@@ -38,7 +38,7 @@ TINY = {
     "distill": (
         "--teacher mpc --planner-grid 4 --horizon 2 --commit 2 --iterations 1 --num-envs 2 --train-particles 100 "
         "--resolutions 4 8 --steps 60 --handover 30 --rollout-steps 5 --updates 2 --batch-size 4 --eval-every 20 "
-        "--checkpoint-every 10 --log-every 10 --backend eager",
+        "--checkpoint-every 10 --log-every 10",
         50,
         ["stage 1", "stage 2"],
     ),

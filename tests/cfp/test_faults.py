@@ -55,7 +55,8 @@ def test_loading_a_policy_unpickles_nothing(finished, monkeypatch):
 
 
 def test_first_level_of_another_ladder_is_refused(finished, tmp_path, capsys):
-    folder, options = tmp_path / "run", "--steps 40 --handover 20 --resolutions 8 16".split()
+    folder = tmp_path / "run"
+    options = "--steps 40 --handover 20 --resolutions 8 16 --eval-every 0 --eval-episodes 1".split()
     assert run(folder, *options) == 0
     for suffix in ("safetensors", "json"):
         (folder / f"stage1.{suffix}").write_bytes((finished / f"stage1.{suffix}").read_bytes())

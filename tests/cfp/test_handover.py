@@ -8,7 +8,7 @@ import torch
 from tiny_runs import run
 
 from cfp import train
-from cfp.evaluation.evaluate import evaluate
+from cfp.evaluation.evaluate import Result
 from cfp.experiment.coarse_to_fine import CoarseToFine
 from cfp.experiment.process import StopSignals
 from cfp.experiment.run import TrainingRun
@@ -21,11 +21,11 @@ MEANS = [1.0, 3.0, 2.0, 2.5, 9.0, 1.0, 5.0, 4.0, 3.0, 2.0]
 
 @pytest.fixture
 def scripted(monkeypatch):
-    """Evaluations that return given means, whatever the policy."""
+    """Evaluations that play nothing and return given means."""
     left = list(MEANS)
 
     def pretend(trials):
-        return [replace(result, returns=(left.pop(0),) * 2) for result in evaluate(trials)]
+        return [Result(trial.name, trial.resolution, (left.pop(0),) * 2) for trial in trials]
 
     monkeypatch.setattr("cfp.experiment.callbacks.evaluate", pretend)
 
@@ -84,7 +84,7 @@ def test_ladder_of_three_levels_in_one_command(tmp_path):
     folder = tmp_path / "ladder"
     options = "--learner sac --task shapematch --particles 100 --substeps 1 --num-envs 2 --device cpu --no-video "
     options += "--batch-size 4 --buffer-size 60 --update-start 8 --actor-start 0 --gradient-steps 1 --eval-every 10 "
-    options += "--eval-episodes 2 --resolutions 4 8 16 --steps 90 --log-every 10 --checkpoint-every 20"
+    options += "--eval-episodes 1 --resolutions 4 8 16 --steps 90 --log-every 10 --checkpoint-every 20"
     assert train.main([*options.split(), "--out", str(folder)]) == 0
     rows = read_table(folder / "evaluations.csv")
     assert [(row["stage"], row["step"]) for row in rows if row["step"] in ("30", "60")] == [
@@ -139,7 +139,7 @@ def test_critics_of_a_level_begin_with_those_before_if_asked_to(tmp_path, monkey
 
 
 def test_refining_goes_on_with_the_weights_of_a_policy(coarse, tmp_path):
-    options = "--refine --actor-start 100 --random-steps 50 50 --eval-every 10 --steps 90".split()
+    options = "--refine --actor-start 100 --random-steps 50 50 --eval-every 10 --eval-episodes 1 --steps 90".split()
     assert run(tmp_path / "a", "--start-from", str(coarse), *options) == 0
     assert all(not row.get("train/drift") for row in read_table(tmp_path / "a" / "progress.csv"))
     rows = read_table(tmp_path / "a" / "evaluations.csv")
@@ -148,7 +148,7 @@ def test_refining_goes_on_with_the_weights_of_a_policy(coarse, tmp_path):
     assert [row["mean"] for row in rows[:4]] == [rows[0]["mean"]] * 4
     begun, given = (PROGRAM.load(place).actor.state_dict() for place in (tmp_path / "a" / "stage1.json", coarse))
     assert all(torch.equal(begun[key], value) for key, value in given.items())
-    again = ["--refine", "--start-from", str(tmp_path / "a")]
+    again = [*"--refine --steps 110 --eval-every 0 --eval-episodes 1 --start-from".split(), str(tmp_path / "a")]
     assert run(tmp_path / "b", *again) == 0
     assert float(read_table(tmp_path / "b" / "progress.csv")[-1]["train/drift"]) > 0
     assert {row["stage"] for row in read_table(tmp_path / "b" / "progress.csv")} == {"2"}

@@ -32,7 +32,6 @@ OPTIONS = {
     "log_every": 10,
     "video": False,
     "device": "cpu",
-    "backend": "eager",
 }
 
 

@@ -115,19 +115,32 @@ def test_pictures_show_the_mean_action_and_draw_no_random_number():
     assert pictures["picture/observation"][0, 0].tolist() == observation[0, :, 0, 0].tolist()
 
 
-def test_films_at_intervals_leave_learning_as_it_was(finished, wandb, tmp_path):
+def test_films_at_intervals_and_weights_and_biases_leave_learning_as_it_was(finished, wandb, tmp_path):
     imageio = pytest.importorskip("imageio.v2")
     pytest.importorskip("imageio_ffmpeg")
-    assert run(tmp_path / "run", "--video-every", "70", "--wandb", "online") == 0
-    films = sorted((tmp_path / "run" / "videos").iterdir())
+    folder = tmp_path / "run"
+    assert run(folder, *"--video-every 70 --wandb offline --wandb-project mine".split()) == 0
+    films = sorted((folder / "videos").iterdir())
     assert [film.name for film in films] == ["step000000070.mp4", "step000000140.mp4"]
     with imageio.get_reader(films[1]) as film:
         assert film.get_meta_data()["duration"] == pytest.approx(7.0, abs=0.15)  # 3 ms 2,000 times slower, and a second
-    assert_same_run(tmp_path / "run", finished)
-    assert 'href="videos/step000000070.mp4"' in (tmp_path / "run" / "index.html").read_text()
+    assert_same_run(folder, finished)
+    assert 'href="videos/step000000070.mp4"' in (folder / "index.html").read_text()
     assert "videos/" not in (finished / "index.html").read_text()
     sent = [(point["step"], point["video"][1]) for point in wandb.points if "video" in point]
     assert sent == [(70, films[0].name), (140, films[1].name)]
+    (options,) = wandb.started
+    assert (options["mode"], options["project"], options["dir"]) == ("offline", "mine", str(folder))
+    assert options["name"] == "cfp-shapematch-quick-0" and options["config"]["learning"]["batch_size"] == 4
+    assert ("*", "step") in wandb.steps and wandb.finished == 1
+    names = {name for point in wandb.points for name in point} - {"step", "video"}
+    tags = events(finished).Tags()
+    assert names == set(tags["scalars"]) | set(tags["images"])
+    last = [point for point in wandb.points if "picture/gate" in point][-1]
+    assert last["step"] == 150 and last["picture/gate"] == ("image", (192, 386, 3))
+    assert all(value is not None for point in wandb.points for value in point.values())
+    assert train.main(["--out", str(folder), "--resume", "--steps", "160"]) == 0
+    assert wandb.started[1]["id"] == options["id"] and wandb.started[1]["resume"] == "allow"
 
 
 def test_films_without_the_packages_are_refused_at_once(tmp_path, monkeypatch, capsys):
@@ -136,24 +149,6 @@ def test_films_without_the_packages_are_refused_at_once(tmp_path, monkeypatch, c
     error = capsys.readouterr().err
     assert "got 30" in error and "pip install 'torchmpm[video]'" in error
     assert not (tmp_path / "run").exists()
-
-
-def test_weights_and_biases_get_what_tensorboard_gets(wandb, finished, tmp_path):
-    folder = tmp_path / "run"
-    assert run(folder, "--wandb", "offline", "--wandb-project", "mine") == 0
-    (options,) = wandb.started
-    assert (options["mode"], options["project"], options["dir"]) == ("offline", "mine", str(folder))
-    assert options["name"] == "cfp-shapematch-quick-0" and options["config"]["learning"]["batch_size"] == 4
-    assert ("*", "step") in wandb.steps and wandb.finished == 1
-    names = {name for point in wandb.points for name in point} - {"step"}
-    tags = events(finished).Tags()
-    assert names == set(tags["scalars"]) | set(tags["images"])
-    last = [point for point in wandb.points if "picture/gate" in point][-1]
-    assert last["step"] == 150 and last["picture/gate"] == ("image", (192, 386, 3))
-    assert all(value is not None for point in wandb.points for value in point.values())
-    assert (folder / "progress.csv").read_bytes() == (finished / "progress.csv").read_bytes()
-    assert train.main(["--out", str(folder), "--resume", "--steps", "170"]) == 0
-    assert wandb.started[1]["id"] == options["id"] and wandb.started[1]["resume"] == "allow"
 
 
 def test_weights_and_biases_that_is_not_installed_is_refused_at_once(monkeypatch, tmp_path, capsys):

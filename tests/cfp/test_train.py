@@ -55,18 +55,20 @@ def test_run_trains_both_stages_and_leaves_its_files(finished):
 
 
 def test_another_seed_gives_another_run(finished, tmp_path):
-    assert run(tmp_path / "other", "--seed", "1", "--steps", "40", "--handover", "30") == 0
+    assert run(tmp_path / "other", "--seed", "1", *"--steps 40 --handover 30 --eval-episodes 1".split()) == 0
     assert read_table(tmp_path / "other" / "progress.csv")[2] != read_table(finished / "progress.csv")[2]
 
 
-@pytest.mark.parametrize(("step", "number"), [(44, signal.SIGINT), (70, signal.SIGTERM)])
-def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, capsys, step, number):
+def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, capsys):
     folder = tmp_path / "stopped"
-    with at_step(step, lambda: signal.raise_signal(number)):
-        assert run(folder) == 128 + number
+    with at_step(44, lambda: signal.raise_signal(signal.SIGINT)):
+        assert run(folder) == 128 + signal.SIGINT
     assert "--resume" in capsys.readouterr().out
+    with at_step(70, lambda: signal.raise_signal(signal.SIGTERM)):  # the end of a stage
+        assert train.main(["--out", str(folder), "--resume"]) == 128 + signal.SIGTERM
+    assert f"resuming {folder} at step 44" in capsys.readouterr().out
     assert train.main(["--out", str(folder), "--resume"]) == 0
-    assert f"resuming {folder} at step" in capsys.readouterr().out
+    assert f"resuming {folder} at step 70" in capsys.readouterr().out
     assert_same_run(folder, finished)
 
 
@@ -89,7 +91,7 @@ def test_other_options_than_the_checkpoint_s_are_refused(finished, tmp_path, cap
 
 def test_finished_run_can_be_prolonged_and_its_results_do_not_outlive_it(tmp_path, capsys):
     folder = tmp_path / "run"
-    assert run(folder, "--resume", "--steps", "40", "--handover", "20") == 0
+    assert run(folder, *"--resume --steps 40 --handover 20 --eval-every 0 --eval-episodes 1".split()) == 0
     assert "holds no run yet" in capsys.readouterr().out and (folder / "results.json").exists()
     with at_step(44, lambda: signal.raise_signal(signal.SIGTERM)):
         assert train.main(["--out", str(folder), "--resume", "--steps", "60"]) == 128 + signal.SIGTERM
@@ -237,7 +239,8 @@ def test_task_of_a_module_is_trained_and_evaluated_by_name(tmp_path, monkeypatch
         dittogym.tasks.TASKS.pop("bounce", None)
 
     folder = tmp_path / "runs" / "cfp-bounce-quick-0"
-    assert train.main([*TINY, "--task", "bouncing:bounce"]) == 0
+    short = "--steps 40 --handover 20 --eval-every 0 --eval-episodes 1".split()
+    assert train.main([*TINY, *short, "--task", "bouncing:bounce"]) == 0
     forget()
     policy = cfp.load(folder)
     assert policy.description["task"] == "bouncing:bounce" and "bouncing" not in sys.modules

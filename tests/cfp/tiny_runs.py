@@ -11,7 +11,7 @@ TINY = (
     "--task shapematch --learner sac --particles 100 --substeps 1 --num-envs 2 --resolutions 4 8 --steps 150 "
     "--handover 70 --random-steps 10 4 --batch-size 4 --buffer-size 60 --update-start 8 --actor-start 0 "
     "--gradient-steps 1 --eval-every 60 --eval-episodes 2 --checkpoint-every 20 --log-every 10 --no-video "
-    "--device cpu --backend eager"
+    "--device cpu"
 ).split()
 TABLES = ("progress.csv", "evaluations.csv", "results.json")
 
