@@ -65,13 +65,13 @@ def make_tables(runs: Sequence[RunResult], groups: Sequence[Group], protocol: Pr
 
 
 def _describe_protocol(protocol: Protocol) -> str:
-    rule = f"action noise as in the paper: none in {', '.join(paper.WITHOUT_NOISE)}, in all other tasks with it"
+    rule = f"action noise as in the paper: none in {', '.join(paper.WITHOUT_NOISE)}, that of the policy elsewhere"
     noise = {"paper": rule, "with": "action noise", "without": "no action noise"}[protocol.noise]
     text = f"Final evaluations with {protocol.tier} particles and {noise}."
     if protocol.tier != paper.TIER:
         text += (
-            " They are not compared with the paper's returns, which are of full size: returns of other sizes differ "
-            "(--tier full evaluates the same policies there)."
+            " They are not compared with the paper's returns, which were measured with full particles "
+            "(--tier full evaluates the same policies with as many)."
         )
     return text
 
@@ -81,7 +81,7 @@ def _describe_observations(groups: Sequence[Group]) -> str:
     for group in groups:
         labels.setdefault(group.observes, []).append(group.label)
     parts = (f"{observes}: {', '.join(dict.fromkeys(names))}" for observes, names in labels.items())
-    return f"What policies observe – {'; '.join(parts)}."
+    return f"What the policies observe – {'; '.join(parts)}."
 
 
 def _make_pictures(groups: Sequence[Group]) -> dict[str, Picture]:

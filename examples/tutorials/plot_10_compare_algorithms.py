@@ -61,7 +61,7 @@ lines = (out / "returns.csv").read_text().splitlines()
 columns = lines[0].split(",")
 rows = [dict(zip(columns, line.split(","), strict=False)) for line in lines[1:]]
 for row in rows:
-    print(row["algo"], row["mean"])
+    print(f"{row['algo']:9s} {float(row['mean']):.0f}")
 means = {row["algo"]: float(row["mean"]) for row in rows}
 folder.cleanup()
 

@@ -57,7 +57,8 @@ export class Plot {
     context.globalAlpha = 1;
     context.fillText(title, 0, top + 10 * ratio);
     const most = high > -low ? high : low, label = most.toLocaleString(undefined, { maximumFractionDigits: Math.abs(most) < 100 ? 1 : 0 });
-    context.fillText(label, width - context.measureText(label).width, top + 10 * ratio);
+    // Beside the end of the scale that it belongs to.
+    context.fillText(label, width - context.measureText(label).width, most < 0 ? top + height - 3 * ratio : top + 10 * ratio);
     series.forEach((values, k) => {
       context.beginPath();
       const step = Math.max(1, Math.floor(values.length / width));
