@@ -26,10 +26,13 @@ SOURCES = FILMS / "sources.json"
 SIZE, CELL, COLUMNS = 360, 240, 4
 #: Duration of a film, s, and pictures per second.
 SECONDS, RATE = 6.0, 10
+#: Seed of the episode, where that of seed 0 is not typical: in GROW it earns 3,061, those of other seeds about 8,000.
+SEEDS = {"grow": 1}
 
 
-def record_task(task: str, seed: int = 0) -> Recording:
+def record_task(task: str) -> Recording:
     """One episode of a task at the lite tier."""
+    seed = SEEDS.get(task, 0)
     policy = cfp.load(task)
     env = dittogym.TorchEnv(task, particles="lite", resolution=policy.resolution)
     with torch.random.fork_rng():
