@@ -16,7 +16,7 @@ from typing import Any
 
 from cfp.config import RunConfig
 from cfp.evaluate import open_policy, open_run
-from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed, horizon, make_trial
+from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed, make_trial
 from cfp.evaluation.untrained import UntrainedPolicy
 from cfp.policy_protocols import Policy
 from cfp.train import PROGRAM
@@ -44,7 +44,7 @@ def results(
                     quiet = policy.deterministic_by_default
                     trial = make_trial(there, name, policy, policy.resolution, count, deterministic=quiet, seed=seed)
                     trials.append(replace(trial, resolution=policy.description["resolution"]))
-        for result in evaluate(trials, horizon(there)):
+        for result in evaluate(trials, there.make_spec().horizon):
             if result.success is not None or len(result.returns) != success:
                 yield particles, result
 

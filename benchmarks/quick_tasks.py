@@ -15,7 +15,7 @@ from pathlib import Path
 
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from cfp.tables import Table, read_table
+from cfp.tables import CSVTable, read_table
 from dittogym import TASKS
 
 
@@ -59,7 +59,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2000)
     arguments, options = parser.parse_known_args()
     for task in arguments.tasks:
-        table = Table(arguments.table)
+        table = CSVTable(arguments.table)
         if task in (line["task"] for line in table.rows):
             continue
         memory = train(task, arguments.out / task, arguments.steps, options)

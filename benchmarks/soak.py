@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 import dittogym  # noqa: F401  registers the environments
-from cfp.tables import Table
+from cfp.tables import CSVTable
 from torchmpm import diagnostics
 
 
@@ -64,7 +64,7 @@ def main(options: Options) -> None:
     env.reset(seed=0)
     env.step(np.zeros(env.action_space.shape, np.float32))  # compiles the kernels
     env.reset(seed=0)
-    draw, table = np.random.default_rng(0), Table(options.out)
+    draw, table = np.random.default_rng(0), CSVTable(options.out)
     calls = -(-options.steps // options.robots)
     ends = np.linspace(0, calls, options.rows + 1).astype(int)
     for first, last in itertools.pairwise(ends):

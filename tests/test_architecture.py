@@ -301,3 +301,9 @@ def test_global_state_checker(source: str, faults: list[str]) -> None:
 )
 def test_unsafe_loading_checker(source: str, faults: list[str]) -> None:
     assert unsafe_loading_faults(source) == faults
+
+
+@pytest.mark.parametrize("script", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
+def test_benchmarks_import_what_exists(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(script.parent)
+    runpy.run_path(str(script), run_name="imported")
