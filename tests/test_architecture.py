@@ -306,4 +306,5 @@ def test_unsafe_loading_checker(source: str, faults: list[str]) -> None:
 @pytest.mark.parametrize("script", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
 def test_benchmarks_import_what_exists(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(script.parent)
+    monkeypatch.delitem(sys.modules, "test_solver", raising=False)  # scaling.py imports the one beside it
     runpy.run_path(str(script), run_name="imported")
