@@ -201,6 +201,7 @@ def test_missing_ray_names_the_extra(tmp_path, monkeypatch, capsys):
     assert "pip install 'torchmpm[ray]'" in capsys.readouterr().err
 
 
+@pytest.mark.slow  # test_compare.py interrupts a comparison within this process
 def test_comparison_that_is_killed_is_resumed(tmp_path):
     """The parent dies without a word: the run stops with a checkpoint, from which the next command continues."""
     slow = {**MPC, "planner": {"horizon": 3, "commit": 1, "iterations": 10}, "report": {"checkpoint_every": 1}}
