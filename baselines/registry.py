@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from baselines.common.reference_policies import REFERENCE_POLICIES, ReferenceConfig, reference_preset
+from cfp.analytic.config import AnalyticConfig
 from cfp.config import RunConfig
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm, Sees
@@ -49,6 +50,11 @@ def find(name: str) -> type[Algorithm]:
     return algorithm
 
 
+def algorithm_of(config: RunConfig) -> type[Algorithm]:
+    """The class of the algorithm that the options name; runs of ``python -m cfp.train`` with any learner are cfp."""
+    return find("analytic" if isinstance(config, AnalyticConfig) else config.algo)
+
+
 def sees(name: str) -> Sees:
     """What the policies of an algorithm, or a reference policy, look at."""
     return "nothing" if name in REFERENCE_POLICIES else find(name).sees
@@ -63,8 +69,7 @@ def configure(values: dict[str, Any]) -> RunConfig:
         algo = ALIASES[algo]
         values = {**values, "algo": algo}
     if algo == "cfp" and values.get("learner") == "analytic":  # as cfp.train, the program of both learners, writes it
-        algo = "analytic"
-        values = {**values, "algo": algo}
+        algo, values = "analytic", {**values, "algo": "cfp"}
     reference = isinstance(algo, str) and algo in REFERENCE_POLICIES
     if not reference and preset not in (allowed := find(algo).presets):
         raise ConfigError(f"preset must be {' or '.join(allowed)} for {algo}, got {preset!r}")

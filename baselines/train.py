@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 
-from baselines.registry import ALGORITHMS, configure, find, load
+from baselines.registry import ALGORITHMS, algorithm_of, configure, load
 from cfp.experiment import training
 
 PROGRAM = training.Program(
@@ -11,7 +11,7 @@ PROGRAM = training.Program(
     f"Train an algorithm (--algo {'|'.join(ALGORITHMS)}) on a DittoGym task; name it to see its options here.",
     ("--algo shac --task run", "--algo gnn-16 --task kick --seed 1 --out runs/gnn", "--algo mpc --task run --dry-run"),
     configure,
-    lambda config: find(config.algo),
+    algorithm_of,
     load,
 )
 

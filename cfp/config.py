@@ -25,6 +25,8 @@ Learner = Literal["analytic", "sac"]
 LARGEST_SEED = 2**31 - 1
 EVALUATION_SEED = 10_000
 """Added to a run's seed for evaluations, so that they start from initial positions that are not trained on."""
+COUNTED_LAYOUTS = {"environment.resample": "soft actor-critic (cfp, coarse, fine, gnn-*, transformer-*)"}
+"""What `RunConfig.ineffective` says where every episode begins on a layout that is counted from the seed."""
 
 
 @dataclass(frozen=True)
@@ -209,9 +211,14 @@ class CoarseToFineConfig(StagedConfig):
     refine: bool = False
     """Continue to train the last stage of start_from instead."""
 
+    own_learner: ClassVar[Learner]
+    """The learner that these are the options of."""
+
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
+        if self.learner != self.own_learner:
+            raise ConfigError(f"learner must be {self.own_learner} for algo {self.algo}, got {self.learner}")
         if self.refine and self.start_from is None:
             raise ConfigError("refine requires start_from, which names the policy")
 
@@ -229,6 +236,7 @@ class Config(CoarseToFineConfig):
     """Weight of the gate penalty (one less than stages)."""
     learning: LearningConfig = field(default_factory=LearningConfig)
 
+    own_learner: ClassVar[Learner] = "sac"
     per_stage: ClassVar[tuple[str, ...]] = ("random_steps", "alpha")
     per_residual_stage: ClassVar[tuple[str, ...]] = (*StagedConfig.per_residual_stage, "gate_penalty")
 
@@ -258,10 +266,17 @@ class Config(CoarseToFineConfig):
             raise ConfigError("warm_critic must be False with encoder lean, got True (each stage has its own encoder)")
 
 
-def check_training_layouts(name: str, count: int, before: int = 0) -> None:
-    """Check that ``count`` initial positions, an option's value, after ``before`` others are none of evaluations."""
-    if before + count > EVALUATION_SEED:
-        largest = EVALUATION_SEED - before
+def check_training_layouts(name: str, count: int, before: int = 0, stages: int = 1) -> None:
+    """Check that none of the initial positions of training belongs to evaluations.
+
+    Args:
+        name: Name of an option.
+        count: Its value, the number of initial positions in a stage.
+        before: How many others precede them.
+        stages: Stages with initial positions of their own.
+    """
+    largest = (EVALUATION_SEED - before) // stages
+    if count > largest:
         raise ConfigError(f"{name} must be at most {largest}, got {count}: later seeds belong to evaluations")
 
 

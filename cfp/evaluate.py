@@ -155,7 +155,7 @@ def run(program: Program, command: Command) -> str:
     config, policies = command.open(program)
     results = compare(config, policies, command.episodes, command.noise)
     if any(files.values()):
-        recording = record_policy(config, list(policies.values())[-1])
+        recording = record_policy(config, list(policies.values())[-1], command.noise)
         save_media(recording, files, sys.stderr if command.json else None, **options)
     if command.record is not None:
         episodes = _record(command, config, list(policies.values())[-1])

@@ -88,8 +88,8 @@ def preset(task: str, name: Preset = "quick", learner: Learner | None = None) ->
     """The defaults of a task.
 
     Args:
-        task: One of `dittogym.TASKS`, or ``"MODULE:NAME"``. A custom task, for which nothing was published, gets the
-            numbers of RUN with its own action grids, and has no preset ``"paper"``.
+        task: One of `dittogym.TASKS`, or ``"MODULE:NAME"``. A custom task, for which nothing was published,
+            has its own action grids, with the learner ``"sac"`` the numbers of RUN, and no preset ``"paper"``.
         name: ``"paper"``: one robot at full size, the published numbers, the reference's interpolation and faults.
             ``"quick"``: several robots with fewer particles, minutes instead of days. For the learner ``"sac"`` also
             ``"long"``, the same as ``"quick"`` for a night of eight hours on two cores.
@@ -228,7 +228,10 @@ def like_start(base: Options, values: dict[str, Any]) -> Options:
     and strong exploration noise would disturb a policy that can do something already. What else the preset changes was
     not measured for such policies.
     """
-    if not isinstance(base, CoarseToFineConfig) or values.get("start_from") is None or "network" in values:
+    if not isinstance(base, CoarseToFineConfig) or values.get("start_from") is None:
+        return base
+    network = values.get("network")
+    if isinstance(network, dict) and "encoder" in network:
         return base
     spec = load(values["start_from"]).spec
     base = replace(base, network=replace(base.network, encoder=spec.encoder))

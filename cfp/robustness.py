@@ -1,4 +1,4 @@
-"""``python -m cfp.robustness RUN_FOLDER``: how much of its return a policy keeps under faults and other constants."""
+"""``python -m cfp.robustness RUN_FOLDER``: what a policy still returns under disturbances and other constants."""
 
 from __future__ import annotations
 
@@ -44,7 +44,9 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Command(Selection):
-    """Evaluate the newest policy of a run, or a single one, under faults and changed constants, on the same layouts.
+    """Evaluate the newest policy of a run, or a single one, under disturbances and changed constants.
+
+    The episodes of every case start on the same layouts.
 
     Writes robustness.md, .csv, .json and .png.
     """

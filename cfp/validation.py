@@ -29,3 +29,10 @@ def check_fraction(**values: float) -> None:
     for name, value in values.items():
         if not 0 <= value <= 1:
             raise ConfigError(f"{name} must be between 0 and 1, got {value}")
+
+
+def check_decay(**values: float) -> None:
+    """Check that each decay of an average, given by the name of its option, is below 1: with 1 it never changes."""
+    for name, value in values.items():
+        if not 0 <= value < 1:
+            raise ConfigError(f"{name} must be at least 0 and less than 1, got {value}")

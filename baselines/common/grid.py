@@ -3,11 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from cfp.config import RunConfig
+from cfp.config import COUNTED_LAYOUTS, RunConfig
 from dittogym import make_spec
-
-SEEDED = {"environment.resample": "soft actor-critic (cfp, coarse, fine, gnn-*, transformer-*)"}
-"""What `RunConfig.ineffective` says where every episode begins on a layout that is counted from the seed."""
 
 Grid = int | Literal["coarse", "fine"]
 """Action grid R: coarse, fine (the task's), or a number."""
@@ -32,4 +29,4 @@ class GridConfig(RunConfig):
 
     def ineffective(self) -> dict[str, str]:
         """Layouts are counted from the seed."""
-        return super().ineffective() | SEEDED
+        return super().ineffective() | COUNTED_LAYOUTS

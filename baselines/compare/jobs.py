@@ -20,7 +20,7 @@ from cfp.sections import TASK_OPTIONS
 from cfp.weights import is_of_another_task, is_same_task, read_policy
 from dittogym.tasks import task_name
 
-LARGEST_SEED = EVALUATION_SEED - 1001  # larger ones would train on the layouts of the final evaluation
+LARGEST_COMPARED_SEED = EVALUATION_SEED - 1001  # larger ones would train on the layouts of the final evaluation
 IRRELEVANT_OPTIONS = ("device", "environment.backend", "report.video", "report.checkpoint_every", "report.log_every")
 """Options that change neither what a run learns nor which policy it keeps."""
 TASK_DEFINING_OPTIONS = ("substeps", "dt", "dtype", "parity", "resample", "target", "variant")
@@ -153,8 +153,8 @@ def make_jobs(
             given = " ".join(map(str, values)) or "none"
             raise ConfigError(f"{name} must be one or more different values, got {given}")
     for seed in seeds:
-        if not 0 <= seed <= LARGEST_SEED:
-            raise ConfigError(f"seeds must be between 0 and {LARGEST_SEED}, got {seed}")
+        if not 0 <= seed <= LARGEST_COMPARED_SEED:
+            raise ConfigError(f"seeds must be between 0 and {LARGEST_COMPARED_SEED}, got {seed}")
     jobs = []
     for seed in seeds:
         for task in tasks:
@@ -170,7 +170,9 @@ def make_jobs(
 def resolve(plan: Plan, label: str, task: str, preset: str, seed: int, steps: int | None, device: str) -> RunConfig:
     """Options of a run: from the preset, then the plan file, then the command line."""
     values, own = plan.options(label, task), plan.own_options(label, task)
-    algo = values.pop("algo", label)  # that of all runs is for variants only
+    # An algo under common or tasks is that of variants; a label that names an algorithm keeps it, unless its own
+    # section says otherwise.
+    algo = values.pop("algo", label)
     if label in {*ALGORITHMS, *ALIASES, *REFERENCE_POLICIES}:
         algo = own.get("algo", label)
     start: dict[str, Any] = {"algo": algo, "task": task, "preset": preset}

@@ -46,7 +46,7 @@ COST: dict[str, tuple[float, float]] = {"cfp": (54, 4053), "transformer-64": (10
 SUCCESS: dict[str, float] = {"cfp": 0.154, "transformer-64": 0.059, "gnn-64": 0.0}
 """Share of successful episodes in SLOT; of how many is not said."""
 
-FAULTS: dict[str, tuple[float, float]] = {
+DROPOUT_RATIOS: dict[str, tuple[float, float]] = {
     "shapematch": (0.932, 0.911),
     "run": (0.877, 0.954),
     "grow": (0.891, 0.892),

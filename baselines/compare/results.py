@@ -133,7 +133,7 @@ def read_cost(folder: Path) -> Cost | None:
     return Cost(
         last_step=sessions[-1]["to"],
         steps=int(total("to") - total("from")),
-        seconds=max(total("seconds") - total("evaluation_seconds") - teacher["seconds"], 1e-9),
+        seconds=total("seconds") - total("evaluation_seconds"),
         evaluation_seconds=total("evaluation_seconds") + teacher["evaluation_seconds"],
         teacher_seconds=teacher["seconds"] - teacher["evaluation_seconds"],
         teacher_steps=teacher["steps"],

@@ -209,7 +209,7 @@ COST = (
     Column("minutes", "minutes", ".1f", lambda group: group.mean_cost("seconds") / 60),
     Column("teacher", "teacher (min)", ".1f", lambda group: group.mean_cost("teacher_seconds") / 60 or None),
     Column("teacher_steps", value=lambda group: max(cost.teacher_steps for cost in group.costs) or None),
-    Column("judging", "evaluations (min)", ".1f", lambda group: group.mean_cost("evaluation_seconds") / 60),
+    Column("evaluation_minutes", "evaluations (min)", ".1f", lambda group: group.mean_cost("evaluation_seconds") / 60),
     Column("speed", "steps/s", ".1f", lambda group: group.speed),
     Column("episode", "s/episode", ".1f", lambda group: make_spec(group.task).horizon / group.speed),
     Column("memory", "MiB", ".0f", _peak_memory),
@@ -291,9 +291,9 @@ def robustness_table(groups: Sequence[Group]) -> Table:
 
 
 def _published_ratio(group: Group, case: str) -> float | None:
-    if group.label != "cfp" or group.task not in paper.FAULTS:
+    if group.label != "cfp" or group.task not in paper.DROPOUT_RATIOS:
         return None
-    observation, action = paper.FAULTS[group.task]
+    observation, action = paper.DROPOUT_RATIOS[group.task]
     return {"observation dropout 20%": observation, "action dropout 20%": action}.get(case)
 
 

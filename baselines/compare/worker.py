@@ -17,7 +17,7 @@ from typing import Literal
 
 from baselines.compare.final_evaluation import Protocol, evaluate_run
 from baselines.compare.jobs import Job, check_folder, read_sessions
-from baselines.registry import configure, find
+from baselines.registry import algorithm_of, configure
 from cfp.config import to_json
 from cfp.envs.make import choose_device
 from cfp.experiment.process import Stopped, StopSignals, keep_memory, peak_memory
@@ -83,7 +83,7 @@ def _train_and_evaluate(job: Job, signals: StopSignals, own_process: bool) -> No
 def train(job: Job, signals: StopSignals, own_process: bool = True) -> None:
     """Train to the end, and record the cost of this session in ``sessions.json``; a killed process leaves no record."""
     earlier = read_sessions(job.folder)["sessions"]
-    run = TrainingRun(find(job.config.algo), job.config, job.folder, True, signals)
+    run = TrainingRun(algorithm_of(job.config), job.config, job.folder, True, signals)
     first_step, start, finished = run.step, time.perf_counter(), False
     try:
         run.train()
@@ -92,7 +92,7 @@ def train(job: Job, signals: StopSignals, own_process: bool = True) -> None:
         record = {
             "from": first_step,
             "to": run.step,
-            "seconds": time.perf_counter() - start,
+            "seconds": time.perf_counter() - start - run.preparation_seconds,
             "evaluation_seconds": run.evaluation_seconds,
             "memory": peak_memory() if own_process else None,
             "device": choose_device(job.config.device),

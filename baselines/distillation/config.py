@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, field
 
-from baselines.common.grid import SEEDED, Grid
+from baselines.common.grid import Grid
 from baselines.planning.gradient import GradientPlannerConfig
-from cfp.config import StagedConfig, check_training_layouts
+from cfp.config import COUNTED_LAYOUTS, StagedConfig, check_training_layouts
 from cfp.sections import Particles
 from cfp.validation import check_at_least, check_fraction, check_positive
 
@@ -54,7 +54,7 @@ class DistillConfig(StagedConfig):
     def ineffective(self) -> dict[str, str]:
         """Options of the planner have no effect with other teachers; layouts are counted from the seed."""
         planner = {} if self.teacher == "mpc" else dict.fromkeys(("planner.", "planner_grid"), "teacher mpc")
-        return super().ineffective() | planner | SEEDED
+        return super().ineffective() | planner | COUNTED_LAYOUTS
 
     def check(self) -> None:
         """Check what the types do not express."""
@@ -62,6 +62,6 @@ class DistillConfig(StagedConfig):
         check_at_least(1, rollout_steps=self.rollout_steps, updates=self.updates, batch_size=self.batch_size)
         check_at_least(1, switch_every=self.switch_every, capacity=self.capacity)
         check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
-        check_training_layouts("num_layouts", self.num_layouts * len(self.resolutions), self.environment.num_envs)
+        check_training_layouts("num_layouts", self.num_layouts, self.environment.num_envs, len(self.resolutions))
         check_positive(student_learning_rate=self.student_learning_rate, max_grad_norm=self.max_grad_norm)
         check_fraction(beta_decay=self.beta_decay, dropout=self.dropout)

@@ -41,7 +41,7 @@ METRICS: dict[str, str] = {
     "rollout/return": "mean undiscounted return of the episodes that ended in the last round, None for none",
     "train/loss": "mean squared difference from the teacher's actions, mean over the round's updates",
     "train/fresh_loss": "the same on the labels of the round before the student learned from them, None for no labels",
-    "train/share": "beta, the probability with which the teacher acted in the round",
+    "train/beta": "the probability with which the teacher acted in the round",
     "train/labels": "labels in the data set",
     "train/learning_rate": "Adam's step size",
     "train/episodes": "episodes ended in this stage",
@@ -123,7 +123,7 @@ class Distill(Stateful, CoarseToFineStages):
         return self.collector.episodes.scalars() | {
             "train/loss": sum(losses) / len(losses),
             "train/fresh_loss": fresh_loss,
-            "train/share": beta,
+            "train/beta": beta,
             "train/labels": float(len(self.dataset)),
             "train/learning_rate": learning_rate,
         }
@@ -169,10 +169,6 @@ class Distill(Stateful, CoarseToFineStages):
     def trained_actor(self) -> Actor:
         """The student."""
         return self.actor
-
-    def attached(self, env: Any) -> ActorPolicy:
-        """The present policy, copied once for an evaluation instead of in every step; it ignores ``env``."""
-        return self.policy
 
     @staticmethod
     def preset(task: str, name: str) -> DistillConfig:

@@ -18,6 +18,7 @@ from cfp.evaluation.episodes import Trial, play
 from cfp.experiment.folder import make_folder
 from cfp.files import write_json
 from cfp.from_dict import update_from_dict
+from cfp.hub import is_address
 from cfp.policy_protocols import Policy
 from cfp.sections import EnvironmentConfig
 from cfp.weights import check_trained_for, policy_file, shipped
@@ -100,7 +101,7 @@ def _name(path: str) -> str:
     """The name of a policy: that of its run folder, its file or its repository."""
     if path in shipped() and not Path(path).exists():
         return PRETRAINED
-    place = Path(re.split("[@?]", path)[0]).resolve()
+    place = Path(re.split("[@?]", path)[0] if is_address(path) else path).resolve()
     name = place.parent.name if place.stem == "policy" else place.name.removesuffix(".safetensors")
     return re.sub(r"[^\w.,+()-]", "-", name, flags=re.ASCII)[:60]
 

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from cfp.agent import fused
 from cfp.agent.composition import blend
-from cfp.agent.lean import LeanEncoder, Observation, Trunk, image_of
+from cfp.agent.lean import LeanEncoder, NetworkInput, Trunk, image_of
 from cfp.agent.networks import IMAGE_SIZE, Encoder, PairEncoder, initialise, make_head, normalise_image, upsample
 from cfp.agent.spec import ActorSpec
 
@@ -77,11 +77,17 @@ def sample_squashed_gaussian(
     deterministic: bool,
     generator: torch.Generator | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Sample tanh(mean + s eps) with s from `standard_deviation`, and its log-density (B,)."""
+    """Sample tanh(mean + s eps) with s from `standard_deviation`, and its log-density (B,).
+
+    A ``generator``, if given, belongs to the CPU, whatever the device of the networks.
+    """
     std = standard_deviation(raw_std)
-    noise = torch.zeros_like(mean)
-    if not deterministic:
-        noise.normal_(generator=generator)
+    if deterministic:
+        noise = torch.zeros_like(mean)
+    elif generator is None:
+        noise = torch.randn_like(mean)
+    else:
+        noise = torch.randn(mean.shape, generator=generator).to(mean)
     action = torch.tanh(mean + std * noise)
     return action, squashed_log_prob(noise, std, action)
 
@@ -103,11 +109,6 @@ class SquashedActor(nn.Module):
         """Action for observations (B, ...)."""
         return self.sample(observation, deterministic).action
 
-    def action_log_prob(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Flat actions and log-densities (B,), as stable-baselines3's SAC expects of its actor."""
-        sample = self.sample(observation)
-        return sample.action.flatten(1), sample.log_prob
-
     def set_training_mode(self, mode: bool) -> None:
         """Switch between training and evaluation mode; required by stable-baselines3."""
         self.train(mode)
@@ -127,7 +128,7 @@ class Actor(SquashedActor):
         initialise(self)
 
     def outputs(
-        self, observation: Observation, deterministic: bool = False, generator: torch.Generator | None = None
+        self, observation: NetworkInput, deterministic: bool = False, generator: torch.Generator | None = None
     ) -> Outputs:
         """Evaluate the networks for uint8 observations (B, 3, 64, 64).
 
@@ -150,7 +151,7 @@ class Actor(SquashedActor):
         return Sample(action, log_prob, None, (action,))
 
     def sample(
-        self, observation: Observation, deterministic: bool = False, generator: torch.Generator | None = None
+        self, observation: NetworkInput, deterministic: bool = False, generator: torch.Generator | None = None
     ) -> Sample:
         """Sample an action for uint8 observations (B, 3, 64, 64); a residual actor's ``log_prob`` is its own part's."""
         return self.act(self.outputs(observation, deterministic, generator), deterministic, generator)
@@ -186,7 +187,7 @@ class ResidualActor(Actor):
         self.coarse = coarse.requires_grad_(False)
 
     def outputs(
-        self, observation: Observation, deterministic: bool = False, generator: torch.Generator | None = None
+        self, observation: NetworkInput, deterministic: bool = False, generator: torch.Generator | None = None
     ) -> Outputs:
         """Evaluate the networks; the coarser actor is sampled."""
         image = image_of(observation)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from cfp.agent.spec import RESOLUTIONS
 from cfp.errors import ConfigError
-from cfp.validation import check_at_least, check_fraction, check_positive
+from cfp.validation import check_at_least, check_decay, check_fraction, check_positive
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class LearningConfig:
         if self.max_episode_steps is not None:
             check_at_least(1, max_episode_steps=self.max_episode_steps)
         check_fraction(gamma=self.gamma, tau=self.tau, reward_momentum=self.reward_momentum, final_rate=self.final_rate)
-        check_fraction(weight_average=self.weight_average)
+        check_decay(weight_average=self.weight_average)
         check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
         if self.actor_rate is not None:
             check_positive(actor_rate=self.actor_rate)

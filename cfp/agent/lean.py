@@ -30,10 +30,10 @@ class Encoded(NamedTuple):
         return self._replace(features=self.features.detach())
 
 
-Observation: TypeAlias = Tensor | Encoded
+NetworkInput: TypeAlias = Tensor | Encoded
 
 
-def image_of(observation: Observation) -> Tensor:
+def image_of(observation: NetworkInput) -> Tensor:
     """The images of observations."""
     return observation.image if isinstance(observation, Encoded) else observation
 
@@ -57,7 +57,7 @@ class LeanEncoder(nn.Module):
         super().__init__()
         self.layers = Encoder(3, WIDTH, IMAGE_SIZE // 2)
 
-    def forward(self, observation: Observation) -> Tensor:
+    def forward(self, observation: NetworkInput) -> Tensor:
         """Features of uint8, normalised or `halved` images; those of `Encoded` observations are known."""
         if isinstance(observation, Encoded):
             return observation.features

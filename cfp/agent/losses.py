@@ -7,14 +7,14 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from cfp.agent.actor import Actor
-from cfp.agent.lean import Observation, image_of
+from cfp.agent.lean import NetworkInput, image_of
 from cfp.agent.networks import TwinCritic
 
 
 def critic_target(
     actor: Actor,
     target: TwinCritic,
-    next_obs: Observation,
+    next_obs: NetworkInput,
     rewards: Tensor,
     not_done: Tensor,
     alpha: Tensor | float,
@@ -31,12 +31,12 @@ def critic_target(
         return rewards + not_done * gamma * (q_values - alpha * sample.log_prob[:, None])
 
 
-def smaller_value(critic: TwinCritic, obs: Observation, action: Tensor) -> Tensor:
+def smaller_value(critic: TwinCritic, obs: NetworkInput, action: Tensor) -> Tensor:
     """The smaller one of both critics' values, (B, 1)."""
     return torch.minimum(*critic(obs, action))
 
 
-def critic_loss(critic: TwinCritic, obs: Observation, actions: Tensor, target_q: Tensor) -> Tensor:
+def critic_loss(critic: TwinCritic, obs: NetworkInput, actions: Tensor, target_q: Tensor) -> Tensor:
     """Sum of both critics' mean squared errors for actions (B, 2, R, R)."""
     return torch.stack([F.mse_loss(values, target_q) for values in critic(obs, actions)]).sum()
 
@@ -44,7 +44,7 @@ def critic_loss(critic: TwinCritic, obs: Observation, actions: Tensor, target_q:
 def actor_loss(
     actor: Actor,
     critic: TwinCritic,
-    obs: Observation,
+    obs: NetworkInput,
     alpha: Tensor,
     gate_penalty: float,
     origin: Actor | None = None,

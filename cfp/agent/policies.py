@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from cfp.agent.actor import Actor, SquashedActor, build_actor
 from cfp.agent.actor_policy import check_images
-from cfp.agent.lean import Encoded, LeanCritics, Observation, halved
+from cfp.agent.lean import Encoded, LeanCritics, NetworkInput, halved
 from cfp.agent.networks import TwinCritic, normalise_image
 from cfp.agent.spec import ActorSpec
 
@@ -44,7 +44,7 @@ class NetworkPolicy(sac_policies.SACPolicy, ABC):
         """A part of the actor that the critics read too, and train."""
         return None
 
-    def encode(self, observations: Tensor) -> Observation:
+    def encode(self, observations: Tensor) -> NetworkInput:
         """What actor and critics take for ``observations`` (B, ...) in an update."""
         return normalise_image(observations)
 
@@ -117,7 +117,7 @@ class CFPPolicy(NetworkPolicy):
         """The lean encoder, which actor and critics share."""
         return cast(Actor, self.actor).encoder if self.spec.encoder == "lean" else None
 
-    def encode(self, observations: Tensor) -> Observation:
+    def encode(self, observations: Tensor) -> NetworkInput:
         """What actor and critics take for ``observations`` (B, 3, 64, 64): with a lean encoder its features too."""
         encoder = self.shared_encoder()
         if encoder is None:

@@ -25,7 +25,7 @@ from cfp.agent.actor import Actor
 from cfp.agent.composition import Composition
 from cfp.agent.exploration import CellNoise
 from cfp.agent.hyperparameters import Hyperparameters
-from cfp.agent.lean import Observation
+from cfp.agent.lean import NetworkInput
 from cfp.agent.losses import actor_loss, critic_loss, critic_target
 from cfp.agent.networks import TwinCritic, upsample
 from cfp.agent.policies import CFPPolicy, NetworkPolicy
@@ -171,7 +171,9 @@ class CFP(SAC):
         get_ema_multi_avg_fn(1 - self.tau)(list(target.parameters()), list(critic.parameters()), 1)
         return scalars | self.reward_statistics.scalars()
 
-    def _update_critic(self, obs: Observation, next_obs: Observation, batch: ReplayBufferSamples) -> dict[str, Tensor]:
+    def _update_critic(
+        self, obs: NetworkInput, next_obs: NetworkInput, batch: ReplayBufferSamples
+    ) -> dict[str, Tensor]:
         actor, critic, target = self.networks()
         rewards, not_done = self.reward_statistics(batch.rewards), 1 - batch.dones
         gamma = self.gamma if batch.discounts is None else batch.discounts
@@ -180,7 +182,7 @@ class CFP(SAC):
         self._descend(loss, critic.optimizer, "critic")
         return {"critic_loss": loss.detach(), "q_target": target_q.mean()}
 
-    def _update_actor(self, obs: Observation) -> dict[str, Tensor]:
+    def _update_actor(self, obs: NetworkInput) -> dict[str, Tensor]:
         actor, critic, _ = self.networks()
         own = self.hyperparameters
         critic.requires_grad_(False)  # avoids computing weight gradients of the critics, which would be discarded

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from cfp.analytic.reward import RewardConfig
-from cfp.config import CoarseToFineConfig, Learner, check_training_layouts
+from cfp.config import COUNTED_LAYOUTS, CoarseToFineConfig, Learner, check_training_layouts
 from cfp.sections import Particles
-from cfp.validation import check_at_least, check_fraction, check_positive
+from cfp.validation import check_at_least, check_decay, check_fraction, check_positive
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +73,12 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
     displacement: bool = True
     """The critic sees the robot's displacement since the reset."""
 
+    own_learner: ClassVar[Learner] = "analytic"
     per_stage: ClassVar[tuple[str, ...]] = ("action_step",)
+
+    def ineffective(self) -> dict[str, str]:
+        """Options without effect: layouts are counted from the seed."""
+        return super().ineffective() | COUNTED_LAYOUTS
 
     def check(self) -> None:
         """Check what the types do not express."""
@@ -84,6 +89,7 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
         check_at_least(1, windows_kept=self.windows_kept, max_episode_steps=self.max_episode_steps)
         check_at_least(1, num_layouts=self.num_layouts)
         check_training_layouts("num_layouts", self.num_layouts, self.environment.num_envs)
-        check_fraction(final_step=self.final_step, weight_average=self.weight_average)
+        check_fraction(final_step=self.final_step)
+        check_decay(weight_average=self.weight_average)
         for size in self.action_step:
             check_positive(action_step=size)

@@ -78,7 +78,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         episodes = Episodes(self.env, config.seed, config.max_episode_steps, config.num_layouts)
         self.collector = WindowCollector(episodes, lambda: features(self.env).float(), config)
         self.action_step = ActionStep()
-        self.generator = torch.Generator(self.env.device).manual_seed(config.seed)
+        self.generator = torch.Generator().manual_seed(config.seed)  # on the CPU, so that a run can change its device
         image = self._image()
         example = (image[0], actor.outputs(image).location[0].detach())
         self.memory = ImageMemory(config.windows_kept * config.window * self.env.num_envs, example)

@@ -15,6 +15,7 @@ from cfp.envs.make import make_env
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
 from cfp.evaluation.episodes import SeededPolicy, attached
+from cfp.evaluation.evaluate import Noise, without_noise
 from cfp.policy_protocols import Policy
 from dittogym import TorchEnv
 from dittogym.render.film import VideoUnavailable
@@ -23,10 +24,10 @@ from dittogym.render.recording import Act, Recording, check_film, record
 Recorded = TypeVar("Recorded")
 
 
-def record_policy(config: RunConfig, policy: Policy) -> Recording:
+def record_policy(config: RunConfig, policy: Policy, noise: Noise = "default") -> Recording:
     """One episode of a policy as it is evaluated; of one made for a single layout, that layout."""
     seed = policy.description.get("layout", config.seed + EVALUATION_SEED)
-    return record_episode(config, policy, policy.resolution, policy.deterministic_by_default, seed, record)
+    return record_episode(config, policy, policy.resolution, without_noise(policy, noise), seed, record)
 
 
 def record_episode(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,7 @@ class TrainingRun:
             )
         self.algorithm, self.config, self.folder, self.signals = algorithm, config, folder, signals
         self.stages = len(config.ends())
+        self.preparation_seconds = 0.0  # before the first stage, in this session
         self.evaluation_seconds = 0.0  # in this session
         self.seconds = 0.0  # wall time of all sessions, known after training
         self.checkpoint = Checkpoint(folder / "checkpoint")
@@ -110,9 +112,12 @@ class TrainingRun:
         """Train the stages that are left."""
         for line in self.algorithm.warnings(self.config, self.folder, self.position.stage):
             print(line)
-        previous = None
+        previous, start = None, time.perf_counter()
         try:
-            self.algorithm.prepare(self.config, self.folder, self.signals)
+            try:
+                self.algorithm.prepare(self.config, self.folder, self.signals)
+            finally:
+                self.preparation_seconds = time.perf_counter() - start
             for number in range(self.position.stage, self.stages + 1):
                 self.position = Position(number, self.position.offset)
                 algorithm = self._create(previous)

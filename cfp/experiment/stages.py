@@ -33,6 +33,8 @@ class CoarseToFineStages(Algorithm):
         if policy.spec.resolutions != resolutions[:stages] or (stages == len(resolutions) and not refine):
             allowed = f"the first resolutions of {resolutions}" + ("" if refine else ", but not all")
             raise ConfigError(f"start_from must be a policy of {allowed}, got {policy.spec.resolutions}")
+        if policy.spec.encoder != (encoder := config.network.encoder):
+            raise ConfigError(f"start_from must be a policy with encoder {encoder}, got {policy.spec.encoder}")
         if stages > 1 and policy.spec != (allowed_spec := config.actor_spec(stages)):
             raise ConfigError(f"start_from must have networks {allowed_spec}, got {policy.spec}")
         stage = stages if refine else stages + 1
@@ -55,6 +57,10 @@ class CoarseToFineStages(Algorithm):
         """What has been learned so far."""
         spec, deterministic = self.config.actor_spec(self.stage), self.config.report.eval_deterministic
         return image_policy(spec, self.trained_actor, deterministic)
+
+    def attached(self, env: Any) -> ActorPolicy:
+        """The present policy, copied once for an evaluation instead of in every step; it ignores ``env``."""
+        return self.policy
 
     @classmethod
     def begin(cls, config: Any, stage: int, folder: Path, actor: Actor) -> bool:

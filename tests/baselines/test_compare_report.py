@@ -184,7 +184,7 @@ def test_cost_names_the_particles_of_planners_without_a_tier_of_their_own(tmp_pa
 
 def test_training_of_a_teacher_is_counted_by_itself(tmp_path):
     (job,) = plan_jobs(tmp_path, ["run"], ["distill"], [0], lambda _: Protocol(1))
-    write_run(job, [1.0], {500: 1.0, 1000: 2.0}, seconds=165.0)
+    write_run(job, [1.0], {500: 1.0, 1000: 2.0}, seconds=100.0)
     write_json(job.folder / "teacher" / "cost.json", {"steps": 300, "seconds": 65.0, "evaluation_seconds": 5.0})
     groups = read_groups([job])
     (row,) = cost_table(groups).rows

@@ -49,7 +49,7 @@ def test_curves_are_aligned_where_all_have_values():
 
 
 def test_numbers_of_the_paper_are_complete():
-    assert set(paper.CURVES) == set(paper.EXPERTS) == set(paper.FAULTS) == set(paper.REST)
+    assert set(paper.CURVES) == set(paper.EXPERTS) == set(paper.DROPOUT_RATIOS) == set(paper.REST)
     assert all(len(values) == len(paper.COLUMNS) for values in paper.CURVES.values())
     assert paper.curve("transformer-64", "catch") == (7200, 1260)
     assert paper.curve("fine", "dig") == (570, 40)

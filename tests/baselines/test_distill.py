@@ -148,7 +148,7 @@ def test_student_does_as_the_teacher_in_a_closed_loop():
     student.learn(512, EachUpdate(rows.append))
     assert set(rows[0]) == set(METRICS)
     assert rows[-1]["train/fresh_loss"] < 0.15 * rows[0]["train/fresh_loss"]
-    assert [row["train/share"] for row in rows[:3]] == pytest.approx([1.0, 0.7, 0.49])
+    assert [row["train/beta"] for row in rows[:3]] == pytest.approx([1.0, 0.7, 0.49])
     fine = Distill(config, 2, student.policy)
     fine.collector.teacher = Mirror()
     fine.learn(128, EachUpdate(rows.append))

@@ -68,8 +68,9 @@ def test_quick_learns_by_gradients_and_paper_from_rewards():
         ({"window": 0}, "window must be at least 1, got 0"),
         ({"action_step": (0.0,)}, "action_step must be positive, got 0"),
         ({"action_step": (0.1, 0.1)}, "action_step must have 1 values"),
-        ({"weight_average": 1.5}, "weight_average must be between 0 and 1, got 1.5"),
+        ({"weight_average": 1.0}, "weight_average must be at least 0 and less than 1, got 1.0"),
         ({"refine": True}, "refine requires start_from"),
+        ({"learner": "sac"}, "learner must be analytic for algo cfp, got sac"),
     ],
 )
 def test_impossible_options_are_named(changes, message):
@@ -87,6 +88,16 @@ def test_training_shapes_the_robot(tmp_path):
         rewards.append(scalars["train/true_reward"])
     assert set(scalars) == set(METRICS)
     assert np.mean(rewards[-5:]) > np.mean(rewards[:5]) + 0.8  # 1.5 to 2.7 with three seeds
+
+
+@pytest.mark.cuda
+def test_trains_on_cuda_and_goes_on_on_the_cpu(tmp_path):
+    config = make("shapematch", device="cuda")
+    learner = AnalyticLearner.create(config, 1, tmp_path)
+    learner.update()
+    there = AnalyticLearner.create(replace(config, device="cpu"), 1, tmp_path)
+    there.load_state_dict(learner.state_dict())
+    assert np.isfinite(there.update()["train/reward"])
 
 
 def test_step_has_the_given_size_and_goes_down_the_gradient():

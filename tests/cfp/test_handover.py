@@ -71,6 +71,7 @@ def test_second_level_starts_from_a_policy(coarse, tmp_path, name):
         (["--refine", "--resolutions", "8", "16"], "start_from must be a policy of the first resolutions of (8, 16)"),
         (["--warm-critic"], "warm_critic must be False with start_from"),
         (["--start-from", "no/such"], "there is no policy"),
+        (["--encoder", "full"], "start_from must be a policy with encoder full, got lean"),
         (["--target", "T"], "start_from must be a policy for the target T, got None"),
     ],
 )

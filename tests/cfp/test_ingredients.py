@@ -205,3 +205,5 @@ def test_a_policy_with_the_papers_networks_goes_on_with_fewer_updates_and_withou
     assert started.learning == replace(quick.learning, gradient_steps=4, noise_cells=0, **usual)
     asked = {"task": "run", "learner": "sac", "start_from": "run", "learning": {"noise_cells": 2, "gradient_steps": 8}}
     assert (from_json(asked).learning.noise_cells, from_json(asked).learning.gradient_steps) == (2, 8)
+    gated = from_json({"task": "run", "learner": "sac", "start_from": "run", "network": {"gate_scale": 0.5}})
+    assert gated == replace(started, network=replace(started.network, gate_scale=0.5))
