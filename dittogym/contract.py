@@ -141,6 +141,9 @@ def check_outcome(
     for name, value in outcome.terms.items():
         if not isinstance(value, Tensor) or value.shape != (batch,):
             raise ValueError(f"{who} must return terms of shape (B,), got {_kind(value)} for {name!r}")
+    if unknown := sorted(weights.keys() - outcome.terms.keys() - ENGINE_TERMS):
+        allowed = sorted({*outcome.terms, *ENGINE_TERMS})
+        raise ValueError(f"weights of task {task!r} must be of the terms {allowed}, got {unknown}")
     for name, flag in (("terminated", outcome.terminated), ("success", outcome.success)):
         if flag is not None and not (isinstance(flag, Tensor) and (flag.dtype, *flag.shape) == (torch.bool, batch)):
             raise ValueError(f"{who} must return {name} as bool of shape (B,), got {_kind(flag)}")

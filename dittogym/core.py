@@ -150,11 +150,11 @@ def evaluate(model: Model, state: EnvState, actuation: Tensor, *, soft: bool = F
     info = measured_info(model, state, now)
     valid = info["finite"]
     moment = _moment(model, state, now, observation, EXACT)
-    outcome, terms, reward = _judge(model, moment, actuation, valid)
+    outcome, terms, reward = _weighted_reward(model, moment, actuation, valid)
     image, true_reward = None, reward
     if soft:
         image = soft_observation(model, state)
-        _, terms, reward = _judge(model, moment._replace(observation=image, ops=SMOOTH), actuation, valid)
+        _, terms, reward = _weighted_reward(model, moment._replace(observation=image, ops=SMOOTH), actuation, valid)
     terminated = ~valid if outcome.terminated is None else outcome.terminated | ~valid
     if spec.split_limit is not None:
         terminated = terminated | (now.split > spec.split_limit)
@@ -180,7 +180,9 @@ def _moment(model: Model, state: EnvState, now: Measurement, observation: Tensor
     return Moment(state.particles, model.num_robot_particles, now, state.start, observation, state.memory, ops)
 
 
-def _judge(model: Model, moment: Moment, actuation: Tensor, valid: Tensor) -> tuple[Outcome, dict[str, Tensor], Tensor]:
+def _weighted_reward(
+    model: Model, moment: Moment, actuation: Tensor, valid: Tensor
+) -> tuple[Outcome, dict[str, Tensor], Tensor]:
     """Outcome, weighted terms and their sum; of simulations that are not valid (B,) only ``failure`` counts."""
     spec, now = model.spec, moment.now
     outcome = spec.reward_fn(moment, spec)

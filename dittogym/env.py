@@ -147,9 +147,9 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         Returns:
             The observation (3, 64, 64) uint8, and ``info``.
         """
-        super().reset(seed=seed)
         with torch.no_grad():
             observation, info = self.torch_env.reset(seed=seed, options=options)
+        super().reset(seed=None if seed is None else int(seed))
         self._return = 0.0
         self._show()
         return first(as_numpy(observation)), first(as_numpy(info))
@@ -177,8 +177,14 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         return self.torch_env.save()
 
     def load(self, snapshot: Snapshot) -> np.ndarray:
-        """Continue from a saved moment, see :meth:`dittogym.TorchEnv.load`; returns its image (3, 64, 64) uint8."""
-        return first(as_numpy(self.torch_env.load(snapshot)))
+        """Continue from a saved moment, see :meth:`dittogym.TorchEnv.load`; returns its image (3, 64, 64) uint8.
+
+        In mode ``"human"`` the return in the caption counts from here.
+        """
+        observation = self.torch_env.load(snapshot)
+        self._return = 0.0
+        self._show()
+        return first(as_numpy(observation))
 
     def render(self) -> np.ndarray | None:
         """The picture (512, 512, 3) uint8 in mode ``"rgb_array"``, else nothing."""

@@ -148,6 +148,8 @@ class TaskSpec:
             checks.pair("goal", self.goal)
         for name in ("view", "reach"):
             centre: Centre = getattr(self, name)
+            if not isinstance(centre, tuple | list):
+                raise TypeError(f"{name} must be two numbers, or None for each that follows the robot, got {centre!r}")
             checks.pair(name, tuple(0.0 if c is None else c for c in centre))  # None follows the robot
 
     @property

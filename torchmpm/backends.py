@@ -47,9 +47,9 @@ def cached_tensors(function: Callable[Parameters, Result]) -> Callable[Parameter
 
 
 @functools.cache
-def warn_eager(reason: str) -> None:
-    """Log once for each reason that the backend ``"auto"`` runs eagerly."""
-    _logger.warning("the physics runs operator by operator, many times slower than it could: %s", reason)
+def warn_eager(what: str, reason: str) -> None:
+    """Log once for each reason that ``what``, such as the physics, runs eagerly although that was not asked for."""
+    _logger.warning("%s runs operator by operator, many times slower than it could: %s", what, reason)
 
 
 @functools.cache

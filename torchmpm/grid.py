@@ -52,7 +52,12 @@ class Grid:
         """Nodes per axis including the padding."""
         return self.resolution + 2 * PAD
 
+    @property
+    def extent(self) -> float:
+        """Distance from the origin at which particles leave the window to the right, m; to the left: the margin."""
+        return self.resolution * self.h - self.margin
+
     def contains(self, x: Tensor, origin_x: Tensor) -> Tensor:
         """Whether particles at x (B, N), m, take part: inside of the window from origin_x (B, 1), m; false for NaN."""
         offset = x - origin_x
-        return (offset > self.margin) & (offset < self.resolution * self.h - self.margin)
+        return (offset > self.margin) & (offset < self.extent)

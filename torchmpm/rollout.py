@@ -24,7 +24,7 @@ SEGMENT = 10
 def check_repetition(times: int, segment: Segment, name: str = "times") -> tuple[int, Segment]:
     """``times``, which the caller calls ``name``, and ``segment``, converted to Python's integers."""
     given: Any = segment
-    if given not in (None, "auto"):
+    if given is not None and not (isinstance(given, str) and given == "auto"):
         if isinstance(given, bool) or not isinstance(given, Integral) or int(given) < 1:
             raise ValueError(f"segment must be at least 1, None or 'auto', got {given!r}")
         segment = int(given)

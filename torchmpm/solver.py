@@ -251,7 +251,7 @@ class Solver:
             except ValueError as error:
                 reason = str(error)
         if reason is not None:
-            warn_eager(reason)
+            warn_eager("the physics", reason)
         return reason is None
 
     def _not_native(self, device: torch.device, tangents: bool) -> str | None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from numbers import Integral
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -109,8 +110,13 @@ class ParticleState:
         return self.x.device
 
     def to(self, *args: Any, **kwargs: Any) -> ParticleState:
-        """Copy to another dtype or device; ``args`` and ``kwargs`` are those of :meth:`torch.Tensor.to`."""
-        return tree.map(lambda t: t.to(*args, **kwargs), self)
+        """Copy to another dtype or device; ``args`` and ``kwargs`` are those of :meth:`torch.Tensor.to`.
+
+        Raises:
+            ValueError: The dtype is neither float32 nor float64.
+        """
+        moved: ParticleState = tree.map(lambda t: t.to(*args, **kwargs), self)
+        return ParticleState(*(getattr(moved, field.name) for field in fields(moved)))
 
     def detach(self) -> ParticleState:
         """The same numbers, cut off from the autograd graph."""
@@ -126,16 +132,20 @@ class ParticleState:
         return ParticleState, tuple(getattr(self, f.name) for f in fields(self))
 
     def __getitem__(self, index: Any) -> ParticleState:
-        """Select batch elements; an integer keeps a batch dimension of one.
+        """Select batch elements by a number, slice, list or tensor; a number keeps a batch dimension of one.
 
         Raises:
-            IndexError: There is no such batch element.
+            IndexError: There is no such batch element, or the index is of several dimensions.
         """
+        if isinstance(index, Tensor | np.ndarray) and index.ndim == 0 and index.dtype not in (bool, torch.bool):
+            index = int(index)
         if isinstance(index, Integral):
             index = int(index)
             if not -self.batch_size <= index < self.batch_size:
                 raise IndexError(f"index {index} is out of range for a batch of {self.batch_size}")
             index = slice(index, index + 1 or None)
+        if self.x[index].ndim != self.x.ndim:
+            raise IndexError(f"index must select batch elements, by one dimension, got {index!r}")
         return tree.map(lambda t: t[index], self)
 
     def where(self, mask: Bool[Tensor, " B"], other: ParticleState) -> ParticleState:

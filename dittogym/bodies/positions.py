@@ -32,9 +32,9 @@ MAX_SEED = 2**32 - 1
 def particle_counts(spec: TaskSpec, particles: Particles) -> tuple[int, ...]:
     """Particles of each body; a single number, or ``"lite"`` without ``BodySpec.lite``, keeps the full-size ratio."""
     full = tuple(body.count for body in spec.bodies)
-    if particles == "full":
+    if isinstance(particles, str) and particles == "full":
         return full
-    if particles == "lite":
+    if isinstance(particles, str) and particles == "lite":
         count = spec.robot.lite or min(LITE, full[0])
         counts = (count, *(b.lite or max(1, round(count * b.count / full[0])) for b in spec.objects))
     elif isinstance(particles, (int, np.integer)) and not isinstance(particles, bool):

@@ -1,1 +1,1 @@
-"""Images of the simulation: the raster, its smooth counterpart and the moving window."""
+"""Images of the simulation, as robots observe it: the camera, the raster and its smooth counterpart, in C++ too."""

@@ -41,7 +41,7 @@ class Camera:
         try:
             drawing = native.drawing(self.view, self.boxes, bodies, self.pixels, x.dtype)
         except ValueError as error:  # no compiler, or it failed
-            warn_eager(str(error))
+            warn_eager("the observation", str(error))
             return self.draw(*arrays)
         return drawing(*arrays)
 

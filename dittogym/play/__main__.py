@@ -60,8 +60,8 @@ def options(command: Command) -> dict[str, Any]:
     chosen: dict[str, Any] = {}
     if command.policy is not None:
         known[command.policy] = weights.read_policy(command.policy)[1]
-        told = known[command.policy]["environment"]
-        chosen = {name: told[name] for name in FROM_POLICY if told.get(name) is not None}
+        environment = known[command.policy]["environment"]
+        chosen = {name: environment[name] for name in FROM_POLICY if environment.get(name) is not None}
     task = command.task or (known[command.policy]["task"] if command.policy else "run")
     if (allowed := allowed_instead(task)) is not None:
         raise ValueError(f"task must be one of {allowed}, got {task!r}")

@@ -90,13 +90,13 @@ class Server:
 
     async def page(self, request: Request) -> Response:
         """Answer who asks for the page."""
-        if not knows(request.query_params, self.token):
+        if not has_token(request.query_params, self.token):
             return PlainTextResponse("Open the address that the program printed; it ends in a token.", 403)
         return FileResponse(PAGE / "index.html", headers=HEADERS)
 
     async def play(self, websocket: WebSocket) -> None:
         """Play with a page until it is closed."""
-        if not knows(websocket.query_params, self.token) or not own_origin(websocket.headers):
+        if not has_token(websocket.query_params, self.token) or not own_origin(websocket.headers):
             await websocket.close(1008)  # it was not accepted yet: the status is 403
             return
         await websocket.accept()
@@ -113,7 +113,7 @@ class Server:
             self.connections.discard(connection)
 
 
-def knows(query: QueryParams, token: str) -> bool:
+def has_token(query: QueryParams, token: str) -> bool:
     """Whether a request has the token."""
     return secrets.compare_digest(query.get("token", "").encode(), token.encode())
 

@@ -32,6 +32,7 @@ FLAGS = ("playing", "terminated", "truncated", "success", "invalid")
 SHORT = 2.0
 #: Control steps that are kept for files, the first ones after a reset.
 LONGEST = 3000
+CHANGED_MATTER = "other matter or gravity"
 #: Channels of an action image, by the name of their muscles.
 CHANNELS = {"both": slice(0, 2), "horizontal": slice(0, 1), "vertical": slice(1, 2)}
 #: Loads a policy with ``predict(observation, memory, episode_start, deterministic)``, as stable-baselines3 has it.
@@ -80,7 +81,7 @@ class Session:
         self.policy_name: str | None = None
         self.hand, self.direction = protocol.Hand(None), protocol.Wave(None).direction
         self.physics: dict[str, Any] = {}
-        self.moment: Snapshot | None = None
+        self.moment: tuple[Snapshot, float, bool, bool] | None = None  # with return and ends of the episode
         self.num_frames = self.num_steps = 0
         self._reset(seed)
         self._apply_policy(protocol.Policy(policy))
@@ -128,8 +129,8 @@ class Session:
         with torch.no_grad():
             self.observation, reward, terminated, truncated, info = self.env.step(torch.from_numpy(self.action)[None])
         self.num_steps, self.terms = self.num_steps + 1, info["reward_terms"]
-        if not (self.terminated or self.truncated):
-            self.total += float(reward[0])
+        earned = 0.0 if self.terminated or self.truncated else float(reward[0])
+        self.total += earned
         self.rows.append([self.total, *(float(term[0]) for term in self.terms.values())])
         self.terminated, self.truncated = self.terminated or bool(terminated[0]), self.truncated or bool(truncated[0])
         self.success = "is_success" in info and bool(info["is_success"][0])
@@ -139,7 +140,7 @@ class Session:
             return self._note(f"only the first {LONGEST} steps are kept")
         self.actions.append(self.action)
         self.recording.shots.append(self.shot)
-        self.recording.rewards.append(float(reward[0]))
+        self.recording.rewards.append(earned)
 
     def frame(self, rate: float) -> bytes:
         """The present moment for the page, at ``rate`` simulated seconds per second; see `protocol.pack_frame`."""
@@ -166,7 +167,8 @@ class Session:
         self.total, self.grip, self.memory, self.terms = 0.0, None, None, {}
         self.rows: list[list[float]] = []
         self.actions: list[np.ndarray] = []
-        self.touched: list[str] = []
+        drawn = [name for name, value in self.options.items() if isinstance(value, np.ndarray)]
+        self.touched = [CHANGED_MATTER] * bool(self.physics) + [f"a drawn {name}" for name in drawn]
         self.painted = self.action = np.zeros(self.env.action_shape, np.float32)
         self.gate = np.zeros((2, 0, 0), np.float32)
         self.shot = self.env.shot()
@@ -197,8 +199,9 @@ class Session:
 
     def _as_image(self, array: np.ndarray) -> np.ndarray:
         """What a policy returns (B, 2, R, R), in the orientation of the environment's actions."""
-        told = self.policy.description.get("environment", {})
-        layout: Any = told.get("action_layout") or ("grid" if told.get("parity") == "reference" else "image")
+        trained_in = self.policy.description.get("environment", {})
+        own = "grid" if trained_in.get("parity") == "reference" else "image"
+        layout: Any = trained_in.get("action_layout") or own
         turned = from_grid_indexing(to_grid_indexing(torch.as_tensor(array), layout), self.env.action_layout)
         return turned.numpy()
 
@@ -287,14 +290,15 @@ class Session:
         values = physics_values(physics, 1, self.env.num_particles, state.centre[:, 0])
         check_stability(self.env.model, values)
         if physics != self.physics:
-            self._note("other matter or gravity")
+            self._note(CHANGED_MATTER)
         self.physics, self.env.env_state = physics, replace(state, physics=values)
 
     def _apply_save(self, message: protocol.Save) -> Answers:
         file, name = io.BytesIO(), f"{self.env.spec.name}-{self.shot.step}"
         if message.what == "moment":
-            self.moment, name = self.env.save(), f"{name}.pt"
-            torch.save(self.moment, file)
+            snapshot, name = self.env.save(), f"{name}.pt"
+            self.moment = snapshot, self.total, self.terminated, self.truncated
+            torch.save(snapshot, file)
         elif not self.actions:
             raise ValueError(f"{message.what} must be of at least one step, got none since the reset")
         elif message.what == "actions":
@@ -314,9 +318,13 @@ class Session:
     def _apply_back(self, message: protocol.Back) -> None:
         if self.moment is None:
             raise ValueError("there is no moment to go back to: save one first")
-        self.observation = self.env.load(self.moment)
-        self.terminated = self.truncated = self.success = self.invalid = False
-        self.grip, self.shot = None, self.env.shot()
+        snapshot, self.total, self.terminated, self.truncated = self.moment
+        self.observation = self.env.load(snapshot)
+        state = self.env.env_state
+        values = physics_values(self.physics, 1, self.env.num_particles, state.centre[:, 0])
+        self.env.env_state = replace(state, physics=values)
+        self.success = self.invalid = False
+        self.grip, self.memory, self.shot = None, None, self.env.shot()
         self._note("went back to a saved moment")
 
     def _apply_draw(self, message: protocol.Draw) -> Answers:
@@ -331,7 +339,7 @@ class Session:
             try:
                 self.env = TorchEnv(self.task, 1, **{**self.options, "resolution": self.env.action_resolution})
                 self._reset(self.seed)
-            except ValueError:
+            except Exception:
                 self.env, self.options = old
                 raise
         self.moment = None

@@ -1,1 +1,1 @@
-"""Pictures for people: RGB frames and the window on the screen."""
+"""Pictures for people: frames, films, recordings, replays, and the window on the screen."""

@@ -32,7 +32,7 @@ class ColourScale(NamedTuple):
         low: Value of the first colour.
         high: Value of the last one; larger values have the same colour.
         stops: RGB colours at equal distances from ``low`` to ``high``, between which colours are interpolated.
-        robot_only: Whether other bodies do not have it; they have colours of their own, see :func:`body_colours`.
+        robot_only: Whether other bodies do not have it; they have colours of their own, see :func:`body_colour`.
     """
 
     label: str
@@ -70,12 +70,6 @@ SCALES = {
 def body_colour(body: BodySpec | None) -> Colour:
     """The colour of an object, or of the robot, ``None``."""
     return ROBOT if body is None else GROUND_BODY if isinstance(body.material, Snow) else OBJECT
-
-
-def body_colours(model: Model) -> np.ndarray:
-    """The colours of the bodies, by which particles of different bodies can be told apart, (N, 3) uint8."""
-    kinds = [body_colour(body) for body in (None, *model.spec.objects)]
-    return np.repeat(np.array(kinds, np.uint8), model.camera.counts, axis=0)
 
 
 def muscle_activity(model: Model, state: EnvState, index: int, actuation: Tensor) -> np.ndarray:
@@ -126,11 +120,3 @@ def particle_values(model: Model, state: EnvState, index: int, actuation: Tensor
     if by != "muscle":
         return QUANTITIES[by](model, state, index)
     return np.zeros(model.num_robot_particles) if actuation is None else muscle_activity(model, state, index, actuation)
-
-
-def particle_colours(model: Model, state: EnvState, index: int, actuation: Tensor | None, by: str) -> np.ndarray:
-    """RGB colours (N, 3) uint8 of all particles by the quantity ``by``, a key of :data:`SCALES`."""
-    colours = body_colours(model)
-    values = particle_values(model, state, index, actuation, by)
-    colours[: len(values)] = SCALES[by].colours(values)
-    return colours

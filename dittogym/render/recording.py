@@ -93,6 +93,7 @@ class Recording:
     ) -> Iterator[np.ndarray]:
         """The pictures of a film with task, time, return and playback speed; for the arguments see :meth:`save`."""
         speed = self.default_speed if speed is None else speed
+        checks.number("speed", speed, above=0.0)
         returns = np.cumsum([0.0, *self.rewards])
         for number in range(round(self.duration / speed * rate) + 1):
             time = min(number * speed / rate, self.duration)
@@ -130,7 +131,7 @@ class Recording:
         path = check_film(path, size, rate, speed, zoom, muscles, pictures)
         if path.suffix == ".html":
             with replacing(path) as aside:
-                aside.write_text(self.page(speed))
+                aside.write_text(self.page(speed), encoding="utf-8")
         elif path.suffix == ".png":
             with replacing(path) as aside:
                 Image.fromarray(self._strip(size, zoom, muscles, pictures)).save(aside)
@@ -140,8 +141,13 @@ class Recording:
         return path
 
     def page(self, speed: float | None = None) -> str:
-        """The replay as an HTML page, which begins to play at a ``speed``; 1: real time."""
+        """The replay as an HTML page, which begins to play at a ``speed``; 1: real time.
+
+        Raises:
+            ValueError: The speed is not a positive number.
+        """
         speed = self.default_speed if speed is None else speed
+        checks.number("speed", speed, above=0.0)
         return replay_page(self.scene, self.shots, self.rewards, self.success, speed)
 
     @property

@@ -41,7 +41,7 @@ def replay_page(
     header, data = encode(scene, shots)
     header |= {"rewards": [round(reward, 4) for reward in rewards], "success": success, "speed": speed}
     text = json.dumps(header, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    page = PLAYER.read_text().replace("%TITLE%", escape(scene.task)).replace("%HEADER%", text)
+    page = PLAYER.read_text(encoding="utf-8").replace("%TITLE%", escape(scene.task)).replace("%HEADER%", text)
     return page.replace("%DATA%", base64.b64encode(data).decode())
 
 
@@ -54,7 +54,8 @@ def encode(scene: Scene, shots: Sequence[Shot]) -> tuple[dict[str, Any], bytes]:
     ``muscle`` (T, n) of the robot's particles and ``deformation`` (T, N). Differences begin from zero.
     """
     stride = math.ceil((len(shots) - 1) / MOST_MOMENTS) or 1
-    kept = [*shots[:-1:stride], shots[-1]] if len(shots) > 1 else shots
+    steps = sorted({*range(0, len(shots), stride), len(shots) - 1})
+    kept = [shots[step] for step in steps]
     chosen, counts = _selection(scene, shots[0])
     arrays = [_positions(kept, chosen)]
     for name, particles in (("muscle", chosen[: counts[0]]), ("deformation", chosen)):
@@ -63,10 +64,9 @@ def encode(scene: Scene, shots: Sequence[Shot]) -> tuple[dict[str, Any], bytes]:
         arrays.append(np.diff(values, axis=0, prepend=np.uint8(0)).tobytes())
     header = scene.as_json() | {
         "quantum": QUANTUM,
-        "valueStep": VALUE_STEP,
         "particles": len(shots[0].x),
         "stride": stride,
-        "steps": [shot.step - shots[0].step for shot in kept],
+        "steps": steps,
         "centre": [_rounded(shot.centre) for shot in kept],
         "corner": [_rounded(shot.corner(VIEW_WIDTH)) for shot in kept],
         "width": VIEW_WIDTH,

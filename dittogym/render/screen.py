@@ -29,6 +29,8 @@ class Screen:
         if self._surface is None:
             self._surface = pygame.display.set_mode(picture.shape[1::-1])
             pygame.display.set_caption(self._title)
+        if pygame.display.get_surface() is not self._surface:  # pygame has one window; another environment took it
+            return False
         pygame.surfarray.blit_array(self._surface, picture.transpose(1, 0, 2))
         pygame.display.flip()
         self._clock.tick(self._fps)
@@ -48,5 +50,6 @@ class Screen:
                 self._clock.tick(self._fps)
 
     def close(self) -> None:
-        """Close the window."""
-        pygame.display.quit()
+        """Close the window, unless it belongs to another environment by now."""
+        if pygame.display.get_init() and pygame.display.get_surface() is self._surface:
+            pygame.display.quit()

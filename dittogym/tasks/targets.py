@@ -77,7 +77,7 @@ def load_target(target: TargetLike, fit: bool = True) -> np.ndarray:
         mask = _fitted(picture)
     if not mask.any() or mask.all():
         raise ValueError(f"target must have pixels of the shape and of the ground, got {mask.sum()} of {mask.size}")
-    if reasons := _obstacles(mask):
+    if reasons := _unmatchable_reasons(mask):
         warnings.warn(f"no robot can be expected to match the target: {'; '.join(reasons)}", stacklevel=2)
     return mask
 
@@ -114,7 +114,7 @@ def _fitted(picture: np.ndarray) -> np.ndarray:
     return _reduced(cv2.warpAffine(drawn, move, (FINE * SIZE,) * 2, flags=cv2.INTER_LINEAR))
 
 
-def _obstacles(mask: np.ndarray) -> list[str]:
+def _unmatchable_reasons(mask: np.ndarray) -> list[str]:
     """Why a robot is unlikely to take this shape."""
     reasons, area = [], int(mask.sum())
     low, high = (round(share * ROBOT_AREA) for share in AREAS)

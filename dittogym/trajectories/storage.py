@@ -97,8 +97,11 @@ def save_minari(dataset_id: str, episodes: Sequence[Episode], env: gymnasium.Env
 
     Raises:
         ImportError: Minari or h5py is not installed.
+        ValueError: There is no episode.
     """
     minari = _minari()
+    if not episodes:
+        raise ValueError("episodes must be at least one, got none")
     buffers = [
         minari.data_collector.EpisodeBuffer(
             id=i,

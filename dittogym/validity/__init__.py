@@ -42,9 +42,8 @@ def find_valid(particles: ParticleState, robot: int, origin: Tensor, native: boo
     planes, origin = particles.stack().detach().contiguous(), origin.detach().contiguous()
     _, batch, count = planes.shape
     valid = torch.empty(batch, dtype=torch.bool, device="cpu")
-    extent = GRID.resolution * GRID.h - GRID.margin
     pointers = (planes.data_ptr(), origin.data_ptr(), valid.data_ptr())
-    function(ctypes.byref(Simulations(batch, count, robot, GRID.margin, extent, *pointers)))
+    function(ctypes.byref(Simulations(batch, count, robot, GRID.margin, GRID.extent, *pointers)))
     return valid
 
 

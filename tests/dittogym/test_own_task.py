@@ -256,6 +256,10 @@ def test_weights_name_every_term() -> None:
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"weights of task 'hop' must hold every term .* got none for \['height'\]"):
         env.step(actions(env, 1)[0])
+    env = tiny(dataclasses.replace(hop(), weights={"height": 7.0, "alve": 1.0}))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"weights of task 'hop' must be of the terms .* got \['alve'\]"):
+        env.step(actions(env, 1)[0])
 
 
 @pytest.mark.parametrize("task", ["grow", "dig", "catch"])

@@ -18,6 +18,7 @@ from dittogym.play import protocol
 from dittogym.play.hand import press, wave
 from dittogym.play.protocol import HEAD, Draw, Hand, Matter, Paint, Reset, Save, Step, Wave, parse
 from dittogym.play.session import FLAGS, Session
+from dittogym.render.replay import encode
 
 SMALL = {"particles": 200, "substeps": 10}
 
@@ -173,6 +174,11 @@ def test_matter_changes_while_it_moves_and_stays_after_a_reset() -> None:
         played.apply(Reset())
     played.apply(Matter(stiffness=1.0, yield_stress=1.0, gravity=9.0))
     assert played.env.env_state.physics == {} and played.touched
+    played.apply(Reset())
+    assert not played.touched  # nothing but the actions decides about the episode
+    played.apply(Matter(stiffness=2.0, yield_stress=1.0, gravity=9.0))
+    played.apply(Reset())
+    assert played.touched == ["other matter or gravity"]
     with pytest.raises(ValueError, match="dt must be at most"):
         played.apply(Matter(stiffness=1e4, yield_stress=1.0, gravity=9.0))
     played.advance()
@@ -204,10 +210,13 @@ def test_moments() -> None:
     played.advance()
     (answer,) = played.apply(Save("moment"))
     snapshot = torch.load(io.BytesIO(base64.b64decode(answer["content"])), weights_only=True)
-    then = played.env.state.x.clone()
+    then, total = played.env.state.x.clone(), played.total
     played.advance()
     played.apply(protocol.Back())
-    assert torch.equal(played.env.state.x, then) and shown(played).step == 1
+    assert torch.equal(played.env.state.x, then) and shown(played).step == 1 and played.total == total
+    played.advance()
+    header, _ = encode(played.recording.scene, played.recording.shots)
+    assert header["steps"] == [0, 1, 2, 3]  # moments in the order in which they were played
     env = TorchEnv("run", **SMALL)
     env.load(snapshot)
     assert torch.equal(env.state.x, then)

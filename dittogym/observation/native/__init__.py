@@ -49,7 +49,7 @@ def drawing(
         "boxes": len(boxes),
         "view": tuple(math.nan if c is None else c for c in view),
         "margin": GRID.margin,
-        "extent": GRID.resolution * GRID.h - GRID.margin,
+        "extent": GRID.extent,
         "clip": CLIP,
         "saturation": SATURATION,
     }
