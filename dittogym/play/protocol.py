@@ -130,7 +130,10 @@ def parse(text: str) -> Message:
     Raises:
         ValueError: It is not JSON, or not a message with exactly its fields, in their ranges.
     """
-    message: Message = _DECODER.decode(text)
+    try:
+        message: Message = _DECODER.decode(text)
+    except msgspec.DecodeError as error:  # a ValueError in newer versions only
+        raise ValueError(str(error)) from error
     return message
 
 
