@@ -83,8 +83,15 @@ def rms(differences: np.ndarray) -> float:
     return float(np.sqrt(np.square(differences.reshape(len(differences), -1)).sum(1).mean()))
 
 
+def millimetres(distance: float) -> str:
+    """A distance in m as text; where robots fall apart, single particles fly away."""
+    if distance > 1.0:
+        return "torn"
+    return f"{1e3 * distance:.2g}" if 1e-5 < distance < 0.1 else f"{1e3 * distance:.0f}"
+
+
 def row(task: str, kind: str, short: list[Episode], long: list[Episode]) -> dict[str, object]:
-    """How much the longer substep changes, and how much two layouts differ; root mean squares."""
+    """How much the longer substep changes, and how much two initial positions differ; root mean squares."""
     last = [min(len(one.centres), len(other.centres)) - 1 for one, other in zip(short, long, strict=True)]
     totals, centres = (
         [np.array([each(episode, k) for episode, k in zip(episodes, last, strict=True)]) for episodes in (short, long)]
@@ -95,12 +102,12 @@ def row(task: str, kind: str, short: list[Episode], long: list[Episode]) -> dict
         "task": task,
         "episodes": kind,
         "steps": max(len(episode.centres) for episode in short),
-        "return, 0.1 ms": f"{totals[0].mean():.1f}",
-        "return, 0.2 ms": f"{totals[1].mean():.1f}",
-        "changed by": f"{rms(totals[1] - totals[0]):.1f}",
-        "between layouts": f"{rms(totals[0][first] - totals[0][second]):.1f}",
-        "centre of mass moved by (mm)": f"{1e3 * rms(centres[1] - centres[0]):.3g}",
-        "between layouts (mm)": f"{1e3 * rms(centres[0][first] - centres[0][second]):.3g}",
+        "return, 0.1 ms": f"{totals[0].mean():.0f}",
+        "return, 0.2 ms": f"{totals[1].mean():.0f}",
+        "changed by": f"{rms(totals[1] - totals[0]):.0f}",
+        "between positions": f"{rms(totals[0][first] - totals[0][second]):.0f}",
+        "centre of mass moved by (mm)": millimetres(rms(centres[1] - centres[0])),
+        "between positions (mm)": millimetres(rms(centres[0][first] - centres[0][second])),
     }
 
 
@@ -159,9 +166,9 @@ def gradients(task: str) -> dict[str, object]:
         "task": task,
         "cosine": f"{cosines.mean():.3f}",
         "least cosine": f"{cosines.min():.3f}",
-        "cosine between layouts": f"{others.mean():.3f}",
+        "cosine between positions": f"{others.mean():.3f}",
         "ratio of norms": f"{ratios.min():.2f} to {ratios.max():.2f}",
-        "norms between layouts": f"{short.norm(dim=1).std() / short.norm(dim=1).mean():.0%}",
+        "norms between positions": f"{short.norm(dim=1).std() / short.norm(dim=1).mean():.0%}",
     }
 
 
