@@ -52,6 +52,17 @@ TASKS: dict[str, TaskNumbers] = {
 }
 
 
+# The actor follows the newest windows at once. With a longer memory it averages over old actions, and learns little of
+# the few new ones that lead over a stair, through a passage or into the soil.
+_FOLLOW: dict[str, Any] = {
+    "windows_kept": 4,
+    "minibatches": 16,
+    "minibatch_size": 64,
+    "weight_average": 0.95,
+    "max_episode_steps": 400,
+    "num_layouts": 16,
+    "environment": EnvironmentConfig(num_envs=4),
+}
 ANALYTIC: dict[str, dict[str, Any]] = {
     "shapematch": {
         "steps": 4_800,
@@ -70,6 +81,9 @@ ANALYTIC: dict[str, dict[str, Any]] = {
     "run": {"steps": 12_800, "handover": (9_600,), "max_episode_steps": 200},
     # The contact at the beginning of an episode decides about the rest, and short episodes show more beginnings.
     "kick": {"action_step": (0.15, 0.02), "max_episode_steps": 200},
+    "obstacle": _FOLLOW | {"steps": 25_600, "handover": (22_400,), "final_step": 0.3, "displacement": True},
+    "slot": _FOLLOW | {"steps": 19_200, "handover": (16_000,)},
+    "dig": _FOLLOW | {"steps": 16_000, "handover": (12_800,), "weight_average": 0.98},
 }
 """Options of the learner ``analytic`` that differ from task to task; found by the experiments that the documentation
 reports."""
@@ -128,11 +142,11 @@ def analytic_preset(task: str, name: str = "quick") -> AnalyticConfig:
         "action_step": (0.1, 0.02),
         "gate_bias": (-3.0,),  # a gate that is nearly closed leaves the coarse policy as it is at first
         "environment": EnvironmentConfig(num_envs=8),
+        "displacement": not on_speed,
     } | ANALYTIC.get(task, {})
     return AnalyticConfig(
         task=task,
         resolutions=published.resolutions,
-        displacement=not on_speed,
         reward=RewardConfig("speed" if on_speed else "task"),
         network=replace(published.network, interpolation="half_pixel"),
         report=ReportConfig(eval_every=options["steps"] // 12, checkpoint_every=options["steps"] // 12, log_every=320),

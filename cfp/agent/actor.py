@@ -82,12 +82,9 @@ def sample_squashed_gaussian(
     A ``generator``, if given, belongs to the CPU, whatever the device of the networks.
     """
     std = standard_deviation(raw_std)
-    if deterministic:
-        noise = torch.zeros_like(mean)
-    elif generator is None:
-        noise = torch.randn_like(mean)
-    else:
-        noise = torch.randn(mean.shape, generator=generator).to(mean)
+    noise = torch.zeros_like(mean)
+    if not deterministic:
+        noise = noise.normal_() if generator is None else torch.randn(mean.shape, generator=generator).to(mean)
     action = torch.tanh(mean + std * noise)
     return action, squashed_log_prob(noise, std, action)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -10,7 +11,7 @@ import torch
 from gymnasium import spaces
 from torch import Tensor, nn
 
-from cfp.agent.actor import build_actor
+from cfp.agent.actor import Actor, build_actor
 from cfp.agent.networks import IMAGE_SIZE
 from cfp.agent.spec import ActorSpec
 from cfp.files import write_policy
@@ -39,18 +40,19 @@ class ActorPolicy(nn.Module, Shareable):
     """An actor with stable-baselines3's ``predict``; `cfp.load` returns one.
 
     Args:
-        spec: Structure of the actor, whose weights are random until a state is loaded.
+        spec: Structure of the actor.
         deterministic_by_default: Whether the run that trained it evaluates it without noise.
+        actor: Of that structure; None: one with random weights.
     """
 
     uses_image = True
 
-    def __init__(self, spec: ActorSpec, deterministic_by_default: bool = False) -> None:
+    def __init__(self, spec: ActorSpec, deterministic_by_default: bool = False, actor: Actor | None = None) -> None:
         super().__init__()
         self.spec = spec
         self.deterministic_by_default = deterministic_by_default
         self.description: dict[str, Any] = {}
-        self.actor = build_actor(spec).requires_grad_(False)
+        self.actor = (build_actor(spec) if actor is None else actor).requires_grad_(False)
         self.observation_space = spaces.Box(0, 255, IMAGE_SHAPE, np.uint8)
         self.action_space = spaces.Box(-1.0, 1.0, (2, self.resolution, self.resolution), np.float32)
 
@@ -112,8 +114,6 @@ class ActorPolicy(nn.Module, Shareable):
         return action, None if sample.gate is None else sample.gate.cpu().numpy()
 
 
-def image_policy(spec: ActorSpec, actor: nn.Module, deterministic: bool) -> ActorPolicy:
-    """Policy with a copy of an actor's weights, on the actor's device."""
-    policy = ActorPolicy(spec, deterministic)
-    policy.actor.load_state_dict(actor.state_dict())
-    return policy.to(next(actor.parameters()).device)
+def image_policy(spec: ActorSpec, actor: Actor, deterministic: bool) -> ActorPolicy:
+    """Policy with a copy of an actor, on its device; takes no numbers from torch's generator."""
+    return ActorPolicy(spec, deterministic, copy.deepcopy(actor))
