@@ -293,6 +293,7 @@ def test_time_limit_bootstraps_and_termination_does_not():
     assert buffer.next_observations[2, 0, 1].max() == 3
 
 
+@pytest.mark.slow
 def test_learning_improves_the_return():
     def make_env():
         return FakeEnv(num_envs=8, resolution=4, horizon=5, start=-0.4, push=1.0)

@@ -23,6 +23,7 @@ def small_files():
     resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
+@pytest.mark.slow
 def test_full_disk_is_an_error_and_the_last_checkpoint_still_good(finished, tmp_path, capsys):
     folder = tmp_path / "run"
     with small_files() as fill, at_step(50, fill):

@@ -81,6 +81,7 @@ def test_policy_that_does_not_fit_is_refused(coarse, tmp_path, capsys, options, 
     assert not (tmp_path / "a").exists()
 
 
+@pytest.mark.slow
 def test_ladder_of_three_levels_in_one_command(tmp_path):
     folder = tmp_path / "ladder"
     options = "--learner sac --task shapematch --particles 100 --substeps 1 --num-envs 2 --device cpu --no-video "

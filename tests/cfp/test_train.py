@@ -72,6 +72,7 @@ def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, caps
     assert_same_run(folder, finished)
 
 
+@pytest.mark.slow
 def test_layouts_that_are_drawn_anew_go_on_as_if_nothing_had_happened(tmp_path):
     options = "--resample --resolutions 4 --handover --random-steps 10 --steps 128 --eval-every 0 --eval-episodes 1"
     assert run(tmp_path / "whole", *options.split()) == 0
