@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 import uvicorn
 from starlette.applications import Starlette
 from starlette.datastructures import Headers, QueryParams
@@ -134,7 +135,9 @@ class Connection:
 
     async def run(self, new_session: Callable[[], Session]) -> None:
         """Play until the page is closed."""
-        executor = ThreadPoolExecutor(1, "play")  # torch's threads belong to the thread that calls it
+        # Torch's threads belong to the thread that calls it. One robot gains nothing from several, and the browser
+        # needs the other cores.
+        executor = ThreadPoolExecutor(1, "play", torch.set_num_threads, (1,))
         simulation = asyncio.create_task(self.simulate(new_session, executor))
         reader = asyncio.create_task(self.read())
         try:
