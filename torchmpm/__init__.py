@@ -2,8 +2,8 @@
 
 State goes in, state comes out: :class:`ParticleState` holds everything that moves, and :class:`Solver`, a frozen
 description of grid, bodies and boundary, advances it. ``substep`` is the algorithm, ``materials`` holds the
-constitutive laws, and ``native`` the same substep as fused kernels. This package imports
-torch, NumPy and jaxtyping, and Triton for the CUDA kernels.
+constitutive laws, and ``native`` the same substep as fused kernels. This package imports torch, NumPy and jaxtyping,
+and Triton for the CUDA kernels.
 """
 
 from torchmpm import diagnostics, sampling, tree

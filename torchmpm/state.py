@@ -138,7 +138,7 @@ class ParticleState:
             IndexError: There is no such batch element, or the index is of several dimensions.
         """
         if isinstance(index, Tensor | np.ndarray) and index.ndim == 0 and index.dtype not in (bool, torch.bool):
-            index = int(index)
+            index = index.item()
         if isinstance(index, Integral):
             index = int(index)
             if not -self.batch_size <= index < self.batch_size:

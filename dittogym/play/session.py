@@ -339,7 +339,7 @@ class Session:
             try:
                 self.env = TorchEnv(self.task, 1, **{**self.options, "resolution": self.env.action_resolution})
                 self._reset(self.seed)
-            except Exception:
+            except Exception:  # a task of the user's may raise anything
                 self.env, self.options = old
                 raise
         self.moment = None

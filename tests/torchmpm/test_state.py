@@ -6,6 +6,7 @@ import sys
 import textwrap
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from scenes import assert_identical, lively, robot
@@ -95,17 +96,23 @@ def test_planes_are_the_components_and_invert() -> None:
 
 def test_integer_index_keeps_the_batch_dimension() -> None:
     state = lively(4, 3)
-    for index in (0, 1, 2, -1, -3):
+    for index in (0, 1, 2, -1, -3, torch.tensor(1), np.array(-1), np.int64(2)):
         picked = state[index]
         assert picked.batch_size == 1
         assert torch.equal(picked.x[0], state.x[index])
         assert torch.equal(picked.F[0], state.F[index])
 
 
-@pytest.mark.parametrize("index", [3, -4])
-def test_integer_index_out_of_range(index: int) -> None:
+@pytest.mark.parametrize("index", [3, -4, (0, 1), None, torch.tensor(True), torch.tensor(1.5), torch.tensor(3)])
+def test_index_that_is_no_batch_element(index: object) -> None:
     with pytest.raises(IndexError):
         lively(4, 3)[index]
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.int64])
+def test_other_dtypes_are_refused(dtype: torch.dtype) -> None:
+    with pytest.raises(ValueError, match="x must be float32 or float64"):
+        lively(4, 3).to(dtype)
 
 
 @pytest.mark.parametrize("index", [slice(1, None), [2, 0], torch.tensor([True, False, True])])
