@@ -50,8 +50,6 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
     learner: Learner = "analytic"
     train_dt: float | None = None
     """Duration of a substep in training, s; None: as in the environment."""
-    iterations: int = 1
-    """Gradient steps on the actions of a window; for each one the window is simulated anew, and its steps count."""
     action_step: tuple[float, ...]
     """Root mean square of each step on the actions of a window, for each stage."""
     final_step: float = 0.4
@@ -85,7 +83,7 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
         super().check()
         self.check_window()
         check_at_least(0, warmup=self.warmup)
-        check_at_least(1, iterations=self.iterations, minibatches=self.minibatches, minibatch_size=self.minibatch_size)
+        check_at_least(1, minibatches=self.minibatches, minibatch_size=self.minibatch_size)
         check_at_least(1, windows_kept=self.windows_kept, max_episode_steps=self.max_episode_steps)
         check_at_least(1, num_layouts=self.num_layouts)
         check_training_layouts("num_layouts", self.num_layouts, self.environment.num_envs)

@@ -33,7 +33,6 @@ from dittogym import core
 METRICS: dict[str, str] = {
     "rollout/return": "mean undiscounted true return of the episodes that ended since the last row, None for none",
     "train/reward": "mean training reward of a step of the actor, before its scale",
-    "train/improved_reward": "the same in the last simulation of the window, with improved actions",
     "train/true_reward": "mean true reward of a step of the actor, at the particle count of training",
     "train/value": "mean value that the target critic gives to the window's states",
     "train/critic_loss": "mean squared error of the critic in the last of its updates",
@@ -44,7 +43,7 @@ METRICS: dict[str, str] = {
     "train/episodes": "episodes ended in this stage",
     "train/terminated": "those that the task ended early",
     "train/nonfinite": "simulations that were not finite and were reset",
-    "train/dropped": "gradients of single actions, of the actor's own, that were not finite and were left out",
+    "train/dropped": "gradients of single actions that were not finite and were left out",
 }
 """Every scalar that `AnalyticLearner.update` logs, and what it means."""
 
@@ -111,29 +110,20 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         config, progress = self.config, stage_progress(self.config, self.stage, self.num_timesteps)
         learning_rate = config.learning_rate * linear_decay(progress)
         step_size = config.action_step[self.stage - 1] * linear_decay(progress, config.final_step)
-        iterations, minibatches = config.iterations, config.minibatches
+        minibatches = config.minibatches
         if self.starts_trained and self.memory.count < config.warmup * config.window * self.env.num_envs:
             # steps towards the values of an untrained critic, fitted to a few windows, would spoil the policy
-            step_size, iterations, minibatches = 0.0, 1, 0
-        start, noise = self.collector.state_dict(), self.generator.get_state()
-        images, improved, window = self._improve(step_size, None)
-        end, better = self.collector.state_dict(), window
-        for _ in range(1, iterations):
-            self.collector.load_state_dict(start)
-            self.generator.set_state(noise)
-            images, improved, better = self._improve(step_size, improved)
-        if iterations > 1:
-            self.collector.load_state_dict(end)  # episodes go on as the actor leads them
+            step_size, minibatches = 0.0, 0
+        images, improved, window = self._improve(step_size)
         self.memory.add(images, improved.flatten(0, 1))
         regression_loss = torch.zeros(())
         for _ in range(minibatches):
             batch = self.memory.sample(config.minibatch_size, self.generator)
             regression_loss = self.regression.update(*batch, learning_rate)
         critic_loss = self.critic.update(window, learning_rate)
-        self.num_timesteps += iterations * config.window * self.env.num_envs
+        self.num_timesteps += config.window * self.env.num_envs
         return self.collector.episodes.scalars() | {
             "train/reward": float(window.rewards.detach().mean()) / config.reward.scale,
-            "train/improved_reward": float(better.rewards.detach().mean()) / config.reward.scale,
             "train/true_reward": window.true_reward,
             "train/value": float(window.next_values.detach().mean()),
             "train/critic_loss": critic_loss,
@@ -143,12 +133,11 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
             "train/limited": float(self.action_step.limited),
         }
 
-    def _improve(self, step_size: float, locations: Tensor | None) -> tuple[Tensor, Tensor, Window]:
+    def _improve(self, step_size: float) -> tuple[Tensor, Tensor, Window]:
         """Simulate a window and take a gradient step on its actions.
 
         Args:
             step_size: Root mean square of the step.
-            locations: Of the actions (T, B, C, R, R); None for the actor's own.
 
         Returns:
             Images (T B, 3, 64, 64), improved locations (T, B, C, R, R), and the window before the step.
@@ -160,8 +149,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
             images.append(self._image())
             with torch.no_grad():
                 outputs = self.actor.outputs(images[-1], generator=self.generator)
-                location = outputs.location if locations is None else locations[len(leaves)]
-                leaves.append(location.clamp(-BOUND, BOUND))
+                leaves.append(outputs.location.clamp(-BOUND, BOUND))
             return self.actor.act(outputs.at(leaves[-1].requires_grad_()), generator=self.generator).action
 
         window = self.collector.collect(act, self.critic)

@@ -198,17 +198,6 @@ def test_run_of_two_stages_and_the_same_run_with_an_interruption(tmp_path):
     assert policies[0].spec.resolutions == (4, 8) and policies[0].description["trained_by"] == "analytic"
 
 
-def test_several_steps_on_the_actions_of_a_window_improve_them_and_count():
-    config = make(iterations=4, action_step=(0.05,), substeps=20)
-    learner = AnalyticLearner(config, 1, build_actor(config.actor_spec(1)))
-    for parameter in learner.critic.target.parameters():
-        torch.nn.init.zeros_(parameter)  # then the rewards are all that is improved
-    scalars = learner.update()
-    assert scalars["train/improved_reward"] > scalars["train/reward"]
-    assert learner.num_timesteps == 4 * config.window * config.environment.num_envs
-    assert int(learner.env.env_state.steps.max()) == config.window  # every one began where the first did
-
-
 def test_a_trained_policy_is_kept_until_the_critic_has_learned():
     config = make(warmup=2)
     learner = AnalyticLearner(config, 1, build_actor(config.actor_spec(1)))
