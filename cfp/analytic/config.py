@@ -54,19 +54,19 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
     """Root mean square of each step on the actions of a window, for each stage."""
     final_step: float = 0.4
     """Fraction of action_step at the end of a stage; it falls linearly."""
-    minibatches: int = 48
+    minibatches: int = 16
     """Steps of the regression after each window."""
-    minibatch_size: int = 128
+    minibatch_size: int = 64
     """Images in a step of the regression."""
-    windows_kept: int = 40
+    windows_kept: int = 4
     """Latest windows that the regression draws from."""
-    weight_average: float = 0.995
+    weight_average: float = 0.95
     """Decay of the average of the actor's weights, which is the policy; 0: the actor itself."""
     warmup: int = 15
     """Windows at the beginning of a stage that starts from a trained policy, in which only the critic learns."""
-    max_episode_steps: int = 10_000
+    max_episode_steps: int = 400
     """Control steps after which a training episode is truncated, if the task's horizon is not shorter."""
-    num_layouts: int = 256
+    num_layouts: int = 16
     """Particle layouts that training episodes start from in turn."""
     displacement: bool = True
     """The critic sees the robot's displacement since the reset."""
