@@ -82,7 +82,7 @@ ANALYTIC: dict[str, dict[str, Any]] = {
     "grow": {"steps": 16_000, "handover": (12_800,)},
     "obstacle": {"steps": 25_600, "handover": (22_400,), "final_step": 0.3, "displacement": True},
     "slot": {"steps": 19_200, "handover": (16_000,)},
-    "dig": {"steps": 16_000, "handover": (12_800,), "weight_average": 0.98},
+    "dig": {"steps": 28_800, "handover": (25_600,), "weight_average": 0.98},
 }
 """Options of the learner ``analytic`` that differ from task to task; found by the experiments that the documentation
 reports."""
