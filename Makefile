@@ -26,7 +26,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "Installing PyTorch (a large download the first time) ..."
 	@$(PIP) torch==2.13.0
 	@echo "Installing torchmpm and its tools ..."
-	@$(PIP) -e ".[dev,play,video]"
+	@$(PIP) -e ".[dev,minari,play,video]"
 	@touch $@
 
 $(DOCS_STAMP): $(STAMP)
