@@ -250,20 +250,15 @@ class Config(CoarseToFineConfig):
         )
 
     def ineffective(self) -> dict[str, str]:
-        """Options that require a policy to refine, or a previous stage."""
+        """Options that require a policy to refine."""
         anchor = {} if self.refine else {"learning.anchor": "refine"}
-        warm = {"learning.warm_critic": "several resolutions"} if len(self.resolutions) == 1 else {}
-        return super().ineffective() | anchor | warm
+        return super().ineffective() | anchor
 
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
         for name in ("random_steps", "alpha", "gate_penalty"):
             check_at_least(0, **{name: min(getattr(self, name), default=0)})
-        if self.learning.warm_critic and self.start_from is not None:
-            raise ConfigError("warm_critic must be False with start_from, got True (a policy file has no critics)")
-        if self.learning.warm_critic and self.network.encoder == "lean":
-            raise ConfigError("warm_critic must be False with encoder lean, got True (each stage has its own encoder)")
 
 
 def check_training_layouts(name: str, count: int, before: int = 0, stages: int = 1) -> None:

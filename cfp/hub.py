@@ -104,7 +104,7 @@ class Shareable:
                 commit = hub.upload_folder(
                     repo_id=repo, folder_path=folder, commit_message=f"Policy for {self.description['task']}"
                 )
-            except (OSError, ValueError) as error:
+            except Exception as error:  # without a network, errors of the library that carries its requests
                 raise ConfigError(f"repo: cannot push to {repo!r} ({' '.join(str(error).split())})") from error
         return pinned(repo, commit.oid, digest)
 

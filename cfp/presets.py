@@ -82,6 +82,7 @@ ANALYTIC: dict[str, dict[str, Any]] = {
     "grow": {"steps": 16_000, "handover": (12_800,)},
     "obstacle": {"steps": 25_600, "handover": (22_400,), "final_step": 0.3, "displacement": True},
     "slot": {"steps": 19_200, "handover": (16_000,)},
+    "catch": {"steps": 28_800, "handover": (25_600,), "max_episode_steps": 300},
     "dig": {"steps": 28_800, "handover": (25_600,), "weight_average": 0.98},
 }
 """Options of the learner ``analytic`` that differ from task to task; found by the experiments that the documentation
@@ -235,11 +236,11 @@ def from_json(values: dict[str, Any]) -> CoarseToFineConfig:
 
 
 def like_start(base: Options, values: dict[str, Any]) -> Options:
-    """A default configuration for the networks of the policy that the JSON ``values`` start from, if any.
+    """A default configuration for the policy that the JSON ``values`` start from, if any.
 
-    Policies with the paper's networks have its action grids. An update takes several times as long, so there are fewer;
-    and strong exploration noise would disturb a policy that can do something already. What else the preset changes was
-    not measured for such policies.
+    A policy of as many stages that is refined keeps its action grids. For policies with the paper's networks the next grid is the
+    paper's; an update takes several times as long, so there are fewer, and strong exploration noise would disturb a
+    policy that can do something already. What else the preset changes was not measured for such policies.
     """
     if not isinstance(base, CoarseToFineConfig) or values.get("start_from") is None:
         return base
@@ -248,9 +249,11 @@ def like_start(base: Options, values: dict[str, Any]) -> Options:
         return base
     spec = load(values["start_from"]).spec
     base = replace(base, network=replace(base.network, encoder=spec.encoder))
-    if not isinstance(base, Config) or spec.encoder == "lean":
-        return base
-    updates = min(4, base.learning.gradient_steps)
-    usual = {name: getattr(LearningConfig(), name) for name in ("n_steps", "weight_average", "max_episode_steps")}
-    learning = replace(base.learning, gradient_steps=updates, noise_cells=0, **usual)
-    return replace(base, learning=learning, resolutions=_numbers(base.task).resolutions)
+    if isinstance(base, Config) and spec.encoder != "lean":
+        updates = min(4, base.learning.gradient_steps)
+        usual = {name: getattr(LearningConfig(), name) for name in ("n_steps", "weight_average", "max_episode_steps")}
+        learning = replace(base.learning, gradient_steps=updates, noise_cells=0, **usual)
+        base = replace(base, learning=learning, resolutions=_numbers(base.task).resolutions)
+    if values.get("refine") and len(spec.resolutions) == len(base.resolutions):
+        return replace(base, resolutions=spec.resolutions)
+    return base

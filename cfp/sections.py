@@ -68,7 +68,8 @@ class EnvironmentConfig:
     def with_dt(self, dt: float, option: str = "dt") -> EnvironmentConfig:
         """These options with the same environment step in substeps of ``dt`` s, the value of an option."""
         check_positive(**{option: dt})
-        substeps = round(self.control_step / dt)
+        ratio = self.control_step / dt
+        substeps = round(ratio) if math.isfinite(ratio) else 0
         if not math.isclose(substeps * dt, self.control_step):
             raise ConfigError(f"{option} must divide an environment step of {self.control_step} s, got {dt}")
         return self if dt == self.dt else replace(self, dt=dt, substeps=substeps)

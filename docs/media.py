@@ -1,7 +1,7 @@
-"""Films of the tasks, with the policies that come with the package: `python docs/media.py [TASK ...]`.
+"""Films of the policies that come with the package: `python docs/media.py [POLICY ...]`.
 
-Each task gets `images/films/TASK.webp`, and all of them together `images/tasks.webp`. `images/films/sources.json` keeps
-the hash of the policy behind each film; a test compares them with those of the package.
+Each policy gets `images/films/POLICY.webp`, and those of all tasks together `images/tasks.webp`. `images/films/sources.json`
+keeps the hash of the policy behind each film; a test compares them with those of the package.
 """
 
 import hashlib
@@ -14,7 +14,7 @@ import torch
 
 import cfp
 import dittogym
-from cfp.weights import SHIPPED
+from cfp.weights import SHIPPED, shipped
 from dittogym.render.film import write_film
 from dittogym.render.recording import Recording
 from dittogym.tasks import headline
@@ -30,11 +30,11 @@ SECONDS, RATE = 6.0, 10
 SEEDS = {"grow": 1}
 
 
-def record_task(task: str) -> Recording:
-    """One episode of a task at the lite tier."""
-    seed = SEEDS.get(task, 0)
-    policy = cfp.load(task)
-    env = dittogym.TorchEnv(task, particles="lite", resolution=policy.resolution)
+def record_policy(name: str) -> Recording:
+    """One episode of a policy at the lite tier."""
+    seed = SEEDS.get(name, 0)
+    policy = cfp.load(name)
+    env = dittogym.TorchEnv(policy.description["task"], particles="lite", resolution=policy.resolution)
     with torch.random.fork_rng():
         torch.manual_seed(seed)  # policies act with noise
         return env.film(policy, seed=seed)
@@ -45,12 +45,12 @@ def write_replays(folder: Path) -> None:
     for task in dittogym.TASKS:
         path, policy = folder / f"{task}.html", SHIPPED / f"{task}.safetensors"
         if not path.exists() or path.stat().st_mtime < policy.stat().st_mtime:
-            record_task(task).save(path)
+            record_policy(task).save(path)
 
 
-def policy_hash(task: str) -> str:
-    """Hash of the policy of a task that comes with the package."""
-    return hashlib.sha256((SHIPPED / f"{task}.safetensors").read_bytes()).hexdigest()
+def policy_hash(name: str) -> str:
+    """Hash of a policy that comes with the package."""
+    return hashlib.sha256((SHIPPED / f"{name}.safetensors").read_bytes()).hexdigest()
 
 
 def grid_frames(recordings: dict[str, Recording]) -> list[np.ndarray]:
@@ -66,15 +66,15 @@ def grid_frames(recordings: dict[str, Recording]) -> list[np.ndarray]:
     return frames
 
 
-def main(tasks: list[str]) -> None:
-    """Make the films of some tasks, or of all, and the grid."""
+def main(names: list[str]) -> None:
+    """Make the films of some policies, or of all, and the grid."""
     sources = json.loads(SOURCES.read_text()) if SOURCES.exists() else {}
-    recordings = {task: record_task(task) for task in dittogym.TASKS}
-    for task in tasks or dittogym.TASKS:
-        speed = max(0.1, round(recordings[task].duration / SECONDS, 1))
-        recordings[task].save(FILMS / f"{task}.webp", size=SIZE, rate=RATE, speed=speed)
-        sources[task] = policy_hash(task)
-    write_film(IMAGES / "tasks.webp", grid_frames(recordings), RATE)
+    recordings = {name: record_policy(name) for name in shipped()}
+    for name in names or recordings:
+        speed = max(0.1, round(recordings[name].duration / SECONDS, 1))
+        recordings[name].save(FILMS / f"{name}.webp", size=SIZE, rate=RATE, speed=speed)
+        sources[name] = policy_hash(name)
+    write_film(IMAGES / "tasks.webp", grid_frames({task: recordings[task] for task in dittogym.TASKS}), RATE)
     SOURCES.write_text(json.dumps(dict(sorted(sources.items())), indent=2) + "\n")
 
 

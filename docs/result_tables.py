@@ -19,10 +19,12 @@ from baselines.compare.plots import final_returns
 from baselines.compare.results import Group
 from baselines.leaderboard.__main__ import rankings
 from baselines.leaderboard.submission import read_submissions
+from cfp import weights
 from dittogym.tasks import headline
 
 DOCS = Path(__file__).resolve().parent
 OBSERVES = ("image", "state", "simulator", "nothing")
+PRETRAINED = weights.shipped()
 Row = dict[str, str]
 
 
@@ -38,7 +40,7 @@ def policies() -> list[Row]:
     for row in read("policies.csv"):
         name = row["policy"]
         observes = "nothing" if name in ("zero", "random") else "image"
-        label = f"{name} actions" if observes == "nothing" else f'`cfp.load("{name}")`' if name == row["task"] else name
+        label = f"{name} actions" if observes == "nothing" else f'`cfp.load("{name}")`' if name in PRETRAINED else name
         rows.append(row | {"algorithm": label, "observes": observes, "name": name})
     return rows
 

@@ -48,17 +48,21 @@ def value(name: str, given: Any, *, least: float | None = None, above: float | N
     number(name, given, least=least, above=above)
 
 
-def entries(name: str, given: Any, *, above: float | None = None, below: float | None = None) -> None:
-    """Raise a ValueError unless all numbers of a tensor, or a number, are finite, above ``above`` and below ``below``.
+def entries(
+    name: str, given: Any, *, least: float | None = None, above: float | None = None, below: float | None = None
+) -> None:
+    """Raise a ValueError unless all numbers of a tensor, or a number, are finite and in range.
+
+    They must be at least ``least``, above ``above`` and below ``below``, where these are given.
 
     Under the transforms of ``torch.func``, where nothing can depend on them, they are not looked at.
     """
     if isinstance(given, Tensor):
         if not transforming() and not given.is_meta:
             for extreme in torch.aminmax(given.detach()):  # NaN if one is among them
-                entries(name, extreme.item(), above=above, below=below)
+                entries(name, extreme.item(), least=least, above=above, below=below)
         return
-    number(name, given, above=above)
+    number(name, given, least=least, above=above)
     if below is not None and not given < below:
         raise ValueError(f"{name} must be below {below}, got {given}")
 

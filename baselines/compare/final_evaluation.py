@@ -1,4 +1,4 @@
-"""The final evaluation of a run's policy, recorded in its folder so that no episode is played twice."""
+"""The final evaluation of a run's policy, recorded in its folder so that it can be continued."""
 
 import hashlib
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from cfp.sections import Particles
 
 RECORD = "final_evaluation.json"
 BATCH = 10
-"""Episodes side by side; what is kept when an evaluation is stopped, or more episodes are asked for."""
+"""Episodes side by side; whole batches are kept when an evaluation is stopped, or more episodes are asked for."""
 PAPER_CASES = 3
 """How many of `make_cases` the paper reports: unperturbed, action dropout, observation dropout."""
 

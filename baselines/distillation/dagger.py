@@ -132,7 +132,7 @@ class Collector(Stateful):
     def _step(self, action: Tensor) -> Tensor:
         """Carry out an action, start new episodes where they are over, return the next observation."""
         observation, reward, terminated, _, info = self.env.step(action)
-        done = self.episodes.record(reward, terminated | ~info["finite"])
+        done = self.episodes.record(reward, terminated)
         if bool(done.any()):
             self.episodes.restart(done, terminated, info["finite"])
             self.left_plan = self.left_plan | done

@@ -66,13 +66,14 @@ class ModularConfig(RunConfig):
 
     def ineffective(self) -> dict[str, str]:
         """Options of several stages, and of grids of actions, have no effect: segments act on nodes."""
-        names = ("anchor", "warm_critic", "noise_cells", "noise_scale")
+        names = ("anchor", "noise_cells", "noise_scale")
         needs = dict.fromkeys((*(f"learning.{name}" for name in names), "environment.action_layout"), "algo cfp")
         return super().ineffective() | needs
 
     def hyperparameters(self, stage: int) -> Hyperparameters:
         """Hyperparameters of the only stage."""
-        return Hyperparameters(**vars(self.learning), alpha=self.alpha, random_steps=self.random_steps)
+        own = vars(self.learning) | {"noise_cells": 0}  # which the options common to a comparison may hold
+        return Hyperparameters(**own, alpha=self.alpha, random_steps=self.random_steps)
 
     def check(self) -> None:
         """Check what the types do not express."""
@@ -138,7 +139,12 @@ class Modular(SACAlgorithm):
 
     def attached(self, env: Any) -> StateBasedPolicy:
         """The present policy, acting on the state of an environment."""
-        return self._policy({}).attached(env)
+        return self.policy.attached(env)
+
+    @property
+    def policy(self) -> SegmentPolicy:
+        """What has been learned so far; it must be attached to an environment."""
+        return self._policy({})
 
     def _policy(self, description: dict[str, Any]) -> SegmentPolicy:
         return SegmentPolicy(cast(ModularActor, self.model.trained_actor), self.config.nodes, description)

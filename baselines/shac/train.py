@@ -18,7 +18,7 @@ from cfp.analytic.episodes import Episodes
 from cfp.analytic.features import StateFeatures
 from cfp.analytic.reward import RewardConfig
 from cfp.analytic.stateful import Stateful
-from cfp.analytic.window import Window, WindowCollector, short_horizon_loss
+from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, short_horizon_loss
 from cfp.config import RunConfig, check_training_layouts
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
@@ -34,17 +34,10 @@ PATIENCE = 10
 """Updates in a row without a finite gradient after which training gives up."""
 
 METRICS: dict[str, str] = {
-    "rollout/return": "mean undiscounted true return of the episodes that ended since the last row, None for none",
-    "train/reward": "mean training reward of a step, before its scale",
-    "train/true_reward": "mean true reward of a step, at the particle count of training",
-    "train/value": "mean value that the target critic gives to the window's states",
+    **WINDOW_METRICS,
     "train/critic_loss": "mean squared error of the critic in the last of its updates",
     "train/gradient_norm": "norm of the actor's gradient before it is clipped",
     "train/learning_rate": "Adam's step size",
-    "train/episodes": "episodes ended in this stage",
-    "train/terminated": "those that the task ended early",
-    "train/nonfinite": "simulations that were not finite and were reset",
-    "train/dropped": "gradients of single actions that were not finite and were left out",
     "train/skipped": "updates without a finite gradient, which were not made",
 }
 """Every scalar that `Shac.update` logs, and what it means."""
@@ -70,10 +63,6 @@ class ShacConfig(WindowConfig, GridConfig):
     dt are given."""
     noise: float = 0.1
     """Standard deviation of actions before tanh (an image policy keeps its network's own, about 0.1)."""
-    max_episode_steps: int = 400
-    """Control steps after which a training episode is truncated; the first ones are truncated at staggered ages."""
-    num_layouts: int = 16
-    """Particle layouts that training episodes start from in turn."""
     deformation: bool = True
     """A policy of the state sees deformation."""
     clock: bool = True
@@ -96,7 +85,7 @@ class ShacConfig(WindowConfig, GridConfig):
         """Check what the types do not express."""
         super().check()
         self.check_window()
-        check_at_least(1, steps=self.steps, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
+        check_at_least(1, steps=self.steps)
         if self.start_from is not None and self.sees != "image":
             raise ConfigError(f"start_from is allowed with sees 'image' only, got sees {self.sees!r}")
         check_training_layouts("num_layouts", self.num_layouts, self.environment.num_envs)
@@ -163,10 +152,7 @@ class Shac(Stateful, Algorithm):
         gradient_norm = self._update_actor(window)
         critic_loss = self.critic.update(window, learning_rate)
         self.num_timesteps += config.window * self.env.num_envs
-        return self.collector.episodes.scalars() | {
-            "train/reward": float(window.rewards.detach().mean()) / config.reward.scale,
-            "train/true_reward": window.true_reward,
-            "train/value": float(window.next_values.detach().mean()),
+        return self.collector.scalars(window) | {
             "train/critic_loss": critic_loss,
             "train/gradient_norm": gradient_norm,
             "train/learning_rate": learning_rate,

@@ -50,8 +50,6 @@ class LearningConfig:
     max_episode_steps: int | None = None
     """Steps after which training episodes are truncated, if the task's horizon is not shorter; robots begin at
     different ages. None: the horizon, and all begin together."""
-    warm_critic: bool = False
-    """Initialise critics and reward statistics of each stage from the previous one, instead of anew."""
 
     def check(self) -> None:
         """Raise a `ConfigError` for values out of range."""

@@ -31,7 +31,7 @@ from cfp.agent.networks import TwinCritic, upsample
 from cfp.agent.policies import CFPPolicy, NetworkPolicy
 from cfp.agent.replay import ReplayRing
 from cfp.agent.reward_statistics import RewardStatistics
-from cfp.errors import NonFiniteError
+from cfp.errors import ConfigError, NonFiniteError
 
 METRICS: dict[str, str] = {
     "train/critic_loss": "sum of both critics' mean squared errors, in normalised rewards",
@@ -48,6 +48,12 @@ METRICS: dict[str, str] = {
     "train/drift": "where a policy is refined: mean square by which sampled actions differ from its mean ones",
 }
 """Scalars that `CFP.train` logs."""
+
+
+SHARED = ("buffer_size", "batch_size", "tau", "gamma", "gradient_steps")
+"""Hyperparameters that stable-baselines3 knows by the same name."""
+FROM_HYPERPARAMETERS = {*SHARED, "learning_rate", "learning_starts", "ent_coef"}
+"""Arguments of stable-baselines3's SAC that `Hyperparameters` holds."""
 
 
 def falling_rate(rate: float, final: float, remaining: float) -> float:
@@ -67,13 +73,17 @@ class CFP(SAC):
     """Soft actor-critic as the coarse-to-fine policy uses it, on stable-baselines3's loop.
 
     In stages after the first, the coarse action is sampled anew in every update and the entropy covers the residual
-    part only, as in the reference implementation.
+    part only, as in the reference implementation. ``predict`` acts by the actor in training; see ``trained_actor``.
 
     Args:
         policy: `CFPPolicy` or its name, or another `cfp.agent.policies.NetworkPolicy`.
         env: Vectorised environment with actions in [-1, 1], of shape (2, R, R) for `CFPPolicy`.
         hyperparameters: Hyperparameters of the stage.
-        sac_options: Further options of stable-baselines3's SAC.
+        sac_options: Further options of stable-baselines3's SAC; those in ``hyperparameters`` are not among them.
+
+    Raises:
+        TypeError: An option of stable-baselines3 is one of the hyperparameters.
+        ConfigError: A hyperparameter is out of range.
 
     Attributes:
         origin: Actor to stay close to while it is refined, with the same action grid; None otherwise.
@@ -90,17 +100,21 @@ class CFP(SAC):
         hyperparameters: Hyperparameters = Hyperparameters(),  # noqa: B008  (it is immutable)
         **sac_options: Any,
     ) -> None:
+        hyperparameters.check()
+        if taken := FROM_HYPERPARAMETERS & sac_options.keys():
+            raise TypeError(f"CFP takes {', '.join(sorted(taken))} from hyperparameters, not as arguments")
+        if hyperparameters.noise_cells and sac_options.get("action_noise") is not None:
+            raise ConfigError(f"noise_cells must be 0 with action_noise, got {hyperparameters.noise_cells}")
         self.hyperparameters = hyperparameters
         self.origin: Actor | None = None
         spec = (sac_options.get("policy_kwargs") or {}).get("spec")
         noisy = sac_options.get("action_noise") is not None  # then the executed action is not composed of parts
         composition = Composition.of(spec) if spec and not noisy else None
-        sac_options.setdefault("replay_buffer_class", ReplayRing)
-        replay = {"seed": sac_options.get("seed"), "composition": composition}
-        replay |= {"n_steps": hyperparameters.n_steps, "gamma": hyperparameters.gamma}
-        sac_options.setdefault("replay_buffer_kwargs", replay)
-        names = ("buffer_size", "batch_size", "tau", "gamma", "gradient_steps")
-        sac_options |= {name: getattr(hyperparameters, name) for name in names}
+        if sac_options.setdefault("replay_buffer_class", ReplayRing) is ReplayRing:
+            replay = {"seed": sac_options.get("seed"), "composition": composition}
+            replay |= {"n_steps": hyperparameters.n_steps, "gamma": hyperparameters.gamma}
+            sac_options["replay_buffer_kwargs"] = replay | (sac_options.get("replay_buffer_kwargs") or {})
+        sac_options |= {name: getattr(hyperparameters, name) for name in SHARED}
         rate, final = hyperparameters.learning_rate, hyperparameters.final_rate
         sac_options["learning_rate"] = rate if final == 1 else partial(falling_rate, rate, final)
         starts, alpha = hyperparameters.update_start, hyperparameters.alpha
@@ -268,7 +282,7 @@ class CFP(SAC):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         modules, tensors = super()._get_torch_save_params()
-        return [*modules, "reward_statistics"], tensors
+        return [*modules, "reward_statistics", *(["average"] if self.average else [])], tensors
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "reward_statistics", "origin", "noise", "average"]

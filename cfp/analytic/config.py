@@ -31,11 +31,17 @@ class WindowConfig:
     """Fraction of the critic that goes into its target after each window."""
     max_grad_norm: float = 1.0
     """Largest norm of a gradient of the networks, of actor and critic each."""
+    max_episode_steps: int = 400
+    """Control steps after which a training episode is truncated, if the task's horizon is not shorter; the first ones
+    are truncated at staggered ages."""
+    num_layouts: int = 16
+    """Particle layouts that training episodes start from in turn."""
     reward: RewardConfig = field(default_factory=RewardConfig)
 
     def check_window(self) -> None:
         """Check these options."""
         check_at_least(1, window=self.window, critic_updates=self.critic_updates)
+        check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
         check_fraction(gamma=self.gamma, td_lambda=self.td_lambda, tau=self.tau)
         check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
 
@@ -64,10 +70,6 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
     """Decay of the average of the actor's weights, which is the policy; 0: the actor itself."""
     warmup: int = 15
     """Windows at the beginning of a stage that starts from a trained policy, in which only the critic learns."""
-    max_episode_steps: int = 400
-    """Control steps after which a training episode is truncated, if the task's horizon is not shorter."""
-    num_layouts: int = 16
-    """Particle layouts that training episodes start from in turn."""
     displacement: bool = True
     """The critic sees the robot's displacement since the reset."""
 
@@ -84,8 +86,7 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
         self.check_window()
         check_at_least(0, warmup=self.warmup)
         check_at_least(1, minibatches=self.minibatches, minibatch_size=self.minibatch_size)
-        check_at_least(1, windows_kept=self.windows_kept, max_episode_steps=self.max_episode_steps)
-        check_at_least(1, num_layouts=self.num_layouts)
+        check_at_least(1, windows_kept=self.windows_kept)
         check_training_layouts("num_layouts", self.num_layouts, self.environment.num_envs)
         check_fraction(final_step=self.final_step)
         check_decay(weight_average=self.weight_average)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from cfp.analytic.stateful import Stateful
-from cfp.envs.vec_env import TorchVecEnv
+from cfp.envs.vec_env import TorchVecEnv, first_limits
 from dittogym import TorchEnv
 
 
@@ -27,7 +27,7 @@ class Episodes(Stateful):
         self.first_seed = seed + count
         env.reset(seed=[self.first_seed + i % num_layouts for i in range(count)])
         self.max_steps = min(max_episode_steps, env.spec.horizon)
-        self.limit = torch.tensor([max(1, self.max_steps * (i + 1) // count) for i in range(count)], device=env.device)
+        self.limit = first_limits(count, self.max_steps, env.device)
         self.returns = torch.zeros(count, device=env.device)
         self.recent_returns: list[float] = []  # undiscounted; of the episodes since the list was last emptied
         self.num_started = count

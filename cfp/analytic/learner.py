@@ -21,29 +21,22 @@ from cfp.analytic.episodes import Episodes
 from cfp.analytic.features import StateFeatures
 from cfp.analytic.regression import ImageMemory, Regression
 from cfp.analytic.stateful import Stateful
-from cfp.analytic.window import Window, WindowCollector, short_horizon_loss
+from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, short_horizon_loss
 from cfp.envs.make import choose_device, make_torch_env
 from cfp.evaluation.pictures import policy_pictures
 from cfp.experiment.algorithm import Scalars
 from cfp.experiment.schedules import linear_decay, stage_progress
-from cfp.experiment.stages import CoarseToFineStages
+from cfp.experiment.stages import CoarseToFineStages, refines
 from cfp.presets import analytic_preset
 from dittogym import core
 
 METRICS: dict[str, str] = {
-    "rollout/return": "mean undiscounted true return of the episodes that ended since the last row, None for none",
-    "train/reward": "mean training reward of a step of the actor, before its scale",
-    "train/true_reward": "mean true reward of a step of the actor, at the particle count of training",
-    "train/value": "mean value that the target critic gives to the window's states",
+    **WINDOW_METRICS,
     "train/critic_loss": "mean squared error of the critic in the last of its updates",
     "train/regression_loss": "mean squared error of the actor's actions in the last step of the regression",
     "train/action_step": "root mean square of the step on the actions",
     "train/learning_rate": "Adam's step size",
     "train/limited": "gradients of single actions that were shortened as outliers",
-    "train/episodes": "episodes ended in this stage",
-    "train/terminated": "those that the task ended early",
-    "train/nonfinite": "simulations that were not finite and were reset",
-    "train/dropped": "gradients of single actions that were not finite and were left out",
 }
 """Every scalar that `AnalyticLearner.update` logs, and what it means."""
 
@@ -79,7 +72,9 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         self.action_step = ActionStep()
         self.generator = torch.Generator().manual_seed(config.seed)  # on the CPU, so that a run can change its device
         image = self._image()
-        example = (image[0], actor.outputs(image).location[0].detach())
+        with torch.no_grad():
+            outputs = actor.outputs(image, deterministic=True, generator=self.generator)
+        example = (image[0], outputs.location[0])
         self.memory = ImageMemory(config.windows_kept * config.window * self.env.num_envs, example)
 
     @staticmethod
@@ -97,6 +92,17 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         algorithm = cls(config, stage, actor)
         algorithm.starts_trained = trained
         return algorithm
+
+    @classmethod
+    def warnings(cls, config: AnalyticConfig, folder: Path, first_stage: int) -> list[str]:
+        """Stages that end before their policy learns."""
+        lines, warmup = [], config.warmup * config.window * config.environment.num_envs
+        for stage in range(first_stage, len(config.ends()) + 1):
+            starts_trained = stage > 1 or refines(config, folder, stage)
+            if starts_trained and (steps := config.stage_steps(stage)) <= warmup:
+                option = f"--warmup {config.warmup}"
+                lines.append(f"stage {stage}: only the critic learns in its {steps:,} steps ({option})")
+        return lines
 
     def _image(self) -> Tensor:
         return core.observe(self.env.model, self.env.env_state)
@@ -122,10 +128,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
             regression_loss = self.regression.update(*batch, learning_rate)
         critic_loss = self.critic.update(window, learning_rate)
         self.num_timesteps += config.window * self.env.num_envs
-        return self.collector.episodes.scalars() | {
-            "train/reward": float(window.rewards.detach().mean()) / config.reward.scale,
-            "train/true_reward": window.true_reward,
-            "train/value": float(window.next_values.detach().mean()),
+        return self.collector.scalars(window) | {
             "train/critic_loss": critic_loss,
             "train/regression_loss": float(regression_loss),
             "train/action_step": step_size,

@@ -15,6 +15,18 @@ from cfp.analytic.stateful import Stateful
 from cfp.errors import NonFiniteError
 from torchmpm import tree
 
+WINDOW_METRICS = {
+    "rollout/return": "mean undiscounted true return of the episodes that ended since the last row, None for none",
+    "train/reward": "mean training reward of a step, before its scale",
+    "train/true_reward": "mean true reward of a step, at the particle count of training",
+    "train/value": "mean value that the target critic gives to the window's states",
+    "train/episodes": "episodes ended in this stage",
+    "train/terminated": "those that the task ended early",
+    "train/nonfinite": "simulations that were not finite and were reset",
+    "train/dropped": "gradients of single actions that were not finite and were left out",
+}
+"""What `WindowCollector.scalars` returns, and what it means."""
+
 
 class Window(NamedTuple):
     """T control steps of B simulations, with their autograd graph."""
@@ -76,6 +88,14 @@ class WindowCollector(Stateful):
             observation = next_observation
         observations, rewards, next_values, done = (torch.stack(values) for values in zip(*steps, strict=True))
         return Window(observations, rewards, next_values, done, true_reward / self.steps)
+
+    def scalars(self, window: Window) -> dict[str, float | None]:
+        """What to log of a window, see `WINDOW_METRICS`."""
+        return self.episodes.scalars() | {
+            "train/reward": float(window.rewards.detach().mean()) / self.reward.scale,
+            "train/true_reward": window.true_reward,
+            "train/value": float(window.next_values.detach().mean()),
+        }
 
     def _robot_positions(self) -> Tensor:
         return self.env.state.x[:, : self.env.model.num_robot_particles].detach()

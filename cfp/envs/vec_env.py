@@ -48,11 +48,8 @@ class TorchVecEnv(VecEnv):
         self._limits = self._first_limits()
 
     def _first_limits(self) -> Tensor | None:
-        """Steps (B,) after which the first episodes are truncated."""
-        if self.max_episode_steps is None:
-            return None
-        ages = torch.arange(1, self.num_envs + 1, device=self.torch_env.device) * self.max_episode_steps
-        return (ages // self.num_envs).clamp(min=1)
+        limit = self.max_episode_steps
+        return None if limit is None else first_limits(self.num_envs, limit, self.torch_env.device)
 
     @torch.no_grad()
     def reset(self) -> VecEnvObs:
@@ -173,6 +170,11 @@ def _to_numpy(tensor: Tensor) -> np.ndarray:
     """Copy a tensor, because the environment may reuse its memory."""
     array: np.ndarray = tensor.detach().cpu().numpy().copy()
     return array
+
+
+def first_limits(num_envs: int, max_steps: int, device: torch.device) -> Tensor:
+    """Steps (B,) after which the first episodes are truncated: a fraction ``(i + 1) / B`` of those of later ones."""
+    return (torch.arange(1, num_envs + 1, device=device) * max_steps // num_envs).clamp(min=1)
 
 
 def monitored(env: Any, max_episode_steps: int | None = None) -> VecMonitor:

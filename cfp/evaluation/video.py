@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
-from cfp.config import EVALUATION_SEED, RunConfig
+from cfp.config import RunConfig
 from cfp.envs.make import make_env
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
 from cfp.evaluation.episodes import SeededPolicy, attached
-from cfp.evaluation.evaluate import Noise, without_noise
+from cfp.evaluation.evaluate import Noise, evaluation_seed, without_noise
 from cfp.policy_protocols import Policy
 from dittogym import TorchEnv
 from dittogym.render.film import VideoUnavailable
@@ -25,8 +25,8 @@ Recorded = TypeVar("Recorded")
 
 
 def record_policy(config: RunConfig, policy: Policy, noise: Noise = "default") -> Recording:
-    """One episode of a policy as it is evaluated; of one made for a single layout, that layout."""
-    seed = policy.description.get("layout", config.seed + EVALUATION_SEED)
+    """The first episode of the policy's evaluation; of one made for a single layout, that layout."""
+    seed = policy.description.get("layout", evaluation_seed(config))
     return record_episode(config, policy, policy.resolution, without_noise(policy, noise), seed, record)
 
 

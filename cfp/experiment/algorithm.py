@@ -40,11 +40,11 @@ class Position:
 class Algorithm(ABC):
     """Trains a policy through one stage of a run; method names are those of stable-baselines3.
 
-    The class methods concern the whole run; an object is one stage. A subclass implements `update`, one turn of the
-    training loop, or `learn`, the whole loop.
+    The class methods concern the whole run; an object, which `create` makes, is one stage. A subclass implements
+    `update`, one turn of the training loop, or `learn`, the whole loop.
 
     Args:
-        config: Options of the run.
+        config: Options of the run. A subclass with other arguments than these overrides `create`.
         stage: Which stage, 1 is the first.
         start: Policy of the stage before; in the first stage `initial_policy`.
     """
@@ -104,9 +104,6 @@ class Algorithm(ABC):
     def set_logger(self, logger: Logger) -> None:
         """Set where scalars go."""
         self.logger = logger
-
-    def warm_start(self, previous: Any) -> None:  # noqa: B027  (most algorithms hand over a policy only)
-        """Take what a new stage needs from the algorithm of the ``previous`` one, besides its policy."""
 
     @property
     def finished(self) -> bool:

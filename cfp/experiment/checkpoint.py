@@ -19,6 +19,8 @@ from cfp.files import parse_json, write_atomically
 from cfp.from_dict import flatten
 
 VERSION = 2
+UNREADABLE = (OSError, RuntimeError, ValueError, LookupError, AttributeError, EOFError)
+"""What torch raises for damaged files, besides `pickle.UnpicklingError`."""
 
 
 class Checkpoint:
@@ -62,7 +64,7 @@ class Checkpoint:
         """Read the state; `CheckpointError` where it is missing, damaged, or of another version."""
         try:
             state = torch.load(self.path, map_location="cpu", weights_only=True)
-        except (OSError, RuntimeError, ValueError, KeyError, EOFError, pickle.UnpicklingError) as error:
+        except (*UNREADABLE, pickle.UnpicklingError) as error:
             raise CheckpointError(f"{self.path}: the checkpoint is damaged ({type(error).__name__})") from error
         if not isinstance(state, dict) or state.get("version") != VERSION:
             found = state.get("version") if isinstance(state, dict) else type(state).__name__

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecMonitor
 
 from cfp.agent.actor import Actor
@@ -110,11 +109,6 @@ class SACAlgorithm(Algorithm):
             scalars["rollout/success"] = float(np.mean(model.ep_success_buffer))
         return scalars
 
-    @property
-    def policy(self) -> PolicyPredictor:
-        """What has been learned so far."""
-        return self.model.policy
-
     def state_dict(self) -> dict[str, Any]:
         """All that learning needs to continue."""
         return model_state_dict(self.model)
@@ -152,14 +146,6 @@ class CoarseToFine(CoarseToFineStages, SACAlgorithm):
         if refines(config, folder, stage):
             model.origin = load(start_path(folder), str(model.device)).actor
         return algorithm
-
-    def warm_start(self, previous: CoarseToFine) -> None:
-        """Take critics and reward statistics from the ``previous`` stage, if the options say so."""
-        if not self.config.learning.warm_critic:
-            return
-        for mine, theirs in zip(self.model.networks()[1:], previous.model.networks()[1:], strict=True):
-            mine.load_state_dict(theirs.state_dict())
-        self.model.reward_statistics.load_state_dict(previous.model.reward_statistics.state_dict())
 
     def images(self) -> dict[str, np.ndarray]:
         """What the actor does with the observation of the first robot."""

@@ -15,6 +15,7 @@ from cfp.errors import CheckpointError
 from cfp.files import write_atomically
 
 FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_DAMAGED = (zipfile.BadZipFile, zlib.error, NotImplementedError)  # what zipfile raises
 _COMPRESSED = ("observations", "next_observations")  # images shrink thirtyfold, actions are noise
 
 
@@ -92,5 +93,5 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         with open(path, "rb") as file, np.load(file) as archive:
             return {name: archive[name] for name in FIELDS}
-    except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, KeyError, EOFError, MemoryError, *_DAMAGED) as error:
         raise CheckpointError(f"{path}: this part of the replay buffer is missing or damaged ({error})") from error

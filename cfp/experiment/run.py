@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from cfp.config import RunConfig, to_json
 from cfp.envs.make import choose_device, make_env
-from cfp.errors import CFPError, ConfigError
+from cfp.errors import CFPError, CheckpointError, ConfigError
 from cfp.evaluation.evaluate import Result, compare
 from cfp.evaluation.page import write_page
 from cfp.evaluation.plots import plot_curve
@@ -35,7 +35,7 @@ from cfp.experiment.checkpoint import Checkpoint, check_same
 from cfp.experiment.folder import copy_policy, holds_progress, holds_run, policy_files, policy_path
 from cfp.experiment.loggers import ProgressTable, Tracker, check_trackers
 from cfp.experiment.process import StopSignals
-from cfp.files import write_atomically, write_json
+from cfp.files import read_json, write_atomically, write_json
 from cfp.tables import CSVTable
 from cfp.weights import is_of_another_task, read_policy
 from dittogym.render.frame import png
@@ -74,6 +74,8 @@ class TrainingRun:
         if resume and self.checkpoint.path.exists():
             self._read_checkpoint()
         else:
+            if holds_progress(folder):  # the evaluation of the policy it starts from, which precedes any checkpoint
+                check_same(self._stored_options(), config)
             if holds_run(folder):
                 print(f"{folder} holds no checkpoint: starting from the beginning")
             self.position = algorithm.initialize(config, folder)
@@ -95,6 +97,14 @@ class TrainingRun:
             write_atomically(path, lambda file: file.write(picture))
             print(f"target: {path}")
 
+    def _stored_options(self) -> dict[str, Any]:
+        """The options of the run that the folder holds."""
+        path = self.folder / "config.json"
+        try:
+            return read_json(path)
+        except (OSError, ValueError) as error:
+            raise CheckpointError(f"{path}: cannot be read ({error})") from error
+
     def _read_checkpoint(self) -> None:
         """Set state, position and step from the checkpoint."""
         config, folder, self.state = self.config, self.folder, self.checkpoint.read()
@@ -112,7 +122,7 @@ class TrainingRun:
         """Train the stages that are left."""
         for line in self.algorithm.warnings(self.config, self.folder, self.position.stage):
             print(line)
-        previous, start = None, time.perf_counter()
+        start = time.perf_counter()
         try:
             try:
                 self.algorithm.prepare(self.config, self.folder, self.signals)
@@ -120,29 +130,26 @@ class TrainingRun:
                 self.preparation_seconds = time.perf_counter() - start
             for number in range(self.position.stage, self.stages + 1):
                 self.position = Position(number, self.position.offset)
-                algorithm = self._create(previous)
+                algorithm = self._create()
                 self._train_stage(Stage(self.config, self.folder, self.position, algorithm))
                 newest = policy_path(self.folder)  # of the next stage already, if this repeats the end after a crash
                 if number < self.stages and read_policy(newest)[1]["stage"] == number:
                     copy_policy(newest, policy_path(self.folder, number))
                 self.position = Position(number, self.position.offset + algorithm.num_timesteps)
-                previous = algorithm
         finally:
             self.seconds = self.checkpoint.seconds
             self.logger.close()
 
-    def _create(self, previous: Algorithm | None) -> Algorithm:
+    def _create(self) -> Algorithm:
         """The algorithm of the present stage: at its beginning, or as the checkpoint holds it."""
         resumed = self.state is not None
         try:
             algorithm = self.algorithm.create(self.config, self.position.stage, self.folder, resumed)
         except CFPError:
-            if previous is None and not resumed:  # options that it refuses leave no run behind
+            if not self.checkpoint.path.exists():  # options that it refuses leave no run behind
                 (self.folder / "config.json").unlink()
             raise
         algorithm.set_logger(self.logger)
-        if previous is not None:
-            algorithm.warm_start(previous)
         if self.state is not None:
             self.checkpoint.restore(algorithm, self.state)
             self.state = None

@@ -64,7 +64,7 @@ class Command:
 class _Choice:
     """Options that are read first, because they choose the preset, and so the default values of all others."""
 
-    decisive: ClassVar[tuple[str, ...]] = ("algo", "task", "preset", "learner", "start_from")
+    decisive: ClassVar[tuple[str, ...]] = ("algo", "task", "preset", "learner", "start_from", "refine")
     """Those that choose the defaults."""
 
     algo: str | None = None
@@ -72,6 +72,7 @@ class _Choice:
     preset: str | None = None
     learner: str | None = None
     start_from: str | None = None
+    refine: bool = False
     out: Folder | None = None
     resume: bool = False
     config: Path | None = None
@@ -169,7 +170,8 @@ def _values(choice: _Choice) -> dict[str, Any]:
             values = read_json(choice.config)
         except (OSError, ValueError) as error:
             raise ConfigError(f"config: {choice.config} cannot be read as JSON ({error})") from error
-    return values | {name: value for name, value in _decisive(vars(choice)).items() if value is not None}
+    given = {name: value for name, value in _decisive(vars(choice)).items() if value is not None and value is not False}
+    return values | given
 
 
 def main(program: Program, arguments: Sequence[str] | None = None, started: str | None = None) -> int:

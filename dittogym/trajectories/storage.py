@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import os
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import gymnasium
 import numpy as np
@@ -17,6 +18,7 @@ from dittogym.trajectories.episode import Episode
 from torchmpm import checks
 
 FORMAT, VERSION = "dittogym-episodes", 1
+_DAMAGED = (zipfile.BadZipFile, zlib.error, NotImplementedError)  # what zipfile raises
 ARRAYS = ("observations", "actions", "rewards", "terminations", "truncations")
 
 
@@ -58,22 +60,28 @@ def load_episodes(path: str | os.PathLike[str]) -> list[Episode]:
     Raises:
         ValueError: It is damaged, or not such a file.
     """
-    try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            about = json.loads(str(archive["about"]))
-            if (about["format"], about["version"]) != (FORMAT, VERSION):
-                raise ValueError(f"its format is {about['format']} {about['version']}")
-            return [
-                Episode(
-                    **{name: archive[f"{i}/{name}"] for name in ARRAYS},
-                    particles={name: archive[f"{i}/particles/{name}"] for name in episode["fields"]},
-                    seed=episode["seed"],
-                    task=episode["task"],
-                )
-                for i, episode in enumerate(about["episodes"])
-            ]
-    except (AttributeError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"path must be a {FORMAT} file of version {VERSION}, got {str(path)!r} ({error})") from error
+    with open(path, "rb") as file:
+        try:
+            return _read(file)
+        except (OSError, LookupError, AttributeError, TypeError, ValueError, EOFError, *_DAMAGED) as error:
+            form = f"a {FORMAT} file of version {VERSION}"
+            raise ValueError(f"path must be {form}, got {str(path)!r} ({error})") from error
+
+
+def _read(file: BinaryIO) -> list[Episode]:
+    with np.load(file, allow_pickle=False) as archive:
+        about = json.loads(str(archive["about"]))
+        if (about["format"], about["version"]) != (FORMAT, VERSION):
+            raise ValueError(f"its format is {about['format']} {about['version']}")
+        return [
+            Episode(
+                **{name: archive[f"{i}/{name}"] for name in ARRAYS},
+                particles={name: archive[f"{i}/particles/{name}"] for name in episode["fields"]},
+                seed=episode["seed"],
+                task=episode["task"],
+            )
+            for i, episode in enumerate(about["episodes"])
+        ]
 
 
 def check_archive(path: str | os.PathLike[str]) -> Path:

@@ -89,7 +89,7 @@ POLICIES = [
     Case(
         "policy missing",
         lambda desk: cfp.load("nobody"),
-        ("nobody.safetensors", "(catch, dig, grow, kick, "),
+        ("nobody.safetensors", "(catch, dig, grow, grow-success, kick, "),
         CheckpointError,
     ),
     *(

@@ -72,7 +72,6 @@ TRAIN = [
     training("a negative temperature", "--alpha -1", "alpha must be at least 0, got -1.0"),
     training("a temperature that is no number", "--alpha nan", "alpha must be finite, got (nan,)"),
     training("a gate without scale", "--gate-scale 0", "gate_scale must be positive, got 0.0"),
-    training("warm critics of nothing", "--warm-critic --encoder full", "warm_critic requires "),
     training("an anchor to nothing", "--anchor 3", "anchor requires refine"),
     training("an unknown backend", "--backend warp", "backend must be one of ('auto', 'eager'", "got 'warp'"),
     training("a target that is not there", "--target none.png", "target must be 'star'", "no such file: 'none.png'"),
@@ -144,7 +143,9 @@ OTHERS = [
     distilling("no labels", "--capacity 0", "capacity must be at least 1, got 0"),
     evaluating("nothing", "", "either policy or a folder must be given, got None"),
     evaluating("a folder that is not there", "{folder}/none", "none: there is no run (no config.json)"),
-    evaluating("an unknown policy", "--policy alchemy", "no shipped one has that name (catch, dig, grow, kick, "),
+    evaluating(
+        "an unknown policy", "--policy alchemy", "no shipped one has that name (catch, dig, grow, grow-success, kick, "
+    ),
     evaluating("no episodes", "--policy run --episodes 0", "episodes must be at least 1, got 0"),
     evaluating(
         "episodes of 401 digits",

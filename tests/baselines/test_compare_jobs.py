@@ -47,14 +47,14 @@ def test_names_in_a_plan_that_mean_nothing_are_reported(tmp_path, capsys):
 
 
 def test_options_without_effect_are_refused_where_they_are_for_one_algorithm(tmp_path, capsys):
-    idle = {"learning": {"warm_critic": True}}
+    idle = {"learning": {"noise_cells": 4}}
     for algos in ({"gnn-16": idle}, {"gnn-16": {"tasks": {"run": idle}}}, {"gnn": {"algo": "gnn-16", **idle}}):
         (label,) = algos
         assert compare(tmp_path / "out", "--algos", label, "--tasks", "run", plan={"algos": algos}) == 2
         error = capsys.readouterr().err
-        assert f"{label} on run: warm_critic requires " in error
+        assert f"{label} on run: noise_cells requires " in error
     full = {"network": {"encoder": "full"}}
-    plan = {"common": idle, "algos": {"cfp": full, "coarse": full, "gnn-16": {"learning": {"warm_critic": False}}}}
+    plan = {"common": idle, "algos": {"cfp": full, "coarse": full, "gnn-16": {"learning": {"noise_cells": 0}}}}
     assert compare(tmp_path / "out", "--dry-run", "--algos", "cfp", "coarse", "gnn-16", plan=plan) == 0
 
 

@@ -300,11 +300,13 @@ def test_privileged_policy_becomes_one_of_images_that_cfp_refines(privileged, tm
     std = policy.actor.std(torch.zeros(1, 32, 4, 4))
     assert torch.nn.functional.softplus(3 * std - 1).mean() == pytest.approx(0.105, abs=1e-3)
     options = "--steps 24 --handover 12 --batch-size 4 --update-start 8 --actor-start 6 --eval-every 12".split()
-    refined = [*TINY, *options, "--learner", "sac", "--refine", "--start-from", str(folder)]
+    grids = TINY.index("--resolutions")
+    refined = [*TINY[:grids], *TINY[grids + 3 :], *options, "--learner", "sac", "--refine", "--start-from", str(folder)]
     assert cfp.train.main([*refined, "--out", str(tmp_path / "refined")]) == 0
     first = read_table(tmp_path / "refined" / "evaluations.csv")[0]
     assert (first["step"], first["stage"]) == ("12", "2")
-    assert cfp.load(tmp_path / "refined").description["task"] == "shapematch"
+    refined_policy = cfp.load(tmp_path / "refined")
+    assert refined_policy.description["task"] == "shapematch" and refined_policy.spec.resolutions == (4, 8)
     assert baselines.load(folder).spec == policy.spec
     capsys.readouterr()
 
@@ -335,7 +337,7 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch, caps
         ("shapematch", "gradient", "T", "teacher must be a policy for the target star, got T"),
         ("kick", "gradient", None, "teacher must be a policy for run, got one for kick"),
         ("run", "gradient", "T", "teacher: cannot compare its target"),
-        (None, "", None, "teacher must be mpc, shac, gradient, catch, dig, grow, kick, obstacle, run, "),
+        (None, "", None, "teacher must be mpc, shac, gradient, catch, dig, grow, grow-success, kick, obstacle, run, "),
     ],
 )
 def test_teacher_that_does_not_fit_is_refused(tmp_path, capsys, task, kind, target, message):

@@ -97,6 +97,11 @@ def model_of(algo, folder):
     return find(algo).create(config(algo), 1, folder).model
 
 
+def test_options_common_to_a_comparison_may_have_cells_of_noise(tmp_path):
+    common = replace(config("gnn-16"), learning=replace(config("gnn-16").learning, noise_cells=4))
+    assert find("gnn-16").create(common, 1, tmp_path).model.noise is None
+
+
 @pytest.mark.parametrize("algo", ["gnn-16", "transformer-16"])
 def test_updates_reduce_the_critic_loss_of_a_fixed_batch(algo, tmp_path):
     model = model_of(algo, tmp_path / "run")

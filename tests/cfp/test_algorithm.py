@@ -9,6 +9,7 @@ import pytest
 import torch
 from fakes import FakeEnv
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch.nn import functional as F
 
@@ -17,7 +18,7 @@ from cfp.agent.policies import CFPPolicy
 from cfp.agent.sac import CFP, METRICS
 from cfp.agent.spec import ActorSpec
 from cfp.envs.vec_env import monitored
-from cfp.errors import NonFiniteError
+from cfp.errors import ConfigError, NonFiniteError
 
 ALPHA, RHO, GAMMA, LIMIT = 0.03, 0.7, 0.9, 0.05
 
@@ -205,7 +206,7 @@ def test_random_phase_and_start_of_updates_are_two_settings():
 
 
 def test_actor_waits_for_the_critics_and_has_a_rate_of_its_own():
-    model = make_model(ActorSpec((8,)), update_start=4, batch_size=4, random_steps=0, actor_start=10, actor_rate=0.0)
+    model = make_model(ActorSpec((8,)), update_start=4, batch_size=4, random_steps=0, actor_start=10, actor_rate=1e-30)
     actor, critic, _ = model.networks()
     before = [[p.clone() for p in network.parameters()] for network in (actor, critic)]
     same = lambda: [  # noqa: E731
@@ -317,13 +318,27 @@ def test_learning_improves_the_return():
 
 
 def test_saved_archive_of_the_base_library_keeps_everything(tmp_path):
-    model = make_model(ActorSpec((8,)), update_start=4)
+    model = make_model(ActorSpec((8,)), update_start=4, weight_average=0.9)
     model.learn(12)
     model.save(tmp_path / "model.zip")
     again = CFP.load(tmp_path / "model.zip", device="cpu")
+    averaged = again.trained_actor.state_dict()
+    assert all(torch.equal(averaged[name], value) for name, value in model.trained_actor.state_dict().items())
     assert torch.equal(again.reward_statistics.mean, model.reward_statistics.mean)
     for name, value in model.policy.state_dict().items():
         assert torch.equal(again.policy.state_dict()[name], value)
+
+
+def test_hyperparameters_are_checked_and_not_given_twice():
+    with pytest.raises(TypeError, match="CFP takes gamma, learning_rate from hyperparameters"):
+        make_model(ActorSpec((8,)), sac_options={"learning_rate": 1e-3, "gamma": 0.9})
+    with pytest.raises(ConfigError, match="noise_cells must be one of"):
+        make_model(ActorSpec((8,)), noise_cells=3)
+    noise = NormalActionNoise(np.zeros(128), np.ones(128))
+    with pytest.raises(ConfigError, match="noise_cells must be 0 with action_noise, got 4"):
+        make_model(ActorSpec((8,)), sac_options={"action_noise": noise}, noise_cells=4)
+    model = make_model(ActorSpec((8,)), sac_options={"replay_buffer_kwargs": {"seed": 3}}, n_steps=3)
+    assert model.replay_buffer.n_steps == 3
 
 
 def test_wrong_action_grid_is_refused():

@@ -151,7 +151,12 @@ def test_a_step_keeps_its_duration_with_other_substeps():
     assert substeps() == (1e-4, 100)
     assert substeps("--dt", "2e-4") == (2e-4, 50)
     assert substeps("--dt", "2e-4", "--substeps", "10") == (2e-4, 10)
-    for wrong, message in (("3e-4", "dt must divide"), ("0", "dt must be positive"), ("5e-4", "dt must be at most")):
+    for wrong, message in (
+        ("3e-4", "dt must divide"),
+        ("1e-320", "dt must divide"),
+        ("0", "dt must be positive"),
+        ("5e-4", "dt must be at most"),
+    ):
         with pytest.raises(ConfigError, match=message):
             substeps("--dt", wrong)
 

@@ -1,8 +1,10 @@
 """``--dry-run`` prints options; a run warns of stages that learn nothing."""
 
 import json
+from dataclasses import replace
 
 from cfp import train
+from cfp.analytic.learner import AnalyticLearner
 from cfp.config import Config
 from cfp.experiment.coarse_to_fine import CoarseToFine
 from cfp.experiment.training import parse
@@ -34,3 +36,10 @@ def test_stages_that_learn_nothing_are_named(tmp_path):
     assert warnings(*learns) == []
     late = "stage 2: no actor update in its 180 steps (--actor-start 200)"
     assert warnings(*learns, "--handover", "220", "--actor-start", "200") == [late]
+
+
+def test_stages_in_which_only_the_critic_learns_are_named(tmp_path):
+    config = parse(train.PROGRAM, "--task run --steps 6000".split()).run
+    line = "stage 2: only the critic learns in its 1,500 steps (--warmup 15)"
+    assert AnalyticLearner.warnings(config, tmp_path, 1) == [line]
+    assert AnalyticLearner.warnings(replace(config, steps=7000), tmp_path, 1) == []

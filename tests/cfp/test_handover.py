@@ -1,7 +1,7 @@
-"""From one level to the next: by plateau, from another run's policy, with warm critics."""
+"""From one level to the next: by plateau, from another run's policy."""
 
 import json
-from dataclasses import replace
+import shutil
 
 import pytest
 import torch
@@ -9,10 +9,6 @@ from tiny_runs import run
 
 from cfp import train
 from cfp.evaluation.evaluate import Result
-from cfp.experiment.coarse_to_fine import CoarseToFine
-from cfp.experiment.process import StopSignals
-from cfp.experiment.run import TrainingRun
-from cfp.experiment.training import parse
 from cfp.tables import read_table
 from cfp.train import PROGRAM
 
@@ -69,7 +65,6 @@ def test_second_level_starts_from_a_policy(coarse, tmp_path, name):
     [
         (["--task", "run"], "start_from must be a policy for run, got one for shapematch"),
         (["--refine", "--resolutions", "8", "16"], "start_from must be a policy of the first resolutions of (8, 16)"),
-        (["--warm-critic"], "warm_critic must be False with start_from"),
         (["--start-from", "no/such"], "there is no policy"),
         (["--encoder", "full"], "start_from must be a policy with encoder full, got lean"),
         (["--target", "T"], "start_from must be a policy for the target T, got None"),
@@ -114,30 +109,17 @@ def test_ladder_of_three_levels_in_one_command(tmp_path):
     ]
 
 
-@pytest.mark.parametrize("warm", [False, True])
-def test_critics_of_a_level_begin_with_those_before_if_asked_to(tmp_path, monkeypatch, warm):
-    options = (
-        "--learner sac --encoder full --particles 100 --substeps 1 --num-envs 2 --resolutions 4 8 --device cpu".split()
-    )
-    config = parse(PROGRAM, [*options, "--warm-critic" if warm else "--no-warm-critic"]).run
-    config = replace(config, report=replace(config.report, eval_every=0))
-    seen = []
-
-    def learn(algorithm, steps, callbacks):
-        model = algorithm.model
-        seen.append({key: value.clone() for key, value in model.policy.critic.state_dict().items()})
-        assert (model.reward_statistics.mean.item() == 7) == (warm and len(seen) == 2)
-        with torch.no_grad():
-            for network in model.networks()[1:]:
-                for parameter in network.parameters():
-                    parameter.fill_(0.125)
-        model.reward_statistics.mean.fill_(7)
-        callbacks.callbacks[0].stage.save_policy()
-
-    monkeypatch.setattr(CoarseToFine, "learn", learn)
-    TrainingRun(CoarseToFine, config, tmp_path / "run", False, StopSignals()).train()
-    kept = all((value == 0.125).all() for key, value in seen[1].items() if value.requires_grad or "patches" not in key)
-    assert kept == warm
+def test_run_without_a_checkpoint_is_continued_with_its_own_options_only(coarse, tmp_path, capsys):
+    """Its first evaluation, and the policy that it kept, belong to the options that it was started with."""
+    folder, options = tmp_path / "a", "--refine --resolutions 4 --handover --steps 40 --random-steps 4".split()
+    options += "--alpha 0.01 --gate-bias --gate-penalty --start-from".split()
+    assert run(folder, *options, str(coarse)) == 0
+    shutil.rmtree(folder / "checkpoint")
+    assert run(folder, *options, str(coarse), "--seed", "7", "--resume") == 2
+    assert "seed: the run was started with 0, got 7" in capsys.readouterr().err
+    (folder / "config.json").unlink()
+    assert run(folder, *options, str(coarse), "--resume") == 2
+    assert "config.json: cannot be read" in capsys.readouterr().err
 
 
 def test_refining_goes_on_with_the_weights_of_a_policy(coarse, tmp_path):

@@ -201,11 +201,20 @@ def test_other_forms_of_addresses_are_refused(address):
         cfp.load(address)
 
 
-def test_what_the_hub_refuses_is_one_error(server, policy):
+def test_what_the_hub_refuses_is_one_error(server, policy, monkeypatch):
+    class TransportError(Exception):
+        """What the library that carries the requests raises: neither `OSError` nor `ValueError`."""
+
+    def unreachable(*arguments, **options):
+        raise TransportError("no route to host")
+
     with pytest.raises(cfp.CheckpointError, match="hf://someone/else: cannot be downloaded"):
         cfp.load("hf://someone/else")
     with pytest.raises(cfp.ConfigError, match="cannot push to 'no name'"):
         policy.push("no name")
+    monkeypatch.setattr(huggingface_hub, "create_repo", unreachable)
+    with pytest.raises(cfp.ConfigError, match="cannot push to 'someone/runner' \\(no route to host\\)"):
+        policy.push(REPO)
     with pytest.raises(cfp.ConfigError, match="policy must come from a run"):
         ActorPolicy(ActorSpec((8,))).push(REPO)
 

@@ -31,6 +31,7 @@ def test_a_control_step_keeps_its_duration_unless_both_are_given() -> None:
         (3e-4, r"dt must divide the control step of 0\.01 s if substeps is not given, got 0\.0003"),
         (0.02, "dt must divide"),
         (0.0, "dt must be positive, got 0.0"),
+        (1e-320, "dt must divide"),
         ("short", "dt must be a number, got 'short'"),
     ],
 )

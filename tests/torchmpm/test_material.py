@@ -274,6 +274,9 @@ def test_lame() -> None:
     mu, lam = lame(young, poisson)
     torch.testing.assert_close(mu * (3 * lam + 2 * mu) / (lam + mu), young)
     torch.testing.assert_close(lam / (2 * (lam + mu)), poisson)
+    for wrong in (-1.0, torch.tensor([1.0, -1.0])):
+        with pytest.raises(ValueError, match=r"young must not be negative, got -1\.0"):
+            lame(wrong, 0.3)
 
 
 @pytest.mark.parametrize("name", ["mu", "lam", "yield_stress"])

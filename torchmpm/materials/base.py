@@ -47,7 +47,8 @@ def lame(young: Value, poisson: Value) -> tuple[Value, Value]:
     Raises:
         ValueError: A number is out of range, or one of a tensor.
     """
-    checks.value("young", young, least=0.0)
+    checks.value("young", young)
+    checks.entries("young", young, least=0.0)
     checks.value("poisson", poisson)
     checks.entries("poisson", poisson, above=-1.0, below=0.5)
     return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
