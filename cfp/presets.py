@@ -238,9 +238,9 @@ def from_json(values: dict[str, Any]) -> CoarseToFineConfig:
 def like_start(base: Options, values: dict[str, Any]) -> Options:
     """A default configuration for the policy that the JSON ``values`` start from, if any.
 
-    A policy of as many stages that is refined keeps its action grids. For policies with the paper's networks the next grid is the
-    paper's; an update takes several times as long, so there are fewer, and strong exploration noise would disturb a
-    policy that can do something already. What else the preset changes was not measured for such policies.
+    A policy of as many stages that is refined keeps its action grids. For policies with the paper's networks the next
+    grid is the paper's; an update takes several times as long, so there are fewer, and strong exploration noise would
+    disturb a policy that can do something already. What else the preset changes was not measured for such policies.
     """
     if not isinstance(base, CoarseToFineConfig) or values.get("start_from") is None:
         return base

@@ -1,7 +1,7 @@
 """Films of the policies that come with the package: `python docs/media.py [POLICY ...]`.
 
-Each policy gets `images/films/POLICY.webp`, and those of all tasks together `images/tasks.webp`. `images/films/sources.json`
-keeps the hash of the policy behind each film; a test compares them with those of the package.
+Each policy gets `images/films/POLICY.webp`, and those of all tasks together `images/tasks.webp`. The hash of the policy
+behind each film is kept in `images/films/sources.json`; a test compares them with those of the package.
 """
 
 import hashlib
