@@ -78,7 +78,7 @@ ANALYTIC: dict[str, dict[str, Any]] = {
         "num_layouts": 256,
     },
     "run": _LONG_MEMORY | {"steps": 12_800, "handover": (9_600,)},
-    "kick": _LONG_MEMORY | {"action_step": (0.15, 0.02)},
+    "kick": _LONG_MEMORY | {"steps": 41_600, "handover": (38_400,), "action_step": (0.15, 0.02)},
     "grow": {"steps": 16_000, "handover": (12_800,)},
     "obstacle": {"steps": 25_600, "handover": (22_400,), "final_step": 0.3, "displacement": True},
     "slot": {"steps": 19_200, "handover": (16_000,)},
