@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zipfile
-import zlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -13,9 +12,9 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 from cfp.errors import CheckpointError
 from cfp.files import write_atomically
+from dittogym.trajectories.storage import ZIP_ERRORS
 
 FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-_DAMAGED = (zipfile.BadZipFile, zlib.error, NotImplementedError)  # what zipfile raises
 _COMPRESSED = ("observations", "next_observations")  # images shrink thirtyfold, actions are noise
 
 
@@ -93,5 +92,5 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         with open(path, "rb") as file, np.load(file) as archive:
             return {name: archive[name] for name in FIELDS}
-    except (OSError, ValueError, KeyError, EOFError, MemoryError, *_DAMAGED) as error:
+    except (OSError, ValueError, KeyError, EOFError, MemoryError, *ZIP_ERRORS) as error:
         raise CheckpointError(f"{path}: this part of the replay buffer is missing or damaged ({error})") from error

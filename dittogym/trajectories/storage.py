@@ -18,7 +18,8 @@ from dittogym.trajectories.episode import Episode
 from torchmpm import checks
 
 FORMAT, VERSION = "dittogym-episodes", 1
-_DAMAGED = (zipfile.BadZipFile, zlib.error, NotImplementedError)  # what zipfile raises
+ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, NotImplementedError)
+"""What zipfile raises for damaged archives, besides `OSError` and `EOFError`."""
 ARRAYS = ("observations", "actions", "rewards", "terminations", "truncations")
 
 
@@ -63,7 +64,7 @@ def load_episodes(path: str | os.PathLike[str]) -> list[Episode]:
     with open(path, "rb") as file:
         try:
             return _read(file)
-        except (OSError, LookupError, AttributeError, TypeError, ValueError, EOFError, *_DAMAGED) as error:
+        except (OSError, LookupError, AttributeError, TypeError, ValueError, EOFError, *ZIP_ERRORS) as error:
             form = f"a {FORMAT} file of version {VERSION}"
             raise ValueError(f"path must be {form}, got {str(path)!r} ({error})") from error
 
