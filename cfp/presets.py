@@ -80,7 +80,7 @@ ANALYTIC: dict[str, dict[str, Any]] = {
     "run": _LONG_MEMORY | {"steps": 12_800, "handover": (9_600,)},
     "kick": _LONG_MEMORY | {"steps": 41_600, "handover": (38_400,), "action_step": (0.15, 0.02)},
     "grow": {"steps": 16_000, "handover": (12_800,)},
-    "obstacle": {"steps": 25_600, "handover": (22_400,), "final_step": 0.3, "displacement": True},
+    "obstacle": {"steps": 48_000, "handover": (44_800,), "final_step": 0.3, "displacement": True},
     "slot": {"steps": 19_200, "handover": (16_000,)},
     "catch": {"steps": 28_800, "handover": (25_600,), "max_episode_steps": 300},
     "dig": {"steps": 28_800, "handover": (25_600,), "weight_average": 0.98},

@@ -237,6 +237,28 @@ def rewards_figure(path: Path) -> None:
     drawing.savefig(path, metadata={"Date": None})
 
 
+def rewards_tasks_figure(path: Path) -> None:
+    """Draw the evaluations of the learner ``sac`` during training in all tasks, one line for each seed and stage."""
+    rows = read("rewards-tasks.csv")
+    drawing = Figure(figsize=(7.2, 4.4), layout="constrained")
+    FigureCanvasSVG(drawing)
+    for axis, task in zip(drawing.subplots(2, 4).flat, dict.fromkeys(row["task"] for row in rows), strict=True):
+        axis.axhline(float(shipped(task, "zero")["mean"]), color="0.65", zorder=0)
+        axis.axhline(paper.CURVES[task][0][0], color="#b03a2e", linestyle="--", zorder=0)
+        for index, seed in enumerate(dict.fromkeys(row["seed"] for row in rows if row["task"] == task)):
+            for stage, line in (("1", ":"), ("2", "-")):
+                own = [row for row in rows if (row["task"], row["seed"], row["stage"]) == (task, seed, stage)]
+                points = [int(row["steps"]) / 1000 for row in own], [float(row["mean"]) for row in own]
+                axis.plot(*points, line, marker="o", ms=3, color=f"C{index}")
+        axis.set_xlim(left=0)
+        axis.set_title(headline(task)[0], fontsize=9)
+        axis.tick_params(labelsize=8)
+        axis.spines[["top", "right"]].set_visible(False)
+    drawing.supxlabel("thousands of environment steps", fontsize=9)
+    drawing.supylabel("return", fontsize=9)
+    drawing.savefig(path, metadata={"Date": None})
+
+
 def ablation_figure(path: Path) -> None:
     """Draw learning curves of the learner ``analytic`` on SHAPE MATCH, one panel for each option that is changed."""
     rows = read("analytic-shapematch.csv")
@@ -278,5 +300,6 @@ def write_results() -> None:
     figure(PAGES / "returns.svg")
     comparison_figure(PAGES / "comparison.svg")
     rewards_figure(PAGES / "rewards.svg")
+    rewards_tasks_figure(PAGES / "rewards-tasks.svg")
     ablation_figure(PAGES / "ablation.svg")
     write(PAGES / "ablation.md", ablation())
