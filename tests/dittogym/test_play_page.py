@@ -142,8 +142,8 @@ def test_sliders_and_files(played: Played) -> None:
     page.click("#play")
     with page.expect_download() as caught:
         page.click("#actions")
-    saved = np.load(caught.value.path())
-    assert saved["actions"].shape[1:] == (2, 8, 8) and list(saved["touched"]) == ["other matter or gravity"]
+    with np.load(caught.value.path()) as saved:
+        assert saved["actions"].shape[1:] == (2, 8, 8) and list(saved["touched"]) == ["other matter or gravity"]
     with page.expect_download() as caught:
         page.click("#moment")
     assert caught.value.suggested_filename.endswith(".pt") and page.is_enabled("#back")

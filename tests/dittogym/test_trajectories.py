@@ -106,7 +106,8 @@ def test_other_files_are_refused(content, reason, tmp_path):
 
 def test_archive_of_another_version_or_with_pickles_is_refused(episodes, tmp_path):
     path = trajectories.save_episodes(tmp_path / "a.npz", episodes[:1])
-    arrays = dict(np.load(path))
+    with np.load(path) as archive:
+        arrays = dict(archive)
     np.savez(path, **arrays | {"about": np.array(str(arrays["about"]).replace('"version": 1', '"version": 2'))})
     with pytest.raises(ValueError, match="its format is dittogym-episodes 2"):
         trajectories.load_episodes(path)
