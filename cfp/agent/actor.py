@@ -178,7 +178,7 @@ class ResidualActor(Actor):
         if self.trunk is None:
             self.encoder = PairEncoder(spec.split)
         else:
-            self.trunk = Trunk(self.action_size)
+            self.trunk = Trunk(resolution)
         self.gate = make_head(resolution)
         initialise(self.gate)
         self.coarse = coarse.requires_grad_(False)

@@ -66,15 +66,21 @@ class LeanEncoder(nn.Module):
 
 
 class ActionEncoder(nn.Module):
-    """Features (B, channels, 4, 4) of actions (B, 2, A, A): one layer on each of 4 x 4 tiles."""
+    """Features (B, channels, 4, 4) of actions (B, 2, A, A): one layer on each of 4 x 4 tiles of an action grid R.
 
-    def __init__(self, size: int, channels: int) -> None:
+    Composed actions are larger than the grid on which they are learned. Without the mean over each cell of the grid,
+    hundreds of weights would see nearly the same value, and an update of Adam would move their sum by as many steps.
+    """
+
+    def __init__(self, resolution: int, channels: int) -> None:
         super().__init__()
-        self.side = size // 4
+        self.resolution, self.side = resolution, resolution // 4
         self.layer = nn.Linear(2 * self.side**2, channels)
 
     def forward(self, action: Tensor) -> Tensor:
         """Encode actions."""
+        if action.shape[-1] != self.resolution:
+            action = F.adaptive_avg_pool2d(action, self.resolution)
         tiles = action.unflatten(3, (4, self.side)).unflatten(2, (4, self.side))  # (B, 2, rows, y, columns, x)
         return F.elu(self.layer(tiles.permute(0, 2, 4, 1, 3, 5).flatten(3))).movedim(-1, 1)
 
@@ -83,14 +89,14 @@ class Trunk(nn.Module):
     """The actor's own layer: from the encoder's features, and those of a coarse action, to a latent (B, 32, 4, 4).
 
     Args:
-        coarse: Rows and columns A of coarse actions; None for the first stage.
+        resolution: Action grid R on which coarse actions are read; None for the first stage, which has none.
     """
 
-    def __init__(self, coarse: int | None = None) -> None:
+    def __init__(self, resolution: int | None = None) -> None:
         super().__init__()
-        self.action = ActionEncoder(coarse, WIDTH) if coarse else None
+        self.action = ActionEncoder(resolution, WIDTH) if resolution else None
         channels = LATENT // 16
-        self.mix = nn.Conv2d(2 * WIDTH if coarse else WIDTH, channels, 3, padding=1)
+        self.mix = nn.Conv2d(2 * WIDTH if resolution else WIDTH, channels, 3, padding=1)
         self.norm = nn.GroupNorm(1, channels)
 
     def forward(self, features: Tensor, coarse: Tensor | None = None) -> Tensor:
@@ -109,14 +115,15 @@ class LeanCritics(nn.Module):
 
     Args:
         size: A.
+        resolution: Action grid R of the actor.
     """
 
     optimizer: torch.optim.Optimizer
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, resolution: int) -> None:
         super().__init__()
         self.size = size
-        self.actions = ActionEncoder(size, 2 * WIDTH)  # half of the channels for each critic
+        self.actions = ActionEncoder(resolution, 2 * WIDTH)  # half of the channels for each critic
         self.heads = nn.ModuleList(perceptron(LATENT, 256, 256, 1, norm=True) for _ in range(2))
         initialise(self)
 

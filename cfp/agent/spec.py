@@ -60,5 +60,3 @@ class ActorSpec:
             raise ConfigError(f"gate_bias must have {count} values for resolutions {self.resolutions}, got {found}")
         if self.patch is not None and not (isinstance(self.patch, int) and finest <= self.patch <= NODES):
             raise ConfigError(f"patch must be between {finest} (the finest action grid) and {NODES}, got {self.patch}")
-        if self.encoder == "lean" and self.action_size % 4:
-            raise ConfigError(f"patch must be a multiple of 4 with encoder lean, got {self.patch}")

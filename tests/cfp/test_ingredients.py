@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from cfp.agent.actor import build_actor
 from cfp.agent.exploration import LONGEST, CellNoise
-from cfp.agent.lean import halved
+from cfp.agent.lean import Encoded, LeanCritics, halved
 from cfp.agent.networks import normalise_image
 from cfp.agent.replay import ReplayRing
 from cfp.agent.spec import ActorSpec
@@ -151,8 +151,19 @@ def test_lean_policy_is_saved_and_loaded(tmp_path):
     full = build_actor(replace(spec, encoder="full"))
     count = [sum(parameter.numel() for parameter in network.parameters()) for network in (actor, full)]
     assert count[0] < 0.8 * count[1]
-    with pytest.raises(ConfigError, match="patch must be a multiple of 4"):
-        ActorSpec((4, 8), (0.0,), patch=18, encoder="lean")
+
+
+@pytest.mark.parametrize("patch", [18, 32])
+def test_lean_networks_read_means_of_actions_over_the_cells_of_their_grid(patch):
+    spec = ActorSpec((4, 8), (0.0,), patch=patch, encoder="lean")
+    action = build_actor(spec)(make_batch(8).observations, deterministic=True)
+    assert action.shape[1:] == (2, patch, patch)
+    critics = LeanCritics(patch, 8)
+    on_grid = torch.randn(3, 2, 8, 8)
+    encoded = critics.actions(on_grid)
+    torch.testing.assert_close(critics.actions(F.interpolate(on_grid, size=64)), encoded)
+    observation = Encoded(torch.zeros(len(action), 3, 32, 32), torch.randn(len(action), 16, 4, 4))
+    assert [values.shape for values in critics(observation, action)] == [(len(action), 1)] * 2
 
 
 def test_actor_starts_after_the_critics_and_rates_fall():
