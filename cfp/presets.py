@@ -90,8 +90,11 @@ reports."""
 ON_SPEED = ("run", "obstacle")
 """Tasks in which gradient methods are trained on speed to the right instead of the task's reward."""
 
-NOISE_SCALE: dict[str, tuple[float, float]] = {"shapematch": (0.1, 0.4)}
-"""Exploration noise of the presets ``quick`` and ``long`` where it is weaker: without gravity it tears robots."""
+SAC: dict[str, dict[str, Any]] = {
+    "shapematch": {"noise_scale": (0.1, 0.4)},  # without gravity strong noise tears robots
+    "dig": {"gamma": 0.99},  # the way through the soil takes hundreds of steps
+}
+"""Options of the presets ``quick`` and ``long`` of the learner ``sac`` that differ from task to task."""
 DEFAULT_TASK = "shapematch"
 """Task of a command line that names none."""
 CUSTOM_TASK = TASKS["run"]
@@ -183,6 +186,21 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
     """Minutes instead of days: many small robots, small networks with many updates, coarser actions first."""
     paper, steps, horizon = _paper(task, numbers), 25_600, dittogym.make_spec(task).horizon
     coarse = numbers.resolutions[0]
+    learning = LearningConfig(
+        batch_size=64,
+        learning_rate=5e-4,
+        gamma=0.95,
+        tau=0.01,
+        buffer_size=20_000,
+        gradient_steps=16,
+        actor_start=800,
+        noise_cells=4,
+        noise_scale=(0.2, 1.0),
+        final_rate=0.1,
+        n_steps=3,
+        weight_average=0.998,
+        max_episode_steps=max(30, horizon // 4),
+    )
     return replace(
         paper,
         preset="quick",
@@ -191,24 +209,11 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
         handover=(steps // 2,),
         resolutions=(coarse // 2, coarse) if coarse > 4 else numbers.resolutions,
         random_steps=(480, 100),
-        alpha=(0.5 * numbers.alpha[0],) * 2,
+        # Smaller cells matter less, each in proportion to its area; with the same temperature, residuals stay random.
+        alpha=(0.5 * numbers.alpha[0], 0.125 * numbers.alpha[0]),
         environment=EnvironmentConfig(),
         network=replace(paper.network, interpolation="half_pixel", encoder="lean"),
-        learning=LearningConfig(
-            batch_size=64,
-            learning_rate=5e-4,
-            gamma=0.95,
-            tau=0.01,
-            buffer_size=20_000,
-            gradient_steps=16,
-            actor_start=800,
-            noise_cells=4,
-            noise_scale=NOISE_SCALE.get(task, (0.2, 1.0)),
-            final_rate=0.1,
-            n_steps=3,
-            weight_average=0.998,
-            max_episode_steps=max(30, horizon // 4),
-        ),
+        learning=replace(learning, **SAC.get(task, {})),
         report=ReportConfig(eval_every=steps // 8, checkpoint_every=steps // 16, log_every=320),
     )
 
