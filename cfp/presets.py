@@ -209,8 +209,7 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
         handover=(steps // 2,),
         resolutions=(coarse // 2, coarse) if coarse > 4 else numbers.resolutions,
         random_steps=(480, 100),
-        # Smaller cells matter less, each in proportion to its area; with the same temperature, residuals stay random.
-        alpha=(0.5 * numbers.alpha[0], 0.125 * numbers.alpha[0]),
+        alpha=(0.5 * numbers.alpha[0],) * 2,
         environment=EnvironmentConfig(),
         network=replace(paper.network, interpolation="half_pixel", encoder="lean"),
         learning=replace(learning, **SAC.get(task, {})),
