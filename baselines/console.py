@@ -1,5 +1,6 @@
 """``torchmpm``: one command for all programs; it imports only the program that it starts."""
 
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -47,6 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     module, _ = PROGRAMS[name]
     if name == "train" and not any(word.partition("=")[0] == "--algo" for word in words):
         module = "cfp.train"
+    sys.path.insert(0, os.getcwd())  # as `python -m` does, for tasks that are defined there
     sys.argv = [f"torchmpm {name}", *words]  # from which the programs read their options and their name
     code: int = import_module(module).main()
     return code

@@ -136,6 +136,11 @@ class StagedConfig(RunConfig):
     per_residual_stage: ClassVar[tuple[str, ...]] = ("handover", "gate_bias")
     """Options with one value for each stage but the first."""
 
+    @property
+    def update_every(self) -> int:
+        """Environment steps from one update to the next."""
+        return self.environment.num_envs
+
     def ends(self) -> tuple[int, ...]:
         """Environment steps since the beginning of the run after which each stage ends."""
         return (*self.handover, self.steps)
@@ -189,9 +194,10 @@ class StagedConfig(RunConfig):
         for name, count in self._counts().items():
             if (found := len(getattr(self, name))) != count:
                 raise ConfigError(f"{name} must have {count} values for resolutions {self.resolutions}, got {found}")
-        if any(end <= start for start, end in pairwise((0, *self.ends()))):
-            allowed = f"increase between 0 and the number of steps, {self.steps}"
-            raise ConfigError(f"handover must {allowed}, got {self.handover}")
+        lengths = tuple(end - start for start, end in pairwise((0, *self.ends())))
+        if min(lengths) < (least := self.update_every):
+            allowed = f"leave at least {least} of {self.steps} steps for every stage, those before an update"
+            raise ConfigError(f"handover must {allowed}, got {self.handover}, stages of {lengths} steps")
 
     def _counts(self) -> dict[str, int]:
         """Number of values of each option that has one for each stage or residual stage."""

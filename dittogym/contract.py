@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dittogym.reward_ops import RewardOps
-from torchmpm import ParticleState
+from torchmpm import ParticleState, checks
 
 #: Terms that the engine adds to those of a task.
 ENGINE_TERMS = frozenset({"split", "action", "alive", "failure"})
@@ -106,6 +106,9 @@ class Outcome(NamedTuple):
     success: Tensor | None = None
     info: Mapping[str, Tensor] | None = None
     memory: Mapping[str, Tensor] | None = None
+
+    def __post_init__(self) -> None:
+        checks.instance("terms", self.terms, Mapping)
 
 
 Memory: TypeAlias = Mapping[str, Tensor]

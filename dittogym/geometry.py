@@ -150,12 +150,16 @@ def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True, fric
         friction: Coulomb coefficient of its faces; ``math.inf`` sticks, as the floor does.
 
     Raises:
-        ValueError: A range is not two node indices, the friction is negative, or the box is narrower than four nodes.
+        ValueError: A range is not two node indices in order, the friction is negative, or the box is narrower than
+            four nodes.
     """
     for axis, given in (("i", i), ("j", j)):
-        kinds = {int} if axis == "i" else {int, type(None)}
+        kinds, open_ends = ({int}, "") if axis == "i" else ({int, type(None)}, ", None for an open end")
         if not isinstance(given, tuple) or len(given) != 2 or not {type(end) for end in given} <= kinds:
-            raise ValueError(f"{axis} must be a range (low, high) of node indices, got {given!r}")
+            raise ValueError(f"{axis} must be a range (low, high) of node indices{open_ends}, got {given!r}")
+        first, last = given
+        if first is not None and last is not None and first > last:
+            raise ValueError(f"{axis} must be a range (low, high) with low <= high, got {given}")
     low, high = j
     box = nodes(*i, -inf if low is None else low, inf if high is None else high)
     return Obstacle(name, (box,), friction, observed=None if visible else ())

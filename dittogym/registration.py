@@ -40,6 +40,8 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
         raise ValueError(f"task must be a name of letters, digits and underscores, got {task!r}")
     if not isinstance(namespace, str) or re.fullmatch(r"[\w:-]+", namespace) is None:
         raise ValueError(f"namespace must be a name of letters, digits, underscores and dashes, got {namespace!r}")
+    if isinstance(make, TaskSpec):
+        raise TypeError("make must be a function that returns a TaskSpec, got a TaskSpec")
     spec = make()
     if not isinstance(spec, TaskSpec):
         raise TypeError(f"make must return a TaskSpec, got {type(spec).__name__}")

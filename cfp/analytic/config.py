@@ -76,6 +76,11 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
     own_learner: ClassVar[Learner] = "analytic"
     per_stage: ClassVar[tuple[str, ...]] = ("action_step",)
 
+    @property
+    def update_every(self) -> int:
+        """Environment steps from one update to the next: a window of all robots."""
+        return self.window * self.environment.num_envs
+
     def ineffective(self) -> dict[str, str]:
         """Options without effect: layouts are counted from the seed."""
         return super().ineffective() | COUNTED_LAYOUTS

@@ -75,7 +75,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         with torch.no_grad():
             outputs = actor.outputs(image, deterministic=True, generator=self.generator)
         example = (image[0], outputs.location[0])
-        self.memory = ImageMemory(config.windows_kept * config.window * self.env.num_envs, example)
+        self.memory = ImageMemory(config.windows_kept * config.update_every, example)
 
     @staticmethod
     def preset(task: str, name: str) -> AnalyticConfig:
@@ -96,7 +96,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
     @classmethod
     def warnings(cls, config: AnalyticConfig, folder: Path, first_stage: int) -> list[str]:
         """Stages that end before their policy learns."""
-        lines, warmup = [], config.warmup * config.window * config.environment.num_envs
+        lines, warmup = [], config.warmup * config.update_every
         for stage in range(first_stage, len(config.ends()) + 1):
             starts_trained = stage > 1 or refines(config, folder, stage)
             if starts_trained and (steps := config.stage_steps(stage)) <= warmup:
@@ -117,7 +117,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         learning_rate = config.learning_rate * linear_decay(progress)
         step_size = config.action_step[self.stage - 1] * linear_decay(progress, config.final_step)
         minibatches = config.minibatches
-        if self.starts_trained and self.memory.count < config.warmup * config.window * self.env.num_envs:
+        if self.starts_trained and self.memory.count < config.warmup * config.update_every:
             # steps towards the values of an untrained critic, fitted to a few windows, would spoil the policy
             step_size, minibatches = 0.0, 0
         images, improved, window = self._improve(step_size)
@@ -127,7 +127,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
             batch = self.memory.sample(config.minibatch_size, self.generator)
             regression_loss = self.regression.update(*batch, learning_rate)
         critic_loss = self.critic.update(window, learning_rate)
-        self.num_timesteps += config.window * self.env.num_envs
+        self.num_timesteps += config.update_every
         return self.collector.scalars(window) | {
             "train/critic_loss": critic_loss,
             "train/regression_loss": float(regression_loss),

@@ -123,8 +123,10 @@ def complete(
         folder = out or Path("runs") / read(program.configure(values)).run.name
         if (folder / "config.json").exists():
             past = read_config(folder, program.configure)
-            if (algo := values.get("algo", past.algo)) != past.algo:
-                raise ConfigError(f"algo must be {past.algo!r}, that of the run in {folder}, got {algo!r}")
+            for name in ("algo", "learner"):
+                own = getattr(past, name, None)
+                if own is not None and (given := values.get(name, own)) != own:
+                    raise ConfigError(f"{name} must be {own!r}, that of the run in {folder}, got {given!r}")
             command = read(update_from_dict(past, values))  # a value that differs from the run's is refused later
             command.run.check()
             return replace(command, out=folder)

@@ -10,21 +10,16 @@ from typing import TypeAlias
 
 import cv2
 import numpy as np
-import torch
 
 from dittogym.bodies.images import PictureLike, read_mask
 from dittogym.bodies.shapes import Figure, Shape
 from dittogym.spec import BodySpec, TaskSpec
-from dittogym.window import contains
-from torchmpm import sampling
 
 #: A path or an array (picture), (K, 2) corners (outline), a shape, or a body.
 BodyLike: TypeAlias = "PictureLike | Sequence[tuple[float, float]] | Shape | BodySpec"
 
 #: Pixels along the longer side of an outline.
 OUTLINE_PIXELS = 512
-#: Points with which the spread of a shape is measured.
-PROBE = 4096
 
 
 def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
@@ -41,17 +36,14 @@ def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
             :mod:`dittogym.bodies.shapes` in world coordinates; or a :class:`dittogym.spec.BodySpec`.
 
     Raises:
-        ValueError: Not readable as one of these, empty, out of the window, in the place of the task's object, or so
-            long that the task would end at once.
+        ValueError: Not readable as one of these, or empty.
     """
     own = spec.robot
     if isinstance(body, Shape):
         body = replace(own, shape=body, count=max(1, round(own.count * body.area / own.shape.area)))
     elif not isinstance(body, BodySpec):
         body = replace(own, shape=_figure(body, own.shape))
-    spec = replace(spec, robot=body)
-    _check_place(spec)
-    return spec
+    return replace(spec, robot=body)
 
 
 def _figure(body: PictureLike | Sequence[tuple[float, float]], own: Shape) -> Figure:
@@ -91,23 +83,3 @@ def _filled(corners: np.ndarray) -> np.ndarray:
     if not (image > outline).any():
         raise ValueError(f"body must have corners that enclose an area, got {corners.tolist()}")
     return np.flipud(image).astype(bool)
-
-
-def _check_place(spec: TaskSpec) -> None:
-    shape = spec.robot.shape
-    (left, bottom), (width, height) = shape.corner, shape.size
-    points = shape.positions(sampling.sobol(PROBE, seed=0))
-    origin = spec.window.origin(torch.from_numpy(points.mean(0, keepdims=True)))
-    corners = origin.new_tensor([[(left, bottom), (left + width, bottom + height)]])
-    if not bool(contains(corners, origin).all()):
-        window = f"{origin[0, 0]:.3f} < x < {origin[0, 0] + 1:.3f}, 0 < y < 1"
-        place = f"{left:.3f} < x < {left + width:.3f}, {bottom:.3f} < y < {bottom + height:.3f}"
-        raise ValueError(f"body must lie inside the window ({window}), got {place}")
-    for other in spec.objects:
-        low, high = np.array(other.shape.corner), np.array(other.shape.corner) + other.shape.size
-        if ((points > low) & (points < high)).all(1).any():
-            place = f"{low.round(4).tolist()} to {high.round(4).tolist()}"
-            raise ValueError(f"body must leave the place of the object free, {place}")
-    split, limit = float(np.sqrt(points.var(0).sum())), spec.split_limit
-    if limit is not None and split >= limit:
-        raise ValueError(f"body must be more compact: its spread is {split:.3f} m, and {spec.name} ends at {limit} m")

@@ -42,7 +42,7 @@ def particle_counts(spec: TaskSpec, particles: Particles) -> tuple[int, ...]:
     elif isinstance(particles, (tuple, list)) and len(particles) == len(full):
         counts = tuple(checks.whole(f"particles[{i}]", n, 1) for i, n in enumerate(particles))
     else:
-        allowed = f"'full', 'lite', a number, or {len(full)} number(s), one a body"
+        allowed = f"'full', 'lite', a number of robot particles, or a tuple of {len(full)}, one for each body"
         raise ValueError(f"particles must be {allowed}, got {particles!r}")
     if min(counts) < 1:
         raise ValueError(f"particles must be at least 1 for every body, got {particles!r}")

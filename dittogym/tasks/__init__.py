@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dittogym.bodies.drawings import BodyLike, with_body
+from dittogym.bodies.place import check_place
 from dittogym.geometry import Obstacle, obstacle_from
 from dittogym.spec import TaskSpec
 from dittogym.tasks.catch import catch
@@ -86,7 +87,8 @@ def make_spec(
         options: Options of that task, such as ``target`` of SHAPE MATCH.
 
     Raises:
-        ValueError: There is no such task, or the body does not fit into it.
+        ValueError: There is no such task, or its robot leaves the window, overlaps an obstacle or the object, or counts
+            as torn from the start.
         TypeError: The task has no such option, or the obstacles are not a sequence of Obstacle.
     """
     if isinstance(task, TaskSpec):
@@ -111,4 +113,6 @@ def make_spec(
         obstacles = [obstacle_from(each) for each in obstacles] if isinstance(obstacles, list | tuple) else obstacles
         checks.instances("obstacles", obstacles, Obstacle)
         spec = replace(spec, obstacles=tuple(obstacles))
-    return spec if body is None else with_body(spec, body)
+    spec = spec if body is None else with_body(spec, body)
+    check_place(spec)
+    return spec

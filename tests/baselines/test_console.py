@@ -80,3 +80,14 @@ def test_no_program_shows_the_help_and_a_wrong_one_the_choice(capsys):
         2,
         "",
     ) and error == f"error: PROGRAM must be one of {', '.join(console.PROGRAMS)}, got 'tarin'\n"
+
+
+def test_tasks_of_the_working_directory_are_found(tmp_path):
+    (tmp_path / "strolling.py").write_text(
+        "import dataclasses, dittogym\n"
+        "dittogym.register('stroll', lambda: dataclasses.replace(dittogym.make_spec('run'), name='stroll'))\n"
+    )
+    script = Path(sys.executable).with_name("torchmpm")
+    command = [script, "train", "--task", "strolling:stroll", "--dry-run"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert '"task": "strolling:stroll"' in done.stdout, done.stderr

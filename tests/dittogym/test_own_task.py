@@ -167,6 +167,8 @@ def test_a_function_that_returns_something_else_is_refused(result: object, kind:
     with pytest.raises(TypeError, match=f"make must return a TaskSpec, got {kind}"):
         dittogym.register("hop", lambda: result)
     assert "hop" not in dittogym.TASKS and "dittogym/hop-coarse-v0" not in gymnasium.registry
+    with pytest.raises(TypeError, match="make must be a function that returns a TaskSpec, got a TaskSpec"):
+        dittogym.register("hop", hop())  # type: ignore[arg-type]
 
 
 def test_a_specification_needs_no_registration() -> None:
@@ -409,9 +411,19 @@ def test_numbers_that_would_fail_late_are_refused(changes: dict, error: type, me
 
 def test_a_robot_outside_its_window_is_refused() -> None:
     wide = BodySpec(Rectangle((0.9, 0.2), (0.3, 0.1)), count=100)
-    env = tiny(dataclasses.replace(hop(), robot=wide, window=Window(left=0.0)))
-    with pytest.raises(ValueError, match="positions must lie inside the window"):
-        env.reset(seed=0)
+    with pytest.raises(ValueError, match="robot must lie inside the window"):
+        tiny(dataclasses.replace(hop(), robot=wide, window=Window(left=0.0)))
+
+
+def test_a_robot_inside_an_obstacle_is_refused() -> None:
+    low = BodySpec(Rectangle((0.05, 0.1), (0.1, 0.1)), count=100)
+    with pytest.raises(ValueError, match="robot must start outside the obstacle 'floor'"):
+        tiny(dataclasses.replace(hop(), robot=low))
+
+
+def test_a_robot_that_counts_as_torn_from_the_start_is_refused() -> None:
+    with pytest.raises(ValueError, match="robot must be more compact"):
+        tiny(dataclasses.replace(hop(), split_limit=0.05))
 
 
 def test_a_robot_of_another_material_and_size() -> None:

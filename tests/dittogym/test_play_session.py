@@ -239,7 +239,7 @@ def test_drawings() -> None:
     before = played.env
     with pytest.raises(ValueError, match="body must be a picture"):
         played.apply(drawing(np.zeros((64, 64)), "body"))
-    with pytest.raises(ValueError, match="body must lie inside the window"):
+    with pytest.raises(ValueError, match="robot must lie inside the window"):
         session().apply(drawing(abs(y) < 2, "body"))
     assert played.env is before
     answers = played.apply(drawing(np.hypot(abs(x) - 30, y) < 20, "target"))  # two discs
