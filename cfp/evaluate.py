@@ -26,7 +26,7 @@ from cfp.policy_protocols import Policy
 from cfp.sections import Particles
 from cfp.train import PROGRAM
 from cfp.validation import check_at_least
-from cfp.weights import policy_file
+from cfp.weights import is_of_another_task, policy_file
 from dittogym.trajectories import Episode, save_episodes
 from dittogym.trajectories.episode import record_batch
 
@@ -71,6 +71,8 @@ class Selection:
         if self.dt is not None:
             config = replace(config, environment=config.environment.with_dt(self.dt))
         config.check()
+        if any(is_of_another_task(policy.description, config.task) for policy in policies.values()):
+            print(f"the file of task {config.task!r} has changed since the policy was trained", file=sys.stderr)
         return config, policies
 
 

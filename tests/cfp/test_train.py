@@ -250,7 +250,13 @@ def test_task_of_a_module_is_trained_and_evaluated_by_name(tmp_path, monkeypatch
     for what in ([str(folder)], ["--policy", str(folder / "policy.safetensors")]):
         forget()
         assert evaluate.main([*what, "--episodes", "1"]) == 0
-        assert "stage 2" in capsys.readouterr().out or "policy" in what[-1]
+        printed = capsys.readouterr()
+        assert ("stage 2" in printed.out or "policy" in what[-1]) and "has changed" not in printed.err
+    forget()
+    with (tmp_path / "bouncing.py").open("a") as file:
+        file.write("\n# another task now")
+    assert evaluate.main([str(folder), "--episodes", "1"]) == 0
+    assert "the file of task 'bouncing:bounce' has changed since the policy was trained" in capsys.readouterr().err
     forget()
     (tmp_path / "bouncing.py").unlink()
     sys.path_importer_cache.clear()
