@@ -119,8 +119,6 @@ def test_shapes_that_do_not_go_together() -> None:
 @pytest.mark.parametrize(
     "values",
     [
-        {"material": Elastic(torch.tensor(math.nan), 50.0)},
-        {"material": Elastic(torch.tensor([1.0, -100.0]), 50.0)},
         {"material": Elastic(torch.tensor(10.0), torch.tensor(-20.0))},
         {"mass": torch.tensor(-1.0)},
         {"mass": torch.tensor(0.0)},
@@ -131,6 +129,21 @@ def test_tensors_that_mean_nothing_are_refused(values: dict) -> None:
     body = Body(**{"count": 2, "material": Elastic(MU, LAM), **values})
     with pytest.raises(ValueError, match=r"values of bodies\[0\] must be finite, its mass and volume positive"):
         Solver(GRID, (body,))
+
+
+@pytest.mark.parametrize(
+    ("material", "constants", "message"),
+    [
+        (Elastic, {"mu": torch.tensor(math.nan), "lam": 50.0}, "mu must not be negative, got nan"),
+        (Elastic, {"mu": torch.tensor([1.0, -100.0]), "lam": 50.0}, "mu must not be negative, got -100.0"),
+        (VonMises, {"mu": torch.tensor(0.0), "lam": 50.0, "yield_stress": 60.0}, "mu must be positive, got 0.0"),
+        (VonMises, {"mu": MU, "lam": LAM, "yield_stress": torch.tensor(-5.0)}, "yield_stress must not be negative"),
+        (Snow, {"mu": MU, "lam": LAM, "compression": torch.tensor(2.0)}, "compression must be below 1, got 2.0"),
+    ],
+)
+def test_constants_in_tensors_are_checked_like_numbers(material: type, constants: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        material(**constants)
 
 
 def test_matter_that_widens_when_it_is_pulled() -> None:

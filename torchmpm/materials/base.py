@@ -91,3 +91,4 @@ def check_not_negative(material: object, *names: str) -> None:
     """Raise a ValueError if a constant of a material is negative or not a number."""
     for name in names:
         checks.value(name, getattr(material, name), least=0.0)
+        checks.entries(name, getattr(material, name), least=0.0)

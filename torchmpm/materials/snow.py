@@ -91,8 +91,7 @@ class Snow(Elastic):
         check_not_negative(self, "compression", "stretch", "hardening")
         checks.number("shear_cutoff", self.shear_cutoff, least=0.0)
         checks.flag("exact_gradients", self.exact_gradients)
-        if not isinstance(self.compression, Tensor) and not self.compression < 1:
-            raise ValueError(f"compression must be below 1, got {self.compression}")
+        checks.entries("compression", self.compression, below=1)
         given = self.hardening_range
         numbers = isinstance(given, tuple) and len(given) == 2 and all(isinstance(bound, Real) for bound in given)
         if not numbers or not 0 <= given[0] <= given[1]:

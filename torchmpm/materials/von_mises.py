@@ -102,7 +102,8 @@ class VonMises(Elastic):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.value("mu", self.mu, above=0.0)  # the strain at yield is a stress divided by it
+        checks.value("mu", self.mu, above=0.0)
+        checks.entries("mu", self.mu, above=0.0)  # the strain at yield is a stress divided by it
         check_not_negative(self, "yield_stress")
 
     def return_map(self, F: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor]:
