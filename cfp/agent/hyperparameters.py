@@ -60,6 +60,8 @@ class LearningConfig:
         if self.buffer_size < self.batch_size:
             raise ConfigError(f"buffer_size must be at least batch_size, {self.batch_size}, got {self.buffer_size}")
         check_at_least(1, n_steps=self.n_steps)
+        if self.n_steps > 1 and self.gamma == 1:
+            raise ConfigError("gamma must be below 1 with several n_steps, got 1")
         if self.max_episode_steps is not None:
             check_at_least(1, max_episode_steps=self.max_episode_steps)
         check_fraction(gamma=self.gamma, tau=self.tau, reward_momentum=self.reward_momentum, final_rate=self.final_rate)

@@ -16,6 +16,7 @@ from torch.nn import functional as F
 from cfp.agent.actor import build_actor
 from cfp.agent.exploration import LONGEST, CellNoise
 from cfp.agent.lean import Encoded, LeanCritics, halved
+from cfp.agent.losses import critic_target
 from cfp.agent.networks import normalise_image
 from cfp.agent.replay import ReplayRing
 from cfp.agent.spec import ActorSpec
@@ -51,6 +52,25 @@ def test_steps_ahead_are_summed_until_the_episode_or_the_memory_ends():
         assert batch.rewards[index].item() == pytest.approx(total, rel=1e-5)
         assert (batch.discounts[index].item(), batch.dones[index].item()) == (factor, ended)
         assert np.array_equal(batch.next_observations[index].numpy(), following)
+
+
+def test_sums_that_end_early_are_normalised_like_whole_ones(monkeypatch):
+    env, seen = FakeEnv(num_envs=3, resolution=4, horizon=4, end_above=0.203), []
+    options = {"n_steps": 3, "gamma": 0.5, "buffer_size": 30, "batch_size": 4, "update_start": 100}
+    model = make_model(ActorSpec((4,)), env, random_steps=100, **options)
+    model.learn(45)
+    model.replay_buffer.rewards[:] = 2.0
+    model.reward_statistics.mean.fill_(2.0 * (1 + 0.5 + 0.25))
+
+    def target(actor, critic, observation, rewards, *others):
+        seen.append(rewards)
+        return critic_target(actor, critic, observation, rewards, *others)
+
+    monkeypatch.setattr("cfp.agent.sac.critic_target", target)
+    batch = model.replay_buffer.sample(30)
+    model.update(batch)
+    assert len(batch.rewards.unique()) == len(batch.discounts.unique()) == 3
+    assert seen[0].abs().max() < 1e-5  # all of them are as large as the mean
 
 
 def test_noise_is_equal_in_cells_held_for_steps_and_larger_from_robot_to_robot():
@@ -201,6 +221,7 @@ def test_options_out_of_range_are_refused():
     for changes, message in (
         ({"noise_cells": 3}, "noise_cells must be one of"),
         ({"n_steps": 0}, "n_steps must be at least 1, got 0"),
+        ({"gamma": 1.0}, "gamma must be below 1 with several n_steps"),
         ({"noise_scale": (0.0, 1.0)}, "noise_scale must be positive"),
     ):
         config = sac_preset("run", "quick")
