@@ -39,8 +39,8 @@ METRICS: dict[str, str] = {
     "train/q": "mean of min(Q1, Q2) at the actor's own actions, in normalised rewards",
     "train/q_target": "mean of the critics' regression target",
     "train/entropy": "mean of -log pi of the sampled (in stage 2: residual) action, summed over all 2 R R entries",
-    "train/reward_mean": "running mean of raw rewards, or of their sums over n_steps, that is subtracted before learning",
-    "train/reward_std": "running standard deviation of the same that they are divided by",
+    "train/reward_mean": "running mean of raw rewards (of their sums over n_steps), which is subtracted before learning",
+    "train/reward_std": "running standard deviation of the same, by which they are divided",
     "train/gate": "mean gate of the residual actor: 0 keeps the coarse action, 1 replaces it",
     "train/gate_penalty": "gate penalty inside the actor loss",
     "train/n_updates": "gradient updates so far in this stage",
@@ -189,10 +189,11 @@ class CFP(SAC):
         self, obs: NetworkInput, next_obs: NetworkInput, batch: ReplayBufferSamples
     ) -> dict[str, Tensor]:
         actor, critic, target = self.networks()
-        gamma = self.gamma if batch.discounts is None else batch.discounts
-        part = (
-            1.0 if batch.discounts is None else (1 - batch.discounts) / (1 - self.gamma**self.hyperparameters.n_steps)
-        )
+        gamma: Tensor | float = self.gamma
+        part: Tensor | float = 1.0
+        if batch.discounts is not None:
+            gamma, whole = batch.discounts, 1 - self.gamma**self.hyperparameters.n_steps
+            part = (1 - gamma) / whole
         rewards, not_done = self.reward_statistics(batch.rewards, part), 1 - batch.dones
         target_q = critic_target(actor, target, next_obs, rewards, not_done, self.ent_coef_tensor, gamma)
         loss = critic_loss(critic, obs, batch.actions, target_q)
