@@ -196,8 +196,10 @@ class StagedConfig(RunConfig):
                 raise ConfigError(f"{name} must have {count} values for resolutions {self.resolutions}, got {found}")
         lengths = tuple(end - start for start, end in pairwise((0, *self.ends())))
         if min(lengths) < (least := self.update_every):
-            allowed = f"leave at least {least} of {self.steps} steps for every stage, those before an update"
-            raise ConfigError(f"handover must {allowed}, got {self.handover}, stages of {lengths} steps")
+            raise ConfigError(
+                f"steps and handover must give every stage at least {least} steps, those of one update, got stages of "
+                f"{', '.join(map(str, lengths))} steps"
+            )
 
     def _counts(self) -> dict[str, int]:
         """Number of values of each option that has one for each stage or residual stage."""

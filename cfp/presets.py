@@ -262,5 +262,5 @@ def like_start(base: Options, values: dict[str, Any]) -> Options:
         learning = replace(base.learning, gradient_steps=updates, noise_cells=0, **usual)
         base = replace(base, learning=learning, resolutions=_numbers(base.task).resolutions)
     if values.get("refine") and len(spec.resolutions) == len(base.resolutions):
-        return replace(base, resolutions=spec.resolutions)
+        return replace(base, resolutions=spec.resolutions, gate_bias=spec.gate_bias)
     return base

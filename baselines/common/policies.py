@@ -1,4 +1,4 @@
-"""Policies that act on the state of a simulation instead of the image, and copies of actors as policies."""
+"""Policies that act on the state of a simulation instead of the image."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ METRICS: dict[str, str] = {
     "train/q": "mean of min(Q1, Q2) at the actor's own actions, in normalised rewards",
     "train/q_target": "mean of the critics' regression target",
     "train/entropy": "mean of -log pi of the sampled (in stage 2: residual) action, summed over all 2 R R entries",
-    "train/reward_mean": "running mean of raw rewards (of their sums over n_steps), which is subtracted before learning",
+    "train/reward_mean": "running mean of rewards (of their sums over n_steps), which is subtracted before learning",
     "train/reward_std": "running standard deviation of the same, by which they are divided",
     "train/gate": "mean gate of the residual actor: 0 keeps the coarse action, 1 replaces it",
     "train/gate_penalty": "gate penalty inside the actor loss",

@@ -33,7 +33,7 @@ from dittogym import core
 METRICS: dict[str, str] = {
     **WINDOW_METRICS,
     "train/critic_loss": "mean squared error of the critic in the last of its updates",
-    "train/regression_loss": "mean squared error of the actor's actions in the last step of the regression",
+    "train/regression_loss": "mean squared error of mean actions and gate logits in the last step of the regression",
     "train/action_step": "root mean square of the step on the actions",
     "train/learning_rate": "Adam's step size",
     "train/limited": "gradients of single actions that were shortened as outliers",

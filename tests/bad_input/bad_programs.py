@@ -65,8 +65,8 @@ TRAIN = [
     training(
         "a late handover",
         "--resolutions 4 8 --random-steps 9 9 --handover 50",
-        "handover must leave at least",
-        "stages of (50, -30) steps",
+        "steps and handover must give every stage at least",
+        "got stages of 50, -30 steps",
     ),
     training("a grid of 5", "--resolutions 5", "resolutions must be increasing values of (4, 8,"),
     training("a negative temperature", "--alpha -1", "alpha must be at least 0, got -1.0"),

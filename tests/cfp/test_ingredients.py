@@ -21,7 +21,7 @@ from cfp.agent.networks import normalise_image
 from cfp.agent.replay import ReplayRing
 from cfp.agent.spec import ActorSpec
 from cfp.errors import ConfigError
-from cfp.presets import from_json, sac_preset
+from cfp.presets import analytic_preset, from_json, sac_preset
 from cfp.weights import load
 
 LEAN = {"plain": ActorSpec((8,), encoder="lean"), "residual": ActorSpec((4, 8), (-1.0,), patch=16, encoder="lean")}
@@ -239,3 +239,10 @@ def test_a_policy_with_the_papers_networks_goes_on_with_fewer_updates_and_withou
     assert (from_json(asked).learning.noise_cells, from_json(asked).learning.gradient_steps) == (2, 8)
     gated = from_json({"task": "run", "learner": "sac", "start_from": "run", "network": {"gate_scale": 0.5}})
     assert gated == replace(started, network=replace(started.network, gate_scale=0.5))
+
+
+def test_a_policy_of_two_stages_is_refined_by_the_other_learner_with_its_own_gate(tmp_path):
+    config = analytic_preset("run")
+    save_actor(tmp_path / "policy.safetensors", build_actor(config.actor_spec(2)), config, 2, 0)
+    refined = from_json({"task": "run", "learner": "sac", "start_from": str(tmp_path), "refine": True})
+    assert refined.actor_spec(2) == config.actor_spec(2)

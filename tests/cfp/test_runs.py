@@ -91,7 +91,7 @@ def test_unfinished_run_has_no_results(finished, tmp_path):
         ({"particles": "few"}, "particles must be 'full' or 'lite' or an integer .* got 'few'"),
         ({"steps": 0}, "steps must be at least 1, got 0"),
         ({"handover": (10, 20)}, "handover must have 1 values"),
-        ({"steps": 96, "num_envs": 2, "window": 32, "handover": (48,)}, "handover must leave at least 64 of 96 steps"),
+        ({"steps": 96, "num_envs": 2, "window": 32, "handover": (48,)}, "every stage at least 64 steps"),
         ({"alpha": (1.0, 1.0)}, "alpha is not an option"),  # of the learner sac only
         ({"refine": True}, "refine requires start_from"),
         ({"warmup": 3, "task": "nowhere"}, "task must be .* got 'nowhere'"),
