@@ -117,7 +117,7 @@ def test_gradient_of_a_field_has_no_infinities(dtype: torch.dtype, cutoff: float
     ("values", "message"),
     [
         ({"compression": -0.1}, "compression must not be negative, got -0.1"),
-        ({"compression": 1.5}, "compression must be below 1, got 1.5"),
+        ({"compression": 1.5}, "compression must be below 1.0, got 1.5"),
         ({"shear_cutoff": -1.0}, "shear_cutoff must not be negative, got -1.0"),
         ({"hardening_range": (5.0, 0.1)}, r"hardening_range must be \(low, high\)"),
     ],

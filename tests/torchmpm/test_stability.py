@@ -138,7 +138,7 @@ def test_tensors_that_mean_nothing_are_refused(values: dict) -> None:
         (Elastic, {"mu": torch.tensor([1.0, -100.0]), "lam": 50.0}, "mu must not be negative, got -100.0"),
         (VonMises, {"mu": torch.tensor(0.0), "lam": 50.0, "yield_stress": 60.0}, "mu must be positive, got 0.0"),
         (VonMises, {"mu": MU, "lam": LAM, "yield_stress": torch.tensor(-5.0)}, "yield_stress must not be negative"),
-        (Snow, {"mu": MU, "lam": LAM, "compression": torch.tensor(2.0)}, "compression must be below 1, got 2.0"),
+        (Snow, {"mu": MU, "lam": LAM, "compression": torch.tensor(2.0)}, "compression must be below 1.0, got 2.0"),
     ],
 )
 def test_constants_in_tensors_are_checked_like_numbers(material: type, constants: dict, message: str) -> None:

@@ -91,7 +91,7 @@ class Snow(Elastic):
         check_not_negative(self, "compression", "stretch", "hardening")
         checks.number("shear_cutoff", self.shear_cutoff, least=0.0)
         checks.flag("exact_gradients", self.exact_gradients)
-        checks.entries("compression", self.compression, below=1)
+        checks.entries("compression", self.compression, below=1.0)
         given = self.hardening_range
         numbers = isinstance(given, tuple) and len(given) == 2 and all(isinstance(bound, Real) for bound in given)
         if not numbers or not 0 <= given[0] <= given[1]:
