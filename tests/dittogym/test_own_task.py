@@ -168,7 +168,7 @@ def test_a_function_that_returns_something_else_is_refused(result: object, kind:
         dittogym.register("hop", lambda: result)
     assert "hop" not in dittogym.TASKS and "dittogym/hop-coarse-v0" not in gymnasium.registry
     with pytest.raises(TypeError, match="make must be a function that returns a TaskSpec, got a TaskSpec"):
-        dittogym.register("hop", hop())  # type: ignore[arg-type]
+        dittogym.register("hop", hop())
 
 
 def test_a_specification_needs_no_registration() -> None:
