@@ -30,9 +30,13 @@ from cfp.presets import sac_preset
 
 
 def make_model(config: Config, stage: int, num_envs: int) -> CFP:
-    """The model of one stage of a configuration, with updates from the first steps on."""
+    """The model of one stage of a configuration, with updates of all networks from the first steps on."""
     hyperparameters = replace(
-        config.hyperparameters(stage), buffer_size=2_000, update_start=config.learning.batch_size, random_steps=0
+        config.hyperparameters(stage),
+        buffer_size=2_000,
+        update_start=config.learning.batch_size,
+        random_steps=0,
+        actor_start=0,
     )
     model = CFP(
         CFPPolicy,
@@ -71,7 +75,9 @@ def encode_one_by_one(encoders, *images: Tensor) -> Tensor:
     latents = []
     for encoder in encoders:
         weights = encoder.first.weight[:, :-2].split([image.shape[1] for image in images], dim=1)
-        parts = [F.conv2d(image, weight, stride=4) for image, weight in zip(images, weights, strict=True)]
+        parts = [
+            F.conv2d(image, weight, stride=encoder.first.stride) for image, weight in zip(images, weights, strict=True)
+        ]
         latents.append(encoder.rest(sum(parts[1:], parts[0])))
     return torch.cat(latents, dim=1)
 

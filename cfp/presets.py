@@ -186,8 +186,8 @@ def _paper(task: str, numbers: TaskNumbers) -> Config:
 
 
 def _quick(task: str, numbers: TaskNumbers) -> Config:
-    """Minutes instead of days: many small robots, small networks with many updates, coarser actions first."""
-    paper, steps, horizon = _paper(task, numbers), 25_600, dittogym.make_spec(task).horizon
+    """Minutes instead of days: many small robots, small networks, coarser actions first."""
+    paper, steps, horizon = _paper(task, numbers), 51_200, dittogym.make_spec(task).horizon
     coarse = numbers.resolutions[0]
     config = replace(
         paper,
@@ -201,12 +201,12 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
         environment=EnvironmentConfig(),
         network=replace(paper.network, interpolation="half_pixel", encoder="lean"),
         learning=LearningConfig(
-            batch_size=64,
+            batch_size=128,
             learning_rate=5e-4,
             gamma=0.95,
             tau=0.01,
-            buffer_size=20_000,
-            gradient_steps=16,
+            buffer_size=50_000,
+            gradient_steps=4,
             actor_start=800,
             noise_cells=4,
             noise_scale=(0.2, 1.0),
@@ -246,8 +246,8 @@ def like_start(base: Options, values: dict[str, Any]) -> Options:
     """A default configuration for the policy that the JSON ``values`` start from, if any.
 
     A policy of as many stages that is refined keeps its action grids. For policies with the paper's networks the next
-    grid is the paper's; an update takes several times as long, so there are fewer, and strong exploration noise would
-    disturb a policy that can do something already. What else the preset changes was not measured for such policies.
+    grid is the paper's. An update takes several times as long, so batches are smaller, and strong exploration noise
+    would disturb a policy that can do something already. What else the preset changes was not measured for them.
     """
     if not isinstance(base, CoarseToFineConfig) or values.get("start_from") is None:
         return base
@@ -257,9 +257,9 @@ def like_start(base: Options, values: dict[str, Any]) -> Options:
     spec = load(values["start_from"]).spec
     base = replace(base, network=replace(base.network, encoder=spec.encoder))
     if isinstance(base, Config) and spec.encoder != "lean":
-        updates = min(4, base.learning.gradient_steps)
+        size = min(64, base.learning.batch_size)
         usual = {name: getattr(LearningConfig(), name) for name in ("n_steps", "weight_average", "max_episode_steps")}
-        learning = replace(base.learning, gradient_steps=updates, noise_cells=0, **usual)
+        learning = replace(base.learning, batch_size=size, noise_cells=0, **usual)
         base = replace(base, learning=learning, resolutions=_numbers(base.task).resolutions)
     if values.get("refine") and len(spec.resolutions) == len(base.resolutions):
         return replace(base, resolutions=spec.resolutions, gate_bias=spec.gate_bias)

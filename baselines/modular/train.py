@@ -122,7 +122,7 @@ class Modular(SACAlgorithm):
             preset=base.preset,
             environment=base.environment,
             report=base.report,
-            learning=replace(base.learning, noise_cells=0, gradient_steps=min(4, base.learning.gradient_steps)),
+            learning=replace(base.learning, noise_cells=0),
             steps=base.steps,
             random_steps=base.random_steps[0],
             alpha=base.alpha[0],

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from cfp.agent import fused
-from cfp.agent.composition import blend
-from cfp.agent.lean import LeanEncoder, NetworkInput, Trunk, image_of
+from cfp.agent.composition import blend, compose
+from cfp.agent.lean import LeanEncoder, NetworkInput, TileHead, Trunk, image_of
 from cfp.agent.networks import IMAGE_SIZE, Encoder, PairEncoder, initialise, make_head, normalise_image, upsample
 from cfp.agent.spec import ActorSpec
 
@@ -98,6 +98,10 @@ class SquashedActor(nn.Module):
         """Sample an action for observations (B, ...)."""
         raise NotImplementedError
 
+    def sample_for_critic(self, observation: Tensor, deterministic: bool = False) -> Sample:
+        """The same with the action as critics take it, which need not be the executed one."""
+        return self.sample(observation, deterministic)
+
     def trainable_parameters(self) -> list[nn.Parameter]:
         """Parameters to optimise: all but those of frozen coarser stages."""
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
@@ -114,18 +118,26 @@ class SquashedActor(nn.Module):
 class Actor(SquashedActor):
     """Actor of stage 1: a squashed Gaussian over (2, R, R), given the observation."""
 
+    critic_size: int | None = None
+    """Size on which actions for critics are blended; None: `ActorSpec.action_size`."""
+
     def __init__(self, resolution: int, spec: ActorSpec | None = None) -> None:
         super().__init__()
         self.resolution = resolution
         lean = spec is not None and spec.encoder == "lean"
         self.encoder: nn.Module = LeanEncoder() if lean else Encoder(3, 32)
         self.trunk = Trunk() if lean else None
-        self.mean = make_head(resolution)
-        self.std = make_head(resolution)
+        head = TileHead if lean and resolution > 4 else make_head
+        self.mean = head(resolution)
+        self.std = head(resolution)
         initialise(self)
 
     def outputs(
-        self, observation: NetworkInput, deterministic: bool = False, generator: torch.Generator | None = None
+        self,
+        observation: NetworkInput,
+        deterministic: bool = False,
+        generator: torch.Generator | None = None,
+        size: int | None = None,
     ) -> Outputs:
         """Evaluate the networks for uint8 observations (B, 3, 64, 64).
 
@@ -133,6 +145,7 @@ class Actor(SquashedActor):
             observation: The images; with a lean encoder also `cfp.agent.lean.Encoded`.
             deterministic: Whether a coarser actor acts without noise.
             generator: Of its noise; None for torch's own.
+            size: Rows and columns on which coarse and residual actions are blended; None: `ActorSpec.action_size`.
         """
         if self.trunk is None:
             latent = self.encoder(normalise_image(image_of(observation)))
@@ -148,10 +161,18 @@ class Actor(SquashedActor):
         return Sample(action, log_prob, None, (action,))
 
     def sample(
-        self, observation: NetworkInput, deterministic: bool = False, generator: torch.Generator | None = None
+        self,
+        observation: NetworkInput,
+        deterministic: bool = False,
+        generator: torch.Generator | None = None,
+        size: int | None = None,
     ) -> Sample:
-        """Sample an action for uint8 observations (B, 3, 64, 64); a residual actor's ``log_prob`` is its own part's."""
-        return self.act(self.outputs(observation, deterministic, generator), deterministic, generator)
+        """Sample an action, see `outputs`; a residual actor's ``log_prob`` is its own part's."""
+        return self.act(self.outputs(observation, deterministic, generator, size), deterministic, generator)
+
+    def sample_for_critic(self, observation: NetworkInput, deterministic: bool = False) -> Sample:
+        """Sample an action that is blended on `ActorSpec.critic_size`."""
+        return self.sample(observation, deterministic, size=self.critic_size)
 
     def fix_std(self) -> None:
         """Set the standard deviation to 0.105 before tanh, and exclude it from training."""
@@ -174,28 +195,37 @@ class ResidualActor(Actor):
         super().__init__(resolution, spec)
         self.interpolation = spec.interpolation
         self.action_size = spec.patch or resolution
+        self.critic_size = spec.critic_size if spec.patch else None
         self.gate_bias, self.gate_scale = gate_bias, spec.gate_scale
         if self.trunk is None:
             self.encoder = PairEncoder(spec.split)
         else:
             self.trunk = Trunk(resolution)
-        self.gate = make_head(resolution)
+        self.gate = make_head(resolution) if self.trunk is None else TileHead(resolution)
         initialise(self.gate)
         self.coarse = coarse.requires_grad_(False)
 
     def outputs(
-        self, observation: NetworkInput, deterministic: bool = False, generator: torch.Generator | None = None
+        self,
+        observation: NetworkInput,
+        deterministic: bool = False,
+        generator: torch.Generator | None = None,
+        size: int | None = None,
     ) -> Outputs:
         """Evaluate the networks; the coarser actor is sampled."""
         image = image_of(observation)
         with torch.no_grad():
-            coarse = self.coarse.sample(image, deterministic, generator)
-            coarse = coarse._replace(action=self._enlarge(coarse.action))
+            coarse = self.coarse.sample(image, deterministic, generator, size)
+            size = size or self.action_size
+            coarse = coarse._replace(action=upsample(coarse.action, size, self.interpolation))
         if self.trunk is None:
             patch = upsample(coarse.action, IMAGE_SIZE, self.interpolation)
             latent = self.encoder(normalise_image(image), patch)
         else:
-            latent = self.trunk(self.encoder(observation), coarse.action)
+            on_grid = coarse.action
+            if size != self.resolution:
+                on_grid = compose(coarse.parts, self.resolution, self.interpolation)
+            latent = self.trunk(self.encoder(observation), on_grid)
         mean, raw_std, gate_logit = fused.decode([self.mean, self.std, self.gate], latent)
         return Outputs(mean, raw_std, gate_logit, coarse)
 
@@ -205,11 +235,9 @@ class ResidualActor(Actor):
         assert gate_logit is not None and coarse is not None
         residual, log_prob = sample_squashed_gaussian(mean, raw_std, deterministic, generator)
         gate = self.gate_scale * torch.sigmoid(gate_logit + self.gate_bias)
-        action = blend(coarse.action, residual, gate, self._enlarge)
+        size = coarse.action.shape[-1]
+        action = blend(coarse.action, residual, gate, lambda image: upsample(image, size, self.interpolation))
         return Sample(action, log_prob, gate, (*coarse.parts, residual, gate))
-
-    def _enlarge(self, image: Tensor) -> Tensor:
-        return upsample(image, self.action_size, self.interpolation)
 
 
 def build_actor(spec: ActorSpec) -> Actor:

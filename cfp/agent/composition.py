@@ -18,24 +18,37 @@ def blend(coarse: Tensor, residual: Tensor, gate: Tensor, enlarge: Callable[[Ten
     return weight * enlarge(residual) + (1 - weight) * coarse
 
 
+def compose(parts: Sequence[Tensor], size: int, interpolation: Interpolation) -> Tensor:
+    """Actions (B, 2, size, size) from their parts: the action of the first stage, then residual and gate of each."""
+
+    def enlarge(image: Tensor) -> Tensor:
+        return upsample(image, size, interpolation)
+
+    action = enlarge(parts[0])
+    for residual, gate in zip(parts[1::2], parts[2::2], strict=True):
+        action = blend(action, residual, gate, enlarge)
+    return action
+
+
 @dataclass(frozen=True)
 class Composition:
-    """Structure of a vector that holds the parts of a composed action, which together are smaller than the action.
+    """Structure of a vector that holds the parts of a composed action, for the replay buffer.
 
     They are the action of the first stage, then residual action and gate of each further one, on its action grid.
     """
 
     resolutions: tuple[int, ...]  # Action grid R of each stage, coarsest first
-    size: int  # Rows and columns A of the composed action
+    size: int  # Rows and columns of the composed action as critics take it
     interpolation: Interpolation
 
     @classmethod
     def of(cls, spec: ActorSpec) -> Composition | None:
-        """Composition of an actor; None if its parts are no smaller than its actions, or are blended on their grids."""
+        """Composition of an actor; None if critics take the executed action, and it is no larger than its parts."""
         if spec.patch is None:
             return None
-        composition = cls(spec.resolutions, spec.action_size, spec.interpolation)
-        return composition if composition.length < 2 * spec.action_size**2 else None
+        composition = cls(spec.resolutions, spec.critic_size, spec.interpolation)
+        smaller = composition.length < 2 * spec.action_size**2
+        return composition if smaller or spec.critic_size < spec.action_size else None
 
     @property
     def grids(self) -> tuple[int, ...]:
@@ -62,12 +75,5 @@ class Composition:
         return self.join([coarser, action, torch.ones_like(action)])
 
     def rebuild(self, vectors: Tensor) -> Tensor:
-        """Compose actions (B, 2, A, A) from vectors (B, length) as the actor does, up to rounding."""
-        coarsest, *rest = self.split(vectors)
-        action = self._enlarge(coarsest)
-        for residual, gate in zip(rest[::2], rest[1::2], strict=True):
-            action = blend(action, residual, gate, self._enlarge)
-        return action
-
-    def _enlarge(self, image: Tensor) -> Tensor:
-        return upsample(image, self.size, self.interpolation)
+        """Compose actions (B, 2, size, size) from vectors (B, length) as the actor does, up to rounding."""
+        return compose(self.split(vectors), self.size, self.interpolation)

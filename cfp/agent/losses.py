@@ -26,7 +26,7 @@ def critic_target(
     discounted sum, and ``gamma`` its n-th power, (B, 1).
     """
     with torch.no_grad():
-        sample = actor.sample(next_obs)
+        sample = actor.sample_for_critic(next_obs)
         q_values = smaller_value(target, next_obs, sample.action)
         return rewards + not_done * gamma * (q_values - alpha * sample.log_prob[:, None])
 
@@ -54,7 +54,7 @@ def actor_loss(
 
     ``gate_penalty`` weighs a residual actor's gate, ``anchor`` the mean squared distance to ``origin``'s mean actions.
     """
-    action, log_prob, gate, _ = actor.sample(obs)
+    action, log_prob, gate, _ = actor.sample_for_critic(obs)
     q_values = smaller_value(critic, obs, action)
     loss = (alpha * log_prob[:, None] - q_values).mean()
     scalars = {"q": q_values.detach().mean(), "entropy": -log_prob.detach().mean()}
@@ -64,8 +64,8 @@ def actor_loss(
         scalars |= {"gate": gate.detach().mean(), "gate_penalty": penalty.detach()}
     if origin is not None:
         with torch.no_grad():
-            reference = origin(image_of(obs), deterministic=True)
-        drift = (action - reference).square().mean()
+            reference = origin.sample_for_critic(image_of(obs), deterministic=True)
+        drift = (action - reference.action).square().mean()
         loss = loss + anchor * drift
         scalars["drift"] = drift.detach()
     return loss, scalars

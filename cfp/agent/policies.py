@@ -110,7 +110,7 @@ class CFPPolicy(NetworkPolicy):
         """Create critics of the executed action."""
         spec = self.spec
         if spec.encoder == "lean":
-            return LeanCritics(spec.action_size, spec.resolutions[-1])
+            return LeanCritics(spec.critic_size)
         return TwinCritic(spec.action_size, spec.split, spec.interpolation)
 
     def shared_encoder(self) -> nn.Module | None:

@@ -50,6 +50,11 @@ class ActorSpec:
         """Rows and columns of the executed action: the patch of a residual actor, else the finest action grid."""
         return self.patch if self.patch and len(self.resolutions) > 1 else self.resolutions[-1]
 
+    @property
+    def critic_size(self) -> int:
+        """Rows and columns of actions as critics take them: lean ones do not need the enlarged action."""
+        return self.resolutions[-1] if self.encoder == "lean" else self.action_size
+
     def __post_init__(self) -> None:
         """Check that the fields match each other."""
         increasing = list(self.resolutions) == sorted(set(self.resolutions))

@@ -102,7 +102,8 @@ def test_closed_gates_leave_the_coarsest_field(task):
         levels = [finest]
         while hasattr(levels[0], "coarse"):
             levels.insert(0, levels[0].coarse)
-        drawn = Sample(3 * torch.rand(2, 2, ladder[0], ladder[0]) - 1.5, torch.zeros(2), None)
+        action = 3 * torch.rand(2, 2, ladder[0], ladder[0]) - 1.5
+        drawn = Sample(action, torch.zeros(2), None, (action,))
         levels[0].sample = lambda *_, drawn=drawn: drawn  # some of the field is clipped
         with torch.no_grad():
             for stage, actor in enumerate(levels, 1):

@@ -15,9 +15,9 @@ from torch.nn import functional as F
 
 from cfp.agent.actor import build_actor
 from cfp.agent.exploration import LONGEST, CellNoise
-from cfp.agent.lean import Encoded, LeanCritics, halved
+from cfp.agent.lean import Encoded, LeanCritics, TileHead, halved
 from cfp.agent.losses import critic_target
-from cfp.agent.networks import normalise_image
+from cfp.agent.networks import normalise_image, upsample
 from cfp.agent.replay import ReplayRing
 from cfp.agent.spec import ActorSpec
 from cfp.errors import ConfigError
@@ -146,9 +146,11 @@ def test_average_of_weights_is_the_policy():
             expected[name] = value.clone() if update == 0 else 0.9 * expected[name] + 0.1 * value
     averaged = model.trained_actor.state_dict()
     assert all(torch.allclose(averaged[name], value, atol=1e-7) for name, value in expected.items())
-    assert not torch.equal(averaged["mean.0.weight"], model.networks()[0].state_dict()["mean.0.weight"])
+    assert not torch.equal(averaged["mean.layers.0.weight"], model.networks()[0].state_dict()["mean.layers.0.weight"])
     model.restart_average()
-    assert torch.equal(model.trained_actor.state_dict()["mean.0.weight"], model.networks()[0].mean[0].weight)
+    assert torch.equal(
+        model.trained_actor.state_dict()["mean.layers.0.weight"], model.networks()[0].mean.layers[0].weight
+    )
 
 
 def test_halved_images_are_means_of_four_pixels():
@@ -174,16 +176,54 @@ def test_lean_policy_is_saved_and_loaded(tmp_path):
 
 
 @pytest.mark.parametrize("patch", [18, 32])
-def test_lean_networks_read_means_of_actions_over_the_cells_of_their_grid(patch):
+def test_lean_critics_take_actions_composed_on_the_grid_of_the_stage(patch):
     spec = ActorSpec((4, 8), (0.0,), patch=patch, encoder="lean")
-    action = build_actor(spec)(make_batch(8).observations, deterministic=True)
-    assert action.shape[1:] == (2, patch, patch)
-    critics = LeanCritics(patch, 8)
-    on_grid = torch.randn(3, 2, 8, 8)
+    actor, images = build_actor(spec), make_batch(8).observations
+    executed, learned = (sample(images, deterministic=True) for sample in (actor.sample, actor.sample_for_critic))
+    assert (executed.action.shape[2:], learned.action.shape[2:]) == ((patch, patch), (8, 8))
+    for one, other in zip(executed.parts, learned.parts, strict=True):
+        torch.testing.assert_close(one, other)
+    coarse, residual, gate = learned.parts
+    torch.testing.assert_close(learned.action, gate * residual + (1 - gate) * upsample(coarse, 8, "half_pixel"))
+    full = build_actor(replace(spec, encoder="full"))
+    assert full.sample_for_critic(images).action.shape[2:] == (patch, patch)
+
+
+@pytest.mark.parametrize("patch", [8, 18])
+def test_batches_hold_actions_as_the_critics_take_them(patch):
+    spec = ActorSpec((4, 8), (0.0,), patch=patch, encoder="lean")
+    model = make_model(spec, FakeEnv(num_envs=2, resolution=patch), update_start=4, batch_size=4)
+    model.learn(24)
+    batch = model.replay_buffer.sample(4)
+    assert batch.actions.shape == (4, 2 * 8 * 8)
+    actor, critic, _ = model.networks()
+    obs = model.policy.encode(batch.observations)
+    assert [values.shape for values in critic(obs, batch.actions)] == [(4, 1)] * 2
+    sampled = actor.sample_for_critic(obs).action
+    assert [values.shape for values in critic(obs, sampled)] == [(4, 1)] * 2
+
+
+def test_larger_actions_are_averaged_over_the_cells_of_the_grid():
+    critics, on_grid = LeanCritics(8), torch.randn(3, 2, 8, 8)
     encoded = critics.actions(on_grid)
     torch.testing.assert_close(critics.actions(F.interpolate(on_grid, size=64)), encoded)
-    observation = Encoded(torch.zeros(len(action), 3, 32, 32), torch.randn(len(action), 16, 4, 4))
-    assert [values.shape for values in critics(observation, action)] == [(len(action), 1)] * 2
+    observation = Encoded(torch.zeros(3, 3, 32, 32), torch.randn(3, 16, 4, 4))
+    assert [values.shape for values in critics(observation, torch.randn(3, 2, 18, 18))] == [(3, 1)] * 2
+
+
+@pytest.mark.parametrize("resolution", [8, 32])
+def test_tiles_of_a_decoded_image_depend_on_their_own_latent(resolution):
+    head, latent = TileHead(resolution), torch.zeros(1, 32, 4, 4)
+    image, side = head(latent), resolution // 4
+    assert image.shape == (1, 2, resolution, resolution) and image.is_contiguous()
+    latent[0, :, 1, 2] = 1.0
+    changed = (head(latent) != image).all(1)[0]
+    assert changed[side : 2 * side, 2 * side : 3 * side].all() and changed.sum() == side**2
+    # The tile of an encoder's weights is that of a decoder's: (component, row, column) within a tile.
+    rows = head.layers[2].bias.detach().clone().copy_(torch.arange(2.0 * side**2))
+    head.layers[2].bias.data.copy_(rows)
+    head.layers[2].weight.data.zero_()
+    torch.testing.assert_close(head(latent)[0, :, :side, :side].flatten(), rows)
 
 
 def test_actor_starts_after_the_critics_and_rates_fall():
@@ -229,12 +269,12 @@ def test_options_out_of_range_are_refused():
             replace(config, learning=replace(config.learning, **changes)).check()
 
 
-def test_a_policy_with_the_papers_networks_goes_on_with_fewer_updates_and_without_noise_of_cells():
+def test_a_policy_with_the_papers_networks_goes_on_with_smaller_batches_and_without_noise_of_cells():
     quick, started = sac_preset("run"), from_json({"task": "run", "learner": "sac", "start_from": "run"})
     assert (quick.network.encoder, started.network.encoder) == ("lean", "full")
     assert (quick.resolutions, started.resolutions) == ((4, 8), (8, 16))
     usual = {"n_steps": 1, "weight_average": 0.0, "max_episode_steps": None}
-    assert started.learning == replace(quick.learning, gradient_steps=4, noise_cells=0, **usual)
+    assert started.learning == replace(quick.learning, batch_size=64, noise_cells=0, **usual)
     asked = {"task": "run", "learner": "sac", "start_from": "run", "learning": {"noise_cells": 2, "gradient_steps": 8}}
     assert (from_json(asked).learning.noise_cells, from_json(asked).learning.gradient_steps) == (2, 8)
     gated = from_json({"task": "run", "learner": "sac", "start_from": "run", "network": {"gate_scale": 0.5}})

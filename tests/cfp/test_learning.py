@@ -48,7 +48,8 @@ def mean_reward(policy, env, steps=20):
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
 def test_reward_rises_within_a_few_hundred_updates(seed):
     config = sac_preset("run", "quick")
-    options = {"random_steps": 64, "update_start": 64, "actor_start": 64, "batch_size": 32}
+    # Fewer steps with more and smaller updates, so that the test takes seconds.
+    options = {"random_steps": 64, "update_start": 64, "actor_start": 64, "batch_size": 32, "gradient_steps": 16}
     options["n_steps"] = 1  # actions change no later reward here, which would only be noise in the targets
     env = DummyVecEnv([BrightSide] * 16)
     env.seed(seed)
