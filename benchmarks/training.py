@@ -24,6 +24,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 import dittogym  # noqa: F401  (registers the environments)
 from cfp import CFP, CFPPolicy, Config
+from cfp.agent.hyperparameters import LearningConfig
 from cfp.envs.make import make_env
 from cfp.experiment.process import keep_memory
 from cfp.presets import sac_preset
@@ -130,25 +131,32 @@ def timed(owner: object, name: str, clock: dict[str, float]) -> Iterator[None]:
     delattr(owner, name)
 
 
-def training(config: Config, steps: int) -> None:
+def former_quick(task: str) -> Config:
+    """Options of the preset quick before its networks became lean."""
+    learning = LearningConfig(
+        batch_size=64, learning_rate=1e-3, gamma=0.9, tau=0.01, buffer_size=20_000, gradient_steps=4
+    )
+    quick, paper = sac_preset(task, "quick"), sac_preset(task, "paper")
+    network = replace(quick.network, encoder="full")
+    return replace(quick, resolutions=paper.resolutions, network=network, learning=learning)
+
+
+def training(task: str, steps: int) -> None:
     """Print training steps per second and the shares of their parts."""
-    print("| stage | robots | updates per step | training steps/s | simulation | updates | rest |")
-    print("| --- " * 7 + "|")
-    many = config.environment.num_envs, config.learning.gradient_steps
-    for stage in (1, 2):
-        for num_envs, gradient_steps in ((1, 1), many):
-            learning = replace(config.learning, gradient_steps=gradient_steps)
-            model, clock = make_model(replace(config, learning=learning), stage, num_envs), dict[str, float]()
+    print(f"| {task}, preset | stage | training steps/s | simulation | updates | rest |")
+    print("| --- " * 6 + "|")
+    for name, config in (("former quick", former_quick(task)), ("quick", sac_preset(task, "quick"))):
+        num_envs = config.environment.num_envs
+        for stage in (1, 2):
+            model, clock = make_model(config, stage, num_envs), dict[str, float]()
             model.learn(config.learning.batch_size + 2 * num_envs)
             with timed(model.env, "step", clock), timed(model, "train", clock):
                 start = time.perf_counter()
                 model.learn(steps * num_envs, reset_num_timesteps=False)
                 total = time.perf_counter() - start
             simulation, update = clock["step"] / total, clock["train"] / total
-            rest = 1 - simulation - update
-            shares = " | ".join(f"{100 * share:.0f} %" for share in (simulation, update, rest))
-            speed = steps * num_envs / total
-            print(f"| {stage} | {num_envs} | {gradient_steps} | {speed:.1f} | {shares} |", flush=True)
+            shares = " | ".join(f"{100 * share:.0f} %" for share in (simulation, update, 1 - simulation - update))
+            print(f"| {name} | {stage} | {steps * num_envs / total:.1f} | {shares} |", flush=True)
 
 
 def environments(steps: int) -> None:
@@ -171,13 +179,13 @@ def main() -> None:
     arguments = parser.parse_args()
     keep_memory()
     print(f"torch {torch.__version__}, {torch.get_num_threads()} threads")
-    config = sac_preset("shapematch", "quick")
     if "updates" not in arguments.skip:
         for task in ("run", "shapematch"):
             print(f"{task}, preset paper")
             updates(sac_preset(task, "paper"), arguments.rounds)
     if "training" not in arguments.skip:
-        training(config, arguments.steps)
+        for task in ("run", "shapematch"):
+            training(task, arguments.steps)
     if "environments" not in arguments.skip:
         environments(arguments.steps)
 

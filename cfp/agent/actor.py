@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from cfp.agent import fused
 from cfp.agent.composition import blend, compose
-from cfp.agent.lean import LeanEncoder, NetworkInput, TileHead, Trunk, image_of
+from cfp.agent.lean import LeanEncoder, NetworkInput, Trunk, image_of
 from cfp.agent.networks import IMAGE_SIZE, Encoder, PairEncoder, initialise, make_head, normalise_image, upsample
 from cfp.agent.spec import ActorSpec
 
@@ -99,7 +99,7 @@ class SquashedActor(nn.Module):
         raise NotImplementedError
 
     def sample_for_critic(self, observation: Tensor, deterministic: bool = False) -> Sample:
-        """The same with the action as critics take it, which need not be the executed one."""
+        """Sample an action as critics take it; it need not be the executed one."""
         return self.sample(observation, deterministic)
 
     def trainable_parameters(self) -> list[nn.Parameter]:
@@ -127,9 +127,8 @@ class Actor(SquashedActor):
         lean = spec is not None and spec.encoder == "lean"
         self.encoder: nn.Module = LeanEncoder() if lean else Encoder(3, 32)
         self.trunk = Trunk() if lean else None
-        head = TileHead if lean and resolution > 4 else make_head
-        self.mean = head(resolution)
-        self.std = head(resolution)
+        self.mean = make_head(resolution)
+        self.std = make_head(resolution)
         initialise(self)
 
     def outputs(
@@ -201,7 +200,7 @@ class ResidualActor(Actor):
             self.encoder = PairEncoder(spec.split)
         else:
             self.trunk = Trunk(resolution)
-        self.gate = make_head(resolution) if self.trunk is None else TileHead(resolution)
+        self.gate = make_head(resolution)
         initialise(self.gate)
         self.coarse = coarse.requires_grad_(False)
 

@@ -57,14 +57,11 @@ def encode(encoders: Sequence[EncoderLayers], *images: Tensor) -> Tensor:
     return hidden
 
 
-def decode(heads: Sequence[nn.Module], latent: Tensor) -> list[Tensor]:
-    """Evaluate heads of the same kind on the same latent (B, 32, 4, 4); returns (B, 2, R, R) each.
-
-    Only the transposed convolutions of `cfp.agent.networks.make_head` are joined.
-    """
-    if not (isinstance(heads[0], nn.Sequential) and isinstance(heads[0][0], nn.ConvTranspose2d)):
+def decode(heads: Sequence[nn.Sequential], latent: Tensor) -> list[Tensor]:
+    """Evaluate heads of `cfp.agent.networks.make_head` on the same latent (B, 32, 4, 4); returns (B, 2, R, R) each."""
+    if not isinstance(heads[0][0], nn.ConvTranspose2d):
         return [head(latent) for head in heads]
-    first, *rest = zip(*cast(Sequence[nn.Sequential], heads), strict=True)
+    first, *rest = zip(*heads, strict=True)
     values = F.conv_transpose2d(channels_last(latent), *_concatenated(first, dim=1), first[0].stride, first[0].padding)
     for layers in rest:
         if isinstance(layers[0], nn.ELU):

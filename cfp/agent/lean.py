@@ -108,27 +108,6 @@ class Trunk(nn.Module):
         return F.elu(self.norm(self.mix(features)))
 
 
-class TileHead(nn.Module):
-    """Decoder from the actor's latent (B, 32, 4, 4) to an image (B, 2, R, R): a perceptron for each of 4 x 4 tiles.
-
-    It writes what `ActionEncoder` reads, and takes a fifth of the time of transposed convolutions.
-    """
-
-    def __init__(self, resolution: int) -> None:
-        super().__init__()
-        channels, side = LATENT // 16, resolution // 4
-        self.side = side
-        self.layers = nn.Sequential(
-            nn.Linear(channels, 2 * channels), nn.ELU(inplace=True), nn.Linear(2 * channels, 2 * side**2)
-        )
-
-    def forward(self, latent: Tensor) -> Tensor:
-        """Decode a latent."""
-        tiles = self.layers(latent.flatten(2).transpose(1, 2)).unflatten(1, (4, 4)).unflatten(3, (2, self.side, -1))
-        image: Tensor = tiles.permute(0, 3, 1, 4, 2, 5).flatten(4).flatten(2, 3)  # (B, 2, rows, y, columns, x)
-        return image
-
-
 class LeanCritics(nn.Module):
     """Two critics of actions (2, R, R) on the features of the shared encoder.
 

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from cfp.agent.actor import build_actor
 from cfp.agent.exploration import LONGEST, CellNoise
-from cfp.agent.lean import Encoded, LeanCritics, TileHead, halved
+from cfp.agent.lean import Encoded, LeanCritics, halved
 from cfp.agent.losses import critic_target
 from cfp.agent.networks import normalise_image, upsample
 from cfp.agent.replay import ReplayRing
@@ -146,11 +146,9 @@ def test_average_of_weights_is_the_policy():
             expected[name] = value.clone() if update == 0 else 0.9 * expected[name] + 0.1 * value
     averaged = model.trained_actor.state_dict()
     assert all(torch.allclose(averaged[name], value, atol=1e-7) for name, value in expected.items())
-    assert not torch.equal(averaged["mean.layers.0.weight"], model.networks()[0].state_dict()["mean.layers.0.weight"])
+    assert not torch.equal(averaged["mean.0.weight"], model.networks()[0].state_dict()["mean.0.weight"])
     model.restart_average()
-    assert torch.equal(
-        model.trained_actor.state_dict()["mean.layers.0.weight"], model.networks()[0].mean.layers[0].weight
-    )
+    assert torch.equal(model.trained_actor.state_dict()["mean.0.weight"], model.networks()[0].mean[0].weight)
 
 
 def test_halved_images_are_means_of_four_pixels():
@@ -209,21 +207,6 @@ def test_larger_actions_are_averaged_over_the_cells_of_the_grid():
     torch.testing.assert_close(critics.actions(F.interpolate(on_grid, size=64)), encoded)
     observation = Encoded(torch.zeros(3, 3, 32, 32), torch.randn(3, 16, 4, 4))
     assert [values.shape for values in critics(observation, torch.randn(3, 2, 18, 18))] == [(3, 1)] * 2
-
-
-@pytest.mark.parametrize("resolution", [8, 32])
-def test_tiles_of_a_decoded_image_depend_on_their_own_latent(resolution):
-    head, latent = TileHead(resolution), torch.zeros(1, 32, 4, 4)
-    image, side = head(latent), resolution // 4
-    assert image.shape == (1, 2, resolution, resolution) and image.is_contiguous()
-    latent[0, :, 1, 2] = 1.0
-    changed = (head(latent) != image).all(1)[0]
-    assert changed[side : 2 * side, 2 * side : 3 * side].all() and changed.sum() == side**2
-    # The tile of an encoder's weights is that of a decoder's: (component, row, column) within a tile.
-    rows = head.layers[2].bias.detach().clone().copy_(torch.arange(2.0 * side**2))
-    head.layers[2].bias.data.copy_(rows)
-    head.layers[2].weight.data.zero_()
-    torch.testing.assert_close(head(latent)[0, :, :side, :side].flatten(), rows)
 
 
 def test_actor_starts_after_the_critics_and_rates_fall():
