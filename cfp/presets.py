@@ -207,7 +207,7 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
             tau=0.01,
             buffer_size=50_000,
             gradient_steps=4,
-            actor_start=800,
+            actor_start=4_000,
             noise_cells=4,
             noise_scale=(0.2, 1.0),
             final_rate=0.1,

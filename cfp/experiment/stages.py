@@ -72,6 +72,8 @@ class CoarseToFineStages(Algorithm):
             path = policy_path(folder, stage - 1)
             with report_mismatch(path):
                 actor.get_submodule("coarse").load_state_dict(load(path, device).actor.state_dict())
+            if config.network.encoder == "lean":  # the new critics learn from features that are good already
+                actor.encoder.load_state_dict(actor.get_submodule("coarse.encoder").state_dict())
         else:
             return False
         return True

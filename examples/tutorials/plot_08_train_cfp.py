@@ -26,7 +26,7 @@ import dittogym
 
 folder = tempfile.TemporaryDirectory()
 out = Path(folder.name) / "star"
-options = "--task shapematch --seed 0 --steps 960 --resolutions 32 --handover --gate-bias --eval-every 192 --no-video"
+options = "--task shapematch --seed 0 --steps 960 --resolutions 32 --eval-every 192 --no-video"
 command = [sys.executable, "-m", "cfp.train", "--out", str(out), *options.split()]
 print(subprocess.run(command, check=True, capture_output=True, text=True).stdout[-600:])
 
