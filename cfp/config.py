@@ -248,6 +248,15 @@ class Config(CoarseToFineConfig):
     per_stage: ClassVar[tuple[str, ...]] = ("random_steps", "alpha")
     per_residual_stage: ClassVar[tuple[str, ...]] = (*StagedConfig.per_residual_stage, "gate_penalty")
 
+    def with_derived(self, base: RunConfig, given: Collection[str]) -> RunConfig:
+        """Scale the start of the actor's updates, too, if there are fewer steps."""
+        config = super().with_derived(base, given)
+        assert isinstance(config, Config) and isinstance(base, Config)
+        start = base.learning.actor_start
+        if "actor_start" in given or self.learning.actor_start != start or self.steps >= base.steps:
+            return config
+        return replace(config, learning=replace(self.learning, actor_start=round(start * self.steps / base.steps)))
+
     def hyperparameters(self, stage: int) -> Hyperparameters:
         """Hyperparameters of a stage."""
         return Hyperparameters(

@@ -111,8 +111,13 @@ def test_fewer_steps_shorten_every_level():
     config = sac_preset("run")
     half = parse(PROGRAM, ["--learner", "sac", "--task", "run", "--steps", str(config.steps // 2)]).run
     assert half.handover == (config.handover[0] // 2,)
+    assert half.learning.actor_start == config.learning.actor_start // 2
     explicit = parse(PROGRAM, ["--learner", "sac", "--task", "run", "--steps", "1000", "--handover", "900"]).run
     assert explicit.handover == (900,)
+    explicit = parse(PROGRAM, "--learner sac --task run --steps 1000 --actor-start 4000".split()).run
+    assert explicit.learning.actor_start == 4000
+    longer = parse(PROGRAM, "--learner sac --task run --steps 100000".split()).run
+    assert longer.learning == config.learning
 
 
 def test_another_number_of_levels_stretches_what_each_has_one_of():

@@ -2,13 +2,18 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 import torch
+from policy_files import save_actor
 from tiny_runs import run
 
 from cfp import train
+from cfp.agent.actor import build_actor
 from cfp.evaluation.evaluate import Result
+from cfp.experiment.coarse_to_fine import CoarseToFine
+from cfp.presets import sac_preset
 from cfp.tables import read_table
 from cfp.train import PROGRAM
 
@@ -58,6 +63,20 @@ def test_second_level_starts_from_a_policy(coarse, tmp_path, name):
     assert all(torch.equal(actor[f"coarse.{key}"], value) for key, value in frozen.items())
     results = json.loads((folder / "results.json").read_text())
     assert [row["policy"] for row in results][2:] == ["stage 1", "stage 2"]
+
+
+def test_second_level_begins_with_the_lean_encoder_of_the_first(tmp_path):
+    for encoder in ("lean", "full"):
+        config = sac_preset("run")
+        config = replace(config, network=replace(config.network, encoder=encoder))
+        coarse, actor = (build_actor(config.actor_spec(stage)) for stage in (1, 2))
+        (tmp_path / encoder).mkdir()
+        save_actor(tmp_path / encoder / "stage1.safetensors", coarse, config, 1, 5)
+        assert CoarseToFine.begin(config, 2, tmp_path / encoder, actor)
+        before, after = coarse.encoder.state_dict(), actor.encoder.state_dict()
+        assert all(torch.equal(value, actor.coarse.encoder.state_dict()[key]) for key, value in before.items())
+        same = before.keys() == after.keys() and all(torch.equal(value, after[key]) for key, value in before.items())
+        assert same == (encoder == "lean")
 
 
 @pytest.mark.parametrize(
