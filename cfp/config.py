@@ -182,7 +182,8 @@ class StagedConfig(RunConfig):
     def ineffective(self) -> dict[str, str]:
         """Options without effect under the others: a single stage has no gate."""
         single = {"network.gate_scale": "several resolutions"} if len(self.resolutions) == 1 else {}
-        return super().ineffective() | single
+        lean = {"network.split": "encoder full"} if self.network.encoder == "lean" else {}
+        return super().ineffective() | single | lean
 
     def check(self) -> None:
         """Check what the types do not express."""
@@ -253,7 +254,7 @@ class Config(CoarseToFineConfig):
         config = super().with_derived(base, given)
         assert isinstance(config, Config) and isinstance(base, Config)
         start = base.learning.actor_start
-        if "actor_start" in given or self.learning.actor_start != start or self.steps >= base.steps:
+        if "actor_start" in given or self.steps >= base.steps:
             return config
         return replace(config, learning=replace(self.learning, actor_start=round(start * self.steps / base.steps)))
 
@@ -267,9 +268,10 @@ class Config(CoarseToFineConfig):
         )
 
     def ineffective(self) -> dict[str, str]:
-        """Options that require a policy to refine."""
+        """Options that require a policy to refine, or noise on cells."""
         anchor = {} if self.refine else {"learning.anchor": "refine"}
-        return super().ineffective() | anchor
+        noise = {} if self.learning.noise_cells else {"learning.noise_scale": "noise_cells"}
+        return super().ineffective() | anchor | noise
 
     def check(self) -> None:
         """Check what the types do not express."""

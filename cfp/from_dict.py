@@ -85,3 +85,8 @@ def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     for name, value in values.items():
         flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
     return flat
+
+
+def leaf_names(values: dict[str, Any]) -> set[str]:
+    """Names of nested options without those of their sections."""
+    return {name.rpartition(".")[2] for name in flatten(values)}

@@ -222,7 +222,7 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
 
 def _long(task: str, numbers: TaskNumbers) -> Config:
     """A night of eight hours on two cores: more steps and a longer memory."""
-    quick, steps = _quick(task, numbers), 800_000
+    quick, steps = _quick(task, numbers), 1_600_000
     return replace(
         quick,
         preset="long",
@@ -254,13 +254,13 @@ def like_start(base: Options, values: dict[str, Any]) -> Options:
     network = values.get("network")
     if isinstance(network, dict) and "encoder" in network:
         return base
-    spec = load(values["start_from"]).spec
+    spec, lean = load(values["start_from"]).spec, base.network.encoder == "lean"
     base = replace(base, network=replace(base.network, encoder=spec.encoder))
-    if isinstance(base, Config) and spec.encoder != "lean":
-        size = min(64, base.learning.batch_size)
+    if isinstance(base, Config) and lean and spec.encoder != "lean":
         usual = {name: getattr(LearningConfig(), name) for name in ("n_steps", "weight_average", "max_episode_steps")}
-        learning = replace(base.learning, batch_size=size, noise_cells=0, **usual)
-        base = replace(base, learning=learning, resolutions=_numbers(base.task).resolutions)
+        base = replace(base, learning=replace(base.learning, batch_size=64, noise_cells=0, **usual))
+        if len(base.resolutions) > 1:
+            base = replace(base, resolutions=_numbers(base.task).resolutions)
     if values.get("refine") and len(spec.resolutions) == len(base.resolutions):
         return replace(base, resolutions=spec.resolutions, gate_bias=spec.gate_bias)
     return base

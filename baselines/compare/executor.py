@@ -171,7 +171,9 @@ class RayExecutor(Executor):
             self._ray.cancel(reference)
 
     def shutdown(self, kill: bool) -> None:
-        """Disconnect from the cluster, which ends all tasks of this process."""
+        """Disconnect from the cluster, which ends all tasks of this process, unless the caller had connected to it."""
+        if kill:
+            self.stop()
         if self._owned:
             self._ray.shutdown()
 

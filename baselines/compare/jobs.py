@@ -15,7 +15,7 @@ from cfp.config import EVALUATION_SEED, RunConfig, to_json
 from cfp.errors import ConfigError
 from cfp.experiment.folder import holds_run, read_config
 from cfp.files import read_json
-from cfp.from_dict import flatten
+from cfp.from_dict import flatten, leaf_names
 from cfp.sections import TASK_OPTIONS
 from cfp.weights import is_of_another_task, is_same_task, read_policy
 from dittogym.tasks import task_name
@@ -176,12 +176,14 @@ def resolve(plan: Plan, label: str, task: str, preset: str, seed: int, steps: in
     if label in {*ALGORITHMS, *ALIASES, *REFERENCE_POLICIES}:
         algo = own.get("algo", label)
     start: dict[str, Any] = {"algo": algo, "task": task, "preset": preset}
-    base = configure(start)
-    if steps is not None and hasattr(base, "steps"):
-        values.setdefault("steps", steps)
-    values["report"] = {"video": False, **values.get("report", {})}
+    start |= {name: values[name] for name in ("learner", "start_from", "refine") if name in values}
     try:
-        config = configure({**start, "seed": seed, "device": device, **values}).with_derived(base, values)
+        base = configure(start)
+        if steps is not None and hasattr(base, "steps"):
+            values.setdefault("steps", steps)
+        values["report"] = {"video": False, **values.get("report", {})}
+        config = configure({**start, "seed": seed, "device": device, **values})
+        config = config.with_derived(base, leaf_names(values))
         config.check()
         config.check_effect(base, flatten(own))  # options for all algorithms may have no effect on some of them
     except ConfigError as error:

@@ -186,8 +186,8 @@ class ResidualActor(Actor):
     """Actor of a later stage: refines the action of a frozen coarser actor through a gate (paper, Section 4.2).
 
     ``a = up(g) up(a_res) + (1 - up(g)) up(a_coarse)`` with ``g = gate_scale sigmoid(z_g + gate_bias)``, one gate value
-    per cell and muscle; ``up`` enlarges to `ActorSpec.action_size`. The coarser actor is sampled anew in every call,
-    may be residual itself, and is never trained.
+    per cell and muscle; ``up`` enlarges to `ActorSpec.action_size`, for critics to `ActorSpec.critic_size`. The coarser
+    actor is sampled anew in every call, may be residual itself, and is never trained.
     """
 
     def __init__(self, coarse: Actor, resolution: int, gate_bias: float, spec: ActorSpec) -> None:

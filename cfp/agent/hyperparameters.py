@@ -18,7 +18,8 @@ class LearningConfig:
     actor_rate: float | None = None
     """Adam's step size for the actor alone; None: the same as for the critics."""
     actor_start: int = 0
-    """Environment steps of each stage before the first actor update; until then only the critics learn."""
+    """Environment steps of each stage before the first actor update; until then only the critics learn. The value of a
+    preset is scaled down with fewer steps."""
     gamma: float = 0.99
     """Discount factor."""
     tau: float = 0.005
@@ -86,3 +87,8 @@ class Hyperparameters(LearningConfig):
     """Weight rho of the gate penalty ``mean ||g||_2 / R`` in the actor loss of a residual actor."""
     random_steps: int = 500
     """Environment steps with uniformly random actions at the start."""
+
+    def check(self) -> None:
+        """Raise a `ConfigError` for values out of range."""
+        super().check()
+        check_at_least(0, alpha=self.alpha, gate_penalty=self.gate_penalty, random_steps=self.random_steps)

@@ -37,7 +37,7 @@ def smaller_value(critic: TwinCritic, obs: NetworkInput, action: Tensor) -> Tens
 
 
 def critic_loss(critic: TwinCritic, obs: NetworkInput, actions: Tensor, target_q: Tensor) -> Tensor:
-    """Sum of both critics' mean squared errors for actions (B, 2, R, R)."""
+    """Sum of both critics' mean squared errors for actions (B, 2, R, R) or (B, 2 R R)."""
     return torch.stack([F.mse_loss(values, target_q) for values in critic(obs, actions)]).sum()
 
 

@@ -17,7 +17,7 @@ from cfp.agent.spec import Interpolation
 from dittogym.action import bicubic
 
 IMAGE_SIZE = 64
-"""Rows and columns of the observation, and of every action as input of an encoder."""
+"""Rows and columns of the observation, and of actions as input of the paper's encoders."""
 
 LATENT = 32 * 4 * 4
 """Number of entries of a latent image."""

@@ -107,7 +107,7 @@ class CFPPolicy(NetworkPolicy):
         return build_actor(self.spec)
 
     def new_critic(self) -> TwinCritic | LeanCritics:
-        """Create critics of the executed action."""
+        """Create critics of actions as the actor's ``sample_for_critic`` composes them."""
         spec = self.spec
         if spec.encoder == "lean":
             return LeanCritics(spec.critic_size)

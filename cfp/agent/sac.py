@@ -35,7 +35,7 @@ from cfp.errors import ConfigError, NonFiniteError
 
 METRICS: dict[str, str] = {
     "train/critic_loss": "sum of both critics' mean squared errors, in normalised rewards",
-    "train/actor_loss": "mean of alpha log pi - min Q, plus the gate penalty",
+    "train/actor_loss": "mean of alpha log pi - min Q, plus the gate penalty, and with refine anchor times train/drift",
     "train/q": "mean of min(Q1, Q2) at the actor's own actions, in normalised rewards",
     "train/q_target": "mean of the critics' regression target",
     "train/entropy": "mean of -log pi of the sampled (in stage 2: residual) action, summed over all 2 R R entries",
@@ -52,8 +52,10 @@ METRICS: dict[str, str] = {
 
 SHARED = ("buffer_size", "batch_size", "tau", "gamma", "gradient_steps")
 """Hyperparameters that stable-baselines3 knows by the same name."""
-FROM_HYPERPARAMETERS = {*SHARED, "learning_rate", "learning_starts", "ent_coef"}
+FROM_HYPERPARAMETERS = {*SHARED, "learning_rate", "learning_starts", "ent_coef", "n_steps"}
 """Arguments of stable-baselines3's SAC that `Hyperparameters` holds."""
+UNUSED = {"target_update_interval", "target_entropy"}
+"""Arguments of SAC that have no effect here: targets follow each update, and the temperature is a constant."""
 
 
 def falling_rate(rate: float, final: float, remaining: float) -> float:
@@ -82,7 +84,7 @@ class CFP(SAC):
         sac_options: Further options of stable-baselines3's SAC; those in ``hyperparameters`` are not among them.
 
     Raises:
-        TypeError: An option of stable-baselines3 is one of the hyperparameters.
+        TypeError: An option of stable-baselines3 is one of the hyperparameters, or has no effect.
         ConfigError: A hyperparameter is out of range.
 
     Attributes:
@@ -103,6 +105,10 @@ class CFP(SAC):
         hyperparameters.check()
         if taken := FROM_HYPERPARAMETERS & sac_options.keys():
             raise TypeError(f"CFP takes {', '.join(sorted(taken))} from hyperparameters, not as arguments")
+        if unused := UNUSED & sac_options.keys():
+            raise TypeError(f"CFP does not use {', '.join(sorted(unused))}")
+        if hyperparameters.n_steps > 1 and sac_options.get("replay_buffer_class", ReplayRing) is not ReplayRing:
+            raise ConfigError(f"n_steps must be 1 with another replay_buffer_class, got {hyperparameters.n_steps}")
         if hyperparameters.noise_cells and sac_options.get("action_noise") is not None:
             raise ConfigError(f"noise_cells must be 0 with action_noise, got {hyperparameters.noise_cells}")
         self.hyperparameters = hyperparameters
@@ -122,6 +128,8 @@ class CFP(SAC):
 
     def _setup_model(self) -> None:
         super()._setup_model()
+        if isinstance(self.policy, CFPPolicy) and getattr(self.replay_buffer, "composition", None) is None:
+            self.networks()[0].critic_size = None  # batches hold executed actions
         own = self.hyperparameters
         self.reward_statistics = RewardStatistics(own.reward_momentum).to(self.device)
         self.noise = None

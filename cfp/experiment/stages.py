@@ -9,6 +9,7 @@ from typing import Any
 
 from cfp.agent.actor import Actor
 from cfp.agent.actor_policy import ActorPolicy, image_policy
+from cfp.agent.lean import LeanEncoder
 from cfp.config import StagedConfig
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm, Position
@@ -71,9 +72,7 @@ class CoarseToFineStages(Algorithm):
         elif stage > 1:
             path = policy_path(folder, stage - 1)
             with report_mismatch(path):
-                actor.get_submodule("coarse").load_state_dict(load(path, device).actor.state_dict())
-            if config.network.encoder == "lean":  # the new critics learn from features that are good already
-                actor.encoder.load_state_dict(actor.get_submodule("coarse.encoder").state_dict())
+                place_over(actor, load(path, device).actor)
         else:
             return False
         return True
@@ -82,6 +81,13 @@ class CoarseToFineStages(Algorithm):
         """Write the actor with its frozen coarser stages."""
         network = asdict(self.config.actor_spec(self.stage))
         write_policy(path, self.trained_actor.state_dict(), description | {"kind": KIND, "network": network})
+
+
+def place_over(actor: Actor, coarse: Actor) -> None:
+    """Give a fresh actor the weights of the trained one below it, and its lean encoder to begin with."""
+    actor.get_submodule("coarse").load_state_dict(coarse.state_dict())
+    if isinstance(actor.encoder, LeanEncoder):  # so that heads and critics that read it need not wait for its features
+        actor.encoder.load_state_dict(coarse.encoder.state_dict())
 
 
 def start_path(folder: Path) -> Path:

@@ -23,7 +23,7 @@ from cfp.experiment.process import Stopped, StopSignals
 from cfp.experiment.run import TrainingRun, check_options
 from cfp.experiment.run_lock import run_lock
 from cfp.files import read_json
-from cfp.from_dict import flatten, update_from_dict
+from cfp.from_dict import flatten, leaf_names, update_from_dict
 from cfp.policy_protocols import Policy
 
 BASIC = ("task", "target", "algo", "preset", "learner", "steps", "seed", "device", "out", "resume")
@@ -131,7 +131,7 @@ def complete(
             command.run.check()
             return replace(command, out=folder)
     command = read(program.configure(values))
-    run = command.run.with_derived(preset, values.keys() | named)
+    run = command.run.with_derived(preset, leaf_names(values) | set(named))
     run.check()
     run.check_effect(preset)
     return replace(command, run=run, out=command.out or Path("runs") / run.name)

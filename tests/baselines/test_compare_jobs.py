@@ -36,6 +36,18 @@ def test_algorithm_for_all_is_that_of_variants():
     assert found == ["zero", "gnn-16", "coarse", "cem"]
 
 
+def test_presets_follow_the_learner_and_the_policy_to_start_from():
+    algos = {
+        "gradients": {"algo": "cfp", "learner": "analytic", "steps": 6400},
+        "refined": {"algo": "coarse", "start_from": "run", "refine": True},
+        "late": {"algo": "cfp", "steps": 1000, "learning": {"actor_start": 4000}},
+    }
+    gradients, refined, late = (resolve(Plan(algos=algos), name, "run", "quick", 0, None, "cpu") for name in algos)
+    assert (gradients.learner, gradients.handover) == ("analytic", (4800,))
+    assert (refined.resolutions, refined.network.encoder, refined.learning.batch_size) == ((8,), "full", 64)
+    assert late.learning.actor_start == 4000
+
+
 def test_names_in_a_plan_that_mean_nothing_are_reported(tmp_path, capsys):
     algos = {"cfp": {"tasks": {"rnu": {"steps": 9600}, "run": {"steps": 6400}}}, "shac": {"tasks": {"kick": {}}}}
     assert compare(tmp_path / "out", "--dry-run", "--algos", "cfp", "--tasks", "run", plan={"algos": algos}) == 0

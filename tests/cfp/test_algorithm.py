@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from fakes import FakeEnv
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
@@ -346,3 +347,19 @@ def test_wrong_action_grid_is_refused():
         make_model(ActorSpec((16,)), FakeEnv(num_envs=1, resolution=8))
     with pytest.raises(ValueError, match="use_sde"):
         make_model(ActorSpec((8,)), sac_options={"use_sde": True})
+
+
+@pytest.mark.parametrize("option", ["target_update_interval", "target_entropy"])
+def test_options_of_sac_without_effect_are_refused(option):
+    with pytest.raises(TypeError, match=f"CFP does not use {option}"):
+        CFP("CFPPolicy", FakeEnv(num_envs=1, resolution=8), **{option: 3})
+
+
+def test_targets_over_several_steps_need_the_replay_buffer_that_sums_them():
+    with pytest.raises(ConfigError, match="n_steps must be 1 with another replay_buffer_class, got 3"):
+        CFP("CFPPolicy", FakeEnv(num_envs=1), Hyperparameters(n_steps=3), replay_buffer_class=ReplayBuffer)
+
+
+def test_hyperparameters_of_a_stage_are_checked():
+    with pytest.raises(ConfigError, match="alpha must be at least 0, got -1"):
+        CFP("CFPPolicy", FakeEnv(num_envs=1), Hyperparameters(alpha=-1.0))

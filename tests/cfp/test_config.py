@@ -107,7 +107,7 @@ def test_command_line_beats_file_beats_preset(tmp_path):
     assert parse(PROGRAM, ["--particles", "500", "20"]).run.environment.particles == (500, 20)
 
 
-def test_fewer_steps_shorten_every_level():
+def test_fewer_steps_shorten_every_level(tmp_path):
     config = sac_preset("run")
     half = parse(PROGRAM, ["--learner", "sac", "--task", "run", "--steps", str(config.steps // 2)]).run
     assert half.handover == (config.handover[0] // 2,)
@@ -116,6 +116,9 @@ def test_fewer_steps_shorten_every_level():
     assert explicit.handover == (900,)
     explicit = parse(PROGRAM, "--learner sac --task run --steps 1000 --actor-start 4000".split()).run
     assert explicit.learning.actor_start == 4000
+    options = {"learner": "sac", "task": "run", "steps": 1000, "learning": {"actor_start": 4000}}
+    (tmp_path / "options.json").write_text(json.dumps(options))
+    assert parse(PROGRAM, ["--config", str(tmp_path / "options.json")]).run == explicit
     longer = parse(PROGRAM, "--learner sac --task run --steps 100000".split()).run
     assert longer.learning == config.learning
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 from fakes import FakeEnv
 from policy_files import save_actor
+from stable_baselines3.common.noise import NormalActionNoise
 from test_algorithm import make_batch, make_model
 from tiny_runs import assert_same_run, at_step, run
 from torch.nn import functional as F
@@ -155,7 +156,6 @@ def test_halved_images_are_means_of_four_pixels():
     image = make_batch(8).observations
     expected = F.avg_pool2d(normalise_image(image), 2)
     torch.testing.assert_close(halved(image), expected, rtol=0, atol=1e-6)
-    torch.testing.assert_close(halved(normalise_image(image)), expected, rtol=0, atol=1e-6)
     assert halved(expected) is expected
 
 
@@ -207,6 +207,15 @@ def test_larger_actions_are_averaged_over_the_cells_of_the_grid():
     torch.testing.assert_close(critics.actions(F.interpolate(on_grid, size=64)), encoded)
     observation = Encoded(torch.zeros(3, 3, 32, 32), torch.randn(3, 16, 4, 4))
     assert [values.shape for values in critics(observation, torch.randn(3, 2, 18, 18))] == [(3, 1)] * 2
+
+
+def test_critics_take_executed_actions_where_batches_hold_them():
+    env = FakeEnv(num_envs=2, resolution=18)
+    noise = NormalActionNoise(np.zeros((2, 18, 18)), 0.1 * np.ones((2, 18, 18)))
+    for options, size in (({}, 8), ({"action_noise": noise}, 18)):
+        model = make_model(ActorSpec((4, 8), (0.0,), patch=18, encoder="lean"), env, options)
+        obs = model.policy.encode(make_batch(18).observations)
+        assert model.networks()[0].sample_for_critic(obs).action.shape[2:] == (size, size)
 
 
 def test_actor_starts_after_the_critics_and_rates_fall():
@@ -262,6 +271,11 @@ def test_a_policy_with_the_papers_networks_goes_on_with_smaller_batches_and_with
     assert (from_json(asked).learning.noise_cells, from_json(asked).learning.gradient_steps) == (2, 8)
     gated = from_json({"task": "run", "learner": "sac", "start_from": "run", "network": {"gate_scale": 0.5}})
     assert gated == replace(started, network=replace(started.network, gate_scale=0.5))
+
+
+def test_paper_options_stay_with_a_policy_to_start_from():
+    started = from_json({"task": "run", "preset": "paper", "start_from": "run"})
+    assert started == replace(sac_preset("run", "paper"), start_from="run")
 
 
 def test_a_policy_of_two_stages_is_refined_by_the_other_learner_with_its_own_gate(tmp_path):
