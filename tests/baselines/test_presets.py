@@ -29,7 +29,8 @@ def test_presets_are_valid_survive_json_and_agree_with_that_of_cfp(task, preset)
         if hasattr(config, "learning"):  # soft actor-critic
             learning = own.learning
             if name.startswith(("gnn", "transformer")):  # other networks, without a grid of actions
-                learning = replace(learning, noise_cells=0, actor_start=min(800, learning.actor_start))
+                updates, start = min(4, learning.gradient_steps), min(800, learning.actor_start)
+                learning = replace(learning, noise_cells=0, gradient_steps=updates, actor_start=start)
             assert config.learning == learning
             assert (config.environment, config.steps) == (own.environment, own.steps)
         if name in ("coarse", "fine"):
