@@ -1,8 +1,8 @@
 """Cost of a training step and its parts: `python benchmarks/training.py`.
 
 Prints for each update the seconds, floating-point operations and the share of the speed of a matrix product, training
-steps per second of the quick preset with the shares of simulation, updates and the rest, and environment steps per
-second alone.
+steps per second of the preset quick and of its former options with the shares of simulation, updates and the rest, and
+environment steps per second alone.
 """
 
 import argparse
