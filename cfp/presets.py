@@ -251,8 +251,8 @@ def like_start(base: Options, values: dict[str, Any]) -> Options:
     """A default configuration for the policy that the JSON ``values`` start from, if any.
 
     A policy of as many stages that is refined keeps its action grids. For policies with the paper's networks the next
-    grid is the paper's. An update takes several times as long, so there are fewer, of smaller batches. Strong exploration
-    noise would disturb a policy that can do something already. What else the preset changes was not measured for them.
+    grid is the paper's. An update takes several times as long, so there are fewer, of smaller batches. Strong
+    exploration noise would disturb a policy that can do something already. What else differs was not measured for them.
     """
     if not isinstance(base, CoarseToFineConfig) or values.get("start_from") is None:
         return base
