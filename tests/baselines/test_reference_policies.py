@@ -72,8 +72,8 @@ LEARNING = (
 def test_coarse_is_the_first_stage_and_goes_on(tmp_path):
     """With one seed the curves of coarse and CFP are the same up to the handover."""
     trained("coarse", tmp_path / "coarse", *LEARNING, "--resolutions", "4", "--steps", "60")
-    ladder = [*LEARNING, "--resolutions", "4", "8", "--random-steps", "10", "4", "--steps", "60", "--handover", "40"]
-    trained("cfp", tmp_path / "cfp", *ladder)
+    stages = [*LEARNING, "--resolutions", "4", "8", "--random-steps", "10", "4", "--steps", "60", "--handover", "40"]
+    trained("cfp", tmp_path / "cfp", *stages)
     curves = [read_table(tmp_path / name / "evaluations.csv") for name in ("coarse", "cfp")]
     first = [row for row in curves[1] if row["stage"] == "1"]
     assert len(first) == 4 and curves[0][:4] == first and [row["step"] for row in curves[0][4:]] == ["50", "60"]
@@ -85,7 +85,7 @@ def test_fine_from_scratch_has_the_size_of_the_papers(task, count):
     assert sum(parameter.numel() for parameter in build_actor(spec).parameters()) == count
 
 
-def test_resolutions_can_be_studied_and_ladders_are_refused(tmp_path, capsys):
+def test_resolutions_can_be_studied_and_several_are_refused(tmp_path, capsys):
     config = configure({"algo": "fine", "task": "run", "resolutions": [4]})
     config.check()
     assert config.name == "fine4-run-quick-0"

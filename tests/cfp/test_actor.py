@@ -94,19 +94,19 @@ def test_closed_gates_leave_the_coarsest_action(resolutions):
 def test_closed_gates_leave_the_coarsest_field(task):
     config = sac_preset(task, "quick")
     config = replace(config, environment=replace(config.environment, particles=100, substeps=1, num_envs=2))
-    ladders = {config.resolutions, tuple(size for size in (4, 8, 16, 32, 64) if size <= make_spec(task).patch)}
-    for ladder in ladders:
-        shut = replace(config, resolutions=ladder, gate_bias=(-100.0,) * (len(ladder) - 1))
+    several = {config.resolutions, tuple(size for size in (4, 8, 16, 32, 64) if size <= make_spec(task).patch)}
+    for resolutions in several:
+        shut = replace(config, resolutions=resolutions, gate_bias=(-100.0,) * (len(resolutions) - 1))
         torch.manual_seed(0)
-        finest, fields = build_actor(shut.actor_spec(len(ladder))), []
-        levels = [finest]
-        while hasattr(levels[0], "coarse"):
-            levels.insert(0, levels[0].coarse)
-        action = 3 * torch.rand(2, 2, ladder[0], ladder[0]) - 1.5
+        finest, fields = build_actor(shut.actor_spec(len(resolutions))), []
+        stages = [finest]
+        while hasattr(stages[0], "coarse"):
+            stages.insert(0, stages[0].coarse)
+        action = 3 * torch.rand(2, 2, resolutions[0], resolutions[0]) - 1.5
         drawn = Sample(action, torch.zeros(2), None, (action,))
-        levels[0].sample = lambda *_, drawn=drawn: drawn  # some of the field is clipped
+        stages[0].sample = lambda *_, drawn=drawn: drawn  # some of the field is clipped
         with torch.no_grad():
-            for stage, actor in enumerate(levels, 1):
+            for stage, actor in enumerate(stages, 1):
                 env = make_torch_env(shut, shut.action_size(stage))
                 observation, _ = env.reset(seed=0)
                 env.step(actor(observation, deterministic=True))
@@ -125,7 +125,7 @@ def test_composed_action_is_not_clipped():
     assert actor(images(), deterministic=True).abs().max() > 1.001
 
 
-def test_coarser_levels_are_frozen_and_drawn_anew():
+def test_coarser_stages_are_frozen_and_drawn_anew():
     torch.manual_seed(0)
     actor = build_actor(ActorSpec((8, 16), (0.0,)))
     image = images()
@@ -150,6 +150,6 @@ def test_coarser_levels_are_frozen_and_drawn_anew():
         ((8, 16), (), "gate_bias must have 1 values"),
     ],
 )
-def test_impossible_ladders_are_refused(resolutions, bias, message):
+def test_impossible_resolutions_are_refused(resolutions, bias, message):
     with pytest.raises(ValueError, match=message):
         ActorSpec(resolutions, bias)

@@ -104,7 +104,7 @@ def test_checkpoint_survives_a_crash_while_the_next_is_written(tmp_path, monkeyp
     assert other.replay_buffer.size() == 10
 
 
-def test_next_level_replaces_the_replay_of_the_last(tmp_path):
+def test_next_stage_replaces_the_replay_of_the_last(tmp_path):
     checkpoint, coarse, fine = Checkpoint(tmp_path), make(1), make(2)
     coarse.learn(12)
     checkpoint.save(coarse, CONFIG, Position(1))

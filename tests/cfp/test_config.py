@@ -107,7 +107,7 @@ def test_command_line_beats_file_beats_preset(tmp_path):
     assert parse(PROGRAM, ["--particles", "500", "20"]).run.environment.particles == (500, 20)
 
 
-def test_fewer_steps_shorten_every_level(tmp_path):
+def test_fewer_steps_shorten_every_stage(tmp_path):
     config = sac_preset("run")
     half = parse(PROGRAM, ["--learner", "sac", "--task", "run", "--steps", str(config.steps // 2)]).run
     assert half.handover == (config.handover[0] // 2,)
@@ -123,7 +123,7 @@ def test_fewer_steps_shorten_every_level(tmp_path):
     assert longer.learning == config.learning
 
 
-def test_another_number_of_levels_stretches_what_each_has_one_of():
+def test_another_number_of_stages_stretches_what_each_has_one_of():
     five = parse(PROGRAM, "--learner sac --resolutions 4 8 16 32 64 --steps 5000".split()).run
     assert five.handover == (1000, 2000, 3000, 4000)
     assert five.alpha == (0.005,) * 5

@@ -55,7 +55,7 @@ def test_loading_a_policy_unpickles_nothing(finished, monkeypatch):
     assert cfp.load(finished).description["task"] == "shapematch"
 
 
-def test_first_level_of_another_ladder_is_refused(finished, tmp_path, capsys):
+def test_first_stage_of_other_resolutions_is_refused(finished, tmp_path, capsys):
     folder = tmp_path / "run"
     options = "--steps 40 --handover 20 --resolutions 8 16 --eval-every 0 --eval-episodes 1".split()
     assert run(folder, *options) == 0

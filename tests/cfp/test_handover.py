@@ -1,4 +1,4 @@
-"""From one level to the next: by plateau, from another run's policy."""
+"""From one stage to the next: by plateau, from another run's policy."""
 
 import json
 import shutil
@@ -53,7 +53,7 @@ def coarse(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", ["", "policy.safetensors"])
-def test_second_level_starts_from_a_policy(coarse, tmp_path, name):
+def test_second_stage_starts_from_a_policy(coarse, tmp_path, name):
     folder = tmp_path / "fine"
     assert run(folder, "--start-from", str(coarse / name), "--steps", "100") == 0
     assert json.loads((folder / "stage1.json").read_text()) == json.loads((coarse / "policy.json").read_text())
@@ -65,7 +65,7 @@ def test_second_level_starts_from_a_policy(coarse, tmp_path, name):
     assert [row["policy"] for row in results][2:] == ["stage 1", "stage 2"]
 
 
-def test_second_level_begins_with_the_lean_encoder_of_the_first(tmp_path):
+def test_second_stage_begins_with_the_lean_encoder_of_the_first(tmp_path):
     for encoder in ("lean", "full"):
         config = sac_preset("run")
         config = replace(config, network=replace(config.network, encoder=encoder))
@@ -96,8 +96,8 @@ def test_policy_that_does_not_fit_is_refused(coarse, tmp_path, capsys, options, 
 
 
 @pytest.mark.slow
-def test_ladder_of_three_levels_in_one_command(tmp_path):
-    folder = tmp_path / "ladder"
+def test_three_stages_in_one_command(tmp_path):
+    folder = tmp_path / "run"
     options = "--learner sac --task shapematch --particles 100 --substeps 1 --num-envs 2 --device cpu --no-video "
     options += "--batch-size 4 --buffer-size 60 --update-start 8 --actor-start 0 --gradient-steps 1 --eval-every 10 "
     options += "--eval-episodes 1 --resolutions 4 8 16 --steps 90 --log-every 10 --checkpoint-every 20"
@@ -112,12 +112,12 @@ def test_ladder_of_three_levels_in_one_command(tmp_path):
     files = [folder / name for name in ("stage1.safetensors", "stage2.safetensors", "policy.safetensors")]
     policies = [PROGRAM.load(file) for file in files]
     assert [policy.spec.resolutions for policy in policies] == [(4,), (4, 8), (4, 8, 16)]
-    for level, policy in enumerate(policies):
-        own = [row for row in rows if row["stage"] == str(level + 1)]
+    for stage, policy in enumerate(policies):
+        own = [row for row in rows if row["stage"] == str(stage + 1)]
         best = max(own, key=lambda row: float(row["mean"]))  # the first of equals
         assert policy.description["steps"] == int(best["step"])
-        if level:  # the level below is frozen as it was handed over
-            below = policies[level - 1].actor.state_dict()
+        if stage:  # the stage below is frozen as it was handed over
+            below = policies[stage - 1].actor.state_dict()
             mine = policy.actor.state_dict()
             assert all(torch.equal(mine[f"coarse.{key}"], value) for key, value in below.items())
     results = json.loads((folder / "results.json").read_text())
@@ -147,7 +147,7 @@ def test_refining_goes_on_with_the_weights_of_a_policy(coarse, tmp_path):
     assert all(not row.get("train/drift") for row in read_table(tmp_path / "a" / "progress.csv"))
     rows = read_table(tmp_path / "a" / "evaluations.csv")
     assert [(row["step"], row["stage"]) for row in rows[:2]] == [("0", "1"), ("10", "1")]  # judged before it learns
-    # Nothing but the critics has learned in the 30 steps of the first level, and nothing was random.
+    # Nothing but the critics has learned in the 30 steps of the first stage, and nothing was random.
     assert [row["mean"] for row in rows[:4]] == [rows[0]["mean"]] * 4
     begun, given = (PROGRAM.load(place).actor.state_dict() for place in (tmp_path / "a" / "stage1.json", coarse))
     assert all(torch.equal(begun[key], value) for key, value in given.items())

@@ -38,7 +38,7 @@ def test_head_has_the_reference_size_and_shape(resolution, count):
         ((8, 16), True, 66174),
         ((16, 32), False, 97230),
         ((32, 64), False, 98394),
-        ((8,), True, 80596),  # the first level never sees an action: split or not is the same
+        ((8,), True, 80596),  # the first stage never sees an action: split or not is the same
     ],
 )
 def test_actor_has_the_reference_size(resolutions, split, count):
