@@ -259,6 +259,25 @@ def rewards_tasks_figure(path: Path) -> None:
     drawing.savefig(path, metadata={"Date": None})
 
 
+def rewards_stages_figure(path: Path) -> None:
+    """Draw evaluations in SHAPE MATCH of the learner ``sac`` with both stages or a single one, a line for each seed."""
+    rows = read("rewards-stages.csv")
+    drawing = Figure(figsize=(7.2, 3.2), layout="constrained")
+    FigureCanvasSVG(drawing)
+    axis = drawing.subplots()
+    for index, algorithm in enumerate(dict.fromkeys(row["algorithm"] for row in rows)):
+        own = [row for row in rows if row["algorithm"] == algorithm]
+        for number, seed in enumerate(dict.fromkeys(row["seed"] for row in own)):
+            points = [row for row in own if row["seed"] == seed]
+            steps, means = ([float(row[column]) for row in points] for column in ("steps", "mean"))
+            label = None if number else algorithm
+            axis.plot(steps, means, marker="o", ms=3, lw=1, color=f"C{index}", label=label)
+    axis.set(xlabel="environment steps", ylabel="return in SHAPE MATCH", xlim=(0, None))
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.legend(fontsize=9, frameon=False)
+    drawing.savefig(path, metadata={"Date": None})
+
+
 def ablation_figure(path: Path) -> None:
     """Draw learning curves of the learner ``analytic`` on SHAPE MATCH, one panel for each option that is changed."""
     rows = read("analytic-shapematch.csv")
@@ -301,5 +320,6 @@ def write_results() -> None:
     comparison_figure(PAGES / "comparison.svg")
     rewards_figure(PAGES / "rewards.svg")
     rewards_tasks_figure(PAGES / "rewards-tasks.svg")
+    rewards_stages_figure(PAGES / "rewards-stages.svg")
     ablation_figure(PAGES / "ablation.svg")
     write(PAGES / "ablation.md", ablation())

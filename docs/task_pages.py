@@ -65,7 +65,9 @@ The [arguments of all tasks](../tasks.md#arguments).
 ```{include} returns-[[ spec.name ]].md
 ```
 
-[](../results.md) says how the returns were measured, and [](../algorithms.md) what the algorithms are.
+[](../results.md) says how the policies of the package and the planners were measured, and
+[](../experiments/algorithms.md) how the others were; rows of `cfp`, `coarse`, `fine`, `gnn-*` and `transformer-*` have
+earlier defaults of `--learner sac`.
 
 ## Geometry
 
