@@ -6,7 +6,7 @@ Those of ``paper`` are from the reference's configuration files and the paper (D
 from __future__ import annotations
 
 import typing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 import dittogym
@@ -256,8 +256,7 @@ def like_start(base: Options, values: dict[str, Any]) -> Options:
     """
     if not isinstance(base, CoarseToFineConfig) or values.get("start_from") is None:
         return base
-    network = values.get("network")
-    if isinstance(network, dict) and "encoder" in network:
+    if {option.name for option in fields(base)} <= values.keys():  # those of a run, whose start may be gone by now
         return base
     spec, lean = load(values["start_from"]).spec, base.network.encoder == "lean"
     base = replace(base, network=replace(base.network, encoder=spec.encoder))

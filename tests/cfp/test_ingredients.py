@@ -21,6 +21,7 @@ from cfp.agent.losses import critic_target
 from cfp.agent.networks import normalise_image, upsample
 from cfp.agent.replay import ReplayRing
 from cfp.agent.spec import ActorSpec
+from cfp.config import to_json
 from cfp.errors import ConfigError
 from cfp.presets import analytic_preset, from_json, sac_preset
 from cfp.weights import load
@@ -270,8 +271,11 @@ def test_a_policy_with_the_papers_networks_goes_on_with_smaller_batches_and_with
     assert started.learning == replace(quick.learning, batch_size=64, noise_cells=0, **usual)
     asked = {"task": "run", "learner": "sac", "start_from": "run", "learning": {"noise_cells": 2, "gradient_steps": 8}}
     assert (from_json(asked).learning.noise_cells, from_json(asked).learning.gradient_steps) == (2, 8)
+    assert from_json({"task": "run", "learner": "sac", "start_from": "run", "network": {"encoder": "full"}}) == started
     gated = from_json({"task": "run", "learner": "sac", "start_from": "run", "network": {"gate_scale": 0.5}})
     assert gated == replace(started, network=replace(started.network, gate_scale=0.5))
+    complete = to_json(started) | {"start_from": "moved-away"}  # as a run's config.json holds it
+    assert from_json(complete) == replace(started, start_from="moved-away")
 
 
 def test_paper_options_stay_with_a_policy_to_start_from():
