@@ -47,8 +47,12 @@ class RunConfig:
     environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
     report: ReportConfig = field(default_factory=ReportConfig)
 
-    changeable: ClassVar[tuple[str, ...]] = ("device", "report.", "environment.backend")
-    """Options that a resumed run may change (a trailing dot: the whole section)."""
+    changeable: ClassVar[tuple[str, ...]] = (
+        "device",
+        *(f"report.{name}" for name in ("eval_every", "patience", "checkpoint_every", "log_every", "video", "wandb")),
+        "environment.backend",
+    )
+    """What the names of options begin with that a resumed run may change."""
 
     @property
     def name(self) -> str:
@@ -278,6 +282,8 @@ class Config(CoarseToFineConfig):
         super().check()
         for name in ("random_steps", "alpha", "gate_penalty"):
             check_at_least(0, **{name: min(getattr(self, name), default=0)})
+        if (cells := self.learning.noise_cells) > (coarsest := self.resolutions[0]):
+            raise ConfigError(f"noise_cells must be at most {coarsest}, the coarsest of resolutions, got {cells}")
 
 
 def check_training_layouts(name: str, count: int, before: int = 0, stages: int = 1) -> None:

@@ -39,6 +39,7 @@ def download(address: str) -> Path:
     Raises:
         CheckpointError: The address has another form, nothing can be downloaded, or the file has another hash than
             the address, or else ``SHA256SUMS`` in the repository, says.
+        ConfigError: huggingface_hub is not installed.
     """
     found = _ADDRESS.fullmatch(address)
     if found is None:

@@ -137,6 +137,8 @@ def fit(
 
     Raises:
         ConfigError: An option does not exist or is wrong.
+        CheckpointError: A policy or the checkpoint is missing, damaged, or of other options.
+        CFPError: Another process trains in the folder.
         NonFiniteError: Training has diverged.
     """
     if steps is not None:

@@ -158,7 +158,7 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
 
     Raises:
         CheckpointError: The file is missing, damaged, or not such a policy.
-        ConfigError: There is no such device.
+        ConfigError: There is no such device, or huggingface_hub is not installed for an address on the Hub.
 
     Examples:
         >>> import cfp, dittogym, gymnasium

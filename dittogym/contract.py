@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dittogym.reward_ops import RewardOps
-from torchmpm import ParticleState, checks
+from torchmpm import ParticleState
 
 #: Terms that the engine adds to those of a task.
 ENGINE_TERMS = frozenset({"split", "action", "alive", "failure"})
@@ -98,7 +98,8 @@ class Outcome(NamedTuple):
         terminated: (B,) bool, the task's own reasons to end the episode; ``None`` for none.
         success: (B,) bool; ``None`` where success is not defined.
         info: Further quantities for ``info``, with a leading B.
-        memory: Replaces the memory, leading B, with the same names and shapes; ``None`` keeps it.
+        memory: Replaces the memory, leading B, with the same names and shapes; ``None`` keeps it. Tensors of int64 of
+            shape (B, K) hold numbers of particles, which planners with fewer particles translate.
     """
 
     terms: Mapping[str, Tensor]
@@ -106,9 +107,6 @@ class Outcome(NamedTuple):
     success: Tensor | None = None
     info: Mapping[str, Tensor] | None = None
     memory: Mapping[str, Tensor] | None = None
-
-    def __post_init__(self) -> None:
-        checks.instance("terms", self.terms, Mapping)
 
 
 Memory: TypeAlias = Mapping[str, Tensor]
@@ -131,6 +129,8 @@ def check_outcome(
     who = f"reward_fn of task {task!r}"
     if not isinstance(outcome, Outcome):
         raise TypeError(f"{who} must return an Outcome, got {type(outcome).__name__}")
+    if not isinstance(outcome.terms, Mapping):
+        raise TypeError(f"{who} must return terms by name, got {_kind(outcome.terms)}")
     optional = tuple(part if part is None else tuple(part) for part in (outcome.info, outcome.memory))
     names = (tuple(outcome.terms), *optional, outcome.terminated is None, outcome.success is None)
     if names in checked:
@@ -144,8 +144,9 @@ def check_outcome(
     for name, value in outcome.terms.items():
         if not isinstance(value, Tensor) or value.shape != (batch,):
             raise ValueError(f"{who} must return terms of shape (B,), got {_kind(value)} for {name!r}")
-    if unknown := sorted(weights.keys() - outcome.terms.keys() - ENGINE_TERMS):
-        allowed = sorted({*outcome.terms, *ENGINE_TERMS})
+    weighted = {*outcome.terms, *ENGINE_TERMS} - {"failure"}  # the penalty of a failure has its own amount
+    if unknown := sorted(weights.keys() - weighted):
+        allowed = sorted(weighted)
         raise ValueError(f"weights of task {task!r} must be of the terms {allowed}, got {unknown}")
     for name, flag in (("terminated", outcome.terminated), ("success", outcome.success)):
         if flag is not None and not (isinstance(flag, Tensor) and (flag.dtype, *flag.shape) == (torch.bool, batch)):

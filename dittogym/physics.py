@@ -71,6 +71,23 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
     return values
 
 
+def check_effect(spec: TaskSpec, physics: Physics) -> None:
+    """Refuse constants that no body takes, because those that could have a material of their own.
+
+    Raises:
+        ValueError: There is such a constant.
+    """
+    for name in physics:
+        if not has_effect(spec, name):
+            raise ValueError(f"physics may not hold {name!r} in {spec.name}, whose bodies have their own materials")
+
+
+def has_effect(spec: TaskSpec, name: str) -> bool:
+    """Whether a body takes the constant ``name``; one with a material of its own takes no others."""
+    takers = {"mu": spec.bodies, "lam": spec.bodies, "yield_stress": (spec.robot,)}.get(name)
+    return takers is None or any(body.material is None for body in takers)
+
+
 def real_tensor(name: str, given: Any) -> Tensor:
     """Numbers, an array or a tensor as a tensor."""
     try:

@@ -151,6 +151,7 @@ class TaskSpec:
             if not isinstance(centre, tuple | list):
                 raise TypeError(f"{name} must be two numbers, or None for each that follows the robot, got {centre!r}")
             checks.pair(name, tuple(0.0 if c is None else c for c in centre))  # None follows the robot
+            object.__setattr__(self, name, tuple(centre))
 
     @property
     def bodies(self) -> tuple[BodySpec, ...]:

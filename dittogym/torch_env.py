@@ -17,7 +17,7 @@ from dittogym.bodies.positions import InitialPositions, Particles, Seed, get_sta
 from dittogym.contract import measure
 from dittogym.model import EnvState, Parity, Snapshot, check_snapshot, check_stability, make_model
 from dittogym.observation.image import SHAPE
-from dittogym.physics import Physics, merged, physics_values
+from dittogym.physics import Physics, check_effect, merged, physics_values
 from dittogym.render.frame import frame, png
 from dittogym.render.recording import Recording, as_function, film
 from dittogym.render.scene import Shot, describe, take
@@ -262,6 +262,7 @@ class TorchEnv:
         if given is None:
             return self._physics
         values = physics_values(given, self.num_envs, self.num_particles, self._like)
+        check_effect(self.spec, values)
         physics = merged(self.spec, self._physics, values, mask, self._like)
         check_stability(self.model, physics)
         return physics
@@ -284,8 +285,9 @@ class TorchEnv:
 
         Returns:
             observation (B, 3, 64, 64) uint8; reward (B,); terminated (B,) bool; truncated (B,) bool, at the horizon;
-            and ``info`` with ``reward_terms`` by name, ``com``, ``split``, ``finite``, ``is_success`` where the task
-            defines it, and the task's own quantities, all with a leading B.
+            and ``info`` with ``reward_terms`` by name, ``com``, ``split``, ``finite`` (all values are finite, and some
+            of the robot is in the simulation window), ``is_success`` where the task defines it, and the task's own
+            quantities, all with a leading B.
 
         Raises:
             ValueError: The action has the wrong shape or type or is not finite.

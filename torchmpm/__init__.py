@@ -17,9 +17,6 @@ from torchmpm.state import ParticleState
 
 __version__ = "0.1.0"
 
-#: The soil of DittoGym's DIG is the snow model with its default values.
-Soil = Snow
-
 __all__ = [
     "Body",
     "Elastic",
@@ -27,7 +24,6 @@ __all__ = [
     "Material",
     "ParticleState",
     "Snow",
-    "Soil",
     "Solver",
     "VelocityRule",
     "VonMises",

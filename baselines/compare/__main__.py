@@ -93,7 +93,9 @@ class Command:
 
     def check(self) -> None:
         """Check what the types cannot."""
-        check_at_least(1, episodes=self.episodes, slot_episodes=self.slot_episodes, cpus_per_run=self.cpus_per_run or 1)
+        check_at_least(1, episodes=self.episodes, slot_episodes=self.slot_episodes)
+        if self.cpus_per_run is not None:
+            check_at_least(1, cpus_per_run=self.cpus_per_run)
         check_at_least(0, workers=self.workers, gpus_per_run=self.gpus_per_run, retries=self.retries)
         if self.gpus_per_run and self.executor == "local":
             raise ConfigError(f"gpus_per_run must be 0 without --executor ray, got {self.gpus_per_run}")

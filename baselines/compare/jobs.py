@@ -122,8 +122,8 @@ class Job:
         """Whether training has ended, here or by ``python -m baselines.train``, if there is any."""
         if self.untrained:
             return (self.folder / RECORD).exists()
-        finished = read_sessions(self.folder)["finished"]
-        return finished in (True, self.config.ends()[-1]) or (self.folder / "results.json").exists()
+        finished = read_sessions(self.folder)["finished"] == self.config.ends()[-1]
+        return finished or (self.folder / "results.json").exists()
 
     @property
     def state(self) -> str:

@@ -35,7 +35,9 @@ TRAINED = ("shac", "gradient")
 class Teacher(Stateful, ABC):
     """Labels the present states of an environment with actions."""
 
-    fresh: bool = True  # or the last actions are part of a plan, and right only for robots that have followed it
+    fresh: bool = True
+    """Whether the last actions were computed from the present states. If not, they continue a plan, and are labels only
+    for robots that have followed it."""
 
     @abstractmethod
     def act(self, env: TorchEnv, observation: Tensor) -> Tensor:

@@ -25,8 +25,12 @@ class Surrogate:
     def __init__(self, large: TorchEnv, small: TorchEnv) -> None:
         self.env = small
         self.indices = _nearest_particles(large, small)  # (B, n) of the large environment's particles
-        memory = small.env_state.memory  # integers in it are numbers of particles, such as the tip in GROW
-        self._particle_memory = {name: value for name, value in memory.items() if not value.is_floating_point()}
+        same = large.model.camera.counts == small.model.camera.counts
+        memory = {} if same else small.env_state.memory
+        # Numbers of particles, such as those of the tip in GROW, see `dittogym.contract.Outcome`.
+        self._particle_memory = {
+            name: value for name, value in memory.items() if value.dtype == torch.int64 and value.ndim == 2
+        }
 
     def sync(self, state: EnvState) -> None:
         """Bring the small environment to a state of the large one."""

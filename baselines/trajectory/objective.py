@@ -1,14 +1,16 @@
-"""What the optimisation of a whole trajectory minimises: a smooth loss of every step."""
+"""What the optimisation of a whole trajectory minimises: a loss of every step."""
 
 import torch
 from torch import Tensor
 
 from dittogym import TorchEnv
 from dittogym.observation.image import soft_silhouette
+from dittogym.spec import TaskSpec
+from dittogym.tasks.shapematch import reward_fn as overlap
 
 
 class Objective:
-    """The negative reward; in tasks with a target picture, whose reward has no gradient, the difference from it.
+    """The negative reward; with that of SHAPE MATCH, which has no gradient, the difference from the target picture.
 
     This is the mean absolute difference of the soft silhouette and the target, both blurred. A wide blur pulls matter
     towards a target that it does not touch, a narrow one shapes the outline.
@@ -16,7 +18,7 @@ class Objective:
 
     def __init__(self, env: TorchEnv, blur: tuple[float, ...]) -> None:
         self.target: Tensor | None = None
-        if env.spec.target is not None:
+        if matches_shape(env.spec):
             self.target = torch.as_tensor(env.spec.target, device=env.device, dtype=env.dtype)
             self.blurs = [gaussian_matrix(sigma, len(self.target)).to(self.target) for sigma in blur]
 
@@ -31,6 +33,11 @@ class Objective:
         blur = self.blurs[self.phase(progress)]
         difference = soft_silhouette(env.soft_observation()) - self.target
         return (blur @ difference @ blur.T).abs().mean((1, 2))
+
+
+def matches_shape(spec: TaskSpec) -> bool:
+    """Whether the reward of a task is the overlap with its target."""
+    return spec.target is not None and spec.reward_fn is overlap
 
 
 def gaussian_matrix(sigma: float, size: int) -> Tensor:

@@ -10,7 +10,7 @@ from torch.nn.functional import interpolate
 
 from baselines.common.grid import Grid, GridConfig, grid_size
 from baselines.common.open_loop import OpenLoop, OpenLoopAlgorithm
-from baselines.trajectory.objective import Objective
+from baselines.trajectory.objective import Objective, matches_shape
 from cfp.analytic.stateful import Stateful
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
@@ -91,9 +91,9 @@ class GradientConfig(GridConfig):
         return (self.seed, 1) if stage > 1 else super().evaluation(stage)
 
     def ineffective(self) -> dict[str, str]:
-        """Options of the second stage have no effect without one, the blur none in tasks without a target."""
+        """Options of the second stage have no effect without one, the blur none without the reward of SHAPE MATCH."""
         polish = {} if self.polish else dict.fromkeys(("polish_grid", "polish_learning_rate"), "polish")
-        blur = {"blur": "a task that has a target"} if make_spec(self.task).target is None else {}
+        blur = {} if matches_shape(self.make_spec()) else {"blur": "the reward of shapematch"}
         return super().ineffective() | polish | blur
 
     def check(self) -> None:

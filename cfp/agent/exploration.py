@@ -32,7 +32,6 @@ class CellNoise:
     def __init__(
         self, num_envs: int, resolution: int, cells: int, scale: tuple[float, float], seed: int | None
     ) -> None:
-        cells = min(cells, resolution)
         self.block = resolution // cells
         self.scale = np.geomspace(*scale, num_envs, dtype=np.float32)[:, None, None, None]
         self.values = np.zeros((num_envs, 2, cells, cells), np.float32)

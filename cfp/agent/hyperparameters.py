@@ -41,7 +41,7 @@ class LearningConfig:
     noise_cells: int = 0
     """Rows and columns of cells with equal exploration noise, held for some steps; 0: the policy's own noise alone."""
     noise_scale: tuple[float, float] = (0.05, 0.4)
-    """Standard deviation of that noise before tanh, of the first and of the last robot."""
+    """Standard deviation of that noise before tanh, of the first and of the last robot; a single one has the first."""
     n_steps: int = 1
     """Steps whose rewards a critic's target sums up."""
     final_rate: float = 1.0

@@ -59,8 +59,8 @@ UNUSED = {"target_update_interval", "target_entropy"}
 
 
 def falling_rate(rate: float, final: float, remaining: float) -> float:
-    """A learning rate that falls along a line to the fraction ``final``; ``remaining`` goes from 1 to 0."""
-    return rate * (final + (1 - final) * remaining)
+    """A learning rate that falls to the fraction ``final`` on a line; ``remaining`` goes from 1 to 0, or just below."""
+    return rate * (final + (1 - final) * max(remaining, 0.0))
 
 
 def clip_each(parameters: Iterable[nn.Parameter], max_norm: float) -> None:

@@ -17,7 +17,7 @@ OUTLIER = 3.0
 HISTORY = 2_000
 """Latest norms that the median is taken of."""
 BOUND = 2.5
-"""Largest magnitude of an improved location; its tanh is 0.987."""
+"""Largest magnitude of an improved mean, whose tanh is 0.987, and of an improved gate logit before its bias."""
 
 
 class ActionStep(Stateful):

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from cfp.analytic.reward import RewardConfig
 from cfp.config import COUNTED_LAYOUTS, CoarseToFineConfig, Learner, check_training_layouts
-from cfp.sections import Particles
+from cfp.sections import EnvironmentConfig, Particles
 from cfp.validation import check_at_least, check_decay, check_fraction, check_positive
 
 
@@ -81,6 +81,12 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
         """Environment steps from one update to the next: a window of all robots."""
         return self.window * self.environment.num_envs
 
+    @property
+    def training_environment(self) -> EnvironmentConfig:
+        """Options of the simulations in training."""
+        dt = self.environment.dt if self.train_dt is None else self.train_dt
+        return self.environment.for_optimisation(self.task, self.train_particles, dt)
+
     def ineffective(self) -> dict[str, str]:
         """Options without effect: layouts are counted from the seed."""
         return super().ineffective() | COUNTED_LAYOUTS
@@ -89,6 +95,7 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
         """Check what the types do not express."""
         super().check()
         self.check_window()
+        _ = self.training_environment  # checks train_dt
         check_at_least(0, warmup=self.warmup)
         check_at_least(1, minibatches=self.minibatches, minibatch_size=self.minibatch_size)
         check_at_least(1, windows_kept=self.windows_kept)

@@ -55,9 +55,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
 
     def __init__(self, config: AnalyticConfig, stage: int, actor: Actor) -> None:
         self.config, self.stage = config, stage
-        dt = config.environment.dt if config.train_dt is None else config.train_dt
-        environment = config.environment.for_optimisation(config.task, config.train_particles, dt)
-        training = replace(config, environment=environment)
+        training = replace(config, environment=config.training_environment)
         self.env = make_torch_env(training, config.action_size(stage))
         actor.fix_std()
         self.actor = actor

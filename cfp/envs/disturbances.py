@@ -18,6 +18,7 @@ from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import monitored
 from dittogym.action import bicubic
 from dittogym.geometry import floor
+from dittogym.physics import has_effect
 from dittogym.spec import TaskSpec
 
 FLOOR = floor().name
@@ -46,6 +47,8 @@ def reason_without_effect(case: Case, spec: TaskSpec, uses_image: bool = True) -
         return "the policy does not use the image"
     if "gravity" in case.physics and not any(spec.gravity):
         return f"{spec.name} has no gravity"
+    if not all(has_effect(spec, name) for name in case.physics):
+        return f"the bodies of {spec.name} have their own materials"
     if case.friction is None:
         return ""
     floors = [item for item in spec.obstacles if item.name == FLOOR]

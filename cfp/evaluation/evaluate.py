@@ -59,6 +59,9 @@ def make_trial(
     config: RunConfig, name: str, policy: PolicyPredictor, size: int, episodes: int, *, deterministic: bool, seed: int
 ) -> Trial:
     """Episodes of a policy with actions (2, size, size) in the environment of a run."""
+    batch, cache = batch_size(config, episodes), None
+    if isinstance(policy, UntrainedPolicy) and batch == 1:  # random actions of several at once depend on all of them
+        cache = EpisodeCache.of(config, policy.kind, size)
     return Trial(
         name=name,
         resolution=size,
@@ -67,8 +70,8 @@ def make_trial(
         episodes=episodes,
         deterministic=deterministic,
         seed=seed,
-        batch=batch_size(config, episodes),
-        cache=EpisodeCache.of(config, policy.kind, size) if isinstance(policy, UntrainedPolicy) else None,
+        batch=batch,
+        cache=cache,
     )
 
 

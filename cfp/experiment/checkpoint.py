@@ -101,7 +101,7 @@ def check_same(stored: dict[str, Any], given: RunConfig) -> None:
     for name in {**old, **new}:
         if name.startswith(given.changeable) or old.get(name) == new.get(name):
             continue
-        allowed = ", ".join(option.rstrip(".") for option in given.changeable)
+        allowed = ", ".join(given.changeable)
         raise ConfigError(
             f"{name.split('.')[-1]}: the run was started with {old.get(name)!r}, got {new.get(name)!r}; "
             f"a resumed run may change only: {allowed}"

@@ -80,10 +80,10 @@ class _Choice:
 
 def parse(program: Program, arguments: Sequence[str], started: str | None = None) -> Command:
     """Read a command line; ``SystemExit`` after ``--help``, or for an option that does not exist or cannot be read."""
-    choice, _ = tyro.cli(_Choice, args=list(arguments), return_unknown_args=True, add_help=False, console_outputs=False)
+    prog = started or program_name(f"{program.package}.train", arguments)
+    choice, _ = tyro.cli(_Choice, prog=prog, args=list(arguments), return_unknown_args=True, add_help=False)
 
     def read(defaults: RunConfig) -> Command:
-        prog = started or program_name(f"{program.package}.train", arguments)
         command: Command = read_options(
             Command(defaults),
             BASIC,

@@ -17,7 +17,7 @@ from torch import Tensor
 from dittogym.action import bicubic, from_grid_indexing, patch_corner, to_grid_indexing
 from dittogym.geometry import NODES
 from dittogym.model import Snapshot, check_stability
-from dittogym.physics import physics_values
+from dittogym.physics import check_effect, physics_values
 from dittogym.play import protocol
 from dittogym.play.hand import Grip, press, wave
 from dittogym.render.recording import Recording
@@ -141,6 +141,7 @@ class Session:
         self.actions.append(self.action)
         self.recording.shots.append(self.shot)
         self.recording.rewards.append(earned)
+        self.recording.success = self.success if "is_success" in info else None
 
     def frame(self, rate: float) -> bytes:
         """The present moment for the page, at ``rate`` simulated seconds per second; see `protocol.pack_frame`."""
@@ -288,6 +289,7 @@ class Session:
         if message.gravity != -spec.gravity[1]:
             physics["gravity"] = (spec.gravity[0], -message.gravity)
         values = physics_values(physics, 1, self.env.num_particles, state.centre[:, 0])
+        check_effect(spec, values)
         check_stability(self.env.model, values)
         if physics != self.physics:
             self._note(CHANGED_MATTER)

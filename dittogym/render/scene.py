@@ -38,7 +38,7 @@ class Matter:
 
 
 class Solid(NamedTuple):
-    """A box of an obstacle, m; ``filled`` unless the robot does not see it."""
+    """A box of an obstacle, m; ``filled`` if the robot sees it, or if it is a floor: a box with a top only."""
 
     left: float
     right: float

@@ -116,6 +116,8 @@ TRAIN = [
     training("a folder that is not text", "--out run\udcff", "error: out must be text in UTF-8, got 'run\\udcff'"),
     training("an unset variable as its folder", "--out ''", "error: out must name a folder, got ''"),
     training("a variable that is not set", "--out=", "error: out must name a folder, got ''"),
+    training("an option without its value", "--task", "Missing value for argument '--task"),
+    training("noise of more cells than actions", "--noise-cells 32", "noise_cells must be at most"),
 ]
 
 OTHERS = [
@@ -131,7 +133,7 @@ OTHERS = [
     learning("cem", "one elite", "--elites 1", "elites", "got 1"),
     learning("shac", "an endless discount", "--gamma nan", "gamma must be finite, got nan"),
     learning("shac", "a policy of the state", "--start-from run", "start_from", "sees 'image'"),
-    learning("gradient", "a blur of rewards", "--task run --blur 1", "blur requires ", "a task that has a target"),
+    learning("gradient", "a blur of rewards", "--task run --blur 1", "blur requires ", "the reward of shapematch"),
     distilling("plans of no planner", "--iterations 9", "iterations requires teacher mpc"),
     learning("zero", "training", "", "'zero' is a reference policy", "python -m baselines.compare --algos zero"),
     distilling("a teacher of another task", "--teacher run", "teacher must be a policy for shapematch, got one for"),

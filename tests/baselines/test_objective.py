@@ -1,10 +1,13 @@
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
 import torch
 
 from baselines.trajectory.objective import Objective, gaussian_matrix
-from dittogym import TorchEnv
+from dittogym import TorchEnv, make_spec
+from dittogym.contract import Outcome
 
 
 @pytest.mark.parametrize("sigma", [0.0, 1.0, 3.5])
@@ -39,3 +42,14 @@ def test_blurs_follow_one_another():
 def test_tasks_without_a_picture_minimise_the_negative_reward():
     env = TorchEnv("run", resolution=8, particles=100, substeps=1)
     assert Objective(env, (0.0,))(env, torch.tensor([2.5]), 0.5).tolist() == [-2.5]
+
+
+def test_the_reward_of_a_task_derived_from_shape_match_counts():
+    def drift(moment, spec):
+        return Outcome({"drift": moment.now.com[:, 0]})
+
+    spec = dataclasses.replace(make_spec("shapematch"), name="drift", reward_fn=drift, weights={"drift": 1.0})
+    env = TorchEnv(spec, resolution=8, particles=100, substeps=1)
+    env.reset(seed=0)
+    reward = torch.ones(1)
+    assert Objective(env, (0.0,))(env, reward, 0.0) == -reward

@@ -204,5 +204,7 @@ def test_resumed_run_may_change_only_what_does_not_alter_it():
     check_same(stored, replace(config, environment=replace(config.environment, backend="eager")))
     with pytest.raises(ConfigError, match=r"gamma: the run was started with 0\.9.*, got 0\.5"):
         check_same(stored, replace(config, learning=replace(config.learning, gamma=0.5)))
+    with pytest.raises(ConfigError, match="eval_episodes: the run was started with 5, got 9"):
+        check_same(stored, replace(config, report=replace(config.report, eval_episodes=9)))
     with pytest.raises(ConfigError, match="task: the run was started with 'run', got 'shapematch'"):
         check_same(stored, replace(config, task="shapematch"))

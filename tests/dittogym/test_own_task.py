@@ -437,6 +437,25 @@ def test_a_robot_of_another_material_and_size() -> None:
     assert (elastic.state.x - own.state.x).abs().max() > 1e-6
 
 
+def test_constants_that_no_body_takes_are_refused() -> None:
+    robot = dataclasses.replace(hop().robot, material=Elastic(1500.0, 50.0))
+    env = tiny(dataclasses.replace(hop(), robot=robot))
+    with pytest.raises(ValueError, match="physics may not hold 'mu' in hop, whose bodies have their own materials"):
+        env.reset(seed=0, options={"physics": {"mu": 900.0}})
+    env.reset(seed=0, options={"physics": {"mass": 2.0, "gravity": (0.0, -1.0)}})
+
+
+def test_terms_without_names_are_refused() -> None:
+    env = tiny(dataclasses.replace(hop(), reward_fn=lambda moment, spec: Outcome(moment.now.com[:, 1])))
+    env.reset(seed=0)
+    with pytest.raises(TypeError, match="reward_fn of task 'hop' must return terms by name"):
+        env.step(torch.zeros(1, *env.action_shape))
+
+
+def test_centres_of_windows_may_be_lists() -> None:
+    assert dataclasses.replace(hop(), view=[None, 0.28]).view == (None, 0.28)
+
+
 @pytest.mark.parametrize(
     ("task", "options"),
     [

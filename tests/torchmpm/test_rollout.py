@@ -191,3 +191,38 @@ def test_checkpoints_bound_the_memory() -> None:
     assert segmented < 0.4 * whole
     assert peak_memory(40, 4) < 1.4 * segmented
     assert peak_memory(20, None, checkpointed=True) < 0.4 * whole
+
+
+class Learned(torch.nn.Module):
+    """A law whose stiffness is a parameter of a module."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.mu = torch.nn.Parameter(torch.tensor([500.0], dtype=torch.float64))
+
+    def law(self) -> Elastic:
+        return Elastic(self.mu, 50.0)
+
+    def return_map(self, F: Any, Jp: Tensor) -> Any:
+        return self.law().return_map(F, Jp)
+
+    def stress(self, F: Any, Jp: Tensor) -> Any:
+        return self.law().stress(F, Jp)
+
+    def energy(self, F: Any, Jp: Tensor) -> Any:
+        return self.law().energy(F, Jp)
+
+    def stiffness(self) -> Any:
+        return self.law().stiffness()
+
+
+def test_an_optimiser_step_between_a_step_of_a_learned_law_and_its_gradient_is_refused() -> None:
+    law = Learned()
+    solver = robot(5, bodies=(Body(5, law, mass=2.0),), backend="eager")
+    final = solver.step(lively(5), substeps=20)
+    final.x.square().sum().backward(retain_graph=True)
+    assert law.mu.grad.abs().item() > 0
+    with torch.no_grad():
+        law.mu.mul_(0.5)
+    with pytest.raises(RuntimeError, match=rf"^bodies\[0\].material.mu {CHANGED}"):
+        final.x.square().sum().backward()

@@ -1,10 +1,10 @@
 """Bodies: runs of consecutive particles of one material."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchmpm import checks
 from torchmpm.materials.base import Material, Value, broadcast_plane
@@ -42,7 +42,13 @@ class Body:
     def constants(self) -> dict[str, Value]:
         """Constants of the body and its material by name, such as ``material.mu``; numbers, (), (B,) or (B, count)."""
         own = {name: getattr(self, name) for name in ("mass", "volume")}
-        return own | {f"material.{name}": value for name, value in vars(self.material).items()}
+        law = self.material
+        if isinstance(law, nn.Module):
+            values = dict(law.named_parameters())
+        else:
+            names = [each.name for each in fields(law)] if is_dataclass(law) else vars(law)
+            values = {name: getattr(law, name) for name in names}
+        return own | {f"material.{name}": value for name, value in values.items()}
 
 
 def slices(bodies: Sequence[Body]) -> Iterator[tuple[Body, slice]]:
