@@ -285,9 +285,8 @@ class TorchEnv:
 
         Returns:
             observation (B, 3, 64, 64) uint8; reward (B,); terminated (B,) bool; truncated (B,) bool, at the horizon;
-            and ``info`` with ``reward_terms`` by name, ``com``, ``split``, ``finite`` (all values are finite, and some
-            of the robot is in the simulation window), ``is_success`` where the task defines it, and the task's own
-            quantities, all with a leading B.
+            and, all with a leading B, ``info``: ``reward_terms`` by name, ``com``, ``split``, ``finite`` (false outside
+            the simulation window, too), ``is_success`` where the task defines it, and the task's own quantities.
 
         Raises:
             ValueError: The action has the wrong shape or type or is not finite.

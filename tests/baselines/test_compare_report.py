@@ -36,7 +36,7 @@ def write_run(job, scores, curve, *, successes=0, seconds=100.0, cases=(0.8, 0.5
     write_text(job.folder / "evaluations.csv", "\n".join(["step,mean", *lines]) + "\n")
     session = {"from": 0, "to": 1000, "seconds": seconds + 7, "evaluation_seconds": 7.0, "memory": 2**30}
     session |= {"device": "cpu"}
-    write_json(job.folder / "sessions.json", {"finished": True, "sessions": [session]})
+    write_json(job.folder / "sessions.json", {"finished": job.config.ends()[-1], "sessions": [session]})
     protocol, task = replace(job.protocol, episodes=len(scores)), job.config.task
     (first,) = protocol.batches(task)
     entries = {first: {"returns": scores, "successes": successes}}
