@@ -93,7 +93,7 @@ class GradientConfig(GridConfig):
     def ineffective(self) -> dict[str, str]:
         """Options of the second stage have no effect without one, the blur none without the reward of SHAPE MATCH."""
         polish = {} if self.polish else dict.fromkeys(("polish_grid", "polish_learning_rate"), "polish")
-        blur = {} if matches_shape(self.make_spec()) else {"blur": "the reward of shapematch"}
+        blur = {} if matches_shape(make_spec(self.task)) else {"blur": "the reward of shapematch"}
         return super().ineffective() | polish | blur
 
     def check(self) -> None:

@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cfp.errors import ConfigError
+
 EXPONENT, LONGEST = 2.0, 16
 """Of the zeta distribution of the number of steps for which noise is held: its exponent, and its largest value."""
 
@@ -32,6 +34,8 @@ class CellNoise:
     def __init__(
         self, num_envs: int, resolution: int, cells: int, scale: tuple[float, float], seed: int | None
     ) -> None:
+        if cells > resolution:
+            raise ConfigError(f"noise_cells must be at most {resolution}, the action grid, got {cells}")
         self.block = resolution // cells
         self.scale = np.geomspace(*scale, num_envs, dtype=np.float32)[:, None, None, None]
         self.values = np.zeros((num_envs, 2, cells, cells), np.float32)

@@ -133,6 +133,9 @@ OTHERS = [
     learning("cem", "one elite", "--elites 1", "elites", "got 1"),
     learning("shac", "an endless discount", "--gamma nan", "gamma must be finite, got nan"),
     learning("shac", "a policy of the state", "--start-from run", "start_from", "sees 'image'"),
+    learning(
+        "gradient", "a target of another task", "--task run --target T", "task 'run' got an unexpected", "'target'"
+    ),
     learning("gradient", "a blur of rewards", "--task run --blur 1", "blur requires ", "the reward of shapematch"),
     distilling("plans of no planner", "--iterations 9", "iterations requires teacher mpc"),
     learning("zero", "training", "", "'zero' is a reference policy", "python -m baselines.compare --algos zero"),

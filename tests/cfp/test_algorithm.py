@@ -335,6 +335,8 @@ def test_hyperparameters_are_checked_and_not_given_twice():
         make_model(ActorSpec((8,)), sac_options={"learning_rate": 1e-3, "gamma": 0.9})
     with pytest.raises(ConfigError, match="noise_cells must be one of"):
         make_model(ActorSpec((8,)), noise_cells=3)
+    with pytest.raises(ConfigError, match="noise_cells must be at most 8, the action grid, got 16"):
+        make_model(ActorSpec((8,)), noise_cells=16)
     noise = NormalActionNoise(np.zeros(128), np.ones(128))
     with pytest.raises(ConfigError, match="noise_cells must be 0 with action_noise, got 4"):
         make_model(ActorSpec((8,)), sac_options={"action_noise": noise}, noise_cells=4)

@@ -51,7 +51,7 @@ TOLERANCE = {"slot": 1e-2, "dig": 5e-3, "grow": 2e-3}
 
 
 def test_every_task_has_its_figures() -> None:
-    assert LAYOUT.keys() == REST.keys() == DRIVE.keys() <= dittogym.TASKS.keys()
+    assert LAYOUT.keys() == REST.keys() == DRIVE.keys() == dittogym.TASKS.keys()
 
 
 @pytest.mark.parametrize("task", LAYOUT)
