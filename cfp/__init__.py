@@ -1,4 +1,4 @@
-"""The coarse-to-fine policy (CFP): soft actor-critic on action images of increasing resolution."""
+"""The coarse-to-fine policy (CFP): action images of increasing resolution, learned by gradients or from rewards."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

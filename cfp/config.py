@@ -13,7 +13,7 @@ from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
 from cfp.agent.spec import ActorSpec
 from cfp.errors import ConfigError
 from cfp.from_dict import flatten
-from cfp.sections import EnvironmentConfig, NetworkConfig, ReportConfig
+from cfp.sections import EnvironmentConfig, NetworkConfig, Particles, ReportConfig
 from cfp.validation import check_at_least
 from dittogym import make_spec
 from dittogym.spec import TaskSpec
@@ -52,7 +52,7 @@ class RunConfig:
         *(f"report.{name}" for name in ("eval_every", "patience", "checkpoint_every", "log_every", "video", "wandb")),
         "environment.backend",
     )
-    """What the names of options begin with that a resumed run may change."""
+    """Prefixes of the names of the options that a resumed run may change."""
 
     @property
     def name(self) -> str:
@@ -121,6 +121,27 @@ class RunConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class OptimisationConfig(RunConfig):
+    """A run that differentiates simulations, or plans in them; they may have fewer particles and longer substeps."""
+
+    train_particles: Particles | None = None
+    """Particles of the simulations in training, at most the environment's; None: as many."""
+    train_dt: float | None = None
+    """Duration of a substep in training, s; None: 2e-4 in tasks where this changes little, unless substeps or
+    dt are given."""
+
+    @property
+    def training_environment(self) -> EnvironmentConfig:
+        """Options of the simulations in training."""
+        return self.environment.for_optimisation(self.task, self.train_particles, self.train_dt)
+
+    def check(self) -> None:
+        """Check what the types do not express."""
+        super().check()
+        _ = self.training_environment  # checks train_dt
+
+
+@dataclass(frozen=True, kw_only=True)
 class StagedConfig(RunConfig):
     """A run that trains several stages with action grids of increasing resolution, listed coarsest first."""
 
@@ -160,13 +181,13 @@ class StagedConfig(RunConfig):
     def actor_spec(self, stage: int) -> ActorSpec:
         """Structure of the actor of a stage, including all coarser ones."""
         return ActorSpec(
-            self.resolutions[:stage],
-            self.gate_bias[: stage - 1],
-            self.network.split,
-            self.network.gate_scale,
-            self.network.interpolation,
-            None if self.network.interpolation == "aligned" else make_spec(self.task).patch,
-            self.network.encoder,
+            resolutions=self.resolutions[:stage],
+            gate_bias=self.gate_bias[: stage - 1],
+            split=self.network.split,
+            gate_scale=self.network.gate_scale,
+            interpolation=self.network.interpolation,
+            patch=None if self.network.interpolation == "aligned" else make_spec(self.task).patch,
+            encoder=self.network.encoder,
         )
 
     def with_derived(self, base: RunConfig, given: Collection[str]) -> RunConfig:

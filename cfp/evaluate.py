@@ -99,7 +99,8 @@ class Command(Selection):
     json: bool = False
     """Print JSON instead of a table."""
     video: Path | None = None
-    """Also film one episode of the newest policy: a file .mp4, .gif or .webp, or .png for a row of pictures."""
+    """Also film one episode of the newest policy, with noise if --noise is both: a file .mp4, .gif or .webp, or .png
+    for a row of pictures."""
     replay: Path | None = None
     """Also write one episode of it as a page (.html) that plays in any browser."""
     record: Path | None = None

@@ -14,7 +14,7 @@ from torch import Tensor
 
 LARGEST_JSON = 2**20  # bytes
 FORMAT = "cfp-policy"
-"""Entry of a policy file under which its description is."""
+"""Key of the description in the metadata of a policy file."""
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], Any]) -> None:

@@ -30,7 +30,7 @@ from cfp.train import PROGRAM
 from cfp.validation import check_at_least
 from dittogym.spec import TaskSpec
 
-EXAMPLES = ("runs/run", "--policy run --cases noise shift --out runs/noise")
+EXAMPLES = ("runs/run", "--policy run --cases noise gravity --out runs/noise")
 COLUMNS = (
     Column("case", "case"),
     Column("episodes"),

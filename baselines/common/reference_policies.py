@@ -38,7 +38,7 @@ def reference_preset(algo: str, task: str, name: str) -> ReferenceConfig:
         task=task,
         preset=base.preset,
         environment=replace(base.environment, num_envs=1),
-        report=ReportConfig(1, checkpoint_every=1, log_every=1),
+        report=ReportConfig(eval_every=1, checkpoint_every=1, log_every=1),
     )
 
 

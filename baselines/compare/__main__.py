@@ -16,7 +16,7 @@ from baselines.compare.results import RunResult, read_result
 from baselines.compare.worker import Outcome
 from baselines.leaderboard.evaluation import submit
 from baselines.leaderboard.protocol import PROTOCOLS
-from baselines.registry import ALGORITHMS
+from baselines.registry import ALGORITHMS, ALIASES
 from cfp.config import Preset, RunConfig
 from cfp.errors import ConfigError
 from cfp.experiment.cli import program_name, read_options, run_command, with_examples
@@ -99,8 +99,12 @@ class Command:
         check_at_least(0, workers=self.workers, gpus_per_run=self.gpus_per_run, retries=self.retries)
         if self.gpus_per_run and self.executor == "local":
             raise ConfigError(f"gpus_per_run must be 0 without --executor ray, got {self.gpus_per_run}")
+        if self.address is not None and self.executor == "local":
+            raise ConfigError(f"address requires --executor ray, got {self.address}")
         if self.only is not None and self.report_only:
             raise ConfigError(f"only cannot be combined with --report-only, got {self.only}")
+        if self.protocol is not None and (self.only is not None or self.report_only):
+            raise ConfigError(f"protocol cannot be combined with --only or --report-only, got {self.protocol}")
         if self.policies and (self.protocol is None or self.report_only or self.dry_run or self.only is not None):
             names = " ".join(self.policies)
             raise ConfigError(f"policies requires protocol, and none of only, report_only and dry_run, got {names}")
@@ -133,6 +137,7 @@ class Command:
 def compare(command: Command) -> int:
     """Carry out a comparison; returns the exit code."""
     command.check()
+    command = replace(command, algos=tuple(ALIASES.get(name, name) for name in command.algos))  # as the report names it
     if command.policies:
         _submit(command, command.policies)
         return 0
@@ -165,7 +170,7 @@ def compare(command: Command) -> int:
         outcomes = _carry_out(command, chosen, signals)
     if command.only is None:
         _report(command, jobs)
-    if command.protocol and command.only is None and not signals.number:
+    if command.protocol and not signals.number:
         names = [job.config.algo if job.untrained else str(job.folder) for job in jobs if job.trained]
         _submit(command, list(dict.fromkeys(names)))  # a reference policy has a run in each task
     if signals.number:

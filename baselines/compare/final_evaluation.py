@@ -17,7 +17,7 @@ from cfp.envs.disturbances import Case, make_cases
 from cfp.envs.make import choose_device
 from cfp.errors import CheckpointError
 from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed, make_trial
-from cfp.files import parse_json, write_json
+from cfp.files import read_json, write_json
 from cfp.robustness import report
 from cfp.sections import Particles
 
@@ -101,7 +101,7 @@ class Record:
 def read_record(path: Path, **types: type) -> dict[str, Any]:
     """Read a JSON object from a run folder; ``types`` are those of the values that it must hold."""
     try:
-        record: dict[str, Any] = parse_json(path.read_text())
+        record = read_json(path)
         for name, kind in types.items():
             if not isinstance(record[name], kind):
                 raise TypeError(f"{name} must be of type {kind.__name__}, got {record[name]!r}")

@@ -10,7 +10,7 @@ from typing import Any
 
 from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare.final_evaluation import RECORD, Protocol, read_record
-from baselines.registry import ALGORITHMS, ALIASES, configure, sees
+from baselines.registry import ALGORITHMS, configure, sees
 from cfp.config import EVALUATION_SEED, RunConfig, to_json
 from cfp.errors import ConfigError
 from cfp.experiment.folder import holds_run, read_config
@@ -173,7 +173,7 @@ def resolve(plan: Plan, label: str, task: str, preset: str, seed: int, steps: in
     # An algo under common or tasks is that of variants; a label that names an algorithm keeps it, unless its own
     # section says otherwise.
     algo = values.pop("algo", label)
-    if label in {*ALGORITHMS, *ALIASES, *REFERENCE_POLICIES}:
+    if label in {*ALGORITHMS, *REFERENCE_POLICIES}:
         algo = own.get("algo", label)
     start: dict[str, Any] = {"algo": algo, "task": task, "preset": preset}
     start |= {name: values[name] for name in ("learner", "start_from", "refine") if name in values}

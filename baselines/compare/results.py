@@ -3,17 +3,18 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from baselines.compare.final_evaluation import FinalEvaluation, read_evaluation, read_record
 from baselines.compare.jobs import Job, read_sessions
 from baselines.compare.stats import Curve, interquartile_mean, score_interval
+from cfp.experiment.algorithm import Sees
 from cfp.sections import Particles
 from cfp.tables import read_table
 
-OBSERVATIONS = ("image", "state", "simulator", "nothing")
+OBSERVATIONS = get_args(Sees)
 """What policies observe, in the order of tables."""
 
 

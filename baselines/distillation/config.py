@@ -51,6 +51,11 @@ class DistillConfig(StagedConfig):
     planner_grid: Grid = "coarse"
     """Action grid of the teacher mpc."""
 
+    @property
+    def update_every(self) -> int:
+        """Environment steps from one update to the next: a round of all robots."""
+        return self.rollout_steps * self.environment.num_envs
+
     def ineffective(self) -> dict[str, str]:
         """Options of the planner have no effect with other teachers; layouts are counted from the seed."""
         planner = {} if self.teacher == "mpc" else dict.fromkeys(("planner.", "planner_grid"), "teacher mpc")

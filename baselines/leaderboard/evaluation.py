@@ -77,7 +77,8 @@ def _reference(protocol: FixedProtocol, name: str, task: str) -> Candidate:
 def _trained(protocol: FixedProtocol, path: str) -> Candidate:
     file = policy_file(path)
     policy = load(file)
-    about, cost = policy.description, read_cost(file.parent)
+    about = policy.description
+    cost = read_cost(file.parent) if file.name == "policy.safetensors" else None  # that of the whole run
     protocol.check_task(about["task"])
     check_trained_for("policies", about, about["task"], protocol.environment)
     training = Training(about["steps"])

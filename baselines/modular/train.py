@@ -8,7 +8,6 @@ from typing import Any, ClassVar, cast, get_args
 
 from stable_baselines3.common.vec_env import VecMonitor
 
-from baselines.common.policies import StateBasedPolicy
 from baselines.modular.env import SegmentedEnv
 from baselines.modular.networks import Kind, ModularActor, ModularCritics, SegmentPolicy
 from baselines.modular.nodes import Nodes
@@ -141,10 +140,6 @@ class Modular(SACAlgorithm):
         monitor = VecMonitor(TorchVecEnv(env, env.spaces, config.learning.max_episode_steps))
         model = cls.make_model(config, monitor, ModularPolicy, networks, cls.hyperparameters(config, stage, folder))
         return cls(config, stage, model)
-
-    def attached(self, env: Any) -> StateBasedPolicy:
-        """The present policy, acting on the state of an environment."""
-        return self.policy.attached(env)
 
     @property
     def policy(self) -> SegmentPolicy:

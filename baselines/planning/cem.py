@@ -45,6 +45,11 @@ class CEMPlannerConfig(PlannerConfig):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 0 and less than 1, got {getattr(self, name)}")
 
+    def check_grid(self, size: int) -> None:
+        """Check that the noise has no more cells than an action grid of ``size`` rows and columns."""
+        if self.noise_grid > size:
+            raise ConfigError(f"noise_grid must be at most {size}, the action grid, got {self.noise_grid}")
+
 
 class CEMPlanner(Planner[CEMPlannerConfig]):
     """Plans by the cross-entropy method (Rubinstein, 1999) with correlated noise (Pinneri et al., CoRL 2020).
@@ -78,8 +83,8 @@ class CEMPlanner(Planner[CEMPlannerConfig]):
     def _noise(self, plan: Tensor) -> Tensor:
         """Standard normal noise (T, B, P, 2, R, R), correlated in time; none for the first candidate."""
         (steps, batch, _, _, size), config = plan.shape, self.config
-        grid = min(config.noise_grid, size)
-        shape = (steps, batch, config.candidates, 2, grid, grid)
+        config.check_grid(size)
+        shape = (steps, batch, config.candidates, 2, config.noise_grid, config.noise_grid)
         noise = torch.randn(shape, generator=self.generator, dtype=plan.dtype)
         noise[:, :, 0] = 0.0
         for previous, current in pairwise(noise):

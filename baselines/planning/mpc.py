@@ -12,11 +12,12 @@ from baselines.planning.base import Planner, PlannerConfig
 from baselines.planning.cem import CEMPlanner, CEMPlannerConfig
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.planning.surrogate import Surrogate
+from cfp.config import OptimisationConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Scalars, Sees
 from cfp.presets import sac_preset
-from cfp.sections import EnvironmentConfig, Particles, ReportConfig
+from cfp.sections import EnvironmentConfig, ReportConfig
 from dittogym import make_spec
 
 METRICS: dict[str, str] = {
@@ -25,21 +26,17 @@ METRICS: dict[str, str] = {
     "train/plans": "plans evaluated so far; each is a simulation of the planner's horizon",
     "train/failed": "plans so far that were not finite; they are never carried out",
 }
-"""Every scalar that `MPC.learn` logs, and what it means."""
+"""Every scalar that `MPC.update` logs, and what it means."""
 
 
 @dataclass(frozen=True)
-class PlannedConfig(GridConfig):
+class PlannedConfig(OptimisationConfig, GridConfig):
     """A planned episode: one robot on the layout of the seed, from the start to the end of the task.
 
-    The environment options say where plans are carried out and evaluated.
+    The environment options say where plans are carried out and evaluated; train_particles and train_dt, where they are
+    tried.
     """
 
-    train_particles: Particles | None = None
-    """Particles of the simulations in which plans are tried, at most the environment's; None: as many."""
-    train_dt: float | None = None
-    """Duration of a substep in them, s; None: 2e-4 in tasks where this changes little, unless substeps or
-    dt are given."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
 
     def ends(self) -> tuple[int, ...]:
@@ -55,8 +52,6 @@ class PlannedConfig(GridConfig):
         super().check()
         if self.environment.num_envs != 1:
             raise ConfigError(f"num_envs must be 1 (an episode is planned by itself), got {self.environment.num_envs}")
-        if self.environment.resample:
-            raise ConfigError("resample must be False (an episode is planned on one layout), got True")
 
 
 @dataclass(frozen=True)
@@ -76,6 +71,11 @@ class CEMConfig(PlannedConfig):
     """Which algorithm."""
     planner: CEMPlannerConfig = field(default_factory=CEMPlannerConfig)
 
+    def check(self) -> None:
+        """Check what the types do not express."""
+        super().check()
+        self.planner.check_grid(self.resolution(1))
+
 
 def episode_preset(task: str, name: str) -> dict[str, Any]:
     """Options of `PlannedConfig` for a task; SHAPE MATCH, whose reward is all detail, gets an action grid of 16."""
@@ -86,7 +86,13 @@ def episode_preset(task: str, name: str) -> dict[str, Any]:
         "task": task,
         "preset": "quick" if quick else "paper",
         "environment": replace(EnvironmentConfig() if quick else environment, num_envs=1),
-        "report": ReportConfig(horizon // 4 + 1, 1, True, checkpoint_every=horizon // 20 + 1, log_every=10),
+        "report": ReportConfig(
+            eval_every=horizon // 4 + 1,
+            eval_episodes=1,
+            eval_deterministic=True,
+            checkpoint_every=horizon // 20 + 1,
+            log_every=10,
+        ),
         "grid": 16 if task == "shapematch" else "coarse",
         "train_particles": None if quick else "lite",
     }
@@ -108,9 +114,8 @@ class MPC(OpenLoopAlgorithm):
         self.env = make_torch_env(config, config.resolution(1), 1)
         self.env.reset(seed=config.seed)
         self.surrogate = None
-        environment = config.environment.for_optimisation(config.task, config.train_particles, config.train_dt)
-        if environment != config.environment:
-            cheap = make_torch_env(replace(config, environment=environment), config.resolution(1), 1)
+        if config.training_environment != config.environment:
+            cheap = make_torch_env(replace(config, environment=config.training_environment), config.resolution(1), 1)
             cheap.reset(seed=config.seed)
             self.surrogate = Surrogate(self.env, cheap)
         planning_env = self.surrogate.env if self.surrogate else self.env

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from baselines.common.grid import GridConfig
-from baselines.common.policies import StateBasedPolicy
 from baselines.shac.networks import ImageActor, StateActor, StatePolicy, image_critic
 from cfp.agent.actor_policy import ActorPolicy, image_policy
 from cfp.analytic.config import WindowConfig
@@ -19,7 +18,7 @@ from cfp.analytic.features import StateFeatures
 from cfp.analytic.reward import RewardConfig
 from cfp.analytic.stateful import Stateful
 from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, short_horizon_loss
-from cfp.config import RunConfig, check_training_layouts
+from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.algorithm import Algorithm, Scalars, Sees
@@ -58,9 +57,6 @@ class ShacConfig(WindowConfig, GridConfig):
     """Input of the policy: the privileged state (matter, deformation, clock), or the image like CFP's."""
     start_from: str | None = None
     """Policy of the image with one stage from which the actor starts, except for its standard deviation."""
-    train_dt: float | None = None
-    """Duration of a substep in training, s; None: 2e-4 in tasks where this changes little, unless substeps or
-    dt are given."""
     noise: float = 0.1
     """Standard deviation of actions before tanh (an image policy keeps its network's own, about 0.1)."""
     deformation: bool = True
@@ -84,11 +80,9 @@ class ShacConfig(WindowConfig, GridConfig):
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
-        self.check_window()
         check_at_least(1, steps=self.steps)
         if self.start_from is not None and self.sees != "image":
             raise ConfigError(f"start_from is allowed with sees 'image' only, got sees {self.sees!r}")
-        check_training_layouts("num_layouts", self.num_layouts, self.environment.num_envs)
         check_at_least(0, noise=self.noise)
 
 
@@ -105,8 +99,7 @@ class Shac(Stateful, Algorithm):
 
     def __init__(self, config: ShacConfig, stage: int = 1, start: Policy | None = None) -> None:
         self.config = config
-        environment = config.environment.for_optimisation(config.task, config.train_particles, config.train_dt)
-        training = replace(config, environment=environment)
+        training = replace(config, environment=config.training_environment)
         self.env = make_torch_env(training, config.resolution(stage))
         self.features = StateFeatures(config.deformation, config.clock, config.displacement)
         with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
@@ -192,11 +185,6 @@ class Shac(Stateful, Algorithm):
             return StatePolicy(self.actor, self.features, self.config.noise, {"deterministic": deterministic})
         return image_policy(self.actor.spec, self.actor.actor, deterministic)
 
-    def attached(self, env: Any) -> StateBasedPolicy | ActorPolicy:
-        """The present policy, acting on the state of the environment ``env`` if it does not see the image."""
-        policy = self.policy
-        return policy.attached(env) if isinstance(policy, StatePolicy) else policy
-
     @staticmethod
     def preset(task: str, name: str) -> ShacConfig:
         """Defaults of a task: ``quick`` takes minutes and is evaluated at the lite tier.
@@ -212,7 +200,12 @@ class Shac(Stateful, Algorithm):
             steps=13_000 if quick else 52_000,
             learning_rate=1e-3 if quick else 5e-4,
             environment=replace(base.environment, num_envs=4),
-            report=ReportConfig(3200 if quick else 0, 3, base.report.eval_deterministic, log_every=320),
+            report=ReportConfig(
+                eval_every=3200 if quick else 0,
+                eval_episodes=3,
+                eval_deterministic=base.report.eval_deterministic,
+                log_every=320,
+            ),
             displacement=not on_speed,
             reward=RewardConfig("speed" if on_speed else "task"),
         )

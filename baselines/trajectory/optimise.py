@@ -12,7 +12,7 @@ from baselines.common.grid import Grid, GridConfig, grid_size
 from baselines.common.open_loop import OpenLoop, OpenLoopAlgorithm
 from baselines.trajectory.objective import Objective, matches_shape
 from cfp.analytic.stateful import Stateful
-from cfp.config import RunConfig
+from cfp.config import OptimisationConfig, RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.algorithm import Scalars, Sees
@@ -44,7 +44,7 @@ METRICS: dict[str, str] = {
 
 
 @dataclass(frozen=True)
-class GradientConfig(GridConfig):
+class GradientConfig(OptimisationConfig, GridConfig):
     """A run of open-loop gradient descent. An iteration simulates num_envs episodes on fixed particle layouts.
 
     The environment options say where the actions are evaluated; train_particles and train_dt, where they are optimised.
@@ -62,9 +62,6 @@ class GradientConfig(GridConfig):
     """Control steps that a gradient reaches back; 0: the whole episode."""
     train_particles: Particles = "lite"
     """Particles of the simulation in the first stage."""
-    train_dt: float | None = None
-    """Duration of a substep in the first stage, s; None: 2e-4 in tasks where this changes little, unless substeps or
-    dt are given."""
     blur: tuple[float, ...] = (4.0, 2.0, 1.0, 0.0)
     """SHAPE MATCH: standard deviations, in pixels, of the blur of both pictures, one after the other."""
     polish: int = 0
@@ -130,9 +127,7 @@ class Gradient(Stateful, OpenLoopAlgorithm):
 
     def __init__(self, config: GradientConfig, stage: int = 1, start: OpenLoop | None = None) -> None:
         self.config, self.stage, polishes = config, stage, stage > 1
-        environment = config.environment
-        if not polishes:
-            environment = environment.for_optimisation(config.task, config.train_particles, config.train_dt)
+        environment = config.environment if polishes else config.training_environment
         training = replace(config, environment=environment)
         self.env = make_torch_env(training, config.resolution(stage), 1 if polishes else None)
         self.env.reset(seed=config.seed)
@@ -246,7 +241,13 @@ class Gradient(Stateful, OpenLoopAlgorithm):
             task=task,
             preset="quick" if quick else "paper",
             environment=EnvironmentConfig(num_envs=1, particles="full") if quick else environment,
-            report=ReportConfig(50 * horizon, 3, True, checkpoint_every=10 * horizon, log_every=horizon),
+            report=ReportConfig(
+                eval_every=50 * horizon,
+                eval_episodes=3,
+                eval_deterministic=True,
+                checkpoint_every=10 * horizon,
+                log_every=horizon,
+            ),
             train_particles="lite" if quick else "full",
         )
         return config if task == "shapematch" else replace(config, iterations=30, grid="coarse", window=16)

@@ -31,7 +31,7 @@ from cfp.agent.networks import TwinCritic, upsample
 from cfp.agent.policies import CFPPolicy, NetworkPolicy
 from cfp.agent.replay import ReplayRing
 from cfp.agent.reward_statistics import RewardStatistics
-from cfp.errors import ConfigError, NonFiniteError
+from cfp.errors import NonFiniteError
 
 METRICS: dict[str, str] = {
     "train/critic_loss": "sum of both critics' mean squared errors, in normalised rewards",
@@ -54,8 +54,9 @@ SHARED = ("buffer_size", "batch_size", "tau", "gamma", "gradient_steps")
 """Hyperparameters that stable-baselines3 knows by the same name."""
 FROM_HYPERPARAMETERS = {*SHARED, "learning_rate", "learning_starts", "ent_coef", "n_steps"}
 """Arguments of stable-baselines3's SAC that `Hyperparameters` holds."""
-UNUSED = {"target_update_interval", "target_entropy"}
-"""Arguments of SAC that have no effect here: targets follow each update, and the temperature is a constant."""
+UNUSED = {"target_update_interval", "target_entropy", "action_noise", "replay_buffer_class"}
+"""Arguments of SAC that CFP does not take: targets follow each update, the temperature is a constant, and exploration
+noise and replay buffer are its own."""
 
 
 def falling_rate(rate: float, final: float, remaining: float) -> float:
@@ -84,7 +85,7 @@ class CFP(SAC):
         sac_options: Further options of stable-baselines3's SAC; those in ``hyperparameters`` are not among them.
 
     Raises:
-        TypeError: An option of stable-baselines3 is one of the hyperparameters, or has no effect.
+        TypeError: An option of stable-baselines3 is one of the hyperparameters, or is not used here.
         ConfigError: A hyperparameter is out of range.
 
     Attributes:
@@ -107,19 +108,13 @@ class CFP(SAC):
             raise TypeError(f"CFP takes {', '.join(sorted(taken))} from hyperparameters, not as arguments")
         if unused := UNUSED & sac_options.keys():
             raise TypeError(f"CFP does not use {', '.join(sorted(unused))}")
-        if hyperparameters.n_steps > 1 and sac_options.get("replay_buffer_class", ReplayRing) is not ReplayRing:
-            raise ConfigError(f"n_steps must be 1 with another replay_buffer_class, got {hyperparameters.n_steps}")
-        if hyperparameters.noise_cells and sac_options.get("action_noise") is not None:
-            raise ConfigError(f"noise_cells must be 0 with action_noise, got {hyperparameters.noise_cells}")
         self.hyperparameters = hyperparameters
         self.origin: Actor | None = None
         spec = (sac_options.get("policy_kwargs") or {}).get("spec")
-        noisy = sac_options.get("action_noise") is not None  # then the executed action is not composed of parts
-        composition = Composition.of(spec) if spec and not noisy else None
-        if sac_options.setdefault("replay_buffer_class", ReplayRing) is ReplayRing:
-            replay = {"seed": sac_options.get("seed"), "composition": composition}
-            replay |= {"n_steps": hyperparameters.n_steps, "gamma": hyperparameters.gamma}
-            sac_options["replay_buffer_kwargs"] = replay | (sac_options.get("replay_buffer_kwargs") or {})
+        replay = {"seed": sac_options.get("seed"), "composition": Composition.of(spec) if spec else None}
+        replay |= {"n_steps": hyperparameters.n_steps, "gamma": hyperparameters.gamma}
+        sac_options["replay_buffer_kwargs"] = replay | (sac_options.get("replay_buffer_kwargs") or {})
+        sac_options["replay_buffer_class"] = ReplayRing
         sac_options |= {name: getattr(hyperparameters, name) for name in SHARED}
         rate, final = hyperparameters.learning_rate, hyperparameters.final_rate
         sac_options["learning_rate"] = rate if final == 1 else partial(falling_rate, rate, final)
@@ -128,8 +123,6 @@ class CFP(SAC):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        if isinstance(self.policy, CFPPolicy) and getattr(self.replay_buffer, "composition", None) is None:
-            self.networks()[0].critic_size = None  # batches hold executed actions
         own = self.hyperparameters
         self.reward_statistics = RewardStatistics(own.reward_momentum).to(self.device)
         self.noise = None
@@ -232,7 +225,8 @@ class CFP(SAC):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         """Actions to execute, and their form in the replay buffer."""
-        composition: Composition | None = getattr(self.replay_buffer, "composition", None)
+        assert isinstance(self.replay_buffer, ReplayRing)
+        composition = self.replay_buffer.composition
         random_steps = self.hyperparameters.random_steps
         if self.num_timesteps < random_steps:
             # stable-baselines3 ends its random phase where updates start; here the two are independent.

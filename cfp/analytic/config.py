@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from cfp.analytic.reward import RewardConfig
-from cfp.config import COUNTED_LAYOUTS, CoarseToFineConfig, Learner, check_training_layouts
+from cfp.config import COUNTED_LAYOUTS, CoarseToFineConfig, Learner, OptimisationConfig, check_training_layouts
 from cfp.sections import EnvironmentConfig, Particles
 from cfp.validation import check_at_least, check_decay, check_fraction, check_positive
 
 
 @dataclass(frozen=True, kw_only=True)
-class WindowConfig:
+class WindowConfig(OptimisationConfig):
     """Options of all learners that differentiate windows of simulation and value their ends by a critic."""
 
     train_particles: Particles = "lite"
@@ -38,12 +38,14 @@ class WindowConfig:
     """Particle layouts that training episodes start from in turn."""
     reward: RewardConfig = field(default_factory=RewardConfig)
 
-    def check_window(self) -> None:
-        """Check these options."""
+    def check(self) -> None:
+        """Check what the types do not express."""
+        super().check()
         check_at_least(1, window=self.window, critic_updates=self.critic_updates)
         check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)
         check_fraction(gamma=self.gamma, td_lambda=self.td_lambda, tau=self.tau)
         check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)
+        check_training_layouts("num_layouts", self.num_layouts, self.environment.num_envs)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,12 +96,9 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
-        self.check_window()
-        _ = self.training_environment  # checks train_dt
         check_at_least(0, warmup=self.warmup)
         check_at_least(1, minibatches=self.minibatches, minibatch_size=self.minibatch_size)
         check_at_least(1, windows_kept=self.windows_kept)
-        check_training_layouts("num_layouts", self.num_layouts, self.environment.num_envs)
         check_fraction(final_step=self.final_step)
         check_decay(weight_average=self.weight_average)
         for size in self.action_step:

@@ -138,7 +138,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         """Simulate a window and take a gradient step on its actions.
 
         Args:
-            step_size: Root mean square of the step.
+            step_size: Root mean square of the step; 0: none, and no gradients are computed.
 
         Returns:
             Images (T B, 3, 64, 64), improved locations (T, B, C, R, R), and the window before the step.
@@ -153,10 +153,14 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
                 leaves.append(outputs.location.clamp(-BOUND, BOUND))
             return self.actor.act(outputs.at(leaves[-1].requires_grad_()), generator=self.generator).action
 
-        window = self.collector.collect(act, self.critic)
+        with torch.set_grad_enabled(step_size > 0):
+            window = self.collector.collect(act, self.critic)
+        actions = torch.stack(leaves).detach()
+        if not step_size:
+            return torch.cat(images), actions, window
         gradients = torch.autograd.grad(short_horizon_loss(window, self.config.gamma), leaves)
         self.env.detach()
-        improved = self.action_step(torch.stack(leaves).detach(), torch.stack(gradients), step_size)
+        improved = self.action_step(actions, torch.stack(gradients), step_size)
         return torch.cat(images), improved, window
 
     def row(self) -> Scalars:

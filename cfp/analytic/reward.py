@@ -68,7 +68,8 @@ class Neighbours:
         """Find neighbours among a robot's particles (B, N, 2), m."""
         count = min(MAX_SAMPLES, x.shape[1])
         index = torch.linspace(0, x.shape[1] - 1, count, device=x.device).long()
-        nearest = torch.cdist(x[:, index], x[:, index]).topk(min(NEIGHBOURS + 1, count), largest=False)
+        samples = x[:, index] - x.mean(1, keepdim=True)  # cdist loses digits far from the origin
+        nearest = torch.cdist(samples, samples).topk(min(NEIGHBOURS + 1, count), largest=False)
         distance, neighbours = nearest.values[..., 1:], nearest.indices[..., 1:]  # the first is the particle itself
         return cls(index.expand(len(x), -1), neighbours, distance, distance < RADIUS)
 

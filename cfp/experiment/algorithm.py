@@ -15,7 +15,6 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
-from cfp.agent.actor_policy import Memory, Observation, Start
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
 from cfp.experiment.folder import policy_path
@@ -143,18 +142,9 @@ class Algorithm(ABC):
     def policy(self) -> PolicyPredictor:
         """What has been learned so far."""
 
-    def predict(
-        self, observation: Observation, state: Memory = None, episode_start: Start = None, deterministic: bool = False
-    ) -> tuple[np.ndarray, Memory]:
-        """Actions (B, 2, R, R) for a batch, its ``observation`` and memory ``state``, and the memory for the next step.
-
-        ``episode_start`` tells which elements begin anew, ``deterministic`` whether to act without noise.
-        """
-        return self.policy.predict(observation, state, episode_start, deterministic)
-
     @abstractmethod
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
-        """Write the policy and its ``description`` as a ``.safetensors`` file, see `cfp.weights.write_policy`."""
+        """Write the policy and its ``description`` as a ``.safetensors`` file, see `cfp.files.write_policy`."""
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:

@@ -182,7 +182,7 @@ class EvaluationCallback(StageCallback):
         start, stage, config = time.perf_counter(), self.stage, self.stage.config
         seed, episodes = config.evaluation(stage.number)
         size, deterministic = config.action_size(stage.number), config.report.eval_deterministic
-        trial = make_trial(config, "", stage.algorithm, size, episodes, deterministic=deterministic, seed=seed)
+        trial = make_trial(config, "", stage.algorithm.policy, size, episodes, deterministic=deterministic, seed=seed)
         result = evaluate([trial])[0]
         if result.mean > max(self.means, default=-float("inf")):
             stage.save_policy()  # before the row: a crash between the two repeats the evaluation
@@ -217,7 +217,7 @@ class FilmCallback(StageCallback):
         path = stage.folder / "videos" / f"step{stage.step:09d}.mp4"
         size, (seed, _) = config.action_size(stage.number), config.evaluation(stage.number)
         deterministic = config.report.eval_deterministic
-        record_episode(config, stage.algorithm, size, deterministic, seed, record).save(path)
+        record_episode(config, stage.algorithm.policy, size, deterministic, seed, record).save(path)
         self.tracker.film(stage.step, path)
 
 
@@ -230,7 +230,7 @@ class CheckpointCallback(StageCallback):
         self._saved = stage.step
 
     def _act(self) -> None:
-        if not self.evaluation.means:  # without evaluations there is no best policy but the newest
+        if not self.evaluation.every or not self.evaluation.means:  # without evaluations the newest is the best
             self.stage.save_policy()
         self.checkpoint.save(self.stage.algorithm, self.stage.config, self.stage.position)
         self._saved = self.stage.step

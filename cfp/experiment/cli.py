@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import re
 import signal
 import sys
 import typing
@@ -39,7 +40,8 @@ def run_command(command: Callable[[], int | None]) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1 if isinstance(error, NonFiniteError | OSError) else 2
     except (MemoryError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and "allocate memory" not in str(error):  # how torch reports it
+        # how torch reports it, on a CPU and on a GPU
+        if isinstance(error, RuntimeError) and not re.search("allocate memory|out of memory", str(error)):
             raise
         advice = "reduce num_envs, episodes, particles or buffer_size"
         print(f"error: not enough memory: {advice} ({error})", file=sys.stderr)

@@ -59,10 +59,6 @@ class CoarseToFineStages(Algorithm):
         spec, deterministic = self.config.actor_spec(self.stage), self.config.report.eval_deterministic
         return image_policy(spec, self.trained_actor, deterministic)
 
-    def attached(self, env: Any) -> ActorPolicy:
-        """The present policy, copied once for an evaluation instead of in every step; it ignores ``env``."""
-        return self.policy
-
     @classmethod
     def begin(cls, config: Any, stage: int, folder: Path, actor: Actor) -> bool:
         """Give a freshly built ``actor`` the weights with which a stage begins; tell whether it is trained already."""

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 import tyro
 
-from cfp.config import RunConfig, to_json
+from cfp.config import CoarseToFineConfig, RunConfig, to_json
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm
 from cfp.experiment.cli import program_name, read_options, run_command, with_examples
@@ -200,7 +200,8 @@ def train(program: Program, command: Command, hint: str) -> None:
         check_options(config)
         print(json.dumps(to_json(config), indent=2))
         return
-    print(f"{config.algo} on {config.task}, preset {config.preset}, seed {config.seed} -> {folder}")
+    learner = f", learner {config.learner}" if isinstance(config, CoarseToFineConfig) else ""
+    print(f"{config.algo} on {config.task}{learner}, preset {config.preset}, seed {config.seed} -> {folder}")
     with run_lock(folder):
         with StopSignals() as signals:
             run = TrainingRun(program.find(config), config, folder, command.resume, signals)

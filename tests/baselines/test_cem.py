@@ -41,6 +41,11 @@ def test_search_finds_what_every_simulation_wants() -> None:
     assert (plan.mean((0, 2, 3, 4)) - target.flatten()).abs().max() < 0.1
 
 
+def test_noise_of_more_cells_than_actions_is_refused() -> None:
+    with pytest.raises(ConfigError, match="noise_grid must be at most 4, the action grid, got 5"):
+        CEMPlanner(small("run", substeps=1), quick(noise_grid=5)).plan()
+
+
 def test_simulations_of_a_batch_are_planned_apart() -> None:
     noise = torch.linspace(-1.5, 1.5, 8).view(1, 1, 8, 1, 1, 1).expand(3, 1, 8, 2, 4, 4)
     target = torch.tensor([0.6, -0.4]).view(2, 1, 1, 1)

@@ -16,6 +16,8 @@ from baselines.registry import configure
     [
         ("--seeds 9500 --algos mpc", "seeds must be between 0 and 8999, got 9500"),
         ("--only 0 --report-only", "only cannot be combined with --report-only"),
+        ("--address head:6379", "address requires --executor ray, got head:6379"),
+        ("--protocol v1 --report-only", "protocol cannot be combined with --only or --report-only, got v1"),
         (
             "--algos mpc other",
             "target must be the same for all algorithms on shapematch, got 'M' for other and None for mpc",
@@ -31,7 +33,7 @@ def test_wrong_options_are_named(tmp_path, capsys, options, message):
 
 def test_algorithm_for_all_is_that_of_variants():
     plan = Plan(common={"algo": "coarse"}, algos={"long": {"steps": 9600}, "shac": {"algo": "cem"}})
-    labels = ("zero", "gnn16", "long", "shac")
+    labels = ("zero", "gnn-16", "long", "shac")
     found = [resolve(plan, label, "run", "quick", 0, None, "cpu").algo for label in labels]
     assert found == ["zero", "gnn-16", "coarse", "cem"]
 
@@ -46,6 +48,11 @@ def test_presets_follow_the_learner_and_the_policy_to_start_from():
     assert (gradients.learner, gradients.handover) == ("analytic", (4800,))
     assert (refined.resolutions, refined.network.encoder, refined.learning.batch_size) == ((8,), "full", 64)
     assert late.learning.actor_start == 4000
+
+
+def test_other_spellings_are_reported_under_the_name(tmp_path, capsys):
+    assert compare(tmp_path / "out", "--dry-run", "--algos", "gnn16", "--tasks", "run", plan={}) == 0
+    assert capsys.readouterr().out.split()[:2] == ["0", "gnn-16-run-quick-0"]
 
 
 def test_names_in_a_plan_that_mean_nothing_are_reported(tmp_path, capsys):

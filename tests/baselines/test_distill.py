@@ -95,6 +95,7 @@ class Mirror(Teacher):
         ({"updates": 0}, "updates must be at least 1, got 0"),
         ({"student_learning_rate": 0.0}, "student_learning_rate must be positive, got 0.0"),
         ({"gate_bias": ()}, "gate_bias must have 1 values"),
+        ({"rollout_steps": 90_000}, "steps and handover must give every stage at least"),
     ],
 )
 def test_impossible_options_are_named(changes, message):
@@ -314,7 +315,7 @@ def test_privileged_policy_becomes_one_of_images_that_cfp_refines(privileged, tm
 def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch, capsys):
     base = Shac.preset("shapematch", "quick")
     tiny = replace(base, steps=32, window=4, train_particles=100, environment=EnvironmentConfig(2, 100, 1))
-    tiny = replace(tiny, report=ReportConfig(0, 1, video=False))
+    tiny = replace(tiny, report=ReportConfig(eval_every=0, eval_episodes=1, video=False))
     monkeypatch.setattr(Shac, "preset", staticmethod(lambda task, name: tiny))
     folder = tmp_path / "run"
     assert distill.main([*TINY, *LESSONS, "--teacher", "shac", "--out", str(folder)]) == 0

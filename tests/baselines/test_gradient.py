@@ -37,6 +37,7 @@ def test_only_the_first_stage_takes_longer_substeps():
     ("changes", "message"),
     [
         ({"iterations": 0}, "iterations must be at least 1, got 0"),
+        ({"train_dt": 3e-3}, "train_dt must divide an environment step of"),
         ({"window": -1}, "window must be at least 0, got -1"),
         ({"polish_learning_rate": 0.0}, "polish_learning_rate"),
         ({"blur": ()}, "blur"),

@@ -87,7 +87,7 @@ def config(algo, **changes):
         steps=40,
         random_steps=10,
         environment=EnvironmentConfig(num_envs=2, particles=200, substeps=2),
-        report=ReportConfig(0, 1, video=False, checkpoint_every=20, log_every=20),
+        report=ReportConfig(eval_every=0, eval_episodes=1, video=False, checkpoint_every=20, log_every=20),
         learning=replace(base.learning, batch_size=8, buffer_size=60, update_start=8),
         **changes,
     )

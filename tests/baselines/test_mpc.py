@@ -88,7 +88,6 @@ def test_layout_of_the_reference_is_kept() -> None:
     ("change", "named"),
     [
         ({"environment": replace(ENVIRONMENT, num_envs=2)}, "num_envs"),
-        ({"environment": replace(ENVIRONMENT, resample=True)}, "resample"),
         ({"planner": GradientPlannerConfig(horizon=4, commit=5)}, "commit"),
     ],
 )

@@ -80,7 +80,7 @@ def speed(algorithm, steps=32):
     """Mean velocity to the right, m/s, of the policy without noise on a layout of its own."""
     env = TorchEnv("run", 1, particles=500)
     env.reset(seed=99)
-    policy, start = algorithm.attached(env), env.env_state.centre[0, 0].item()
+    policy, start = algorithm.policy.attached(env), env.env_state.centre[0, 0].item()
     for _ in range(steps):
         action, _ = policy.predict(np.zeros((1, 3, 64, 64), np.uint8), deterministic=True)
         env.step(torch.as_tensor(action))
@@ -271,10 +271,10 @@ def test_policy_goes_through_its_file(sees, tmp_path):
     assert policy.description["sees"] == sees and policy.resolution == 8
     env = make_env(algorithm.config, 8, 2)
     images = env.reset()
-    actions = [attached(each, env).predict(images, deterministic=True)[0] for each in (algorithm, policy)]
+    actions = [attached(each, env).predict(images, deterministic=True)[0] for each in (algorithm.policy, policy)]
     assert np.array_equal(*actions) and np.abs(actions[0]).max() > 0
     options = {"deterministic": False, "seed": 3}
-    results = evaluate([make_trial(algorithm.config, "", each, 8, 2, **options) for each in (algorithm, policy)])
+    results = evaluate([make_trial(algorithm.config, "", each, 8, 2, **options) for each in (algorithm.policy, policy)])
     assert results[0] == results[1]
     assert len(record_policy(algorithm.config, policy).shots) == 31
 
@@ -304,7 +304,7 @@ def test_actor_on_the_image_begins_with_a_policy_of_any_algorithm(tmp_path):
 def test_policy_of_the_state_says_what_it_needs(tmp_path):
     algorithm = Shac(make())
     with pytest.raises(ValueError, match="got 'kick'"):
-        algorithm.attached(TorchEnv("kick", 1, particles=100))
+        algorithm.policy.attached(TorchEnv("kick", 1, particles=100))
     path = tmp_path / "policy.safetensors"
     algorithm.save_policy(path, describe_run(algorithm.config, "shac", 1, 0))
     path.write_bytes(path.read_bytes().replace(b"inputs", b"outputs"[:6]))

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 import torch
 from fakes import FakeEnv
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch.nn import functional as F
 
@@ -337,9 +335,6 @@ def test_hyperparameters_are_checked_and_not_given_twice():
         make_model(ActorSpec((8,)), noise_cells=3)
     with pytest.raises(ConfigError, match="noise_cells must be at most 8, the action grid, got 16"):
         make_model(ActorSpec((8,)), noise_cells=16)
-    noise = NormalActionNoise(np.zeros(128), np.ones(128))
-    with pytest.raises(ConfigError, match="noise_cells must be 0 with action_noise, got 4"):
-        make_model(ActorSpec((8,)), sac_options={"action_noise": noise}, noise_cells=4)
     model = make_model(ActorSpec((8,)), sac_options={"replay_buffer_kwargs": {"seed": 3}}, n_steps=3)
     assert model.replay_buffer.n_steps == 3
 
@@ -351,15 +346,10 @@ def test_wrong_action_grid_is_refused():
         make_model(ActorSpec((8,)), sac_options={"use_sde": True})
 
 
-@pytest.mark.parametrize("option", ["target_update_interval", "target_entropy"])
-def test_options_of_sac_without_effect_are_refused(option):
+@pytest.mark.parametrize("option", ["target_update_interval", "target_entropy", "action_noise", "replay_buffer_class"])
+def test_options_of_sac_that_are_not_used_are_refused(option):
     with pytest.raises(TypeError, match=f"CFP does not use {option}"):
         CFP("CFPPolicy", FakeEnv(num_envs=1, resolution=8), **{option: 3})
-
-
-def test_targets_over_several_steps_need_the_replay_buffer_that_sums_them():
-    with pytest.raises(ConfigError, match="n_steps must be 1 with another replay_buffer_class, got 3"):
-        CFP("CFPPolicy", FakeEnv(num_envs=1), Hyperparameters(n_steps=3), replay_buffer_class=ReplayBuffer)
 
 
 def test_hyperparameters_of_a_stage_are_checked():

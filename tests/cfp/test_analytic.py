@@ -205,7 +205,7 @@ def test_a_trained_policy_is_kept_until_the_critic_has_learned():
     before, critic = parameters(learner.actor), parameters(learner.critic.network)
     for _ in range(2):
         learner.update()
-    assert torch.equal(parameters(learner.actor), before)
+    assert torch.equal(parameters(learner.actor), before) and learner.action_step.norms == []  # no gradients
     assert not torch.equal(parameters(learner.critic.network), critic)
     learner.update()
     assert not torch.equal(parameters(learner.actor), before)
@@ -221,6 +221,8 @@ def test_an_episode_that_ends_in_success_has_the_value_of_the_option(success, ex
     env = dittogym.TorchEnv(spec, 2, particles=300, substeps=4)
     episodes = Episodes(env, seed=0, max_episode_steps=10, num_layouts=2)
     reward = RewardConfig(success_reward=2.0)  # times the scale 0.05, for 1 / (1 - gamma) = 10 steps
-    collector = WindowCollector(episodes, lambda: torch.zeros(2, 1), WindowConfig(reward=reward, window=1, gamma=0.9))
+    collector = WindowCollector(
+        episodes, lambda: torch.zeros(2, 1), WindowConfig(task="run", reward=reward, window=1, gamma=0.9)
+    )
     window = collector.collect(lambda _: torch.zeros(2, *env.action_shape), lambda seen: seen[:, 0] + 7.0)
     assert window.next_values.tolist() == [[pytest.approx(expected)] * 2]

@@ -3,6 +3,7 @@
 import signal
 
 import pytest
+import torch
 
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
 from cfp.experiment.cli import run_command
@@ -18,6 +19,7 @@ from cfp.experiment.process import Stopped
         (OSError("No space left on device"), 1),
         (MemoryError("backend"), 1),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), 1),
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"), 1),
     ],
 )
 def test_expected_error_is_one_line_and_an_exit_code(capsys, error, code):

@@ -9,7 +9,6 @@ import pytest
 import torch
 from fakes import FakeEnv
 from policy_files import save_actor
-from stable_baselines3.common.noise import NormalActionNoise
 from test_algorithm import make_batch, make_model
 from tiny_runs import assert_same_run, at_step, run
 from torch.nn import functional as F
@@ -211,13 +210,10 @@ def test_larger_actions_are_averaged_over_the_cells_of_the_grid():
     assert [values.shape for values in critics(observation, torch.randn(3, 2, 18, 18))] == [(3, 1)] * 2
 
 
-def test_critics_take_executed_actions_where_batches_hold_them():
-    env = FakeEnv(num_envs=2, resolution=18)
-    noise = NormalActionNoise(np.zeros((2, 18, 18)), 0.1 * np.ones((2, 18, 18)))
-    for options, size in (({}, 8), ({"action_noise": noise}, 18)):
-        model = make_model(ActorSpec((4, 8), (0.0,), patch=18, encoder="lean"), env, options)
-        obs = model.policy.encode(make_batch(18).observations)
-        assert model.networks()[0].sample_for_critic(obs).action.shape[2:] == (size, size)
+def test_critics_take_actions_on_the_action_grid():
+    model = make_model(ActorSpec((4, 8), (0.0,), patch=18, encoder="lean"), FakeEnv(num_envs=2, resolution=18))
+    obs = model.policy.encode(make_batch(18).observations)
+    assert model.networks()[0].sample_for_critic(obs).action.shape[2:] == (8, 8)
 
 
 def test_actor_starts_after_the_critics_and_rates_fall():

@@ -174,6 +174,9 @@ def test_cases_are_chosen_by_words(folder):
     names = ["unperturbed", "action dropout 20%", "observation dropout 20%", "mu x 0.8"]
     assert [case.name for case in chosen] == names + [f"floor friction {value}" for value in (0, 0.5, "sticky")]
     assert robustness.choose(cases, [], run, policy) == cases
+    for example in robustness.EXAMPLES:
+        words = example.partition("--cases ")[2].partition(" --")[0].split()
+        assert len(robustness.choose(cases, words, run, policy)) > len(words)
     ground = [replace(item, name="ground") if item.name == "floor" else item for item in run.obstacles]
     with pytest.raises(ConfigError, match="floor friction 0: run has no obstacle named 'floor'; floor"):
         robustness.choose(cases, ["friction"], replace(run, obstacles=tuple(ground)), policy)

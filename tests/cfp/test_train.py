@@ -30,7 +30,7 @@ from cfp.experiment.training import parse
 from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
 from cfp.tables import read_table
-from cfp.weights import policy_file, shipped
+from cfp.weights import policy_file, read_policy, shipped
 from dittogym.render.frame import png
 from dittogym.tasks.targets import load_target
 
@@ -99,6 +99,13 @@ def test_finished_run_can_be_prolonged_and_its_results_do_not_outlive_it(tmp_pat
     assert not (folder / "results.json").exists()
     assert train.main(["--out", str(folder), "--resume"]) == 0
     assert read_table(folder / "progress.csv")[-1]["step"] == "60" and (folder / "results.json").exists()
+
+
+def test_without_evaluations_the_newest_policy_is_kept(tmp_path):
+    folder, policy = tmp_path / "run", tmp_path / "run" / "policy.safetensors"
+    assert run(folder, *"--steps 40 --handover 20 --eval-every 8 --eval-episodes 1".split()) == 0
+    assert train.main(["--out", str(folder), "--resume", "--steps", "60", "--eval-every", "0"]) == 0
+    assert read_policy(policy)[1]["steps"] == 60
 
 
 def test_help_names_the_program_that_was_started(tmp_path):
