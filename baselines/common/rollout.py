@@ -8,6 +8,7 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
+from cfp.errors import ConfigError
 from dittogym import core
 from dittogym.action import ActionIndexing, to_grid_indexing
 from dittogym.core import StepResult
@@ -21,6 +22,12 @@ StepFunction: TypeAlias = Callable[[Model, EnvState, Tensor], StepResult]
 def soft_step(model: Model, state: EnvState, action: Tensor) -> StepResult:
     """A step with the task's smooth reward."""
     return core.step(model, state, action, soft=True)
+
+
+def check_differentiable(value: Tensor, task: str) -> None:
+    """Refuse a return that does not depend on the actions through operations that have a gradient."""
+    if not value.requires_grad:
+        raise ConfigError(f"task: the reward of {task!r} has no gradient in the actions")
 
 
 class Rollout(NamedTuple):

@@ -11,8 +11,7 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity
 from tqdm import tqdm
 
-from baselines.common.rollout import repeat, rollout, to_dtype
-from cfp.errors import ConfigError
+from baselines.common.rollout import check_differentiable, repeat, rollout, to_dtype
 from dittogym.model import EnvState, Model
 
 STEP_SIZES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
@@ -62,8 +61,7 @@ class ReturnFunction:
         gradients = []
         for batch in self._batches(actions):
             rewards = self._rewards(batch.requires_grad_())
-            if not rewards.requires_grad:
-                raise ConfigError(f"task: the reward of {self.model.spec.name!r} has no gradient in the actions")
+            check_differentiable(rewards, self.model.spec.name)
             gradients.append(torch.autograd.grad(rewards.sum(), batch)[0].transpose(0, 1))
         return torch.cat(gradients)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from baselines.common.rollout import check_differentiable
 from baselines.planning.base import BestPlans, Planner, PlannerConfig, where_simulation
 from cfp.validation import check_positive
 from dittogym.model import EnvState
@@ -49,6 +50,7 @@ class GradientPlanner(Planner[GradientPlannerConfig]):
         for _ in range(config.iterations):
             with torch.enable_grad():  # also where the caller has switched gradients off
                 smooth, value = self._evaluate(state, plan)
+                check_differentiable(smooth, self.env.spec.name)
                 (gradient,) = torch.autograd.grad(-smooth.sum(), plan)
             best.update(plan, value)
             finite_gradient = gradient.isfinite().flatten(2).all(2).all(0)

@@ -17,7 +17,7 @@ from cfp.analytic.episodes import Episodes
 from cfp.analytic.features import StateFeatures
 from cfp.analytic.reward import RewardConfig
 from cfp.analytic.stateful import Stateful
-from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, short_horizon_loss
+from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
@@ -209,6 +209,11 @@ class Shac(Stateful, Algorithm):
             displacement=not on_speed,
             reward=RewardConfig("speed" if on_speed else "task"),
         )
+
+    @classmethod
+    def warnings(cls, config: ShacConfig, folder: Path, first_stage: int) -> list[str]:
+        """A reward without gradient."""
+        return reward_warnings(config)
 
     @classmethod
     def initial_policy(cls, config: ShacConfig) -> ActorPolicy | None:

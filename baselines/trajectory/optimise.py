@@ -10,6 +10,7 @@ from torch.nn.functional import interpolate
 
 from baselines.common.grid import Grid, GridConfig, grid_size
 from baselines.common.open_loop import OpenLoop, OpenLoopAlgorithm
+from baselines.common.rollout import check_differentiable
 from baselines.trajectory.objective import Objective, matches_shape
 from cfp.analytic.stateful import Stateful
 from cfp.config import OptimisationConfig, RunConfig
@@ -186,6 +187,7 @@ class Gradient(Stateful, OpenLoopAlgorithm):
             running = running & ~terminated
             is_last = step + 1 == self.horizon or not bool(running.any())
             if is_last or (step + 1) % window == 0:
+                check_differentiable(window_loss, self.config.task)
                 window_loss.backward()
                 loss += float(window_loss.detach())
                 window_loss = torch.zeros_like(window_loss)

@@ -21,7 +21,7 @@ from cfp.analytic.episodes import Episodes
 from cfp.analytic.features import StateFeatures
 from cfp.analytic.regression import ImageMemory, Regression
 from cfp.analytic.stateful import Stateful
-from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, short_horizon_loss
+from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
 from cfp.envs.make import choose_device, make_torch_env
 from cfp.evaluation.pictures import policy_pictures
 from cfp.experiment.algorithm import Scalars
@@ -93,8 +93,8 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
 
     @classmethod
     def warnings(cls, config: AnalyticConfig, folder: Path, first_stage: int) -> list[str]:
-        """Stages that end before their policy learns."""
-        lines, warmup = [], config.warmup * config.update_every
+        """Stages that end before their policy learns, and a reward without gradient."""
+        lines, warmup = reward_warnings(config), config.warmup * config.update_every
         for stage in range(first_stage, len(config.ends()) + 1):
             starts_trained = stage > 1 or refines(config, folder, stage)
             if starts_trained and (steps := config.stage_steps(stage)) <= warmup:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -12,7 +13,11 @@ from cfp.analytic.config import WindowConfig
 from cfp.analytic.episodes import Episodes
 from cfp.analytic.reward import Neighbours, training_reward
 from cfp.analytic.stateful import Stateful
+from cfp.envs.make import make_torch_env
 from cfp.errors import NonFiniteError
+from dittogym import core
+from dittogym.contract import Moment, Outcome
+from dittogym.spec import TaskSpec
 from torchmpm import tree
 
 WINDOW_METRICS = {
@@ -114,6 +119,27 @@ class WindowCollector(Stateful):
         finite = gradient.isfinite().flatten(1).all(1)
         self.episodes.counts["dropped"] += int((~finite).sum())
         return torch.where(finite[:, None, None, None], gradient, 0.0)
+
+
+def reward_warnings(config: WindowConfig) -> list[str]:
+    """A line if no term of the task's own reward has a gradient in the actions, so that only the critic guides."""
+    if config.reward.form == "speed":
+        return []
+    env = make_torch_env(replace(config, environment=config.training_environment), config.action_size(1), 1)
+    env.reset(seed=config.seed)
+    differentiable = []
+
+    def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
+        outcome = env.spec.reward_fn(moment, spec)
+        differentiable.extend(term.requires_grad for term in outcome.terms.values())
+        return outcome
+
+    action = torch.zeros(1, *env.action_shape, device=env.device, requires_grad=True)
+    model = replace(env.model, spec=replace(env.spec, reward_fn=reward_fn))
+    core.step(model, env.env_state, action, soft=True)
+    if any(differentiable):
+        return []
+    return [f"the reward of {config.task} has no gradient in the actions; --learner sac learns from rewards alone"]
 
 
 def short_horizon_loss(window: Window, gamma: float) -> Tensor:

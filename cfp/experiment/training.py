@@ -130,6 +130,8 @@ def complete(
             command = read(update_from_dict(past, values))  # a value that differs from the run's is refused later
             command.run.check()
             return replace(command, out=folder)
+        if "task" not in values and "task" not in named:
+            raise ConfigError(f"out: {folder} holds no run to resume; name a --task to start one there")
     command = read(program.configure(values))
     run = command.run.with_derived(preset, leaf_names(values) | set(named))
     run.check()

@@ -67,6 +67,8 @@ def allowed_instead(task: object) -> str | None:
                 raise ImportError("its name must be a word, without dots")
             if getattr(importlib.import_module(module), "__file__", None) is None:
                 raise ImportError("that is a folder, not a file")
+        except ModuleNotFoundError as error:
+            return f"{allowed} (there is no module {error.name!r} in the working directory or on the Python path)"
         except Exception as error:  # whatever the module does
             return f"{allowed} (module {module!r}: {type(error).__name__}: {error})"
     if name in TASKS:

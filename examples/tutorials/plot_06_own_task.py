@@ -24,7 +24,7 @@ from dittogym.geometry import ceiling, floor, solid
 
 
 def reward_fn(moment: dittogym.contract.Moment, spec: dittogym.TaskSpec) -> dittogym.Outcome:
-    """Reward height above the start; a hop of 3 cm is a success."""
+    """Reward height above the start; it is a success to end 3 cm higher."""
     height = moment.now.com[:, 1] - moment.start.com[:, 1]
     return dittogym.Outcome({"height": height}, success=height > 0.03)
 

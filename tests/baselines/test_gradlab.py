@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import dittogym
+from baselines import train
 from baselines.gradlab import __main__ as command
 from baselines.gradlab.measure import COLUMNS, STEP_SIZES, finite_difference_errors, measure
 from baselines.gradlab.report import conclude, objections, write
@@ -147,6 +148,10 @@ def test_task_without_a_gradient_is_named(tmp_path, capsys, monkeypatch) -> None
     monkeypatch.setitem(dittogym.TASKS, "count", lambda: counts)
     assert command.main(["--quick", "--task", "count", "--out", str(tmp_path)]) == 2
     assert "'count' has no gradient" in capsys.readouterr().err
+    options = "--task count --particles 300 --substeps 4 --no-video --out".split()
+    for algo in ("gradient --train-particles 300", "mpc"):
+        assert train.main(["--algo", *algo.split(), *options, str(tmp_path / algo[:3])]) == 2
+        assert "'count' has no gradient" in capsys.readouterr().err
 
 
 def test_horizons_end_with_the_episode(tmp_path) -> None:

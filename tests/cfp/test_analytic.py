@@ -19,7 +19,7 @@ from cfp.analytic.episodes import Episodes
 from cfp.analytic.learner import METRICS, AnalyticLearner
 from cfp.analytic.regression import ImageMemory, Regression
 from cfp.analytic.reward import RewardConfig
-from cfp.analytic.window import WindowCollector
+from cfp.analytic.window import WindowCollector, reward_warnings
 from cfp.errors import ConfigError
 from cfp.experiment.folder import policy_path
 from cfp.sections import EnvironmentConfig
@@ -40,6 +40,18 @@ def make(task="run", stages=1, **changes):
     defaults |= {"action_step": (0.1, 0.1)[:stages], "environment": environment, "train_particles": 300}
     defaults |= {"device": "cpu", "window": 4, "minibatches": 4, "minibatch_size": 8, "windows_kept": 3, "warmup": 0}
     return replace(cfp.preset(task, "quick", "analytic"), **defaults | changes)
+
+
+def counting(moment, spec):
+    return Outcome({"far": (moment.now.com[:, 0] > moment.start.com[:, 0]).float()})
+
+
+def test_a_reward_without_gradient_is_noticed(monkeypatch):
+    spec = replace(dittogym.make_spec("run"), name="count", reward_fn=counting, weights={"far": 1.0, "action": 1e-4})
+    monkeypatch.setitem(dittogym.TASKS, "count", lambda: spec)
+    config = make(reward=RewardConfig("task"))
+    assert reward_warnings(config) == []
+    assert "the reward of count has no gradient in the actions" in reward_warnings(replace(config, task="count"))[0]
 
 
 def test_can_train_with_longer_substeps_than_it_is_evaluated_with():

@@ -101,6 +101,12 @@ def test_finished_run_can_be_prolonged_and_its_results_do_not_outlive_it(tmp_pat
     assert read_table(folder / "progress.csv")[-1]["step"] == "60" and (folder / "results.json").exists()
 
 
+def test_resuming_nothing_is_an_error_unless_a_task_is_named(tmp_path, capsys):
+    assert train.main(["--out", str(tmp_path / "none"), "--resume"]) == 2
+    assert "none holds no run to resume; name a --task to start one there" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
+
+
 def test_without_evaluations_the_newest_policy_is_kept(tmp_path):
     folder, policy = tmp_path / "run", tmp_path / "run" / "policy.safetensors"
     assert run(folder, *"--steps 40 --handover 20 --eval-every 8 --eval-episodes 1".split()) == 0
@@ -268,7 +274,7 @@ def test_task_of_a_module_is_trained_and_evaluated_by_name(tmp_path, monkeypatch
     (tmp_path / "bouncing.py").unlink()
     sys.path_importer_cache.clear()
     assert evaluate.main([str(folder), "--episodes", "1"]) == 2
-    assert "(module 'bouncing': ModuleNotFoundError" in capsys.readouterr().err
+    assert "(there is no module 'bouncing' in the working directory" in capsys.readouterr().err
 
 
 def test_page_shows_the_run_and_opens_from_disk(finished):

@@ -5,6 +5,7 @@ import hashlib
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from types import MappingProxyType
 
 import gymnasium
 import numpy as np
@@ -15,13 +16,13 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from tiny import SMALL, actions, assert_same_bits, everything, make_vec, tiny
 
 import dittogym
-from dittogym.bodies.shapes import Disc, Rectangle
+from dittogym.bodies.shapes import Disc, Figure, Lattice, Rectangle
 from dittogym.contract import Moment, Outcome
 from dittogym.geometry import ceiling, floor, solid
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.tasks import fingerprint, headline
 from dittogym.window import Window
-from torchmpm import Elastic, VelocityRule
+from torchmpm import Elastic, Snow, VelocityRule
 
 
 @pytest.fixture(autouse=True)
@@ -128,7 +129,7 @@ def test_a_module_that_registers_the_task_is_imported_by_name(tmp_path, monkeypa
     for task, reason in (
         ("hopping:fly", "module 'hopping' does not register 'fly'"),
         ("torn:leap", "module 'torn': ZeroDivisionError: division by zero"),
-        ("missing_one:leap", "module 'missing_one': ModuleNotFoundError: No module named 'missing_one'"),
+        ("missing_one:leap", "there is no module 'missing_one' in the working directory or on the Python path"),
         ("folder.hidden:leap", "module 'folder.hidden': ImportError: its name must be a word, without dots"),
         (":leap", "module '': ImportError"),
         ("folder:leap", "module 'folder': ImportError: that is a folder, not a file"),
@@ -189,6 +190,20 @@ def peak_reward(moment: Moment, spec: TaskSpec) -> Outcome:
         info={"peak": peak, "stone": moment.now.object_com},
         memory={"peak": peak},
     )
+
+
+def test_a_memory_that_is_no_dict_is_reset_in_part() -> None:
+    """It may be any mapping."""
+    spec = dataclasses.replace(
+        hop(),
+        initial_memory=lambda moment, spec: MappingProxyType({"peak": moment.now.com[:, 1]}),
+    )
+    env = tiny(spec, 2)
+    env.reset(seed=0)
+    positions, before = env.state.x.clone(), env.env_state.memory["peak"].clone()
+    positions[..., 1] += 0.1
+    env.reset(options={"positions": positions, "reset_mask": [False, True]})
+    assert (env.env_state.memory["peak"] - before).tolist() == pytest.approx([0.0, 0.1])
 
 
 def test_memory_and_objects_of_a_task_of_ones_own() -> None:
@@ -463,6 +478,11 @@ def test_centres_of_windows_may_be_lists() -> None:
         ("run", {"body": np.array([(0, 0), (4, 0), (4, 1), (0, 1)]), "device": torch.device("cpu")}),
         ("run", {"obstacles": (solid("box", i=(60, 66), j=(None, 24), friction=math.inf), floor(), ceiling(119))}),
         ("shapematch", {"target": dittogym.make_spec("shapematch", target="T").target}),
+        ("run", {"body": Disc((0.1, 0.16), 0.15)}),
+        ("run", {"body": Lattice((0.1, 0.16), (0.15, 0.15))}),
+        ("run", {"body": Figure(np.tri(6, dtype=bool), (0.1, 0.16), 0.03)}),
+        ("dig", {"body": BodySpec(Rectangle((-0.2, 0.5), (0.14, 0.14)), 900, 3.0, Elastic(300.0, 50.0))}),
+        ("dig", {"body": BodySpec(Disc((-0.2, 0.5), 0.14), 900, material=Snow(300.0, 50.0, hardening_range=(1, 2)))}),
     ],
 )
 def test_an_environment_is_made_again_from_the_json_of_its_specification(task: str, options: dict) -> None:
@@ -472,6 +492,21 @@ def test_an_environment_is_made_again_from_the_json_of_its_specification(task: s
     assert models[0].constants == models[1].constants
     assert np.array_equal(env.reset(seed=0)[0], same.reset(seed=0)[0])
     gymnasium.make_vec(f"dittogym/{task}-coarse-v0", 2, **SMALL, **options).spec.to_json()
+
+
+def test_what_json_cannot_write_of_a_body_is_refused() -> None:
+    """A material that is learned, and a shape of one's own."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Own(Disc):
+        tilt: float = 0.0
+
+    learned = BodySpec(Disc((0.1, 0.16), 0.15), 900, material=Elastic(torch.tensor(300.0), 50.0))
+    with pytest.raises(TypeError, match="Tensor is not JSON serializable"):
+        gymnasium.make("dittogym/run-coarse-v0", body=learned, **SMALL).spec.to_json()
+    spec = gymnasium.make("dittogym/run-coarse-v0", body=Own((0.1, 0.16), 0.15), **SMALL).spec
+    with pytest.raises(ValueError, match=r"body of a specification must have a kind of BodySpec, Disc.* got {'corner'"):
+        gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(spec.to_json()))
 
 
 def test_its_title_is_its_name() -> None:
