@@ -20,7 +20,6 @@ compiler = runpy.run_path("torchmpm/native/cpu/compiler.py")
 KERNELS = {
     "torchmpm/native/cpu/native.cpp": [[option] for option in compiler["REAL"].values()],
     "dittogym/observation/native/picture.cpp": [["-ffp-contract=off"]],
-    "dittogym/validity/validity.cpp": [[]],
 }
 
 

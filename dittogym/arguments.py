@@ -16,6 +16,8 @@ from torchmpm.backends import transforming
 
 Value = TypeVar("Value")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
+#: Substeps in a control step, far above any use.
+MOST_SUBSTEPS = 1_000_000
 RESET_OPTIONS = ("physics", "positions", "reset_mask")
 
 
@@ -39,11 +41,12 @@ def find_substeps(dt: float, substeps: int | None) -> int:
     """Substeps of ``dt`` s in a control step; ``None`` stands for as many as take :data:`CONTROL_STEP`."""
     checks.number("dt", dt, above=0.0)
     if substeps is not None:
-        return checks.whole("substeps", substeps, 1)
+        return checks.whole("substeps", substeps, 1, MOST_SUBSTEPS)
     ratio = CONTROL_STEP / dt
-    count = round(ratio) if math.isfinite(ratio) else 0
+    count = round(ratio) if ratio <= MOST_SUBSTEPS else 0
     if not math.isclose(count * dt, CONTROL_STEP):
-        raise ValueError(f"dt must divide the control step of {CONTROL_STEP} s if substeps is not given, got {dt}")
+        problem = f"dt must divide the control step of {CONTROL_STEP} s if substeps is not given, got {dt}"
+        raise ValueError(f"{problem}; there may be at most {MOST_SUBSTEPS} substeps")
     return count
 
 

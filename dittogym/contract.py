@@ -125,15 +125,17 @@ def check_memory(task: str, memory: object, stale: tuple[str, ...], batch: int) 
 def check_outcome(
     task: str, outcome: object, memory: Memory, weights: Mapping[str, float], batch: int, checked: set[tuple[Any, ...]]
 ) -> None:
-    """Refuse what a task must not return from a step; shapes are checked when names appear for the first time."""
+    """Refuse what a task must not return from a step; names and shapes are checked when they are new."""
     who = f"reward_fn of task {task!r}"
     if not isinstance(outcome, Outcome):
         raise TypeError(f"{who} must return an Outcome, got {type(outcome).__name__}")
-    if not isinstance(outcome.terms, Mapping):
-        raise TypeError(f"{who} must return terms by name, got {_kind(outcome.terms)}")
-    optional = tuple(part if part is None else tuple(part) for part in (outcome.info, outcome.memory))
-    names = (tuple(outcome.terms), *optional, outcome.terminated is None, outcome.success is None)
-    if names in checked:
+    parts = {"terms": outcome.terms, "info": outcome.info, "memory": outcome.memory}
+    for what, values in parts.items():
+        if not isinstance(values, Mapping) and (values is not None or what == "terms"):
+            raise TypeError(f"{who} must return {what} by name, got {_kind(values)}")
+    flags = {"terminated": outcome.terminated, "success": outcome.success}
+    forms = (batch, *map(_forms, (*parts.values(), flags)))
+    if forms in checked:
         return
     info = outcome.info or {}
     for part, taken in (("terms", ENGINE_TERMS & outcome.terms.keys()), ("info", ENGINE_INFO & info.keys())):
@@ -142,13 +144,13 @@ def check_outcome(
     if missing := [name for name in outcome.terms if name not in weights]:
         raise ValueError(f"weights of task {task!r} must hold every term of reward_fn, got none for {missing}")
     for name, value in outcome.terms.items():
-        if not isinstance(value, Tensor) or value.shape != (batch,):
-            raise ValueError(f"{who} must return terms of shape (B,), got {_kind(value)} for {name!r}")
+        if not isinstance(value, Tensor) or value.shape != (batch,) or value.is_complex():
+            raise ValueError(f"{who} must return terms of shape (B,) in real numbers, got {_kind(value)} for {name!r}")
     weighted = {*outcome.terms, *ENGINE_TERMS} - {"failure"}  # the penalty of a failure has its own amount
     if unknown := sorted(weights.keys() - weighted):
         allowed = sorted(weighted)
         raise ValueError(f"weights of task {task!r} must be of the terms {allowed}, got {unknown}")
-    for name, flag in (("terminated", outcome.terminated), ("success", outcome.success)):
+    for name, flag in flags.items():
         if flag is not None and not (isinstance(flag, Tensor) and (flag.dtype, *flag.shape) == (torch.bool, batch)):
             raise ValueError(f"{who} must return {name} as bool of shape (B,), got {_kind(flag)}")
     _check_leading(who, "info", info, batch)
@@ -156,7 +158,14 @@ def check_outcome(
         before, after = ({name: _kind(value) for name, value in m.items()} for m in (memory, outcome.memory))
         if before != after:
             raise ValueError(f"{who} must return memory like that of initial_memory, {before}, got {after}")
-    checked.add(names)
+    checked.add(forms)
+
+
+def _forms(values: Mapping[str, Any] | None) -> tuple[Any, ...] | None:
+    """Names, types and shapes of values."""
+    if values is None:
+        return None
+    return tuple([(name, getattr(v, "dtype", type(v)), getattr(v, "shape", None)) for name, v in values.items()])
 
 
 def _check_leading(who: str, what: str, values: Mapping[str, object], batch: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -15,8 +16,7 @@ from dittogym.contract import Measurement, Moment, Outcome, check_memory, check_
 from dittogym.model import EnvState, Model
 from dittogym.physics import Physics
 from dittogym.reward_ops import EXACT, SMOOTH, RewardOps, action_cost
-from dittogym.validity import find_valid
-from dittogym.window import centre_in_window
+from dittogym.window import centre_in_window, contains
 from torchmpm import ParticleState, diagnostics, tree
 from torchmpm.backends import cached_tensors, transforming
 
@@ -70,7 +70,7 @@ def reset(model: Model, positions: Tensor, physics: Physics | None = None) -> tu
     observation = observe(model, state)
     memory = spec.initial_memory(_moment(model, state, start, observation, EXACT), spec)
     check_memory(spec.name, memory, spec.stale_memory, len(positions))
-    return replace(state, memory=memory), observation
+    return replace(state, memory=dict(memory)), observation  # of any kind of mapping
 
 
 def step(model: Model, state: EnvState, action: Tensor, *, soft: bool = False) -> StepResult:
@@ -88,7 +88,7 @@ def step(model: Model, state: EnvState, action: Tensor, *, soft: bool = False) -
 def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState, Tensor]:
     """Advance the physics by one control step.
 
-    Elements that are not finite afterwards have no gradient in what they came from.
+    Elements that are not finite afterwards have no gradient in what they came from, nor in the task's own constants.
 
     Args:
         model: The task.
@@ -113,11 +113,17 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
     spec, solver = model.spec, model.solver_for(state.physics)
     actuation = patch_field(action, spec.patch, state.physics.get("max_actuation", spec.max_actuation))
     on_nodes = place(actuation, centre_in_window(spec.reach, state.centre, state.origin), solver.grid.resolution)
-    particles = solver.step(
-        state.particles, on_nodes, substeps=model.substeps, origin=state.origin, segment=model.segment
-    )
-    if guarded:
+    advance = partial(solver.step, substeps=model.substeps, origin=state.origin, segment=model.segment)
+    particles = advance(state.particles, on_nodes)
+    learned = torch.is_grad_enabled() and any(value.requires_grad for value in model.solver.constants.values())
+    if guarded or learned:
         finite.append(diagnostics.finite(particles))
+    if learned and not transforming() and not bool(finite[0].all()):
+        # All elements share the task's own constants, so no hook can tell them apart there. Step once more without
+        # those that are not finite: particles take no part if they are at no place.
+        nowhere = tree.map(lambda tensor: torch.full_like(tensor, math.nan), state.particles)
+        again = advance(tree.where(finite[0], state.particles, nowhere), on_nodes)
+        particles = tree.where(finite[0], again, particles.detach())
     com = particles.x[:, : model.num_robot_particles].mean(1)
     com = torch.where(torch.isfinite(com).all(-1, keepdim=True), com, state.centre)  # the last that was finite
     origin = spec.window.origin(com) if spec.window.moves else state.origin
@@ -173,7 +179,8 @@ def measured_info(model: Model, state: EnvState, now: Measurement) -> dict[str, 
 
 def is_valid(model: Model, state: EnvState) -> Tensor:
     """Which simulations can go on, (B,) bool: all numbers are finite and some of the robot is in the window."""
-    return find_valid(state.particles, model.num_robot_particles, state.origin, model.camera.native)
+    robot = state.particles.x[:, : model.num_robot_particles].detach()
+    return diagnostics.finite(state.particles) & contains(robot, state.origin.detach()).any(1)
 
 
 def _moment(model: Model, state: EnvState, now: Measurement, observation: Tensor, ops: RewardOps) -> Moment:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from gymnasium.envs.registration import EnvSpec
 
+from dittogym.bodies.drawings import body_values
 from dittogym.model import Snapshot
 from dittogym.render.frame import frame, pace
 from dittogym.render.recording import Recording, as_function, film
@@ -41,7 +42,9 @@ def as_tensor(action: Any, env: TorchEnv, single: bool = False) -> torch.Tensor:
     except (RuntimeError, TypeError, ValueError) as error:  # rows of different lengths, sparse tensors
         raise ValueError(f"action must be numbers of shape {expected}, got {type(action).__name__}: {error}") from error
     if array.dtype.kind not in "fiu" or array.shape != expected:
-        raise ValueError(f"action must be numbers of shape {expected}, got {array.dtype} of shape {array.shape}")
+        other = array.shape == (*expected[:-2], *array.shape[-1:] * 2) != expected
+        hint = f"; make the environment with resolution={array.shape[-1]}" if other else ""
+        raise ValueError(f"action must be numbers of shape {expected}, got {array.dtype} of shape {array.shape}{hint}")
     # A copy: torch takes neither negative strides nor foreign byte orders.
     numbers = np.float64 if env.dtype is torch.float64 else np.float32
     array = np.array(array[None] if single else array, numbers, order="C")
@@ -85,7 +88,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, torch.dtype | torch.device | os.PathLike):
         return str(value)
     if not isinstance(value, np.ndarray):
-        return value
+        return body_values(value)
     if value.dtype.kind == "u" and value.shape[1:] != (2,):  # a picture; lists of whole numbers are outlines
         value = (value // 257 if value.dtype == np.uint16 else value) / 255
     return value.tolist()
@@ -229,7 +232,7 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
     def _show(self) -> None:
         if self._screen is None:
             return
-        shown, torch_env = self.torch_env.shot(), self.torch_env
+        shown, torch_env = self.torch_env.shot(0, ("muscle",)), self.torch_env
         scene = describe(torch_env.model)
         caption = (
             f"{scene.task}   {shown.step * scene.dt:.2f} s   return {self._return:.1f}",

@@ -49,7 +49,7 @@ class Obstacle:
     Attributes:
         name: For messages and docs.
         boxes: Boxes with edges on nodes, at least 4 nodes wide and high.
-        friction: Coulomb coefficient of their faces; ``math.inf`` sticks.
+        friction: Coulomb coefficient of their faces; ``math.inf`` sticks, ``None`` stands for 0. Rules have their own.
         rules: What it does to matter instead of what follows from the boxes; of several rules for one direction on a
             node the first in the task's list counts.
         observed: The boxes that the robot sees instead, in the occupancy channel; ``()``: it is invisible.
@@ -57,7 +57,7 @@ class Obstacle:
 
     name: str
     boxes: tuple[Box, ...] = ()
-    friction: float = 0.0
+    friction: float | None = None
     rules: tuple[VelocityRule, ...] | None = None
     observed: tuple[Box, ...] | None = None
 
@@ -66,6 +66,11 @@ class Obstacle:
         checks.instances("boxes", self.boxes, Box)
         if self.observed is not None:
             checks.instances("observed", self.observed, Box)
+        if self.rules is not None and self.friction is not None:
+            raise ValueError(
+                f"friction must not be given with rules, which have their own, got {self.friction} for {self.name!r}; "
+                "Obstacle.with_friction changes that of all its faces"
+            )
         checks.instances("rules", self.velocity_rules, VelocityRule)
 
     @property
@@ -73,7 +78,7 @@ class Obstacle:
         """What it does to matter."""
         if self.rules is not None:
             return self.rules
-        return tuple(rule for box in self.boxes for rule in _faces(box, self.friction))
+        return tuple(rule for box in self.boxes for rule in _faces(box, self.friction or 0.0))
 
     @property
     def observed_boxes(self) -> tuple[Box, ...]:
@@ -82,8 +87,9 @@ class Obstacle:
 
     def with_friction(self, friction: float) -> Obstacle:
         """The same obstacle with another Coulomb coefficient on all its faces."""
-        rules = self.rules and tuple(replace(rule, friction=friction) for rule in self.rules)
-        return replace(self, friction=friction, rules=rules)
+        if self.rules is None:
+            return replace(self, friction=friction)
+        return replace(self, rules=tuple(replace(rule, friction=friction) for rule in self.rules))
 
 
 def obstacle_from(values: Any) -> Any:

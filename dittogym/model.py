@@ -87,7 +87,7 @@ class Model:
         substeps: Substeps of a control step.
         camera: Draws observations.
         segment: Substeps between checkpoints where gradients are enabled, see :meth:`torchmpm.Solver.step`.
-        checked: Names that the task has returned so far.
+        checked: Names and shapes that the task has returned so far.
     """
 
     spec: TaskSpec
@@ -104,7 +104,10 @@ class Model:
 
     @functools.cached_property
     def constants(self) -> dict[str, str]:
-        """By name what determines an episode besides its state, as texts that are equal for equal values."""
+        """By name what determines an episode besides its state, as texts that are equal for equal values.
+
+        Tensors that require gradients are told by their shape alone: they are learned, and change as one learns.
+        """
         names = [each.name for each in fields(self.spec) if each.name not in ("coarse", "fine")]
         spec = {name: _as_text(getattr(self.spec, name)) for name in names}
         return {**spec, "substeps": str(self.substeps), "dt": str(self.solver.dt)}
@@ -124,8 +127,10 @@ def _as_text(value: Any) -> str:
         return _as_text(sorted(value.items()))
     if isinstance(value, tuple | list):
         return f"[{', '.join(map(_as_text, value))}]"
-    if isinstance(value, np.ndarray | Tensor):
-        return f"{tuple(value.shape)} {hashlib.sha256(np.asarray(value).tobytes()).hexdigest()}"
+    if isinstance(value, Tensor):
+        return f"{tuple(value.shape)} learned" if value.requires_grad else _as_text(value.detach().cpu().numpy())
+    if isinstance(value, np.ndarray):
+        return f"{tuple(value.shape)} {hashlib.sha256(value.tobytes()).hexdigest()}"
     if callable(value):
         return str(getattr(value, "__qualname__", type(value).__name__))
     text = repr(value)

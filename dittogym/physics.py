@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from typing import Any, TypeAlias
 
@@ -38,7 +39,8 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
 
     Args:
         given: Mapping from ``dittogym.physics.NAMES`` to numbers or arrays of shape () or (B,); for ``gravity`` (2,) or
-            (B, 2); for those of ``PER_PARTICLE`` also (B, N), robot first.
+            (B, 2); for those of ``PER_PARTICLE`` also (B, N), robot first; the values of particles whose body has a
+            material of its own (the soil of DIG), and the yield stress of objects, have no effect.
         batch: Number B of simulations.
         particles: Number N of particles.
         like: Gives dtype and device.
@@ -72,14 +74,23 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
 
 
 def check_effect(spec: TaskSpec, physics: Physics) -> None:
-    """Refuse constants that no body takes, because those that could have a material of their own.
+    """Refuse constants that no body takes, as all have materials of their own, and warn of those that no robot takes.
 
     Raises:
-        ValueError: There is such a constant.
+        ValueError: There is such a constant, or ``lam`` is below ``-mu``.
     """
     for name in physics:
         if not has_effect(spec, name):
             raise ValueError(f"physics may not hold {name!r} in {spec.name}, whose bodies have their own materials")
+        if name in ("mu", "lam") and spec.robot.material is not None:
+            alone = f"physics[{name!r}] changes the object of {spec.name} alone, not the robot with its own material"
+            warnings.warn(alone, stacklevel=4)  # where TorchEnv.reset is called
+    if physics.keys() & {"mu", "lam"}:
+        own = defaults(spec, next(iter(physics.values())))
+        mu, lam = _alike(*(physics.get(name, own[name]).detach() for name in ("mu", "lam")))
+        if bool((low := lam < -mu).any()):
+            least = f"-mu, {-mu[low][0].item():g}"
+            raise ValueError(f"physics['lam'] must be at least {least}, got {lam[low][0].item():g}")
 
 
 def has_effect(spec: TaskSpec, name: str) -> bool:
@@ -89,17 +100,19 @@ def has_effect(spec: TaskSpec, name: str) -> bool:
 
 
 def real_tensor(name: str, given: Any) -> Tensor:
-    """Numbers, an array or a tensor as a tensor."""
+    """A tensor as it is; numbers, lists and arrays in float64, whatever torch's default is."""
+    if isinstance(given, Tensor):
+        if given.is_complex() or given.dtype == torch.bool:
+            raise ValueError(f"{name} must be real numbers, got {given.dtype}")
+        return given
     try:
-        if isinstance(given, np.ndarray) and given.dtype.kind in "biuf":
-            # A copy: torch takes neither negative strides nor foreign byte orders.
-            given = np.array(given, np.float64, order="C")
-        tensor = given if isinstance(given, Tensor) else torch.as_tensor(given, device="cpu")
-    except (TypeError, ValueError, RuntimeError) as error:
+        array = np.asarray(given)
+    except (TypeError, ValueError, RuntimeError) as error:  # rows of different lengths, tensors that have a gradient
         raise ValueError(f"{name} must be numbers, got {given!r}") from error
-    if tensor.is_complex() or tensor.dtype == torch.bool:
-        raise ValueError(f"{name} must be real numbers, got {tensor.dtype}")
-    return tensor
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"{name} must be real numbers, got {given!r}")
+    # A copy: torch takes neither negative strides nor foreign byte orders.
+    return torch.from_numpy(np.array(array, np.float64, order="C"))
 
 
 def merged(spec: TaskSpec, old: Physics, new: Physics, mask: Tensor, like: Tensor) -> dict[str, Tensor]:

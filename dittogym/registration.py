@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Callable
 
 import gymnasium
 
+from dittogym.env import Env
 from dittogym.spec import TaskSpec
-from dittogym.tasks import TASKS
+from dittogym.tasks import TASKS, make_spec
+from dittogym.torch_env import TorchEnv
+from dittogym.vector import BatchEnv
+from torchmpm import checks
 
 ENTRY_POINT = "dittogym.env:Env"
+_SEVERAL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+#: Arguments that environments keep to themselves.
+TAKEN = {name for taker in (TorchEnv, Env, BatchEnv, make_spec) for name in inspect.signature(taker).parameters}
 
 
 def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "dittogym", version: int = 0) -> None:
@@ -25,8 +33,9 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
             of the old one are removed.
 
     Raises:
-        ValueError: The name belongs to another function, differs from that in the specification or is not one word.
-        TypeError: ``make`` is not a function, or does not return a :class:`dittogym.TaskSpec`.
+        ValueError: The name belongs to another function, differs from that in the specification or is not one word, an
+            argument of ``make`` is one of the environments too, or the version is not a whole number.
+        TypeError: ``make`` is not a function without required arguments that returns a :class:`dittogym.TaskSpec`.
 
     Examples:
         >>> import dataclasses, dittogym, gymnasium
@@ -40,8 +49,14 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
         raise ValueError(f"task must be a name of letters, digits and underscores, got {task!r}")
     if not isinstance(namespace, str) or re.fullmatch(r"[\w:-]+", namespace) is None:
         raise ValueError(f"namespace must be a name of letters, digits, underscores and dashes, got {namespace!r}")
-    if isinstance(make, TaskSpec):
-        raise TypeError("make must be a function that returns a TaskSpec, got a TaskSpec")
+    version = checks.whole("version", version, 0)
+    if not callable(make):
+        raise TypeError(f"make must be a function that returns a TaskSpec, got {type(make).__name__}")
+    own = {name: each for name, each in inspect.signature(make).parameters.items() if each.kind not in _SEVERAL}
+    if bare := [name for name, each in own.items() if each.default is each.empty]:
+        raise TypeError(f"make must have defaults for all its arguments, got none for {', '.join(bare)}")
+    if taken := sorted(TAKEN & own.keys()):
+        raise ValueError(f"make must have arguments of other names than the environments', got {', '.join(taken)}")
     spec = make()
     if not isinstance(spec, TaskSpec):
         raise TypeError(f"make must return a TaskSpec, got {type(spec).__name__}")

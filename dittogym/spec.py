@@ -151,6 +151,8 @@ class TaskSpec:
             if not isinstance(centre, tuple | list):
                 raise TypeError(f"{name} must be two numbers, or None for each that follows the robot, got {centre!r}")
             checks.pair(name, tuple(0.0 if c is None else c for c in centre))  # None follows the robot
+            if not all(c is None or 0 <= c <= 1 for c in centre):
+                raise ValueError(f"{name} must be 0 to 1 m from the lower left corner of the window, got {centre!r}")
             object.__setattr__(self, name, tuple(centre))
 
     @property

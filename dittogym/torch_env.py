@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +20,7 @@ from dittogym.observation.image import SHAPE
 from dittogym.physics import Physics, check_effect, merged, physics_values
 from dittogym.render.frame import frame, png
 from dittogym.render.recording import Recording, as_function, film
-from dittogym.render.scene import Shot, describe, take
+from dittogym.render.scene import QUANTITIES, Shot, describe, take
 from dittogym.spec import DT, TaskSpec
 from dittogym.tasks import make_spec
 from torchmpm import ParticleState, checks, tree
@@ -187,7 +187,7 @@ class TorchEnv:
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Continue from a saved moment, to the last bit as if nothing had happened since.
 
-        The positions and the physics of the next reset, and a ``TimeLimit`` wrapper's count, are not part of it.
+        Positions and physics of the next reset, a ``TimeLimit``'s count, and learned materials are not part of it.
 
         Args:
             snapshot: Of this environment or one like it; one of a single simulation goes into every element.
@@ -307,9 +307,9 @@ class TorchEnv:
         """The present image (B, 3, 64, 64) as a smooth function; see :func:`dittogym.core.soft_observation`."""
         return core.soft_observation(self.model, self.env_state)
 
-    def shot(self, index: int = 0) -> Shot:
-        """What pictures show of the present moment of one simulation, ``index``."""
-        return take(self.model, self.env_state, index, self._actuation)
+    def shot(self, index: int = 0, quantities: Sequence[str] = QUANTITIES) -> Shot:
+        """What pictures show of the present moment of one simulation, ``index``, with these quantities alone."""
+        return take(self.model, self.env_state, index, self._actuation, quantities)
 
     def render(self, index: int = 0, *, muscles: bool = True, size: int = 512, zoom: float | None = None) -> np.ndarray:
         """Picture (S, S, 3) uint8 of one simulation in RGB.
@@ -321,7 +321,7 @@ class TorchEnv:
             zoom: The picture shows 1 / zoom metres, 1 is the whole window; ``None``: 0.56 m, a little more than the
                 robot observes.
         """
-        return frame(describe(self.model), self.shot(index), size, zoom, muscles)
+        return frame(describe(self.model), self.shot(index, ("muscle",)), size, zoom, muscles)
 
     def film(
         self, policy: Any, path: str | os.PathLike[str] | None = None, *, seed: Seed = 0, index: int = 0, **options: Any
@@ -340,7 +340,7 @@ class TorchEnv:
             The recording, from which further films can be saved. A notebook shows it.
 
         Raises:
-            ValueError: An option is out of range.
+            ValueError: An option is out of range, or the kind of file does not take it.
             TypeError: The policy is neither a function nor has a method ``predict``.
         """
         return film(self, as_function(policy), path, seed, index, options)

@@ -124,7 +124,7 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             The observations (B, 3, 64, 64) uint8 of all elements, and ``info``.
         """
         observation, info = self.torch_env.reset(seed=seed, options=options)
-        first_seed = seed[0] if isinstance(seed, Sequence) else seed
+        first_seed = seed[0] if isinstance(seed, Sequence | np.ndarray) else seed
         super().reset(seed=None if first_seed is None else int(first_seed))
         mask = (options or {}).get("reset_mask")
         self._ended &= False if mask is None else ~_array(mask)

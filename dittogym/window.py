@@ -11,7 +11,7 @@ from torchmpm import Grid, checks
 
 #: The grid of every task.
 GRID = Grid(NODES)
-#: Centre (x, y) in window coordinates, m; ``None`` stands for the robot's centre.
+#: Centre (x, y), 0 to 1 m from the lower left corner of the window; ``None`` stands for the robot's centre.
 Centre: TypeAlias = tuple[float | None, float | None]
 
 

@@ -6,13 +6,17 @@ from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 import torch
+from torch import Tensor
 
+from torchmpm import tree
 from torchmpm.native.cpu.compiler import find_compiler
 from torchmpm.native.cpu.library import NO_COMPILER, provenance
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 BACKENDS = ("auto", "eager", "compile", "native")
+#: Results that a function of :func:`cached_tensors` keeps.
+LARGEST_CACHE = 64
 _logger = logging.getLogger(__name__)
 
 
@@ -35,13 +39,25 @@ def transforming() -> bool:
 def cached_tensors(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Keep the tensors that a function of hashable arguments returns, for as long as they serve all later calls.
 
-    Those made in inference mode could not serve gradients; those made under a transform of ``torch.func`` end with it.
+    Those made in inference mode could not serve gradients; those made under a transform of ``torch.func`` end with it,
+    and so do those of a trace, such as that of ``torch.export``, whose tensors hold no numbers.
     """
-    cached = functools.lru_cache(maxsize=64)(torch.inference_mode(False)(function))
+    kept: dict[Any, Result] = {}
 
-    @functools.wraps(cached)
+    @functools.wraps(function)
     def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        return function(*args, **kwargs) if transforming() else cached(*args, **kwargs)  # type: ignore[arg-type]
+        if transforming() or torch.compiler.is_compiling():
+            return function(*args, **kwargs)
+        key = args, tuple(kwargs.items())
+        result = kept.get(key)
+        if result is None:
+            with torch.inference_mode(False):
+                result = function(*args, **kwargs)
+            if all(type(tensor) is Tensor for tensor in tree.leaves(result)):
+                if len(kept) >= LARGEST_CACHE:
+                    kept.clear()
+                kept[key] = result
+        return result
 
     return call
 

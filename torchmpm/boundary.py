@@ -74,6 +74,9 @@ def fixed(
         i: Inclusive range of node indices in x.
         j: Inclusive range of node indices in y.
         frame: Origin of the ranges, see :class:`VelocityRule`.
+
+    Raises:
+        ValueError: A range is empty, or of other than whole numbers, or the frame is unknown.
     """
     return tuple(VelocityRule(direction, i, j, 0.0, frame) for direction in _DIRECTIONS)
 

@@ -40,7 +40,7 @@ def value(name: str, given: Any, *, least: float | None = None, above: float | N
     """As :func:`number`, or a tensor, whose numbers are left to :func:`entries`."""
     if isinstance(given, Tensor):
         tensor(name, given)
-        if given.is_complex() or not given.numel():
+        if given.is_complex() or given.dtype == torch.bool or not given.numel():
             raise ValueError(f"{name} must be real and not empty, got {given.dtype} of shape {tuple(given.shape)}")
         return
     if not isinstance(given, Real):
@@ -75,10 +75,11 @@ def tensor(name: str, given: Any) -> None:
 
 
 def points(name: str, given: Any) -> None:
-    """Raise a ValueError unless these are points (N, 2) of the unit square."""
-    shape, kind = getattr(given, "shape", None), getattr(getattr(given, "dtype", None), "kind", "")
-    if shape is None or shape[1:] != (2,) or kind not in "fiu" or not ((given >= 0) & (given <= 1)).all():
-        found = f"an array of shape {shape}" if isinstance(given, np.ndarray) else _brief(given)
+    """Raise a ValueError unless this is an array (N, 2) of points of the unit square."""
+    array = isinstance(given, np.ndarray)
+    shaped = array and given.shape[1:] == (2,) and given.dtype.kind in "fiu"
+    if not shaped or not ((given >= 0) & (given <= 1)).all():
+        found = f"an array of {given.dtype} of shape {given.shape}" if array else _brief(given)
         raise ValueError(f"{name} must be an array (N, 2) of numbers from 0 to 1, got {found}")
 
 

@@ -1,11 +1,14 @@
 """Loops over steps, with checkpoints so that memory stays bounded under autograd."""
 
+import weakref
 from collections.abc import Callable, Iterable, Mapping
+from contextvars import ContextVar
 from functools import partial
 from numbers import Integral
 from typing import Any, Literal, TypeAlias, TypeVar, cast
 
 import torch
+from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from torchmpm import checks, tree
@@ -19,6 +22,10 @@ Output = TypeVar("Output")
 Segment: TypeAlias = int | Literal["auto"] | None
 #: Segment of ``"auto"`` where only checkpoints bound the memory.
 SEGMENT = 10
+#: What was read before a checkpoint is replayed: a name, the tensor as long as it lives, and its counter of changes.
+Reads: TypeAlias = list[tuple[str, "weakref.ref[Tensor]", int]]
+#: Of the checkpoints, from the outermost in, whose function runs for the first time.
+_running: ContextVar[tuple[Reads, ...]] = ContextVar("_running", default=())
 
 
 def check_repetition(times: int, segment: Segment, name: str = "times") -> tuple[int, Segment]:
@@ -31,6 +38,29 @@ def check_repetition(times: int, segment: Segment, name: str = "times") -> tuple
     return checks.whole(name, times, 0), segment
 
 
+def note_reads(reads: Mapping[str, Any]) -> None:
+    """Tell the checkpoints around a step which tensors it reads besides its state, by name.
+
+    They must not change before the replay. What a checkpoint's function itself makes is made anew then, and not kept.
+    """
+    running = _running.get()
+    if running and not transforming():
+        found = _versions(reads)
+        for record in running:
+            record += found
+
+
+def _versions(reads: Mapping[str, Any]) -> Reads:
+    # Tensor._version is the counter that torch's documentation of in-place checks describes; it has no public name.
+    # Views share it with their base, which lives on where a function makes a new view in each call.
+    tensors = [(name, tensor) for name, read in reads.items() for tensor in tree.leaves(read)]
+    return [(name, weakref.ref(_base(t)), t._version) for name, t in tensors if not t.is_inference()]
+
+
+def _base(tensor: Tensor) -> Tensor:
+    return tensor if tensor._base is None else tensor._base
+
+
 def _checkpointed(function: Callable[[State], State], state: State, reads: Mapping[str, Any]) -> State:
     """Run a function so that autograd keeps only its input and replays it in the backward pass.
 
@@ -39,17 +69,20 @@ def _checkpointed(function: Callable[[State], State], state: State, reads: Mappi
     """
     if not torch.is_grad_enabled() or transforming() or torch.compiler.is_compiling():
         return function(state)
-
-    def versions(state: State) -> dict[str, list[int]]:
-        # Tensor._version is the counter that torch's documentation of in-place checks describes; it has no public name.
-        read = {"state": state, **reads}
-        return {name: [t._version for t in tree.leaves(read[name]) if not t.is_inference()] for name in read}
-
-    before = versions(state)
+    before, replaying = _versions({"state": state, **reads}), False
 
     def replayable(state: State) -> State:
-        for name, now in versions(state).items():
-            if now != before[name]:
+        nonlocal replaying
+        if not replaying:
+            replaying = True
+            token = _running.set((*_running.get(), before))
+            try:
+                return function(state)
+            finally:
+                _running.reset(token)
+        for name, reference, version in before:
+            tensor = reference()
+            if tensor is not None and tensor._version != version:
                 raise RuntimeError(
                     f"{name} was changed in place after a step had read it, and the backward pass replays that step: "
                     "give each step tensors of its own, such as a clone, or keep the whole graph (checkpointed=False, "
@@ -77,11 +110,13 @@ def repeated(
         segment: With gradients enabled, keep the state only every ``segment`` steps and replay the steps between in
             the backward pass: memory for ``times / segment`` states and the graph of ``segment`` steps, for one more
             forward pass. ``None``, and any value under ``torch.func``, keeps the whole graph; ``"auto"`` is 10.
-        reads: Tensors by name that ``step`` reads besides the state, and that must not change before a replay.
+        reads: Tensors by name that ``step`` reads besides the state, and that must not change before a replay. Those
+            that :meth:`torchmpm.Solver.step` reads need not be among them.
 
     Raises:
         ValueError: ``times`` is negative or ``segment`` is below 1.
-        RuntimeError: In the backward pass: the state or one of ``reads`` was changed in place before its replay.
+        RuntimeError: In the backward pass: the state, one of ``reads``, or a tensor that a :class:`torchmpm.Solver`
+            within ``step`` reads was changed in place before its replay.
     """
     times, segment = check_repetition(times, segment)
     segment = SEGMENT if segment == "auto" else segment
@@ -117,7 +152,9 @@ def trajectory(
         The final state and the list of outputs, one per input.
 
     Raises:
-        RuntimeError: In the backward pass: a state or an input was changed in place before the replay of its step.
+        RuntimeError: In the backward pass: a state, an input, or a tensor that a :class:`torchmpm.Solver` within
+            ``step`` reads (its constants, the actuation, the origin) was changed in place before the replay. Other
+            tensors that ``step`` reads are not checked.
     """
 
     def advance(value: Input, state: State) -> State:

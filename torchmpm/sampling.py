@@ -24,6 +24,10 @@ def uniform(count: int, generator: np.random.Generator) -> Points:
     Args:
         count: N, at least 1.
         generator: Where they are drawn from.
+
+    Raises:
+        ValueError: ``count`` is not a whole number above 0.
+        TypeError: ``generator`` is not a :class:`numpy.random.Generator`.
     """
     checks.instance("generator", generator, np.random.Generator)
     return generator.random((checks.whole("count", count, 1), 2))
@@ -37,6 +41,7 @@ def sobol(count: int, seed: int) -> Points:
         seed: Of the scrambling, a whole number from 0 to 2**63 - 1.
 
     Raises:
+        ValueError: ``count`` or ``seed`` is not a whole number in its range.
         RuntimeError: Under a transform of ``torch.func``, which has no such random numbers.
     """
     checks.whole("seed", seed, 0, 2**63 - 1)
@@ -54,6 +59,9 @@ def box(numbers: Points, corner: tuple[float, float], size: tuple[float, float])
         numbers: (N, 2) points of the unit square.
         corner: Lower left corner, m.
         size: Width and height, m.
+
+    Raises:
+        ValueError: ``numbers`` is not such an array, ``corner`` not two numbers, or ``size`` not two positive numbers.
     """
     checks.points("numbers", numbers)
     checks.pair("corner", corner)
@@ -68,6 +76,9 @@ def disc(numbers: Points, centre: tuple[float, float], radius: float) -> Points:
         numbers: (N, 2) points of the unit square.
         centre: Centre, m.
         radius: Radius, m.
+
+    Raises:
+        ValueError: ``numbers`` is not such an array, ``centre`` not two numbers, or ``radius`` not positive.
     """
     _check_round(numbers, centre, radius)
     distance, angle = radius * np.sqrt(numbers[:, 0]), 2.0 * math.pi * numbers[:, 1]
@@ -83,6 +94,9 @@ def chord_disc(numbers: Points, centre: tuple[float, float], radius: float) -> P
         numbers: (N, 2) points of the unit square.
         centre: Centre, m.
         radius: Radius, m.
+
+    Raises:
+        ValueError: ``numbers`` is not such an array, ``centre`` not two numbers, or ``radius`` not positive.
     """
     _check_round(numbers, centre, radius)
     across, along = 2.0 * numbers[:, 0] - 1.0, 2.0 * numbers[:, 1] - 1.0
@@ -103,6 +117,10 @@ def lattice(cells: tuple[int, int], corner: tuple[float, float], size: tuple[flo
         cells: Number of cells in x and y, N at most 2**30.
         corner: Lower left corner, m.
         size: Width and height, m.
+
+    Raises:
+        ValueError: ``cells`` is not two whole numbers above 0 or too many, ``corner`` not two numbers, or ``size`` not
+            two positive numbers.
     """
     checks.pair("cells", cells)
     for axis, count in zip("xy", cells, strict=True):
@@ -125,7 +143,7 @@ def image(numbers: Points, mask: NDArray[np.bool_], corner: tuple[float, float],
         size: Width and height of the whole image, m.
 
     Raises:
-        ValueError: The mask has no pixel set, or another shape.
+        ValueError: The mask has no pixel set or another shape, or another argument is not as in :func:`box`.
     """
     checks.points("numbers", numbers)
     if not isinstance(mask, np.ndarray) or mask.ndim != 2 or mask.dtype.kind not in "biu":

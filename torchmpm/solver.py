@@ -19,7 +19,7 @@ from torchmpm.materials.base import Value
 from torchmpm.materials.body import Body, per_particle
 from torchmpm.native.cpu.library import load
 from torchmpm.native.kernels import Kernels
-from torchmpm.rollout import Segment, check_repetition, repeated
+from torchmpm.rollout import Segment, check_repetition, note_reads, repeated
 from torchmpm.state import ParticleState
 from torchmpm.substep import Planes, Scene, substep
 
@@ -46,7 +46,7 @@ class Solver:
 
     Raises:
         ValueError: No bodies, ``dt`` not positive or above :meth:`stable_dt`, ``damping`` not from 0 to 1, gravity not
-            two numbers, a tensor that is not finite, or an unknown or unavailable backend.
+            two numbers or of another shape, a tensor that is not finite, or an unknown or unavailable backend.
         TypeError: ``grid``, a body or a rule has another type.
 
     Examples:
@@ -88,7 +88,11 @@ class Solver:
         checks.instances("rules", self.rules, VelocityRule)
         for name in ("bodies", "rules"):  # a list could change after the tables of the kernels were built
             object.__setattr__(self, name, tuple(getattr(self, name)))
-        if not isinstance(self.gravity, Tensor):
+        if isinstance(self.gravity, Tensor):
+            checks.value("gravity", self.gravity)
+            if self.gravity.ndim not in (1, 2) or self.gravity.shape[-1] != 2:
+                raise ValueError(f"gravity must have shape (2,) or (B, 2), got {tuple(self.gravity.shape)}")
+        else:
             if not isinstance(self.gravity, Sequence) or len(self.gravity) != 2:
                 raise ValueError(f"gravity must be two numbers (x, y) or a tensor, got {self.gravity!r}")
             for component, value in zip("xy", self.gravity, strict=True):
@@ -106,7 +110,8 @@ class Solver:
         if not self.allow_unstable:
             self._check_stability()
         for name, tensor in self.constants.items():
-            checks.entries(name, tensor, above=0.0 if name.endswith(("mass", "volume")) else None)
+            if tensor.is_floating_point() and tensor.numel():  # a material may have tensors of all kinds
+                checks.entries(name, tensor, above=0.0 if name.endswith(("].mass", "].volume")) else None)
         if not self.allow_unstable:
             largest = self.grid.h / self.dt**2  # with it, a particle at rest crosses a cell within a substep
             for part in (self.gravity,) if isinstance(self.gravity, Tensor) else self.gravity:
@@ -130,7 +135,10 @@ class Solver:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def with_constants(self, bodies: tuple[Body, ...], gravity: tuple[float, float] | Tensor) -> "Solver":
-        """The same solver with other constants, for those that change in every step; skips all checks.
+        """The same solver with other constants, for those that change in every step.
+
+        The checks of the constructor are skipped, that of the largest stable ``dt`` too; :meth:`step` checks the shapes
+        that it reads.
 
         Args:
             bodies: Bodies of the same counts.
@@ -181,7 +189,10 @@ class Solver:
     ) -> ParticleState:
         """Advance all simulations by ``substeps * dt`` seconds.
 
-        Particles outside the window in x keep their whole state until the window comes back to them.
+        Particles outside the window keep their whole state until it comes back to them, and contribute to no
+        derivative; so do those whose position is not finite. A velocity or deformation of a particle in the window
+        that is not finite spreads through the grid in its simulation. It can make the derivative in a constant that
+        simulations share NaN, also that of a loss on other simulations alone.
 
         Args:
             state: The current state.
@@ -210,11 +221,14 @@ class Solver:
         origin = self._check_arguments(state, actuation, origin)
         if substeps == 0 or state.batch_size == 0:
             return state
+        reads: dict[str, Any] = {}
+        if not torch.compiler.is_compiling():
+            reads = {"origin": origin} | self.constants
+            note_reads({"actuation": actuation, **reads})
         if self.runs_native(state, actuation, origin):
             return self.kernels.step(state, actuation, origin, self.gravity, substeps, segment)
         function: Any = compiled(type(self).substep) if self.backend == "compile" else type(self).substep
         run = partial(function, self, self.scene(state, actuation, origin))
-        reads = {} if torch.compiler.is_compiling() else {"origin": origin} | self.constants
         return ParticleState.from_planes(repeated(run, state.planes(), substeps, segment=segment, reads=reads))
 
     def substep(self, scene: Scene, planes: Planes) -> Planes:

@@ -135,8 +135,10 @@ class ParticleState:
         """Select batch elements by a number, slice, list or tensor; a number keeps a batch dimension of one.
 
         Raises:
-            IndexError: There is no such batch element, or the index is of several dimensions.
+            IndexError: There is no such batch element, or the index is of several dimensions, a tuple, True or False.
         """
+        if isinstance(index, tuple | bool):  # which would select particles, or count as 0 or 1
+            raise IndexError(f"index must be a number, slice, list or tensor, got {index!r}")
         if isinstance(index, Tensor | np.ndarray) and index.ndim == 0 and index.dtype not in (bool, torch.bool):
             index = index.item()
         if isinstance(index, Integral):
@@ -149,7 +151,11 @@ class ParticleState:
         return tree.map(lambda t: t[index], self)
 
     def where(self, mask: Bool[Tensor, " B"], other: ParticleState) -> ParticleState:
-        """Take whole batch elements: this state where ``mask`` (B,) holds, ``other`` elsewhere."""
+        """Take whole batch elements: this state where ``mask`` (B,) holds, ``other`` elsewhere.
+
+        Raises:
+            RuntimeError: ``mask`` is not bool, or its length or the sizes of ``other`` do not fit.
+        """
         return tree.where(mask, self, other)
 
     def planes(self) -> tuple[Tensor, ...]:

@@ -66,19 +66,30 @@ def substep(scene: Scene, planes: Planes) -> Planes:
 
 def particles_to_grid(scene: Scene, planes: Planes) -> Scattered:
     """First half of a substep: deform the particles, evaluate their stress, collect mass and momentum on the nodes."""
-    x, y, vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, Jp = planes
+    x, y, *others = planes
     dt, grid = scene.dt, scene.grid
-    inside = grid.contains(x, scene.origin[:, 0:1])
+    inside = takes_part(grid, x, y, scene.origin)
     nodes = stencil(grid, x, y, scene.origin)
+    # Others get harmless numbers: zero times theirs, which may not be finite, would spoil derivatives that all share.
+    zero, one = x.new_zeros(()), x.new_ones(())
+    rest = (*[zero] * 6, one, zero, zero, one, one)
+    still = (torch.where(inside, plane, number) for plane, number in zip(others, rest, strict=True))
+    vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, Jp = still
     trial = matmul((1.0 + dt * c0, dt * c1, dt * c2, 1.0 + dt * c3), (f0, f1, f2, f3))
-    F, Jp, stress_momentum = _deform(scene, nodes, trial, Jp)
+    F, Jp, stress_momentum = _deform(scene, nodes, inside, trial, Jp)
     momentum = transfer.particles_to_grid(
         grid, nodes, inside.to(x.dtype), (vx, vy), (c0, c1, c2, c3), scene.mass, stress_momentum
     )
     return Scattered(nodes, inside, F, Jp, momentum)
 
 
-def _deform(scene: Scene, nodes: Stencil, trial: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor, Sym2]:
+def takes_part(grid: Grid, x: Tensor, y: Tensor, origin: Tensor) -> Tensor:
+    """Which particles at (x, y), (B, N) each, m, move: those in the window at origin (B, 2), m."""
+    height = (y - origin[:, 1:2]) * (1.0 / grid.h)
+    return grid.contains(x, origin[:, 0:1]) & (height >= 0.0) & (height <= grid.resolution)
+
+
+def _deform(scene: Scene, nodes: Stencil, inside: Tensor, trial: Mat2, Jp: Tensor) -> tuple[Mat2, Tensor, Sym2]:
     """Returned deformation gradient, plastic volume ratio and ``-dt V 4/h^2 tau`` of all bodies."""
     parts: list[tuple[Tensor, ...]] = []
     for body, part in slices(scene.bodies):
@@ -87,7 +98,9 @@ def _deform(scene: Scene, nodes: Stencil, trial: Mat2, Jp: Tensor) -> tuple[Mat2
         F, after = body.material.return_map((a[:, part], b[:, part], c[:, part], d[:, part]), before)
         tau = resolved_stress(body, F, before, scene.grid.h, scene.dt)
         if body.muscle and scene.actuation is not None:
-            active = muscle_stress(F, transfer.interpolate(nodes.part(part), scene.actuation))
+            pulls = transfer.interpolate(nodes.part(part), scene.actuation)
+            ax, ay = (torch.where(inside[:, part], pull, 0.0) for pull in pulls)
+            active = muscle_stress(F, (ax, ay))
             tau = (tau[0] + active[0], tau[1] + active[1], tau[2] + active[2])
         factor = -scene.dt * (4.0 / scene.grid.h**2) * broadcast_plane(body.volume, before, "volume")
         parts.append((*F, after, *(factor * component for component in tau)))

@@ -46,7 +46,11 @@ class CEMPlannerConfig(PlannerConfig):
                 raise ConfigError(f"{name} must be at least 0 and less than 1, got {getattr(self, name)}")
 
     def check_grid(self, size: int) -> None:
-        """Check that the noise has no more cells than an action grid of ``size`` rows and columns."""
+        """Check that the noise has no more cells than an action grid of ``size`` rows and columns.
+
+        Raises:
+            ConfigError: It has more.
+        """
         if self.noise_grid > size:
             raise ConfigError(f"noise_grid must be at most {size}, the action grid, got {self.noise_grid}")
 

@@ -127,7 +127,7 @@ def reward_warnings(config: WindowConfig) -> list[str]:
         return []
     env = make_torch_env(replace(config, environment=config.training_environment), config.action_size(1), 1)
     env.reset(seed=config.seed)
-    differentiable = []
+    differentiable: list[bool] = []
 
     def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
         outcome = env.spec.reward_fn(moment, spec)

@@ -24,18 +24,37 @@ def read_mask(picture: PictureLike, name: str, others: str) -> np.ndarray:
     """What is drawn in a picture, (H, W) bool, row 0 at the top.
 
     In a picture with transparent pixels it is what is not transparent; else what is bright, or, where all four corners
-    are bright, what is dark. Bool arrays are taken as they are.
+    are bright, what is dark. Bool arrays are taken as they are. Colours may come in any order, RGB or BGR.
     """
     image = _read(picture, name, others)
     if image.ndim == 3 and image.shape[2] == 4 and (image[..., 3] < OPAQUE).any():
         return np.asarray(image[..., 3] >= OPAQUE)
-    grey = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_BGR2GRAY)
+    grey = image if image.ndim == 2 else _brightness(image[..., :3])
     threshold = OPAQUE - 1.0
     if int(grey.max()) - int(grey.min()) >= CONTRAST:
         threshold, _ = cv2.threshold(grey, 0, 255, cv2.THRESH_OTSU)
     mask = np.asarray(grey > threshold)
     on_bright = mask[[0, 0, -1, -1], [0, -1, 0, -1]].all() and not mask.all()
     return ~mask if on_bright and np.asarray(picture).dtype != bool else mask
+
+
+def _brightness(colours: np.ndarray) -> np.ndarray:
+    """One number (H, W) uint8 for each pixel (H, W, 3), whatever the order of the channels.
+
+    That of the brightest (red on black) or of the darkest channel (red on white), whichever tells more apart; or if
+    neither does, as for red on green, how much a pixel differs from the upper left corner.
+    """
+    extreme = max((colours.max(-1), colours.min(-1)), key=_separation)
+    difference = np.abs(colours - colours[0, 0].astype(np.int16)).max(-1).astype(np.uint8)
+    return next((each for each in (extreme, difference) if np.ptp(each) >= CONTRAST), extreme)
+
+
+def _separation(grey: np.ndarray) -> float:
+    """The variance between the two groups of pixels that Otsu's threshold makes, which it makes as large as it can."""
+    bright = cv2.threshold(grey, 0, 255, cv2.THRESH_OTSU)[1] > 0
+    if bright.all() or not bright.any():
+        return 0.0
+    return float(bright.mean() * (~bright).mean() * (grey[bright].mean() - grey[~bright].mean()) ** 2)
 
 
 def _read(picture: PictureLike, name: str, others: str) -> np.ndarray:

@@ -21,7 +21,7 @@ from torchmpm.sampling import Points
 Particles: TypeAlias = "str | int | tuple[int, ...]"
 
 #: Seed of the first element, from which the others count on, or one for each; ``None``, alone or for one: not seeded.
-Seed: TypeAlias = "int | Sequence[int | None] | None"
+Seed: TypeAlias = "int | Sequence[int | None] | np.ndarray | None"
 
 #: Robot particles of the lite tier.
 LITE = 2000
@@ -121,6 +121,7 @@ class InitialPositions:
     def _seeds(self, seed: Seed) -> Sequence[int | None]:
         if seed is None:
             return [None] * self.num_envs
+        seed = seed.tolist() if isinstance(seed, np.ndarray) and seed.ndim else seed
         if not isinstance(seed, (list, tuple, range)):
             first = checks.whole("seed", seed, 0, MAX_SEED + 1 - self.num_envs)
             return range(first, first + self.num_envs)

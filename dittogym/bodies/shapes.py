@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -47,7 +47,7 @@ class Disc:
 
     corner: tuple[float, float]
     diameter: float
-    draws: int = 4
+    draws: ClassVar[int] = 4
 
     def __post_init__(self) -> None:
         checks.pair("corner", self.corner)
@@ -80,7 +80,7 @@ class Rectangle:
 
     corner: tuple[float, float]
     size: tuple[float, float]
-    draws: int = 4
+    draws: ClassVar[int] = 4
 
     def __post_init__(self) -> None:
         checks.pair("corner", self.corner)
@@ -100,7 +100,7 @@ class Rectangle:
 class Lattice(Rectangle):
     """Box with evenly spaced particles in rows from the bottom up, without any randomness."""
 
-    draws: int = 0
+    draws: ClassVar[int] = 0
 
     def positions(self, numbers: Points) -> Points:
         """World positions (N, 2) in m, in rows that differ by at most one particle."""
@@ -129,7 +129,7 @@ class Figure:
     mask: np.ndarray
     corner: tuple[float, float]
     pixel: float
-    draws: int = 2
+    draws: ClassVar[int] = 2
 
     def __post_init__(self) -> None:
         checks.pair("corner", self.corner)

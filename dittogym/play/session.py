@@ -14,12 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dittogym.action import bicubic, from_grid_indexing, patch_corner, to_grid_indexing
+from dittogym.action import from_grid_indexing, patch_corner, to_grid_indexing
 from dittogym.geometry import NODES
-from dittogym.model import Snapshot, check_stability
+from dittogym.model import check_stability
 from dittogym.physics import check_effect, physics_values
 from dittogym.play import protocol
 from dittogym.play.hand import Grip, press, wave
+from dittogym.play.moment import Moment, stacked
 from dittogym.render.recording import Recording
 from dittogym.render.scene import Shot, describe
 from dittogym.tasks import TASKS, headline, task_name
@@ -81,7 +82,7 @@ class Session:
         self.policy_name: str | None = None
         self.hand, self.direction = protocol.Hand(None), protocol.Wave(None).direction
         self.physics: dict[str, Any] = {}
-        self.moment: tuple[Snapshot, float, bool, bool] | None = None  # with return and ends of the episode
+        self.moment: Moment | None = None
         self.num_frames = self.num_steps = 0
         self._reset(seed)
         self._apply_policy(protocol.Policy(policy))
@@ -162,8 +163,8 @@ class Session:
         return protocol.pack_frame(counters, numbers, rows, (protocol.quantise(shot.x, shot.origin), codes, *images))
 
     def _reset(self, seed: int | None) -> None:
-        self.observation, _ = self.env.reset(seed=seed, options={"physics": self.physics})
-        self.seed = self.seed if seed is None else seed
+        seed = self.seed if seed is None else seed  # also that of a moment that was gone back to
+        self.observation, self.seed = self.env.reset(seed=seed, options={"physics": self.physics})[0], seed
         self.terminated = self.truncated = self.success = self.invalid = False
         self.total, self.grip, self.memory, self.terms = 0.0, None, None, {}
         self.rows: list[list[float]] = []
@@ -298,36 +299,33 @@ class Session:
     def _apply_save(self, message: protocol.Save) -> Answers:
         file, name = io.BytesIO(), f"{self.env.spec.name}-{self.shot.step}"
         if message.what == "moment":
-            snapshot, name = self.env.save(), f"{name}.pt"
-            self.moment = snapshot, self.total, self.terminated, self.truncated
-            torch.save(snapshot, file)
+            name, ends = f"{name}.pt", (self.terminated, self.truncated)
+            past = self.env.save(), self.total, *ends, self.seed, self.actions, self.recording, self.touched
+            self.moment = Moment(*past).copy()
+            torch.save(self.moment.snapshot, file)
         elif not self.actions:
             raise ValueError(f"{message.what} must be of at least one step, got none since the reset")
         elif message.what == "actions":
             name += "-actions.npz"
-            np.savez_compressed(file, actions=self._sequence(), seed=self.seed, touched=np.array(self.touched, str))
+            actions, touched = stacked(self.actions, self.env.spec.patch), np.array(self.touched, str)
+            np.savez_compressed(file, actions=actions, seed=self.seed, touched=touched)
         else:
             name += ".html"
             file.write(self.recording.page().encode())
         return [{"type": "file", "name": name, "content": base64.b64encode(file.getvalue()).decode()}]
 
-    def _sequence(self) -> np.ndarray:
-        """The actions since the reset (T, 2, R, R); those of several resolutions as executed, on the patch."""
-        if len({action.shape for action in self.actions}) == 1:
-            return np.stack(self.actions)
-        return np.stack([bicubic(torch.from_numpy(each), self.env.spec.patch).numpy() for each in self.actions])
-
     def _apply_back(self, message: protocol.Back) -> None:
         if self.moment is None:
             raise ValueError("there is no moment to go back to: save one first")
-        snapshot, self.total, self.terminated, self.truncated = self.moment
-        self.observation = self.env.load(snapshot)
-        state = self.env.env_state
+        then = self.moment.copy()  # what came after it did not happen
+        self.total, self.terminated, self.truncated = then.total, then.terminated, then.truncated
+        self.seed, self.actions, self.recording = then.seed, then.actions, then.recording
+        self.observation, state = self.env.load(then.snapshot), self.env.env_state
         values = physics_values(self.physics, 1, self.env.num_particles, state.centre[:, 0])
         self.env.env_state = replace(state, physics=values)
         self.success = self.invalid = False
         self.grip, self.memory, self.shot = None, None, self.env.shot()
-        self._note("went back to a saved moment")
+        self.touched = list(dict.fromkeys((*then.touched, *self.touched, "went back to a saved moment")))
 
     def _apply_draw(self, message: protocol.Draw) -> Answers:
         size = round(len(message.pixels) ** 0.5)

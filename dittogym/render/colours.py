@@ -105,7 +105,8 @@ def shear_strain(model: Model, state: EnvState, index: int) -> np.ndarray:
 
 def speed(model: Model, state: EnvState, index: int) -> np.ndarray:
     """Speed of each particle (N,), m/s."""
-    return state.particles.v[index].detach().norm(dim=-1).cpu().numpy()
+    x, y = state.particles.v[index].detach().unbind(-1)
+    return torch.hypot(x, y).cpu().numpy()  # many times faster than Tensor.norm
 
 
 #: The quantities of :data:`SCALES` but ``"muscle"``, which needs the actuation.

@@ -16,13 +16,19 @@ from PIL import Image
 from dittogym.render.files import replacing
 from dittogym.render.film import UNITS, possible_rate, write_film
 from dittogym.render.frame import frame, pace
-from dittogym.render.replay import replay_page
+from dittogym.render.replay import SHOWN, replay_page
 from dittogym.render.scene import Scene, Shot, check_view, describe
 from torchmpm import checks
 
 #: Chooses actions (B, 2, R, R) from observations (B, 3, 64, 64).
 Act: TypeAlias = Callable[[np.ndarray], Any]
-SUFFIXES = (*UNITS, ".png", ".html")
+_OF_A_FILM = ("size", "rate", "speed", "zoom", "muscles")
+#: Options of :meth:`Recording.save` that have an effect, by suffix.
+OPTIONS: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(UNITS, _OF_A_FILM),
+    ".png": ("size", "zoom", "muscles", "pictures"),
+    ".html": ("speed",),
+}
 #: Playback speeds, as a fraction of real time, and the shortest film for which one of them is chosen, s.
 SPEEDS = tuple(mantissa / 10**exponent for exponent in range(6) for mantissa in (1.0, 0.5, 0.2))
 SHORTEST = 4.0
@@ -114,6 +120,9 @@ class Recording:
     ) -> Path:
         """Write a film, a filmstrip or a replay, and return its path.
 
+        A filmstrip takes no ``rate`` and ``speed``, a film no ``pictures``, a replay only ``speed``. Other options have
+        no effect, so that several files can share them; ``film(policy, path, ...)`` of an environment refuses them.
+
         Args:
             path: ``.mp4``, ``.gif`` or ``.webp``: a film; ``.png``: some pictures beside each other; ``.html``: a page
                 that plays the episode in any browser, also without a network.
@@ -179,8 +188,8 @@ def check_film(
 ) -> Path:
     """Check the arguments of :meth:`Recording.save`, and return the path."""
     path = Path(path)
-    if path.suffix not in SUFFIXES:
-        raise ValueError(f"path must end in one of {', '.join(SUFFIXES)}, got {str(path)!r}")
+    if path.suffix not in OPTIONS:
+        raise ValueError(f"path must end in one of {', '.join(OPTIONS)}, got {str(path)!r}")
     check_view(size, zoom)
     checks.number("rate", rate, above=0.0)
     if speed is not None:
@@ -191,9 +200,15 @@ def check_film(
 
 
 def check_wanted(path: Any, options: dict[str, Any]) -> None:
-    """Check the arguments of :meth:`Recording.save`, of which none may be given without a path."""
+    """Check the arguments of :meth:`Recording.save` for a single file, of which none may be without effect."""
+    known = (*_OF_A_FILM, "pictures")
+    if unknown := [name for name in options if name not in known]:
+        raise TypeError(f"film got an unexpected keyword argument {unknown[0]!r}; it takes {', '.join(known)}")
     if path is not None:
-        check_film(path, **options)
+        suffix = check_film(path, **options).suffix
+        if unused := [name for name in options if name not in OPTIONS[suffix]]:
+            allowed = ", ".join(OPTIONS[suffix])
+            raise ValueError(f"{unused[0]} must not be given with a path that ends in {suffix}, which takes {allowed}")
     elif options:
         raise TypeError(f"path must be given with {', '.join(options)}, got None")
 
@@ -218,12 +233,12 @@ def record(env: Any, act: Act, seed: Any = 0, index: int = 0) -> Recording:
     """
     with torch.no_grad():
         observation, _ = env.reset(seed=seed)
-        recording, ended = Recording(describe(env.model), [env.shot(index)]), False
+        recording, ended = Recording(describe(env.model), [env.shot(index, SHOWN)]), False
         info: dict[str, Any] = {}
         while not ended:
             action = torch.as_tensor(act(observation.cpu().numpy()), device=env.device)
             observation, reward, terminated, truncated, info = env.step(action)
-            recording.shots.append(env.shot(index))
+            recording.shots.append(env.shot(index, SHOWN))
             recording.rewards.append(float(reward[index]))
             ended = bool(terminated[index] | truncated[index])
     recording.observation = observation[index].cpu().numpy()

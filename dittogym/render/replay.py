@@ -16,6 +16,8 @@ import numpy as np
 from dittogym.render.scene import VIEW_WIDTH, Scene, Shot
 
 PLAYER = Path(__file__).parent / "replay.html"
+#: Quantities of particles that a replay holds; it computes speeds itself.
+SHOWN = ("muscle", "deformation")
 #: At most so many moments and particles are kept, evenly spread.
 MOST_MOMENTS, MOST_PARTICLES = 400, 3000
 #: Positions are multiples of this, m.
@@ -58,7 +60,7 @@ def encode(scene: Scene, shots: Sequence[Shot]) -> tuple[dict[str, Any], bytes]:
     kept = [shots[step] for step in steps]
     chosen, counts = _selection(scene, shots[0])
     arrays = [_positions(kept, chosen)]
-    for name, particles in (("muscle", chosen[: counts[0]]), ("deformation", chosen)):
+    for name, particles in zip(SHOWN, (chosen[: counts[0]], chosen), strict=True):
         rest = np.full(len(shots[0].x), 127, np.uint8)
         values = np.stack([shot.values.get(name, rest)[particles] for shot in kept]) // VALUE_STEP
         arrays.append(np.diff(values, axis=0, prepend=np.uint8(0)).tobytes())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -18,6 +19,8 @@ from dittogym.spec import TaskSpec
 from dittogym.window import centre_in_window
 from torchmpm import Snow, checks
 
+#: Names of all quantities of particles.
+QUANTITIES = tuple(SCALES)
 #: Radius of a particle by the distance between particles, which closes even a body of random positions; of a grain.
 RADIUS, GRAIN_RADIUS = 1.25, 0.7
 #: Width that the default camera shows, a little more than the half metre that the robot observes, m.
@@ -132,8 +135,13 @@ def _outlines(spec: TaskSpec) -> tuple[np.ndarray, ...]:
     return tuple((outline[:, 0] + 0.5 - pixels / 2) * (0.5 / pixels, -0.5 / pixels) for outline in outlines)
 
 
-def take(model: Model, state: EnvState, index: int, actuation: Tensor | None) -> Shot:
-    """The present moment of one element of a batch, with the ``actuation`` (B, 2, P, P) of the last step, Pa."""
+def take(
+    model: Model, state: EnvState, index: int, actuation: Tensor | None, quantities: Iterable[str] = QUANTITIES
+) -> Shot:
+    """The present moment of one element of a batch, with the ``actuation`` (B, 2, P, P) of the last step, Pa.
+
+    Of its values only ``quantities`` are computed: a picture shows muscles alone.
+    """
     if not isinstance(index, (int, np.integer)) or not 0 <= index < len(state.steps):
         raise IndexError(f"index must be between 0 and {len(state.steps) - 1}, got {index!r}")
     index = int(index)
@@ -141,8 +149,8 @@ def take(model: Model, state: EnvState, index: int, actuation: Tensor | None) ->
     view = centre_in_window(model.spec.view, state.centre[one], state.origin[one])
     places = (value.detach().cpu().double().numpy()[0] for value in (state.origin[one], view, state.centre[one]))
     values = {
-        by: scale.codes(particle_values(model, state, index, actuation, by))
-        for by, scale in SCALES.items()
+        by: SCALES[by].codes(particle_values(model, state, index, actuation, by))
+        for by in quantities
         if by != "muscle" or actuation is not None
     }
     x = state.particles.x[index].detach().cpu().numpy().astype(np.float32)

@@ -89,8 +89,8 @@ def make_spec(
         options: Options of that task, such as ``target`` of SHAPE MATCH.
 
     Raises:
-        ValueError: There is no such task, or its robot leaves the window, overlaps an obstacle or the object, or counts
-            as torn from the start.
+        ValueError: There is no such task, one of its bodies leaves the window or overlaps an obstacle, or its robot
+            overlaps the object or counts as torn from the start.
         TypeError: The task has no such option, or the obstacles are not a sequence of Obstacle.
     """
     if isinstance(task, TaskSpec):

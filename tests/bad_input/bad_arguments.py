@@ -214,7 +214,11 @@ ENVIRONMENT = table(
         ("seed and a half", lambda: env().reset(seed=1.5), "seed must be a whole number, got 1.5"),
         ("seed too large", lambda: env(num_envs=2).reset(seed=2**32 - 1), "seed must be at most 4294967294, got"),
         ("options of a list", lambda: env().reset(options=[1]), ("options must be a mapping", "physics", "got [1]")),
-        ("positions of a text", lambda: env().reset(options={"positions": "x"}), "positions must be numbers, got 'x'"),
+        (
+            "positions of a text",
+            lambda: env().reset(options={"positions": "x"}),
+            "positions must be real numbers, got 'x'",
+        ),
         (
             "positions of NaN",
             lambda: env().reset(options={"positions": np.full((60, 2), math.nan)}),
@@ -226,7 +230,7 @@ ENVIRONMENT = table(
         (
             "mu of a truth",
             lambda: env().reset(options={"physics": {"mu": True}}),
-            ("physics['mu'] must be real", "bool"),
+            ("physics['mu'] must be real", "True"),
         ),
         (
             "gravity that crosses cells",

@@ -151,7 +151,15 @@ def test_policies_are_functions_or_predict() -> None:
         ({"path": "film.mp4", "speed": -1}, "speed must be positive, got -1"),
         ({"path": "film.mp4", "zoom": 0}, "zoom must be positive, got 0"),
         ({"path": "film.png", "pictures": 0}, "pictures must be at least 1, got 0"),
+        ({"path": "film.html", "size": 64}, "size must not be given with a path that ends in .html, which takes speed"),
+        ({"path": "film.png", "speed": 1}, ".png, which takes size, zoom, muscles, pictures"),
+        ({"path": "film.webp", "pictures": 4}, ".webp, which takes size, rate, speed, zoom, muscles"),
         ({"size": 64}, "path must be given with size"),
+        (
+            {"sped": 1},
+            "film got an unexpected keyword argument 'sped'; it takes size, rate, speed, zoom, muscles, pict",
+        ),
+        ({"path": "film.mp4", "size": 64, "sped": 1}, "film got an unexpected keyword argument 'sped'"),
     ],
 )
 def test_options_are_checked_before_the_episode(options: dict, message: str) -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import dittogym
-from dittogym.geometry import floor, solid
+from dittogym.geometry import Obstacle, floor, side_walls, solid
 
 
 def test_a_solid_box_stops_matter() -> None:
@@ -32,6 +32,15 @@ def test_bad_geometry() -> None:
     with pytest.raises(ValueError, match="friction must not be negative"):
         floor(-1.0)
     assert floor().velocity_rules[0].friction == math.inf
+    for friction in (0.0, 0.3):  # it would have no effect
+        with pytest.raises(ValueError, match=f"friction must not be given with rules.* got {friction} for 'floor'"):
+            dataclasses.replace(floor(), friction=friction)
+
+
+@pytest.mark.parametrize("obstacle", [floor(), solid("box", (60, 66), (None, 24), friction=math.inf), side_walls(60)])
+def test_another_friction(obstacle: Obstacle) -> None:
+    rules = obstacle.with_friction(0.3).velocity_rules
+    assert rules == tuple(dataclasses.replace(rule, friction=0.3) for rule in obstacle.velocity_rules)
 
 
 def test_specifications_take_no_options() -> None:

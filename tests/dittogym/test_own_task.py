@@ -163,12 +163,29 @@ def test_a_taken_name_is_refused() -> None:
     assert tiny("run").spec.name == "run"
 
 
+@pytest.mark.parametrize(
+    ("make", "options", "error", "message"),
+    [
+        (5, {}, TypeError, "make must be a function that returns a TaskSpec, got int"),
+        (lambda pull, *, size, **rest: hop(), {}, TypeError, "make must have defaults for .* got none for pull, size$"),
+        (lambda particles=3, body=None: hop(), {}, ValueError, "make must have .* other names .* got body, particles$"),
+        (hop, {"version": -1}, ValueError, "version must not be negative, got -1"),
+        (hop, {"version": "1"}, ValueError, "version must be a whole number, got '1'"),
+    ],
+)
+def test_what_cannot_be_registered(make: object, options: dict, error: type, message: str) -> None:
+    with pytest.raises(error, match=message):
+        dittogym.register("hop", make, **options)
+    assert "hop" not in dittogym.TASKS
+    dittogym.register("hop", lambda *args, **options: hop())
+
+
 @pytest.mark.parametrize(("result", "kind"), [(None, "NoneType"), ({"name": "hop"}, "dict"), (TaskSpec, "type")])
 def test_a_function_that_returns_something_else_is_refused(result: object, kind: str) -> None:
     with pytest.raises(TypeError, match=f"make must return a TaskSpec, got {kind}"):
         dittogym.register("hop", lambda: result)
     assert "hop" not in dittogym.TASKS and "dittogym/hop-coarse-v0" not in gymnasium.registry
-    with pytest.raises(TypeError, match="make must be a function that returns a TaskSpec, got a TaskSpec"):
+    with pytest.raises(TypeError, match="make must be a function that returns a TaskSpec, got TaskSpec"):
         dittogym.register("hop", hop())
 
 
@@ -362,7 +379,11 @@ def test_a_longer_limit_than_the_horizon() -> None:
     [
         ({"terminated": torch.zeros(2, 2, dtype=torch.bool)}, r"terminated as bool of shape \(B,\), got torch.bool of"),
         ({"success": torch.zeros(2)}, r"success as bool of shape \(B,\), got torch.float32 of shape \(2,\)"),
-        ({"terms": {"height": torch.zeros(3)}}, r"terms of shape \(B,\), got .* of shape \(3,\) for 'height'"),
+        ({"terms": {"height": torch.zeros(3)}}, r"terms of shape \(B,\) .* of shape \(3,\) for 'height'"),
+        (
+            {"terms": {"height": torch.zeros(2) * 1j}},
+            r"terms of shape \(B,\) in real numbers, got torch.complex64 of",
+        ),
         ({"terms": {"alive": torch.zeros(2)}}, r"must not return the engine's own terms, got \['alive'\]"),
         ({"info": {"com": torch.zeros(2)}}, r"must not return the engine's own info, got \['com'\]"),
         ({"info": {"risen": 1.0}}, r"must return info of shape \(B, ...\), got float for 'risen'"),
@@ -379,6 +400,35 @@ def test_an_outcome_that_would_do_harm_later_is_refused(changes: dict, message: 
     )
     env = tiny(spec, 2)
     env.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        env.step(actions(env, 1)[0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"terminated": torch.tensor(True)}, r"terminated as bool of shape \(B,\), got torch.bool of shape \(\)"),
+        ({"terminated": True}, r"terminated as bool of shape \(B,\), got bool"),
+        ({"success": torch.zeros(2)}, r"success as bool of shape \(B,\), got torch.float32"),
+        ({"terms": {"height": torch.zeros(2, 1)}}, r"terms of shape \(B,\) .* of shape \(2, 1\) for 'height'"),
+        ({"info": {"risen": torch.zeros(1)}}, r"must return info of shape \(B, ...\), got .* of shape \(1,\)"),
+        ({"memory": {"first": torch.zeros(2)}}, r"of shape \(2, 2\)'}, got {'first': 'torch"),
+    ],
+)
+def test_an_outcome_is_checked_in_every_step(changes: dict, message: str) -> None:
+    """Also where the names are those of the step before."""
+    usual = {"terminated": None, "info": {"risen": torch.zeros(2)}}
+
+    def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
+        return height(moment, spec)._replace(**{**usual, "memory": moment.memory, **now})
+
+    spec = dataclasses.replace(
+        hop(), reward_fn=reward_fn, initial_memory=lambda moment, spec: {"first": moment.now.com}
+    )
+    env, now = tiny(spec, 2), {}
+    env.reset(seed=0)
+    env.step(actions(env, 1)[0])
+    now = changes
     with pytest.raises(ValueError, match=message):
         env.step(actions(env, 1)[0])
 
@@ -413,6 +463,8 @@ def test_a_function_that_is_written_anew_takes_the_place_of_the_old_one() -> Non
         ({"max_actuation": -5.0}, ValueError, "max_actuation must not be negative, got -5.0"),
         ({"goal": (1.0, 2.0, 3.0)}, ValueError, r"goal must be two numbers \(x, y\), got \(1.0, 2.0, 3.0\)"),
         ({"reach": (None, "up")}, ValueError, "reach y must be a number, got 'up'"),
+        ({"reach": (None, 5.0)}, ValueError, r"reach must be 0 to 1 m from the lower left corner .* got \(None, 5.0\)"),
+        ({"view": (-0.1, 0.5)}, ValueError, r"view must be 0 to 1 m from the lower left corner .* got \(-0.1, 0.5\)"),
         ({"target": np.zeros((3, 3), bool)}, ValueError, r"target must have shape \(64, 64\), got \(3, 3\)"),
         ({"weights": 1.0}, TypeError, "weights must be a Mapping, got 1.0"),
         ({"obstacles": (VelocityRule("-y"),)}, TypeError, r"obstacles\[0\] must be a Obstacle, got VelocityRule"),
@@ -434,6 +486,20 @@ def test_a_robot_inside_an_obstacle_is_refused() -> None:
     low = BodySpec(Rectangle((0.05, 0.1), (0.1, 0.1)), count=100)
     with pytest.raises(ValueError, match="robot must start outside the obstacle 'floor'"):
         tiny(dataclasses.replace(hop(), robot=low))
+
+
+@pytest.mark.parametrize(
+    ("shape", "obstacles", "message"),
+    [
+        (Disc((0.17, 0.02), 0.06), (floor(),), r"objects\[0\] must start outside the obstacle 'floor' .* 0.020 < y"),
+        (Disc((0.7, 0.3), 0.1), (solid("box", (94, 98), (None, 60)),), r"objects\[0\] must start outside .* 'box'"),
+        (Rectangle((0.9, 0.3), (0.2, 0.1)), (), r"objects\[0\] must lie inside the window .* got 0.900 < x < 1.100"),
+    ],
+)
+def test_an_object_outside_its_window_or_in_an_obstacle_is_refused(shape, obstacles: tuple, message: str) -> None:
+    spec = dataclasses.replace(hop(), objects=(BodySpec(shape, count=1000),))
+    with pytest.raises(ValueError, match=message):
+        tiny(dataclasses.replace(spec, obstacles=obstacles))
 
 
 def test_a_robot_that_counts_as_torn_from_the_start_is_refused() -> None:
@@ -460,10 +526,31 @@ def test_constants_that_no_body_takes_are_refused() -> None:
     env.reset(seed=0, options={"physics": {"mass": 2.0, "gravity": (0.0, -1.0)}})
 
 
-def test_terms_without_names_are_refused() -> None:
-    env = tiny(dataclasses.replace(hop(), reward_fn=lambda moment, spec: Outcome(moment.now.com[:, 1])))
+def test_constants_that_only_the_object_takes_are_warned_of() -> None:
+    robot = dataclasses.replace(dittogym.make_spec("kick").robot, material=Elastic(1500.0, 50.0))
+    env = tiny("kick", body=robot)
+    with pytest.warns(UserWarning, match=r"physics\['lam'\] changes the object of kick alone, not the robot") as caught:
+        env.reset(seed=0, options={"physics": {"lam": 60.0}})
+    assert len(caught) == 1 and caught[0].filename == __file__
+    env.reset(seed=0, options={"physics": {"mass": 2.0}})
+
+
+@pytest.mark.parametrize(
+    ("part", "given", "kind"),
+    [
+        ("terms", torch.zeros(1), "torch.float32"),
+        ("terms", None, "None"),
+        ("memory", torch.zeros(1), "torch.float32"),
+        ("info", [1], "list"),
+        ("info", [], "list"),
+    ],
+)
+def test_what_comes_without_names_is_refused(part: str, given: object, kind: str) -> None:
+    env = tiny(
+        dataclasses.replace(hop(), reward_fn=lambda moment, spec: height(moment, spec)._replace(**{part: given}))
+    )
     env.reset(seed=0)
-    with pytest.raises(TypeError, match="reward_fn of task 'hop' must return terms by name"):
+    with pytest.raises(TypeError, match=f"reward_fn of task 'hop' must return {part} by name, got {kind}"):
         env.step(torch.zeros(1, *env.action_shape))
 
 

@@ -55,6 +55,40 @@ def test_one_number_for_all(form, dtype: str) -> None:
         assert values.tolist() == pytest.approx([OWN[name]] * 3)
 
 
+def test_numbers_and_lists_are_as_exact_as_arrays() -> None:
+    """torch would make them float32, or whatever its default is, first."""
+    env = tiny("kick", 2)
+    env.reset(seed=0)
+    places = (env.state.x[0] + 1e-12).tolist()
+    for default in (torch.float32, torch.bfloat16):
+        torch.set_default_dtype(default)
+        try:
+            env.reset(options={"positions": places, "physics": {"mu": 650.1, "lam": [49.9, np.float32(50.0)]}})
+        finally:
+            torch.set_default_dtype(torch.float32)
+        assert env.env_state.physics["mu"].tolist() == [650.1] * 2
+        assert env.env_state.physics["lam"].tolist() == [49.9, 50.0] and env.state.x[1].tolist() == places
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (True, "must be real numbers, got True"),
+        (np.array([True, False]), "must be real numbers, got array"),
+        (torch.tensor(True), r"must be real numbers, got torch.bool"),
+        (1j, "must be real numbers, got 1j"),
+        ("stiff", "must be real numbers, got 'stiff'"),
+        (None, "must be real numbers, got None"),
+        ([[1.0], [1.0, 2.0]], r"must be numbers, got \[\[1.0\], \[1.0, 2.0\]\]"),
+        ([torch.tensor(1.0, requires_grad=True)] * 2, "must be numbers, got "),
+    ],
+)
+def test_what_is_no_number(value: object, message: str) -> None:
+    env = tiny("kick", 2)
+    with pytest.raises(ValueError, match=r"physics\['mu'\] " + message):
+        given(env, mu=value)
+
+
 def test_gravity_for_all_and_for_each() -> None:
     each = [[0.0, -1.0], [2.0, 0.0], [0.0, 0.0]]
     for value in ((1.0, -2.0), np.array([1.0, -2.0]), torch.tensor([1.0, -2.0]), each):
@@ -303,7 +337,8 @@ def test_gradients_stay_with_the_masked_elements() -> None:
         ({"mu": [1.0, -2.0]}, r"physics\['mu'\] must be finite, positive, got -2.0"),
         ({"yield_stress": -1.0}, r"physics\['yield_stress'\] must be finite, not negative"),
         ({"mu": float("nan")}, r"physics\['mu'\] must be finite, positive, got nan"),
-        ({"lam": -1e6}, "stiffness not negative"),
+        ({"lam": [50.0, -5000.0]}, r"physics\['lam'\] must be at least -mu, -650, got -5000"),
+        ({"lam": -70.0, "mu": torch.tensor([[60.0, 80.0]]).repeat(2, 60)}, r"must be at least -mu, -60, got -70"),
         ({"gravity": (0.0, float("nan"))}, r"physics\['gravity'\] must be finite, got nan"),
     ],
 )

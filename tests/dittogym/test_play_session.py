@@ -216,10 +216,40 @@ def test_moments() -> None:
     assert torch.equal(played.env.state.x, then) and shown(played).step == 1 and played.total == total
     played.advance()
     header, _ = encode(played.recording.scene, played.recording.shots)
-    assert header["steps"] == [0, 1, 2, 3]  # moments in the order in which they were played
+    assert header["steps"] == [0, 1, 2] and len(played.actions) == 2  # without what was played before going back
     env = TorchEnv("run", **SMALL)
     env.load(snapshot)
     assert torch.equal(env.state.x, then)
+
+
+def test_files_after_going_back_are_of_what_led_there() -> None:
+    """In the same episode, twice, and from a later one of another seed."""
+    played = session(seed=3)
+    for direction in ("right", "up"):
+        played.apply(Wave(direction))
+        for _ in range(3):
+            played.advance()
+    played.apply(Save("moment"))
+    kept, total = played.actions.copy(), played.total
+    for reset in (None, None, Reset(seed=8)):
+        if reset is not None:
+            played.apply(reset)
+        for _ in range(4):
+            played.advance()
+        played.apply(protocol.Back())
+        assert played.total == pytest.approx(total) == sum(played.recording.rewards)
+        assert [shot.step for shot in played.recording.shots] == list(range(7))
+        played.advance()
+        assert played.total == pytest.approx(sum(played.recording.rewards))
+    (answer,) = played.apply(Save("actions"))
+    saved = np.load(io.BytesIO(base64.b64decode(answer["content"])))
+    assert np.array_equal(saved["actions"][:6], kept) and len(saved["actions"]) == 7 and saved["seed"] == 3
+    assert "went back to a saved moment" in saved["touched"]
+    env = TorchEnv("run", **SMALL)
+    env.reset(seed=3)
+    for action in saved["actions"]:
+        env.step(torch.from_numpy(action)[None])
+    assert torch.equal(env.state.x, played.env.state.x)
 
 
 def drawing(mask: np.ndarray, what: str) -> Draw:

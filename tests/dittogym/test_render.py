@@ -46,6 +46,18 @@ def test_muscles_target_and_size() -> None:
         env.render(size=3)
 
 
+def test_a_shot_holds_the_quantities_that_are_asked_for() -> None:
+    env = TorchEnv("kick", 1, particles=100, substeps=1)
+    env.reset(seed=0)
+    assert set(env.shot().values) == {"deformation", "speed"}  # nothing acts yet
+    env.step(torch.ones(1, *env.action_shape))
+    whole = env.shot()
+    assert set(whole.values) == set(SCALES)
+    for asked in ((), ("muscle",), ("muscle", "deformation")):
+        values = env.shot(0, asked).values
+        assert set(values) == set(asked) and all(np.array_equal(values[by], whole.values[by]) for by in asked)
+
+
 def test_scales() -> None:
     """The quantities in their units, and colours at the ends of a scale, beyond them, and without a value."""
     env = TorchEnv("kick", 1, particles=100, dtype="float64")

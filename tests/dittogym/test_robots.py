@@ -11,6 +11,7 @@ from tiny import TASKS, tiny
 
 import dittogym
 from dittogym.bodies import positions as layout
+from dittogym.bodies.images import read_mask
 from dittogym.bodies.shapes import Disc, Figure, Lattice, Rectangle
 from dittogym.geometry import ceiling, floor, solid
 from dittogym.render.canvas import SOLID
@@ -158,6 +159,32 @@ def test_a_dark_robot_on_bright_ground_is_recognised() -> None:
     bright = np.where(np.pad(ELL, 3), 255, 0).astype(np.uint8)
     masks = [dittogym.make_spec("run", body=picture).robot.shape.mask for picture in (bright, 255 - bright)]
     assert np.array_equal(*masks) and np.array_equal(masks[0], ELL)
+
+
+COLOURS = {"black": 0, "white": 255, "red": (255, 0, 0), "green": (0, 255, 0), "blue": (0, 0, 255), "grey": 128}
+
+
+@pytest.mark.parametrize("ground", ["black", "white", "grey", "green"])
+@pytest.mark.parametrize("colour", ["red", "green", "blue", "white", "black"])
+def test_the_order_of_colours_does_not_matter(colour: str, ground: str, tmp_path) -> None:
+    """Arrays are RGB, OpenCV's BGR; a file is read as OpenCV has it."""
+    if colour == ground:
+        return
+    drawn = np.pad(ELL, 3)[..., None]
+    picture = np.where(drawn, COLOURS[colour], np.broadcast_to(COLOURS[ground], 3)).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "drawing.png"), picture[..., ::-1])
+    for given in (picture, picture[..., ::-1], picture / 255, tmp_path / "drawing.png"):
+        assert np.array_equal(dittogym.make_spec("run", body=given).robot.shape.mask, ELL)
+
+
+def test_a_photograph_is_told_apart_by_what_most_of_it_shows() -> None:
+    """A white bird with a black eye in a blue sky: the brightest channel would find the eye."""
+    y, x = np.mgrid[:60, :60] - 29.5
+    bird, eye = np.hypot(x, y) < 20, np.hypot(x - 5, y + 5) < 3
+    picture = np.where(bird[..., None], 250, (90, 140, 250)).astype(np.uint8)
+    picture[eye] = 0
+    found = read_mask(picture, "body", "")
+    assert np.array_equal(found, bird & ~eye)
 
 
 def wall(i: tuple[int, int] = (32, 38), *, visible: bool = True):

@@ -1,5 +1,6 @@
 """Saved moments: what goes on from one is, to the last bit, what would have gone on without."""
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -8,9 +9,9 @@ import pytest
 import torch
 from tiny import SMALL, TASKS, actions, assert_same_bits, everything, make_vec, stir, tiny
 
-from dittogym import TorchEnv
+from dittogym import TorchEnv, make_spec
 from dittogym.torch_env import Snapshot
-from torchmpm import tree
+from torchmpm import VonMises, tree
 
 STEPS = 3
 
@@ -273,3 +274,31 @@ def test_a_moment_goes_through_a_file(tmp_path) -> None:
     before = go_on(env, drive)
     env.load(torch.load(tmp_path / "moment.pt", weights_only=True))
     assert_same_bits(go_on(env, drive), before)
+
+
+def test_learned_materials_are_no_part_of_what_a_moment_must_fit() -> None:
+    """After a step of the optimiser, an environment returns to where it was before; a fixed material is compared."""
+    moments = {}
+    for learns in (True, False):
+        for mu in (650.0, 700.0):
+            matter = VonMises(torch.tensor(mu, requires_grad=learns), 50.0, 90.0)
+            spec = make_spec("run")
+            env = tiny(replace(spec, robot=replace(spec.robot, material=matter)))
+            env.reset(seed=0)
+            env.step(actions(env, 1)[0])
+            moments.setdefault(learns, []).append((env, env.save()))
+    (_, before), (env, _) = moments[True]
+    env.load(before)
+    assert torch.equal(env.state.x, before.state.particles.x)
+    (_, before), (env, _) = moments[False]
+    with pytest.raises(ValueError, match="the same robot, got another"):
+        env.load(before)
+
+
+@pytest.mark.cuda
+def test_materials_on_a_device() -> None:
+    spec = make_spec("run")
+    matter = VonMises(torch.tensor(650.0, device="cuda"), 50.0, 90.0)
+    env = tiny(replace(spec, robot=replace(spec.robot, material=matter)), device="cuda")
+    env.reset(seed=0)
+    env.load(env.save())

@@ -32,12 +32,15 @@ def test_a_control_step_keeps_its_duration_unless_both_are_given() -> None:
         (0.02, "dt must divide"),
         (0.0, "dt must be positive, got 0.0"),
         (1e-320, "dt must divide"),
+        (1e-300, "dt must divide .* got 1e-300; there may be at most 1000000 substeps"),
         ("short", "dt must be a number, got 'short'"),
     ],
 )
 def test_impossible_substeps_are_refused(dt: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         dittogym.TorchEnv("run", particles=100, dt=dt)
+    with pytest.raises(ValueError, match="substeps must be at most 1000000, got 1000001"):
+        dittogym.TorchEnv("run", particles=100, substeps=1_000_001)
 
 
 @pytest.mark.parametrize("task", TASKS)

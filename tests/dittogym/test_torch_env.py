@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny import actions
+from tiny import actions, forget
 
 import dittogym
 from dittogym import TorchEnv
@@ -51,6 +51,9 @@ def test_a_seed_for_each_element() -> None:
     for wrong, message in (
         ([1, 2], "seed must be a whole number or 3 of them"),
         ([1, -2, 3], r"seed\[1\] must not be"),
+        (np.array([1, 2]), "seed must be a whole number or 3 of them"),
+        (np.array([1.0, 2.0, 3.0]), r"seed\[0\] must be a whole number, got 1.0"),
+        (np.array(3), r"seed must be a whole number, got array\(3\)"),
     ):
         with pytest.raises(ValueError, match=message):
             env.reset(seed=wrong)
@@ -121,10 +124,10 @@ def test_defaults_of_torch_change_nothing() -> None:
     """Neither of dtype, nor of the device, nor autocast."""
     rewards = []
     for context in (nullcontext(), torch.device("meta"), torch.autocast("cpu", torch.bfloat16), float64()):
-        per_particle.__wrapped__.cache_clear()
+        forget(per_particle)
         with context:
             env = small(dtype="float32", particles=60, backend="auto")
-            env.reset(seed=0)
+            env.reset(seed=0, options={"physics": {"mu": 650.1, "gravity": [0.1, -9.3]}})
             rewards.append(
                 env.step(torch.full((1, *env.action_shape), 0.3, device="cpu", dtype=torch.float32), soft=True)[1]
             )

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from tiny import TASKS, actions, set_particles, tiny
+from tiny import TASKS, actions, forget, set_particles, tiny
 from torch import Tensor
 
 from dittogym import core
@@ -55,7 +55,7 @@ def test_an_environment_refuses_transforms_and_is_as_it_was() -> None:
 
 
 def test_nothing_is_kept_from_a_transform() -> None:
-    bicubic_matrix.__wrapped__.cache_clear()
+    forget(bicubic_matrix)
     reward, drive = reward_of("run")
     torch.func.grad(reward)(drive[0])
     kept = bicubic_matrix(8, 64, False, torch.float64, torch.device("cpu"))

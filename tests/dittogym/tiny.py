@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import inspect
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -49,6 +50,11 @@ def set_particles(env: dittogym.TorchEnv, **fields: torch.Tensor) -> None:
     """Put other values in place of fields of the particles."""
     own = {name: fields.get(name, getattr(env.state, name)) for name in ("x", "v", "C", "F", "Jp")}
     env.env_state = replace(env.env_state, particles=ParticleState(**own))
+
+
+def forget(function: Callable[..., Any]) -> None:
+    """Let a function of :func:`torchmpm.backends.cached_tensors` make its tensors anew."""
+    inspect.getclosurevars(function).nonlocals["kept"].clear()
 
 
 def leaves(value: Any, path: str = "") -> Iterator[tuple[str, np.ndarray]]:

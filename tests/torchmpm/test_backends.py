@@ -254,3 +254,40 @@ def test_a_compiled_function_holds_an_eager_step_whole_and_runs_around_other_bac
     with pytest.raises(Exception, match=r"backend 'auto' cannot be traced by torch.compile, use 'eager'"):
         moved("auto", fullgraph=True)
     torch.testing.assert_close(moved("auto"), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_tensors_of_a_trace_are_not_kept() -> None:
+    """They hold no numbers for those who come after it."""
+
+    @backends.cached_tensors
+    def row(count: int) -> tuple[Tensor, Tensor]:
+        return torch.arange(count, device="cpu"), torch.ones(count, device="cpu")
+
+    class Model(torch.nn.Module):
+        def forward(self, x: Tensor) -> Tensor:
+            return x * row(3)[0]
+
+    with FakeTensorMode():
+        assert type(row(2)[0]) is not Tensor
+    exported = torch.export.export(Model(), (torch.ones(3),))
+    for count in (2, 3):
+        assert type(row(count)[0]) is Tensor and row(count)[0].tolist() == list(range(count))
+        assert row(count)[0] is row(count)[0]
+    again = torch.export.export(Model(), (torch.ones(3),))  # with what is kept by now
+    for program in (exported, again):
+        assert program.module()(torch.ones(3)).tolist() == [0.0, 1.0, 2.0]
+
+
+def test_kept_tensors_do_not_pile_up() -> None:
+    calls = []
+
+    @backends.cached_tensors
+    def number(value: int) -> Tensor:
+        calls.append(value)
+        return torch.tensor(value, device="cpu")
+
+    for value in range(backends.LARGEST_CACHE + 1):
+        number(value)
+    assert number(backends.LARGEST_CACHE).item() == backends.LARGEST_CACHE
+    number(0)
+    assert calls == [*range(backends.LARGEST_CACHE + 1), 0]

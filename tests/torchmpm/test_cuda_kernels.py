@@ -1,5 +1,6 @@
 """The CUDA kernels against the plain substep; without a GPU in Triton's interpreter, which takes its time."""
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -148,17 +149,16 @@ def test_lower_end_of_the_window() -> None:
     assert_close(*both(robot(40, rules=()), lively(40, 2, corner=(0.0, -0.1)), substeps=2), 1e-10)
 
 
-@pytest.mark.parametrize("y", [float("nan"), 1e30, -1e30, 1e9, -5.0, 5.0])
+@pytest.mark.parametrize("y", [math.nan, math.inf, 1e308, 1e30, -1e30, 1e9, -5.0, 5.0])
 def test_positions_no_address_exists_for(y: float) -> None:
-    """Above and below the window there is nothing."""
+    """Above and below the window, and at no place, particles keep what they have."""
     state = lively(10)
     x = state.x.clone()
     x[:, 3, 1] = y
     native, eager = both(robot(10, rules=()), replace(state, x=x), substeps=2)
     others = [k for k in range(10) if k != 3]
     torch.testing.assert_close(native.x[:, others], eager.x[:, others], rtol=0, atol=1e-13)
-    expected = torch.full_like(eager.v[:, 3], float("nan") if y != y else 0.0)
-    torch.testing.assert_close(native.v[:, 3], expected, equal_nan=True)
+    assert torch.equal(native.v[:, 3].cpu(), state.v[:, 3])
 
 
 def test_outside_they_keep_everything_and_pass_gradients_through() -> None:
@@ -188,3 +188,21 @@ def test_a_broken_element_harms_no_other(name: str, value: float) -> None:
     assert_close(together, apart, 1e-12)
     for one, other in zip(of_all, of_some, strict=True):
         torch.testing.assert_close(one[[0, 2]], other[[0, 2]], rtol=0, atol=1e-10 * other.abs().max().item())
+
+
+@pytest.mark.parametrize(("plane", "value"), [(0, math.nan), (1, math.nan), (1, math.inf)])
+def test_what_takes_no_part_has_no_derivative_in_shared_constants(plane: int, value: float) -> None:
+    """Particles at no place, see test_limits.py; and those outside, whatever else they hold."""
+    given = state_leaves(15, 2)
+    given["x"][0, 3, plane] = value
+    given["x"][0, 4, 0], given["F"][0, 4], given["v"][0, 4] = 9.0, math.nan, math.inf
+    given = {name: tensor.to(DEVICE) for name, tensor in given.items()}
+    mu = torch.tensor(500.0, dtype=torch.float64, device=DEVICE, requires_grad=True)
+    gradients = []
+    for backend in ("native", "eager"):
+        solver = robot(15, bodies=(Body(15, VonMises(mu, 50.0, 60.0), mass=2.0, muscle=True),), backend=backend)
+        state = ParticleState(*(given[name] for name in STATE))
+        final = solver.step(state, given["actuation"], substeps=3, origin=given["origin"])
+        gradients += torch.autograd.grad(final.F[1].square().sum(), mu)
+    assert gradients[1].isfinite() and gradients[1] != 0
+    torch.testing.assert_close(*gradients, rtol=1e-9, atol=0)

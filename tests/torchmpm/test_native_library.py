@@ -149,3 +149,12 @@ def test_windows() -> None:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
     assert done.stdout.startswith("[0.0, -0.0008999"), done.stderr
     assert done.stderr.endswith("backend 'native' does not run on Windows, except in WSL: use 'eager'\n"), done.stderr
+
+
+def test_the_sources_are_hashed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not for each solver."""
+    robot(5, backend="native")
+    hashed = []
+    monkeypatch.setattr(compiler, "digest_of", lambda *facts: hashed.append(facts) or "0" * 64)
+    robot(5, backend="native")
+    assert hashed == []

@@ -1,6 +1,7 @@
 """Loops over steps and their checkpoints, on a step simple enough to know the answer."""
 
 import gc
+import weakref
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +13,7 @@ from scenes import lively, normal, robot
 from torch import Tensor
 
 from torchmpm import Body, Elastic, ParticleState, estimate_memory, repeated, trajectory
+from torchmpm.backends import compiler_found
 
 
 def double(x: Tensor) -> Tensor:
@@ -226,3 +228,69 @@ def test_an_optimiser_step_between_a_step_of_a_learned_law_and_its_gradient_is_r
         law.mu.mul_(0.5)
     with pytest.raises(RuntimeError, match=rf"^bodies\[0\].material.mu {CHANGED}"):
         final.x.square().sum().backward()
+
+
+NATIVE = pytest.param("native", marks=pytest.mark.skipif(not compiler_found(), reason="no C++ compiler"))
+
+
+@pytest.mark.parametrize("loop", ["trajectory", "repeated"])
+@pytest.mark.parametrize("substeps", [2, 20])
+@pytest.mark.parametrize("backend", ["eager", NATIVE])
+@pytest.mark.parametrize(
+    ("name", "changed"),
+    [
+        *[(n, rf"bodies\[0\].{path}") for n, path in (("mu", "material.mu"), ("mass", "mass"))],
+        *[(n, n) for n in ("gravity", "origin", "actuation")],
+    ],
+)
+def test_what_a_solver_reads_in_a_replayed_step_must_last(
+    name: str, changed: str, backend: str, substeps: int, loop: str
+) -> None:
+    """However few its substeps are; no change, or one after the gradient, is no error."""
+    tensors = {
+        "mu": torch.full((1,), 500.0, dtype=torch.float64),
+        "mass": torch.tensor(2.0, dtype=torch.float64),
+        "gravity": torch.tensor([0.5, -9.8], dtype=torch.float64),
+        "origin": torch.zeros(1, 2, dtype=torch.float64),
+        "actuation": normal(1, 2, 16, 16, seed=1),
+    }
+    body = Body(5, Elastic(tensors["mu"], 50.0), mass=tensors["mass"], muscle=True)
+    solver, state = robot(5, bodies=(body,), gravity=tensors["gravity"], backend=backend), lively(5)
+    v = state.v.clone().requires_grad_()
+    start = replace(state, v=v)
+
+    def step(s: ParticleState) -> ParticleState:
+        # Views of its own, which are gone when the step is replayed.
+        return solver.step(s, tensors["actuation"][:], substeps=substeps, origin=tensors["origin"][:])
+
+    if loop == "trajectory":
+        final, _ = trajectory(lambda s, _: step(s), start, range(3), observe=lambda s: None)
+    else:
+        final = repeated(step, start, 3, segment=1)
+    (gradient,) = torch.autograd.grad(final.x.sum(), v, retain_graph=True)
+    tensors[name].mul_(0.5).add_(0.01)
+    if name == "actuation" and backend == "eager" and substeps == 20:  # only its segments are replayed, with a copy
+        assert torch.equal(torch.autograd.grad(final.x.sum(), v)[0], gradient)
+        return
+    with pytest.raises(RuntimeError, match=f"^{changed} {CHANGED}"):
+        final.x.sum().backward()
+
+
+def test_constants_that_a_step_makes_itself_are_made_again() -> None:
+    """They are no error, and nothing keeps them."""
+    log_mu, state = torch.tensor(6.0, dtype=torch.float64, requires_grad=True), lively(5)
+    made: list[weakref.ref[Tensor]] = []
+
+    def step(s: ParticleState, _: int) -> ParticleState:
+        mu = log_mu.exp()
+        made.append(weakref.ref(mu))
+        return robot(5, bodies=(Body(5, Elastic(mu, 50.0), mass=2.0),)).step(s, substeps=3)
+
+    gradients = []
+    for checkpointed in (False, True):
+        final, _ = trajectory(step, state, range(3), observe=lambda s: None, checkpointed=checkpointed)
+        gc.collect()
+        assert len(made) == 3 and not any(mu() is not None for mu in made)
+        gradients += torch.autograd.grad(final.F.square().sum(), log_mu)
+        made.clear()
+    torch.testing.assert_close(*gradients, rtol=1e-12, atol=0)

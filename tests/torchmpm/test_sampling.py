@@ -138,3 +138,20 @@ def test_image_at_the_last_number(last: float) -> None:
 def test_empty_image() -> None:
     with pytest.raises(ValueError, match="mask must have at least one pixel set, got none"):
         sampling.image(np.full((1, 2), 0.5), np.zeros((3, 3), dtype=bool), (0.0, 0.0), (1.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "got"),
+    [
+        (torch.rand(5, 2), "Tensor"),
+        ([[0.1, 0.2]], "list"),
+        (np.full((5, 2), "a"), r"an array of <U1 of shape \(5, 2\)"),
+        (np.full((5, 2), True), r"an array of bool of shape \(5, 2\)"),
+        (np.zeros((5, 3)), r"an array of float64 of shape \(5, 3\)"),
+        (np.full((5, 2), np.nan), r"an array of float64 of shape \(5, 2\)"),
+        (np.full((5, 2), 2), r"an array of int64 of shape \(5, 2\)"),
+    ],
+)
+def test_what_is_no_array_of_points(numbers: object, got: str) -> None:
+    with pytest.raises(ValueError, match=rf"^numbers must be an array \(N, 2\) of numbers from 0 to 1, got {got}$"):
+        sampling.box(numbers, (0.0, 0.0), (1.0, 1.0))

@@ -3,8 +3,10 @@
 import itertools
 import math
 import pickle
+import re
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,7 +64,8 @@ def reference_substep(
         found = [(base[0] + p, base[1] + q, w[p, 0] * w[q, 1], (np.array((p, q)) - f) * h) for p, q in around]
         return [node for node in found if 0 <= node[0] < n and 0 <= node[1] < n]
 
-    inside = [k for k in range(len(bodies)) if 1e-5 < state["x"][k, 0] - origin[0] < n * h - 1e-5]
+    offsets = state["x"] - origin
+    inside = [k for k, (x, y) in enumerate(offsets) if 1e-5 < x < n * h - 1e-5 and 0.0 <= y <= n * h]
     for k in inside:
         body, x, v, C = bodies[k], state["x"][k], state["v"][k], state["C"][k]
         F, tau = return_and_stress((np.eye(2) + dt * C) @ state["F"][k], body.material)
@@ -369,3 +372,63 @@ def test_a_copy_of_a_solver_builds_its_own_tables() -> None:
     solver, state = robot(20), lively(20)
     expected = solver.step(state, substeps=2)
     assert_identical(pickle.loads(pickle.dumps(solver)).step(state, substeps=2), expected)
+
+
+class Soft:
+    """A law of somebody else, with a tensor of some kind."""
+
+    def __init__(self, name: str, value: Tensor) -> None:
+        setattr(self, name, value)
+
+    def return_map(self, F: Any, Jp: Tensor) -> Any:
+        return F, Jp
+
+    def stress(self, F: Any, Jp: Tensor) -> Any:
+        return Elastic(300.0, 50.0).stress(F, Jp)
+
+    def energy(self, F: Any, Jp: Tensor) -> Tensor:
+        return Elastic(300.0, 50.0).energy(F, Jp)
+
+    def stiffness(self) -> float:
+        return 700.0
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("log_mass", torch.tensor(-1.0)),
+        ("mass", torch.tensor(-1.0)),
+        ("volume", torch.tensor([0.0, -2.0])),
+        ("table", torch.zeros(0)),
+        ("on", torch.tensor([True, False])),
+        ("phase", torch.tensor(1j)),
+        ("index", torch.tensor([-3])),
+    ],
+)
+def test_tensors_of_a_material_may_be_of_all_kinds(name: str, value: Tensor) -> None:
+    own, known = (
+        robot(5, bodies=(Body(5, law, mass=2.0),), backend="eager").step(lively(5), substeps=2)
+        for law in (Soft(name, value), Elastic(300.0, 50.0))
+    )
+    assert_identical(own, known)
+
+
+def test_numbers_of_a_material_and_of_bodies_are_checked() -> None:
+    with pytest.raises(ValueError, match=r"^bodies\[0\].material.log_mass must be finite, got nan"):
+        robot(5, bodies=(Body(5, Soft("log_mass", torch.tensor(math.nan)), mass=2.0),))
+    for name in ("mass", "volume"):
+        body = Body(5, Elastic(300.0, 50.0), **{name: torch.tensor([-1.0])})
+        with pytest.raises(ValueError, match=rf"^bodies\[0\].{name} must be positive, got -1"):
+            robot(5, bodies=(body,), allow_unstable=True)
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (5, 5), (1, 1, 2)])
+def test_gravity_of_another_shape(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=rf"^gravity must have shape \(2,\) or \(B, 2\), got {re.escape(str(shape))}"):
+        robot(5, gravity=torch.zeros(shape))
+
+
+@pytest.mark.parametrize("value", [torch.zeros(0), torch.zeros(0, 2), torch.zeros(2) * 1j, torch.zeros(2) == 1])
+def test_gravity_that_is_no_numbers(value: Tensor) -> None:
+    with pytest.raises(ValueError, match=r"^gravity must be real and not empty, got"):
+        robot(5, gravity=value)

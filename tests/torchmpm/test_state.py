@@ -103,7 +103,13 @@ def test_integer_index_keeps_the_batch_dimension() -> None:
         assert torch.equal(picked.F[0], state.F[index])
 
 
-@pytest.mark.parametrize("index", [3, -4, (0, 1), None, torch.tensor(True), torch.tensor(1.5), torch.tensor(3)])
+@pytest.mark.parametrize(
+    "index",
+    [
+        *(3, -4, None, torch.tensor(True), torch.tensor(1.5), torch.tensor(3)),
+        *(True, False, np.bool_(True), (0, 1), (0,), (slice(None), slice(0, 1)), (slice(None), 0)),
+    ],
+)
 def test_index_that_is_no_batch_element(index: object) -> None:
     with pytest.raises(IndexError):
         lively(4, 3)[index]

@@ -8,7 +8,8 @@ from torch import Tensor
 from torchmpm import checks
 from torchmpm.materials.linalg import Mat2, Sym2
 
-#: A number, or a tensor of shape (), (B,) for one value per simulation, or (B, N) for one per particle.
+#: A number, or a tensor: of shape () for one value, (B,) or (B, 1) for one per simulation, (B, count) for one per
+#: particle of a body, or (1, count) for the same in all simulations.
 Value: TypeAlias = float | Tensor
 
 

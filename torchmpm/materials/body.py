@@ -17,8 +17,8 @@ class Body:
     Attributes:
         count: Number of particles.
         material: Constitutive law, such as :class:`torchmpm.VonMises`.
-        mass: Mass of a particle, kg; a number or a tensor of shape (), (B,) or (B, count).
-        volume: Undeformed volume of a particle, m^2 (two-dimensional); a number, (), (B,) or (B, count).
+        mass: Mass of a particle, kg; a number or a tensor of shape (), (B,), (B, 1), (B, count) or (1, count).
+        volume: Undeformed volume of a particle, m^2 (two-dimensional); a number or a tensor of those shapes.
         muscle: Whether the actuation field acts on it.
 
     Raises:

@@ -29,7 +29,9 @@ def corotated_energy(F: Mat2, mu: Value, lam: Value, J: Tensor | None = None) ->
 
 @dataclass(frozen=True, eq=False)
 class Elastic:
-    """Fixed corotated elastic solid. A constant is a number or a tensor of shape (), (B,) or (B, N).
+    """Fixed corotated elastic solid.
+
+    A constant is a number or a tensor of shape (), (B,), (B, 1), (B, count) or (1, count) with the body's count.
 
     Attributes:
         mu: Second Lame parameter (shear modulus), Pa.
@@ -63,8 +65,8 @@ class Elastic:
     def stiffness(self) -> Value:
         """Largest ratio of stress to strain in undeformed material, Pa: 2 (mu + lam), under a change of volume.
 
-        It is 2 mu, under shear, where lam is negative. A number, or a tensor of shape (), (B, 1) or (B, N) where the
-        constants are tensors.
+        It is 2 mu, under shear, where lam is negative. A number, or a tensor of shape (), (B, 1), (B, count) or
+        (1, count) where the constants are tensors.
         """
         mu, lam = detached_column(self.mu), detached_column(self.lam)
         if isinstance(mu, Tensor) or isinstance(lam, Tensor):

@@ -29,11 +29,11 @@ def resolved_stress(body: Body, F: Mat2, Jp: Tensor, h: float, dt: float) -> Sym
     ``(h / dt)^2 m / V``, the derivative is that of the stable one. All other derivatives are exact.
     """
     material, tau = body.material, body.material.stress(F, Jp)
-    if not (isinstance(material, Snow) and is_limited(body)):
+    if not isinstance(material, Snow) or material.exact_gradients:
         return tau
     with torch.no_grad():
         mass, volume = (broadcast_plane(getattr(body, name), Jp, name) for name in ("mass", "volume"))
-        mu, lam = (torch.as_tensor(value) for value in material.hardened(Jp))
+        mu, lam = material.hardened(Jp)
         stable = (h / dt) ** 2 * mass / volume
         excess = (1.0 - stable / (2.0 * (mu + lam.clamp_min(0.0)))).clamp_min(0.0)
     removed = corotated_stress(F, excess * mu, excess * lam, det(F).abs())

@@ -54,7 +54,8 @@ class Snow(Elastic):
 
     The default values are those of the soil in DittoGym's DIG. The plastic volume ratio Jp collects the area that
     stretches lost to their bounds; the elastic constants are multiplied by ``exp(hardening (1 - Jp))`` within
-    ``hardening_range``, with Jp of the substep before. A constant is a number or a tensor of shape (), (B,) or (B, N).
+    ``hardening_range``, with Jp of the substep before. A constant is a number or a tensor of shape (), (B,), (B, 1),
+    (B, count) or (1, count) with the body's count.
 
     Gradients are deliberately not exact where a substep does not resolve the motion. Forward, plastic flow bounds such
     motion; its exact derivative grows in every substep, until it overflows. So where hardened snow is stiffer than
@@ -118,11 +119,11 @@ class Snow(Elastic):
         return corotated_energy(F, mu, lam, det(F).abs())
 
     def stiffness(self) -> Value:
-        """As that of :class:`Elastic`, at Jp = 1, Pa: a number or a tensor of shape (), (B, 1) or (B, N)."""
+        """As that of :class:`Elastic`, at Jp = 1, Pa."""
         low, high = self.hardening_range
         return min(max(1.0, low), high) * super().stiffness()
 
-    def hardened(self, Jp: Tensor) -> tuple[Value, Value]:
+    def hardened(self, Jp: Tensor) -> tuple[Tensor, Tensor]:
         """Lame parameters mu and lam at ``Jp`` (B, N), Pa."""
         low, high = self.hardening_range
         exponent = broadcast_plane(self.hardening, Jp, "hardening") * (1.0 - Jp)

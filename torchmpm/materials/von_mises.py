@@ -87,7 +87,8 @@ class VonMises(Elastic):
     """Fixed corotated solid that flows plastically once its deviatoric strain reaches a limit.
 
     The robot material of DittoGym (Huang et al., ICLR 2024): soft enough to be driven by muscles, plastic enough to
-    keep a new shape. A constant is a number or a tensor of shape (), (B,) or (B, N).
+    keep a new shape. A constant is a number or a tensor of shape (), (B,), (B, 1), (B, count) or (1, count) with the
+    body's count.
 
     Attributes:
         mu: Second Lame parameter, Pa.

@@ -58,7 +58,13 @@ def cache_folder() -> str:
 
 def provenance() -> Path | tuple[str, ...] | None:
     """Where the kernels come from: a library of the package, or else a compiler; ``None`` if there is neither."""
-    return packaged(compiler.NATIVE, compiler.REAL["float32"]) or compiler.find_compiler()
+    return _own_kernels(family()) or compiler.find_compiler()
+
+
+@functools.cache
+def _own_kernels(processors: str | None) -> Path | None:
+    """The library of the package for the processors of :func:`family`; kept, as its name is a hash of all sources."""
+    return packaged(compiler.NATIVE, compiler.REAL["float32"])
 
 
 def family() -> str | None:

@@ -36,8 +36,8 @@ struct alignas(64) Stencil {
 #pragma omp simd reduction(min : i0, j0) reduction(max : i1, j1)
         for (int k = 0; k < LANES; ++k) {
             const Real offset = block.v[X][k] - ox;
-            const bool inside = (offset > margin) & (offset < extent);
             const Real ux = offset * inverse_h, uy = (block.v[Y][k] - oy) * inverse_h;
+            const bool inside = (offset > margin) & (offset < extent) & (uy >= 0) & (uy <= high);
             Real bx = std::trunc(ux - Real(0.5)), by = std::trunc(uy - Real(0.5));
             const Real dx = inside ? ux - bx : 0, dy = inside ? uy - by : 0;
             fx[k] = dx, fy[k] = dy, on[k] = inside ? Real(1) : Real(0);

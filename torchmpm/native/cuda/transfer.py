@@ -41,9 +41,11 @@ def locate(x, y, origin, valid, constants, resolution):
     """Whether particles take part, their first nodes (i, j), and their distances from these."""
     inverse_h = tl.load(constants + INVERSE_H)
     offset = x - tl.load(origin)
+    up = (y - tl.load(origin + 1)) * inverse_h
     on = valid & (offset > tl.load(constants + MARGIN)) & (offset < tl.load(constants + EXTENT))
+    on = on & (up >= 0.0) & (up <= resolution)  # false for NaN
     i, fx = locate_axis(offset * inverse_h, on, resolution)
-    j, fy = locate_axis((y - tl.load(origin + 1)) * inverse_h, on, resolution)
+    j, fy = locate_axis(up, on, resolution)
     return on, i, j, fx, fy
 
 

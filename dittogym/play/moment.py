@@ -1,0 +1,39 @@
+"""What is saved of an episode: a moment to go back to, and its actions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from dittogym.action import bicubic
+from dittogym.model import Snapshot
+from dittogym.render.recording import Recording
+
+
+class Moment(NamedTuple):
+    """A state, and how its episode came there."""
+
+    snapshot: Snapshot
+    total: float  # Return
+    terminated: bool
+    truncated: bool
+    seed: int  # Of the particles
+    actions: list[np.ndarray]
+    recording: Recording
+    touched: list[str]
+
+    def copy(self) -> Moment:
+        """The same, with lists that do not grow with those of an episode that goes on."""
+        shots, rewards = self.recording.shots.copy(), self.recording.rewards.copy()
+        recording = replace(self.recording, shots=shots, rewards=rewards)
+        return self._replace(actions=self.actions.copy(), recording=recording, touched=self.touched.copy())
+
+
+def stacked(actions: list[np.ndarray], patch: int) -> np.ndarray:
+    """Actions (T, 2, R, R); those of several resolutions as executed, on a patch of so many nodes."""
+    if len({action.shape for action in actions}) == 1:
+        return np.stack(actions)
+    return np.stack([bicubic(torch.from_numpy(each), patch).numpy() for each in actions])
