@@ -259,6 +259,27 @@ def rewards_tasks_figure(path: Path) -> None:
     drawing.savefig(path, metadata={"Date": None})
 
 
+def rewards_ablation_figure(path: Path) -> None:
+    """Draw what the learner ``sac`` returns with each option left out: mean and range of a training's last policy."""
+    rows = [row for row in read("rewards-ablation.csv") if row["episodes"]]
+    drawing = Figure(figsize=(7.2, 3.6), layout="constrained")
+    FigureCanvasSVG(drawing)
+    changes = list(dict.fromkeys(row["change"] for row in rows))
+    for axis, task in zip(drawing.subplots(1, 2, sharey=True), ("run", "shapematch"), strict=True):
+        for row in rows:
+            if row["task"] == task:
+                place, seed = len(changes) - 1 - changes.index(row["change"]), int(row["seed"])
+                low, mean, high = (float(row[column]) for column in ("lowest", "mean", "highest"))
+                axis.plot((low, high), (place - 0.25 * seed,) * 2, color=f"C{seed}", lw=1.5)
+                axis.plot(mean, place - 0.25 * seed, "o", ms=5, color=f"C{seed}")
+        axis.set_title(headline(task)[0], fontsize=10)
+        axis.set_xlabel("return, lowest to highest of ten episodes", fontsize=9)
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.tick_params(labelsize=8)
+        axis.set_yticks(range(len(changes)), reversed(changes))
+    drawing.savefig(path, metadata={"Date": None})
+
+
 def rewards_stages_figure(path: Path) -> None:
     """Draw evaluations in SHAPE MATCH of the learner ``sac`` with both stages or a single one, a line for each seed."""
     rows = read("rewards-stages.csv")
@@ -320,6 +341,7 @@ def write_results() -> None:
     comparison_figure(PAGES / "comparison.svg")
     rewards_figure(PAGES / "rewards.svg")
     rewards_tasks_figure(PAGES / "rewards-tasks.svg")
+    rewards_ablation_figure(PAGES / "rewards-ablation.svg")
     rewards_stages_figure(PAGES / "rewards-stages.svg")
     ablation_figure(PAGES / "ablation.svg")
     write(PAGES / "ablation.md", ablation())

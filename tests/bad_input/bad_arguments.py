@@ -183,7 +183,11 @@ SOLVER = table(
     ]
 ) + table(
     [
-        ("body of jelly", lambda: body(material="jelly"), "material must be a Material, got 'jelly'"),
+        (
+            "body of jelly",
+            lambda: body(material="jelly"),
+            "material must be a Material, got 'jelly', which has no method",
+        ),
         ("solver without grid", lambda: solver(grid=None), "grid must be a Grid, got None"),
         ("solver of one body", lambda: solver(bodies=body()), "bodies must be a sequence of Body, got Body"),
         ("solver, named rule", lambda: solver(rules=("floor",)), "rules[0] must be a VelocityRule, got 'floor'"),

@@ -9,6 +9,9 @@ from torch import Tensor, nn
 from torchmpm import checks
 from torchmpm.materials.base import Material, Value, broadcast_plane
 
+METHODS = ("return_map", "stress", "energy", "stiffness")
+"""Methods of a :class:`torchmpm.Material`."""
+
 
 @dataclass(frozen=True, eq=False)
 class Body:
@@ -34,7 +37,9 @@ class Body:
 
     def __post_init__(self) -> None:
         checks.whole("count", self.count, 1)
-        checks.instance("material", self.material, Material)
+        if lacking := [name for name in METHODS if not callable(getattr(self.material, name, None))]:
+            found = f"{self.material!r:.60}, which has no method {', '.join(lacking)}"
+            raise TypeError(f"material must be a Material, got {found}")
         for name in ("mass", "volume"):
             checks.value(name, getattr(self, name), above=0.0)
         checks.flag("muscle", self.muscle)
