@@ -260,7 +260,7 @@ def rewards_tasks_figure(path: Path) -> None:
 
 
 def rewards_ablation_figure(path: Path) -> None:
-    """Draw what the learner ``sac`` returns with each option left out: mean and range of a training's last policy."""
+    """Draw what the learner ``sac`` returns with each option left out: mean and range of the best policy."""
     rows = [row for row in read("rewards-ablation.csv") if row["episodes"]]
     drawing = Figure(figsize=(7.2, 3.6), layout="constrained")
     FigureCanvasSVG(drawing)
