@@ -9,15 +9,16 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
 
+import dittogym.tasks
 from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
 from cfp.agent.spec import ActorSpec
 from cfp.errors import ConfigError
-from cfp.from_dict import flatten
+from cfp.from_dict import differences, flatten
 from cfp.sections import EnvironmentConfig, NetworkConfig, Particles, ReportConfig
 from cfp.validation import check_at_least
 from dittogym import make_spec
 from dittogym.spec import TaskSpec
-from dittogym.tasks import allowed_instead, task_name
+from dittogym.tasks import task_name
 
 Preset = Literal["quick", "long", "paper"]
 Learner = Literal["analytic", "sac"]
@@ -94,10 +95,10 @@ class RunConfig:
 
     def check_effect(self, base: RunConfig, given: Collection[str] | None = None) -> None:
         """Refuse options, all or those ``given``, that differ from the preset ``base`` but are `ineffective`."""
-        defaults = flatten(to_json(base))
-        for name, value in flatten(to_json(self)).items():
-            for option, required in self.ineffective().items():
-                if name.startswith(option) and value != defaults[name] and (given is None or name in given):
+        ineffective = self.ineffective()
+        for name, (value, _) in differences(to_json(self), to_json(base)).items():
+            for option, required in ineffective.items():
+                if name.startswith(option) and (given is None or name in given):
                     raise ConfigError(f"{name.split('.')[-1]} requires {required}, got {value!r} without it")
 
     def check(self) -> None:
@@ -278,10 +279,7 @@ class Config(CoarseToFineConfig):
         """Scale the start of the actor's updates, too, if there are fewer steps."""
         config = super().with_derived(base, given)
         assert isinstance(config, Config) and isinstance(base, Config)
-        start = base.learning.actor_start
-        if "actor_start" in given or self.steps >= base.steps:
-            return config
-        return replace(config, learning=replace(self.learning, actor_start=round(start * self.steps / base.steps)))
+        return replace(config, learning=scale_start(self.learning, base.learning, self.steps / base.steps, given))
 
     def hyperparameters(self, stage: int) -> Hyperparameters:
         """Hyperparameters of a stage."""
@@ -307,6 +305,15 @@ class Config(CoarseToFineConfig):
             raise ConfigError(f"noise_cells must be at most {coarsest}, the coarsest of resolutions, got {cells}")
 
 
+def scale_start(
+    learning: LearningConfig, base: LearningConfig, fraction: float, given: Collection[str]
+) -> LearningConfig:
+    """Start the actor's updates earlier in a run with a ``fraction`` of the steps of the preset ``base``."""
+    if "actor_start" in given or fraction >= 1:
+        return learning
+    return replace(learning, actor_start=round(base.actor_start * fraction))
+
+
 def check_training_layouts(name: str, count: int, before: int = 0, stages: int = 1) -> None:
     """Check that none of the initial positions of training belongs to evaluations.
 
@@ -323,8 +330,10 @@ def check_training_layouts(name: str, count: int, before: int = 0, stages: int =
 
 def check_task(task: object) -> None:
     """Check that a value names a task; a module that it names is imported."""
-    if (allowed := allowed_instead(task)) is not None:
-        raise ConfigError(f"task must be {allowed}, got {task!r}")
+    try:
+        dittogym.tasks.check_task(task)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
 
 
 def to_json(config: RunConfig) -> dict[str, Any]:

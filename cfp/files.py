@@ -44,12 +44,6 @@ def names_file(path: Path) -> Iterator[None]:
         raise
 
 
-def copy_atomically(source: Path, target: Path) -> None:
-    """Copy a file, as `write_atomically` writes one."""
-    content = source.read_bytes()
-    write_atomically(target, lambda file: file.write(content))
-
-
 def _sync_folder(folder: Path) -> None:
     """Make a rename itself durable; some systems (Windows) cannot open a folder and need nothing here."""
     if os.name != "posix":
@@ -61,14 +55,14 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object from a file of moderate size; ``OSError`` or ``ValueError`` where that cannot be done."""
+def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any]:
+    """Read a JSON object from a file of at most ``largest`` bytes; ``OSError`` or ``ValueError`` if that fails."""
     if path.exists() and not path.is_file():
         raise OSError("it is not a file")  # a pipe or a device might never end
     with open(path, "rb") as file:
-        content = file.read(LARGEST_JSON + 1)
-    if len(content) > LARGEST_JSON:
-        raise ValueError(f"it is larger than {LARGEST_JSON} bytes")
+        content = file.read(largest + 1)
+    if len(content) > largest:
+        raise ValueError(f"it is larger than {largest} bytes")
     value = parse_json(content.decode())
     if not isinstance(value, dict):
         raise ValueError(f"it must hold an object, got {type(value).__name__}")

@@ -87,6 +87,13 @@ def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def differences(first: dict[str, Any], second: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Options that differ, by dotted name: the value in each; None where there is none."""
+    first, second = flatten(first), flatten(second)
+    names = {**first, **second}
+    return {name: (first.get(name), second.get(name)) for name in names if first.get(name) != second.get(name)}
+
+
 def leaf_names(values: dict[str, Any]) -> set[str]:
     """Names of nested options without those of their sections."""
     return {name.rpartition(".")[2] for name in flatten(values)}

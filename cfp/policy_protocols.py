@@ -1,4 +1,4 @@
-"""What programs ask of a trained policy, whatever trained it."""
+"""The interface of trained policies, whatever trained them."""
 
 from __future__ import annotations
 

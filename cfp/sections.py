@@ -46,7 +46,7 @@ class EnvironmentConfig:
     resample: bool = False
     """Draw the particles anew at every reset."""
     target: str | None = None
-    """Target shape, for tasks that have one: a letter, star, or the path of an image; None: the task's default."""
+    """Target shape, for tasks that have one: star, I, M, T, or the path of an image; None: the task's default."""
     variant: Literal["registered", "published"] | None = None
     """Material, for tasks that have variants: that of the registered environment (also None) or that of the published
     training run."""

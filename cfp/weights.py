@@ -20,7 +20,7 @@ from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.spec import RESOLUTIONS, ActorSpec
 from cfp.config import LARGEST_SEED, RunConfig
 from cfp.errors import CheckpointError, ConfigError
-from cfp.files import FORMAT, parse_json
+from cfp.files import FORMAT, parse_json, write_policy
 from cfp.from_dict import type_name, update_from_dict
 from cfp.hub import download, is_address
 from cfp.sections import TASK_OPTIONS, EnvironmentConfig
@@ -114,6 +114,11 @@ def read_policy(path: str | Path, device: str = "cpu") -> tuple[dict[str, Tensor
         if not bool(torch.isfinite(tensor).all()):
             raise CheckpointError(f"{file}: weights must be finite, got NaN or infinity in {name}")
     return tensors, description
+
+
+def copy_policy(source: str | Path, target: Path) -> None:
+    """Copy a policy, its ``.safetensors`` file and the ``.json`` beside it."""
+    write_policy(target, *read_policy(source))
 
 
 def _check_description(description: Any) -> None:

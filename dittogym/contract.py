@@ -1,19 +1,20 @@
-"""What the engine and a task tell each other: measurements and moments one way, outcomes the other."""
+"""The interface between the environment and a task: moments and measurements in, outcomes out."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 
 from dittogym.reward_ops import RewardOps
 from torchmpm import ParticleState
+from torchmpm.materials.linalg import safe_sqrt
 
-#: Terms that the engine adds to those of a task.
+#: Terms that the environment adds to those of a task.
 ENGINE_TERMS = frozenset({"split", "action", "alive", "failure"})
-#: What the engine puts into ``info``.
+#: What the environment puts into ``info``.
 ENGINE_INFO = frozenset({"com", "split", "finite", "object_com", "reward_terms", "is_success", "true_reward"})
 
 
@@ -41,11 +42,7 @@ def measure(particles: ParticleState, num_robot_particles: int) -> Measurement:
     robot, other = slice(None, num_robot_particles), slice(num_robot_particles, None)
     com = x[:, robot].mean(1)
     variance = (x[:, robot] - com[:, None]).square().mean(1).sum(-1)  # several times faster than Tensor.var
-    if variance.requires_grad:  # the square root of zero has no derivative
-        single = variance == 0
-        split = torch.where(single, 0.0, torch.where(single, 1.0, variance).sqrt())
-    else:
-        split = variance.sqrt()
+    split = safe_sqrt(variance)
     if num_robot_particles == x.shape[1]:
         return Measurement(com, v[:, robot].mean(1), split)
     return Measurement(com, v[:, robot].mean(1), split, x[:, other].mean(1), v[:, other].mean(1))
@@ -93,8 +90,8 @@ class Outcome(NamedTuple):
     """What a reward function returns.
 
     Attributes:
-        terms: Reward terms (B,) by name. The engine multiplies each by its weight in ``TaskSpec.weights`` and adds the
-            terms ``split``, ``action``, ``alive`` and ``failure``.
+        terms: Reward terms (B,) by name. The environment multiplies each by its weight in ``TaskSpec.weights`` and adds
+            the terms ``split``, ``action``, ``alive`` and ``failure``.
         terminated: (B,) bool, the task's own reasons to end the episode; ``None`` for none.
         success: (B,) bool; ``None`` where success is not defined.
         info: Further quantities for ``info``, with a leading B.
@@ -122,10 +119,8 @@ def check_memory(task: str, memory: object, stale: tuple[str, ...], batch: int) 
         raise ValueError(f"{who} must return what stale_memory names, got {sorted(memory)} without {missing}")
 
 
-def check_outcome(
-    task: str, outcome: object, memory: Memory, weights: Mapping[str, float], batch: int, checked: set[tuple[Any, ...]]
-) -> None:
-    """Refuse what a task must not return from a step; names and shapes are checked when they are new."""
+def check_outcome(task: str, outcome: object, memory: Memory, weights: Mapping[str, float], batch: int) -> None:
+    """Refuse what a task must not return from a step."""
     who = f"reward_fn of task {task!r}"
     if not isinstance(outcome, Outcome):
         raise TypeError(f"{who} must return an Outcome, got {type(outcome).__name__}")
@@ -134,13 +129,10 @@ def check_outcome(
         if not isinstance(values, Mapping) and (values is not None or what == "terms"):
             raise TypeError(f"{who} must return {what} by name, got {_kind(values)}")
     flags = {"terminated": outcome.terminated, "success": outcome.success}
-    forms = (batch, *map(_forms, (*parts.values(), flags)))
-    if forms in checked:
-        return
     info = outcome.info or {}
     for part, taken in (("terms", ENGINE_TERMS & outcome.terms.keys()), ("info", ENGINE_INFO & info.keys())):
         if taken:
-            raise ValueError(f"{who} must not return the engine's own {part}, got {sorted(taken)}")
+            raise ValueError(f"{who} must not return the environment's own {part}, got {sorted(taken)}")
     if missing := [name for name in outcome.terms if name not in weights]:
         raise ValueError(f"weights of task {task!r} must hold every term of reward_fn, got none for {missing}")
     for name, value in outcome.terms.items():
@@ -158,14 +150,6 @@ def check_outcome(
         before, after = ({name: _kind(value) for name, value in m.items()} for m in (memory, outcome.memory))
         if before != after:
             raise ValueError(f"{who} must return memory like that of initial_memory, {before}, got {after}")
-    checked.add(forms)
-
-
-def _forms(values: Mapping[str, Any] | None) -> tuple[Any, ...] | None:
-    """Names, types and shapes of values."""
-    if values is None:
-        return None
-    return tuple([(name, getattr(v, "dtype", type(v)), getattr(v, "shape", None)) for name, v in values.items()])
 
 
 def _check_leading(who: str, what: str, values: Mapping[str, object], batch: int) -> None:

@@ -193,7 +193,7 @@ def _weighted_reward(
     """Outcome, weighted terms and their sum; of simulations that are not valid (B,) only ``failure`` counts."""
     spec, now = model.spec, moment.now
     outcome = spec.reward_fn(moment, spec)
-    check_outcome(spec.name, outcome, moment.memory, spec.weights, len(now.split), model.checked)
+    check_outcome(spec.name, outcome, moment.memory, spec.weights, len(now.split))
     terms, weights = dict(outcome.terms), spec.weights
     if spec.split_limit is not None:
         terms["split"] = moment.ops.split_penalty(now.split, spec.split_limit)

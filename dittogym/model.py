@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -87,7 +87,6 @@ class Model:
         substeps: Substeps of a control step.
         camera: Draws observations.
         segment: Substeps between checkpoints where gradients are enabled, see :meth:`torchmpm.Solver.step`.
-        checked: Names and shapes that the task has returned so far.
     """
 
     spec: TaskSpec
@@ -95,7 +94,6 @@ class Model:
     substeps: int
     camera: Camera
     segment: Segment = "auto"
-    checked: set[tuple[object, ...]] = field(default_factory=set, repr=False)
 
     @property
     def num_robot_particles(self) -> int:

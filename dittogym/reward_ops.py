@@ -10,6 +10,7 @@ from torch.nn.functional import softplus
 
 from dittogym.observation.image import silhouette, soft_silhouette
 from torchmpm import checks
+from torchmpm.materials.linalg import safe_sqrt
 
 #: The spread of a robot is not counted beyond this, m.
 SPLIT_CAP = 0.2
@@ -111,9 +112,7 @@ def signed_quadratic(z: Tensor, k: float) -> Tensor:
 
 def distance(x: Tensor, point: Tensor) -> Tensor:
     """Distances (B, N) of ``x`` (B, N, 2) from ``point`` (B, 2), m, whose derivative is 0 where they coincide."""
-    squared = _squared_distance(x, point)
-    same = squared == 0
-    return torch.where(same, 0.0, torch.where(same, 1.0, squared).sqrt())
+    return safe_sqrt(_squared_distance(x, point))
 
 
 def _squared_distance(x: Tensor, point: Tensor) -> Tensor:

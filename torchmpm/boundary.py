@@ -120,20 +120,17 @@ def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Fa
     for direction in dict.fromkeys(rule.direction for rule in rules):
         same = [rule for rule in rules if rule.direction == direction]
         active = torch.zeros(1, grid.width**2, dtype=torch.bool, device=origin.device)
-        stick, friction = active, torch.zeros_like(active, dtype=origin.dtype)
+        stick = friction = None
         for rule in same:
             new = covered(rule) & ~active
             active = active | new
             if math.isinf(rule.friction):
-                stick = stick | new
+                stick = new if stick is None else stick | new
             elif rule.friction:
-                friction = torch.where(new, rule.friction, friction)
-        sticks, rubs = (
-            any(math.isinf(rule.friction) for rule in same),
-            any(0 < rule.friction < math.inf for rule in same),
-        )
+                before = torch.zeros_like(new, dtype=origin.dtype) if friction is None else friction
+                friction = torch.where(new, rule.friction, before)
         axis, sign = "xy".index(direction[1]), 1 if direction[0] == "+" else -1
-        result.append(Face(axis, sign, active, stick if sticks else None, friction if rubs else None))
+        result.append(Face(axis, sign, active, stick, friction))
     return tuple(result)
 
 

@@ -30,10 +30,10 @@ def momentum(solver: Solver, state: ParticleState) -> Tensor:
 
 def angular_momentum(solver: Solver, state: ParticleState) -> Tensor:
     """Angular momentum about the world's origin, (B,), kg m^2/s, with the spin in the affine matrices (h^2/4 each)."""
-    _check(solver, state)
+    mass = masses(solver, state)
     orbit = state.x[..., 0] * state.v[..., 1] - state.x[..., 1] * state.v[..., 0]
     spin = 0.25 * solver.grid.h**2 * (state.C[..., 1, 0] - state.C[..., 0, 1])
-    return (masses(solver, state) * (orbit + spin)).sum(-1)
+    return (mass * (orbit + spin)).sum(-1)
 
 
 def kinetic_energy(solver: Solver, state: ParticleState) -> Tensor:
@@ -53,9 +53,9 @@ def elastic_energy(solver: Solver, state: ParticleState) -> Tensor:
 
 def potential_energy(solver: Solver, state: ParticleState) -> Tensor:
     """Energy of position under gravity relative to the world's origin, (B,), J."""
-    _check(solver, state)
+    mass = masses(solver, state)
     gravity = torch.as_tensor(solver.gravity, dtype=state.dtype, device=state.device).reshape(-1, 1, 2)
-    return -(masses(solver, state) * (state.x * gravity).sum(-1)).sum(-1)
+    return -(mass * (state.x * gravity).sum(-1)).sum(-1)
 
 
 def finite(state: ParticleState) -> Tensor:

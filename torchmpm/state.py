@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchmpm import checks, tree
-from torchmpm.backends import transforming
 
 #: Trailing shape of every field after the leading (B, N).
 _TRAILING = {"x": (2,), "v": (2,), "C": (2, 2), "F": (2, 2), "Jp": ()}
@@ -127,7 +126,7 @@ class ParticleState:
         return tree.map(Tensor.clone, self)
 
     def __reduce__(self) -> tuple[type[ParticleState], tuple[Tensor, ...]]:
-        """Pickle the fields alone: copies would not share memory with a copy of :meth:`stack`."""
+        """Pickle the fields, unless they are part of an autograd graph."""
         tree.refuse_graph("a ParticleState", self)
         return ParticleState, tuple(getattr(self, f.name) for f in fields(self))
 
@@ -173,22 +172,11 @@ class ParticleState:
         """Inverse of :meth:`stack`; the fields are views of the tensor (13, B, N)."""
         vector, matrix = (lambda p: p.movedim(0, -1)), (lambda p: p.movedim(0, -1).unflatten(-1, (2, 2)))
         x, v, C, F = vector(stacked[0:2]), vector(stacked[2:4]), matrix(stacked[4:8]), matrix(stacked[8:12])
-        state = cls(x, v, C, F, stacked[12])
-        object.__setattr__(state, "_stack", stacked)
-        return state
+        return cls(x, v, C, F, stacked[12])
 
     def stack(self) -> Tensor:
-        """The :meth:`planes` as one tensor (13, B, N); no copy of what :meth:`from_stack` made without a graph."""
-        stacked: Tensor | None = getattr(self, "_stack", None)
-        if stacked is None or stacked.requires_grad or transforming():
-            return torch.stack(self.planes())
-        memory = stacked.data_ptr()
-        for row, field in zip((0, 2, 4, 8, 12), (self.x, self.v, self.C, self.F, self.Jp), strict=True):
-            # With a graph the tensor goes through the fields, so that derivatives in them can be asked for. And
-            # ``state.x.data = ...`` gives a field other memory.
-            if field.requires_grad or field.data_ptr() != memory + row * stacked.stride(0) * stacked.element_size():
-                return torch.stack(self.planes())
-        return stacked
+        """The :meth:`planes` as one tensor (13, B, N)."""
+        return torch.stack(self.planes())
 
 
 torch.serialization.add_safe_globals([ParticleState])  # its tensors are all that a file holds of it

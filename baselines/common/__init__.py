@@ -1,1 +1,1 @@
-"""What several algorithms share: the training protocol, episodes, rollouts and reference policies."""
+"""Shared by several algorithms: the training protocol, episodes, rollouts and reference policies."""

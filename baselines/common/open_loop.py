@@ -1,4 +1,4 @@
-"""A policy that does not look: the same sequence of actions in every episode."""
+"""An open-loop policy: the same sequence of actions in every episode."""
 
 from __future__ import annotations
 

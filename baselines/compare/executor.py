@@ -1,4 +1,4 @@
-"""What carries out runs: one interface for this process, processes of this machine, and a cluster."""
+"""Executors of runs, with one interface: in this process, in processes of this machine, or on a cluster."""
 
 import contextlib
 import os

@@ -80,6 +80,10 @@ class FinalEvaluation:
         return float(np.mean(self.returns))
 
 
+LARGEST_RECORD = 2**26
+"""Bytes of the largest record that is read; one return takes about 28."""
+
+
 class Record:
     """The entries in ``final_evaluation.json`` of a run folder that belong to the policy that is there now."""
 
@@ -101,7 +105,7 @@ class Record:
 def read_record(path: Path, **types: type) -> dict[str, Any]:
     """Read a JSON object from a run folder; ``types`` are those of the values that it must hold."""
     try:
-        record = read_json(path)
+        record = read_json(path, LARGEST_RECORD)
         for name, kind in types.items():
             if not isinstance(record[name], kind):
                 raise TypeError(f"{name} must be of type {kind.__name__}, got {record[name]!r}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,12 +9,12 @@ from typing import Any
 
 from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare.final_evaluation import RECORD, Protocol, read_record
-from baselines.registry import ALGORITHMS, configure, sees
+from baselines.registry import ALGORITHMS, ALIASES, configure, sees
 from cfp.config import EVALUATION_SEED, RunConfig, to_json
 from cfp.errors import ConfigError
-from cfp.experiment.folder import holds_run, read_config
+from cfp.experiment.folder import holds_run, policy_path, read_config
 from cfp.files import read_json
-from cfp.from_dict import flatten, leaf_names
+from cfp.from_dict import differences, flatten, leaf_names
 from cfp.sections import TASK_OPTIONS
 from cfp.weights import is_of_another_task, is_same_task, read_policy
 from dittogym.tasks import task_name
@@ -53,7 +52,8 @@ class Plan:
             raise ConfigError(f"plan: {path} must hold common, tasks and algos only, got {', '.join(values)}")
         for part, options in values.items():
             _check_options(part, options, named=part != "common")
-        return cls(**values)
+        algos = {ALIASES.get(name, name): options for name, options in values.get("algos", {}).items()}
+        return cls(**{**values, "algos": algos})
 
     def options(self, label: str, task: str) -> Options:
         """Options of a run; of common, task, algorithm, and algorithm in a task the later ones win."""
@@ -219,14 +219,12 @@ def check_folder(job: Job) -> None:
     if not (job.folder / "config.json").exists():
         raise ConfigError(f"out: {job.folder} holds files of a run but no config.json")
     there = read_config(job.folder, configure)
-    old, new = (flatten(json.loads(json.dumps(to_json(config)))) for config in (there, job.config))
-    for name in {**old, **new}:
-        if name not in IRRELEVANT_OPTIONS and old.get(name) != new.get(name):
+    for name, (old, new) in differences(to_json(there), to_json(job.config)).items():
+        if name not in IRRELEVANT_OPTIONS:
             raise ConfigError(
-                f"{name} must be {old.get(name)!r} as in the run in {job.folder}, got {new.get(name)!r}; or name "
-                "another --out"
+                f"{name} must be {old!r} as in the run in {job.folder}, got {new!r}; or name another --out"
             )
-    path = job.folder / "policy.safetensors"
+    path = policy_path(job.folder)
     if path.exists() and is_of_another_task(read_policy(path)[1], job.config.task):
         raise ConfigError(
             f"task: the file that defines {job.config.task!r} has changed since the run in {job.folder} was trained; "

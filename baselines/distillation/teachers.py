@@ -17,14 +17,14 @@ from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.registry import configure, find, load
 from cfp.analytic.stateful import Stateful
 from cfp.errors import CheckpointError, ConfigError
-from cfp.experiment.folder import copy_policy, policy_path
+from cfp.experiment.folder import policy_path
 from cfp.experiment.process import StopSignals
 from cfp.experiment.run import TrainingRun
-from cfp.files import read_json, write_json, write_policy
+from cfp.files import read_json, write_json
 from cfp.hub import is_address
 from cfp.policy_protocols import Policy, SeesState
 from cfp.sections import TASK_OPTIONS, EnvironmentConfig
-from cfp.weights import check_trained_for, read_policy, shipped
+from cfp.weights import check_trained_for, copy_policy, read_policy, shipped
 from dittogym import TorchEnv
 from dittogym.action import ActionIndexing, bicubic_matrix, from_grid_indexing, to_grid_indexing
 
@@ -127,7 +127,7 @@ def copy_teacher(config: DistillConfig, folder: Path) -> None:
             raise
         names = ", ".join(("mpc", *TRAINED, *shipped()))
         raise ConfigError(f"teacher must be {names}, a run folder or a policy.safetensors, got {teacher!r}") from error
-    write_policy(teacher_path(folder), *read_policy(teacher))
+    copy_policy(teacher, teacher_path(folder))
 
 
 def warnings(config: DistillConfig, folder: Path) -> list[str]:

@@ -30,7 +30,7 @@ from cfp.errors import NonFiniteError
 from cfp.experiment.algorithm import Position, Scalars
 from cfp.experiment.folder import policy_path
 from cfp.experiment.process import StopSignals
-from cfp.experiment.schedules import linear_decay, stage_progress
+from cfp.experiment.schedules import linear_decay
 from cfp.experiment.stages import CoarseToFineStages, place_over
 from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
@@ -38,14 +38,14 @@ from cfp.weights import load
 from dittogym import make_spec
 
 METRICS: dict[str, str] = {
-    "rollout/return": "mean undiscounted return of the episodes that ended in the last round, None for none",
+    "rollout/return": "mean undiscounted return of the episodes that ended in the last round; empty for none",
     "train/loss": "mean squared difference from the teacher's actions, mean over the round's updates",
     "train/fresh_loss": "the same on the labels of the round before the student learned from them, None for no labels",
     "train/beta": "the probability with which the teacher acted in the round",
     "train/labels": "labels in the data set",
     "train/learning_rate": "Adam's step size",
     "train/episodes": "episodes ended in this stage",
-    "train/terminated": "those that the task ended early",
+    "train/terminated": "training episodes of this stage that terminated early",
     "train/nonfinite": "simulations that were not finite and were reset",
 }
 """Every scalar that `Distill.update` logs, and what it means."""
@@ -109,7 +109,7 @@ class Distill(Stateful, CoarseToFineStages):
     def update(self) -> Scalars:
         """Collect the labels of a round, and learn from all; a `NonFiniteError` if the loss is not finite."""
         config, beta = self.config, self.config.beta_decay**self.rounds
-        progress = stage_progress(config, self.stage, self.num_timesteps)
+        progress = self.progress
         learning_rate = config.student_learning_rate * linear_decay(progress)
         self.adam.param_groups[0]["lr"] = learning_rate
         with self._seeded():
@@ -155,10 +155,7 @@ class Distill(Stateful, CoarseToFineStages):
         labels = self.dataset.sample(self.config.batch_size)
         loss = self.loss(drop_entries(labels.observations, self.config.dropout), labels.actions)
         if not math.isfinite(value := float(loss.detach())):
-            raise NonFiniteError(
-                f"the loss became {value} after {self.num_timesteps} environment steps of the stage; "
-                "the last checkpoint is untouched"
-            )
+            raise NonFiniteError(f"the loss became {value} after {self.num_timesteps} environment steps of the stage")
         self.adam.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.adam.param_groups[0]["params"], self.config.max_grad_norm)

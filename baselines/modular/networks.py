@@ -113,10 +113,6 @@ class ModularCritics(nn.Module):
         pairs = zip(self.trunks, self.values, strict=True)
         return tuple(value(trunk(observation, values).mean(1)) for trunk, value in pairs)
 
-    def set_training_mode(self, mode: bool) -> None:
-        """Switch between training and evaluation; stable-baselines3 calls it, no layer depends on it."""
-        self.train(mode)
-
 
 class SegmentPolicy(StateBasedPolicy):
     """Acts on the segments of the robots in the environment given to `attached`, not on the image.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, cast, get_args
@@ -13,7 +14,7 @@ from baselines.modular.networks import Kind, ModularActor, ModularCritics, Segme
 from baselines.modular.nodes import Nodes
 from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
 from cfp.agent.policies import NetworkPolicy
-from cfp.config import RunConfig
+from cfp.config import RunConfig, scale_start
 from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
@@ -62,6 +63,11 @@ class ModularConfig(RunConfig):
     def resolution(self, stage: int) -> int:
         """Action grid R: the task's whole patch, so that segments write to its nodes."""
         return make_spec(self.task).patch
+
+    def with_derived(self, base: RunConfig, given: Collection[str]) -> RunConfig:
+        """Scale the start of the actor's updates, if there are fewer steps."""
+        assert isinstance(base, ModularConfig)
+        return replace(self, learning=scale_start(self.learning, base.learning, self.steps / base.steps, given))
 
     def ineffective(self) -> dict[str, str]:
         """Options of several stages, and of grids of actions, have no effect: segments act on nodes."""

@@ -17,7 +17,7 @@ from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Scalars, Sees
 from cfp.presets import sac_preset
-from cfp.sections import EnvironmentConfig, ReportConfig
+from cfp.sections import ReportConfig
 from dittogym import make_spec
 
 METRICS: dict[str, str] = {
@@ -79,13 +79,11 @@ class CEMConfig(PlannedConfig):
 
 def episode_preset(task: str, name: str) -> dict[str, Any]:
     """Options of `PlannedConfig` for a task; SHAPE MATCH, whose reward is all detail, gets an action grid of 16."""
-    quick = name == "quick"
-    environment = sac_preset(task, name).environment
-    horizon = make_spec(task).horizon
+    base, horizon = sac_preset(task, name), make_spec(task).horizon
     return {
         "task": task,
-        "preset": "quick" if quick else "paper",
-        "environment": replace(EnvironmentConfig() if quick else environment, num_envs=1),
+        "preset": name,
+        "environment": replace(base.environment, num_envs=1),
         "report": ReportConfig(
             eval_every=horizon // 4 + 1,
             eval_episodes=1,
@@ -94,7 +92,7 @@ def episode_preset(task: str, name: str) -> dict[str, Any]:
             log_every=10,
         ),
         "grid": 16 if task == "shapematch" else "coarse",
-        "train_particles": None if quick else "lite",
+        "train_particles": None if name == "quick" else "lite",
     }
 
 
@@ -121,7 +119,7 @@ class MPC(OpenLoopAlgorithm):
         planning_env = self.surrogate.env if self.surrogate else self.env
         self.planner = self.planner_type(planning_env, config.planner, seed=config.seed)
         self.actions = torch.zeros(0, *self.env.action_shape)
-        self.total_reward, self.reward, self.is_done = 0.0, 0.0, False
+        self.total_reward, self.reward = 0.0, 0.0
 
     @staticmethod
     def preset(task: str, name: str) -> PlannedConfig:
@@ -133,11 +131,6 @@ class MPC(OpenLoopAlgorithm):
     def policy(self) -> OpenLoop:
         """The record so far, with its layout."""
         return OpenLoop(self.actions, {"layout": self.config.seed})
-
-    @property
-    def finished(self) -> bool:
-        """Whether the episode is over."""
-        return self.is_done
 
     def update(self) -> Scalars:
         """Carry out one more step."""
@@ -159,7 +152,7 @@ class MPC(OpenLoopAlgorithm):
         _, reward, terminated, _, _ = self.env.step(action)
         self.reward = float(reward)
         self.total_reward += self.reward
-        self.is_done = bool(terminated)
+        self.finished = bool(terminated)
 
     def state_dict(self) -> dict[str, Any]:
         """Actions and planner; the state of the robot is restored by repeating its actions."""

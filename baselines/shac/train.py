@@ -22,7 +22,7 @@ from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.algorithm import Algorithm, Scalars, Sees
-from cfp.experiment.schedules import linear_decay, stage_progress
+from cfp.experiment.schedules import linear_decay
 from cfp.policy_protocols import Policy
 from cfp.presets import ON_SPEED, sac_preset
 from cfp.sections import ReportConfig
@@ -139,7 +139,7 @@ class Shac(Stateful, Algorithm):
     def update(self) -> Scalars:
         """Learn from one more window; a `NonFiniteError` if actions, or ten gradients in a row, are not finite."""
         config = self.config
-        learning_rate = config.learning_rate * linear_decay(stage_progress(config, 1, self.num_timesteps))
+        learning_rate = config.learning_rate * linear_decay(self.progress)
         self.actor_adam.param_groups[0]["lr"] = learning_rate
         window = self.collector.collect(self.act, self.critic)
         gradient_norm = self._update_actor(window)
@@ -167,8 +167,7 @@ class Shac(Stateful, Algorithm):
         self.skipped_in_a_row += 1
         if self.skipped_in_a_row >= PATIENCE:
             raise NonFiniteError(
-                f"{PATIENCE} updates in a row had no finite gradient after {self.num_timesteps} environment steps; "
-                "the last checkpoint is untouched"
+                f"{PATIENCE} updates in a row had no finite gradient after {self.num_timesteps} environment steps"
             )
         return None
 

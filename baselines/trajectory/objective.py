@@ -1,4 +1,4 @@
-"""What the optimisation of a whole trajectory minimises: a loss of every step."""
+"""The objective of trajectory optimisation: a loss of every step."""
 
 import torch
 from torch import Tensor

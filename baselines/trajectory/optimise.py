@@ -17,7 +17,7 @@ from cfp.config import OptimisationConfig, RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.algorithm import Scalars, Sees
-from cfp.experiment.schedules import cosine_decay, stage_progress
+from cfp.experiment.schedules import cosine_decay
 from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig, Particles, ReportConfig
 from cfp.validation import check_at_least, check_positive
@@ -147,7 +147,7 @@ class Gradient(Stateful, OpenLoopAlgorithm):
 
     def update(self) -> Scalars:
         """Do one iteration; a `NonFiniteError` after ten failures in a row."""
-        progress = stage_progress(self.config, self.stage, self.num_timesteps)
+        progress = self.progress
         learning_rate = self.backoff * self.learning_rate * cosine_decay(progress)
         self.adam.param_groups[0]["lr"] = learning_rate
         if (phase := self.objective.phase(progress)) != self.phase:
@@ -213,8 +213,7 @@ class Gradient(Stateful, OpenLoopAlgorithm):
         self.failed_in_a_row += 1
         if self.failed_in_a_row >= PATIENCE:
             raise NonFiniteError(
-                f"{PATIENCE} iterations in a row failed after {self.num_timesteps} environment steps of the stage; "
-                "the last checkpoint is untouched"
+                f"{PATIENCE} iterations in a row failed after {self.num_timesteps} environment steps of the stage"
             )
         self.backoff *= BACKOFF
         self._return_to_best()

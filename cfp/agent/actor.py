@@ -110,10 +110,6 @@ class SquashedActor(nn.Module):
         """Action for observations (B, ...)."""
         return self.sample(observation, deterministic).action
 
-    def set_training_mode(self, mode: bool) -> None:
-        """Switch between training and evaluation mode; required by stable-baselines3."""
-        self.train(mode)
-
 
 class Actor(SquashedActor):
     """Actor of stage 1: a squashed Gaussian over (2, R, R), given the observation."""

@@ -133,7 +133,3 @@ class LeanCritics(nn.Module):
         latents = torch.stack([torch.cat([observation.features, part], dim=1) for part in features.chunk(2, dim=1)])
         heads: list[nn.Sequential] = list(self.heads)  # type: ignore[arg-type]
         return tuple(fused.multilayer_perceptrons(heads, latents))
-
-    def set_training_mode(self, mode: bool) -> None:
-        """Switch between training and evaluation mode; required by stable-baselines3."""
-        self.train(mode)

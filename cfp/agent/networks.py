@@ -161,7 +161,3 @@ class TwinCritic(nn.Module):
         ]
         latents = torch.cat(parts, dim=2).transpose(0, 1)  # (2, B, 32, 4, 4)
         return tuple(fused.multilayer_perceptrons([critic.value for critic in critics], latents))
-
-    def set_training_mode(self, mode: bool) -> None:
-        """Switch between training and evaluation mode; required by stable-baselines3."""
-        self.train(mode)

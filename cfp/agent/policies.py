@@ -61,9 +61,15 @@ class NetworkPolicy(sac_policies.SACPolicy, ABC):
         critic.optimizer = self.optimizer_class([*critic.parameters(), *shared], **options)
         target.load_state_dict(critic.state_dict())
         target.requires_grad_(False)
-        target.set_training_mode(False)
+        target.eval()
         self.critic = cast(ContinuousCritic, critic)
         self.critic_target = cast(ContinuousCritic, target)
+
+    def set_training_mode(self, mode: bool) -> None:
+        """Switch actor and critics between training and evaluation."""
+        self.actor.train(mode)
+        self.critic.train(mode)
+        self.training = mode
 
     def networks(self) -> tuple[Actor, TwinCritic, TwinCritic]:
         """Actor, critics and target critics with their own types."""

@@ -214,7 +214,7 @@ class CFP(SAC):
         if not torch.isfinite(loss):
             raise NonFiniteError(
                 f"the {name} loss became {loss.item()} at update {self._n_updates + 1} "
-                f"({self.num_timesteps} environment steps into the stage); the last checkpoint is untouched"
+                f"({self.num_timesteps} environment steps into the stage)"
             )
         optimizer.zero_grad()
         loss.backward()
@@ -283,7 +283,7 @@ class CFP(SAC):
         if not finite.all():
             raise NonFiniteError(
                 f"the {name} of environment {int(np.argmin(finite))} is not finite at step {self.num_timesteps} of "
-                "the stage; nothing of this step was stored and the last checkpoint is untouched"
+                "the stage; nothing of this step was stored"
             )
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

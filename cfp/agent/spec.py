@@ -1,4 +1,4 @@
-"""What an actor is made of, as plain data; enough to build its networks before their weights are loaded."""
+"""The architecture of an actor as plain data, from which its networks are built before their weights are loaded."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_
 from cfp.envs.make import choose_device, make_torch_env
 from cfp.evaluation.pictures import policy_pictures
 from cfp.experiment.algorithm import Scalars
-from cfp.experiment.schedules import linear_decay, stage_progress
+from cfp.experiment.schedules import linear_decay
 from cfp.experiment.stages import CoarseToFineStages, refines
 from cfp.presets import analytic_preset
 from dittogym import core
@@ -111,7 +111,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         Raises:
             NonFiniteError: Actions are not finite.
         """
-        config, progress = self.config, stage_progress(self.config, self.stage, self.num_timesteps)
+        config, progress = self.config, self.progress
         learning_rate = config.learning_rate * linear_decay(progress)
         step_size = config.action_step[self.stage - 1] * linear_decay(progress, config.final_step)
         minibatches = config.minibatches

@@ -21,12 +21,12 @@ from dittogym.spec import TaskSpec
 from torchmpm import tree
 
 WINDOW_METRICS = {
-    "rollout/return": "mean undiscounted true return of the episodes that ended since the last row, None for none",
+    "rollout/return": "mean undiscounted true return of the episodes that ended since the last row; empty for none",
     "train/reward": "mean training reward of a step, before its scale",
     "train/true_reward": "mean true reward of a step, at the particle count of training",
     "train/value": "mean value that the target critic gives to the window's states",
     "train/episodes": "episodes ended in this stage",
-    "train/terminated": "those that the task ended early",
+    "train/terminated": "training episodes of this stage that terminated early",
     "train/nonfinite": "simulations that were not finite and were reset",
     "train/dropped": "gradients of single actions that were not finite and were left out",
 }
@@ -108,7 +108,7 @@ class WindowCollector(Stateful):
     def _guarded(self, action: Tensor) -> Tensor:
         """The same actions, through which only finite gradients go back."""
         if not bool(action.isfinite().all()):
-            raise NonFiniteError("the actor's actions became NaN or infinite; the last checkpoint is untouched")
+            raise NonFiniteError("the actor's actions became NaN or infinite")
         if not action.requires_grad:
             return action
         view = action.view_as(action)

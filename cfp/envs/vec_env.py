@@ -79,7 +79,7 @@ class TorchVecEnv(VecEnv):
             NonFiniteError: An action is NaN or infinite.
         """
         if not np.isfinite(actions).all():
-            raise NonFiniteError("an action is not finite: the policy has diverged; the last checkpoint is untouched")
+            raise NonFiniteError("an action is not finite: the policy has diverged")
         self._actions = torch.as_tensor(actions, dtype=torch.float32, device=self.torch_env.device)
 
     @torch.no_grad()

@@ -17,7 +17,7 @@ from cfp.evaluation.pictures import match_pictures
 from cfp.evaluation.results import to_rows
 from cfp.evaluation.table import Table, columns
 from cfp.files import write_atomically, write_text
-from cfp.from_dict import flatten
+from cfp.from_dict import differences
 from cfp.tables import read_table
 from dittogym.render.frame import png
 from dittogym.render.recording import Recording
@@ -87,9 +87,9 @@ def write_page(
 
 def changed_options(config: RunConfig, preset: RunConfig) -> dict[str, tuple[Any, Any]]:
     """Options, by their dotted names, that differ from the preset: their value, and that of the preset."""
-    own, usual = flatten(to_json(config)), flatten(to_json(preset))
-    own.pop("algo")  # each algorithm has presets of its own, CFP one for each learner
-    return {name: (value, usual.get(name)) for name, value in own.items() if value != usual.get(name)}
+    changes = differences(to_json(config), to_json(preset))
+    changes.pop("algo", None)  # each algorithm has presets of its own, CFP one for each learner
+    return changes
 
 
 def command_words(config: RunConfig, preset: RunConfig) -> list[str]:

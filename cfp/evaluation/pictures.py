@@ -1,4 +1,4 @@
-"""What a policy does with one observation, as pictures."""
+"""Pictures of the output of a policy for one observation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dittogym.render.colours import ROBOT
 
 PICTURES: dict[str, str] = {
     "picture/observation": "what the first training robot shows: red occupancy, green and blue velocity in x and y",
-    "picture/action": "the mean action for it, x-muscles left, y-muscles right: red pulls, blue pushes, white rests",
+    "picture/action": "the mean action for it, x-muscles left, y-muscles right: red contracts, blue expands",
     "picture/gate": "the gate of a residual actor in the same way: white keeps the coarse action, red replaces it",
 }
 """Pictures of every evaluation (TensorBoard only), and what they show."""

@@ -1,4 +1,4 @@
-"""What an algorithm offers to be trained, stopped, resumed, evaluated and compared like any other."""
+"""The interface by which an algorithm is trained, stopped, resumed, evaluated and compared."""
 
 from __future__ import annotations
 
@@ -51,7 +51,10 @@ class Algorithm(ABC):
     sees: ClassVar[Sees] = "image"  # what its policies look at; their training may use more
     presets: ClassVar[tuple[str, ...]] = ("quick", "paper")
     num_timesteps: int = 0  # environment steps taken in this stage
+    config: Any  # options of the run, a RunConfig
+    stage: int = 1  # in training, 1 is the first
     starts_trained: bool = False  # with a policy that is then evaluated before the first step
+    finished: bool = False  # whether the stage is over before its last step
     replay_buffer: ReplayBuffer | None = None  # transitions to keep in checkpoints
     logger: Logger
     scalars: Scalars = {}  # of the last update
@@ -105,9 +108,9 @@ class Algorithm(ABC):
         self.logger = logger
 
     @property
-    def finished(self) -> bool:
-        """Whether the stage is over before its last step."""
-        return False
+    def progress(self) -> float:
+        """Fraction of the stage that is done, 0 to 1; a stage after one that ended early is longer, and stays at 1."""
+        return min(self.num_timesteps / self.config.stage_steps(self.stage), 1.0)
 
     def learn(self, total_timesteps: int, callback: BaseCallback | None = None) -> Algorithm:
         """Take at least ``total_timesteps`` environment steps and learn from them.

@@ -1,4 +1,4 @@
-"""What happens between two updates of a stage: rows in the logs, evaluations, films, checkpoints, stopping."""
+"""Callbacks between two updates of a stage: logs, evaluations, films, checkpoints, stopping."""
 
 from __future__ import annotations
 

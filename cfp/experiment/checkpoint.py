@@ -16,7 +16,7 @@ from cfp.errors import CheckpointError, ConfigError
 from cfp.experiment.algorithm import Algorithm, Position
 from cfp.experiment.replay_archive import ReplayArchive
 from cfp.files import parse_json, write_atomically
-from cfp.from_dict import flatten
+from cfp.from_dict import differences
 
 VERSION = 2
 UNREADABLE = (OSError, RuntimeError, ValueError, LookupError, AttributeError, EOFError)
@@ -73,7 +73,7 @@ class Checkpoint:
             parse_json(state["config"])
             if min(state["stage"] - 1, state["offset"], state["num_timesteps"]) < 0:
                 raise ValueError("a count is negative")
-            self._before = float(state.get("seconds", 0.0))  # the first runs did not record it
+            self._before = float(state["seconds"])
         except (KeyError, TypeError, ValueError) as error:
             raise self.does_not_fit(error) from error
         return state
@@ -97,12 +97,9 @@ class Checkpoint:
 
 def check_same(stored: dict[str, Any], given: RunConfig) -> None:
     """Refuse to resume a checkpoint with other options than its own, but for those that may change."""
-    old, new = flatten(stored), flatten(json.loads(json.dumps(to_json(given))))
-    for name in {**old, **new}:
-        if name.startswith(given.changeable) or old.get(name) == new.get(name):
-            continue
-        allowed = ", ".join(given.changeable)
-        raise ConfigError(
-            f"{name.split('.')[-1]}: the run was started with {old.get(name)!r}, got {new.get(name)!r}; "
-            f"a resumed run may change only: {allowed}"
-        )
+    for name, (old, new) in differences(stored, json.loads(json.dumps(to_json(given)))).items():
+        if not name.startswith(given.changeable):
+            raise ConfigError(
+                f"{name.split('.')[-1]}: the run was started with {old!r}, got {new!r}; a resumed run may change only: "
+                + ", ".join(given.changeable)
+            )

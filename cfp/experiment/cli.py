@@ -1,4 +1,4 @@
-"""What all command lines share: error lines, exit codes, and how a program is called in its help."""
+"""Functions of all command lines: error lines, exit codes, and how a program is called in its help."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What lies where in the folder of a run."""
+"""File names in the folder of a run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from cfp.config import RunConfig
 from cfp.errors import CFPError, CheckpointError, ConfigError
-from cfp.files import copy_atomically, read_json
+from cfp.files import read_json
 from cfp.weights import read_policy
 
 
@@ -91,9 +91,3 @@ def policy_files(folder: Path, stages: int) -> dict[str, Path]:
     if newest.exists():
         files[f"stage {read_policy(newest)[1]['stage']}"] = newest
     return files
-
-
-def copy_policy(source: Path, target: Path) -> None:
-    """Copy a ``.safetensors`` file and the ``.json`` beside it."""
-    for suffix in (".safetensors", ".json"):
-        copy_atomically(source.with_suffix(suffix), target.with_suffix(suffix))

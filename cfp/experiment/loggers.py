@@ -1,4 +1,4 @@
-"""What a run shows while it trains, beside its tables: TensorBoard, and Weights & Biases for those who ask for it."""
+"""Loggers of a run beside its tables: TensorBoard, and optionally Weights & Biases."""
 
 from __future__ import annotations
 

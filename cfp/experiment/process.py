@@ -1,4 +1,4 @@
-"""What a command line does to its own process: stop signals and the allocator."""
+"""Settings of a command line's own process: stop signals and the allocator."""
 
 from __future__ import annotations
 

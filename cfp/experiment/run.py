@@ -15,8 +15,8 @@ from tqdm import tqdm
 
 from cfp.config import OptimisationConfig, RunConfig, to_json
 from cfp.envs.make import choose_device, make_env
-from cfp.errors import CFPError, CheckpointError, ConfigError
-from cfp.evaluation.evaluate import Result, compare
+from cfp.errors import CFPError, CheckpointError, ConfigError, NonFiniteError
+from cfp.evaluation.evaluate import compare
 from cfp.evaluation.page import write_page
 from cfp.evaluation.plots import plot_curve
 from cfp.evaluation.results import format_table, to_rows
@@ -33,12 +33,12 @@ from cfp.experiment.callbacks import (
     StopCallback,
 )
 from cfp.experiment.checkpoint import Checkpoint, check_same
-from cfp.experiment.folder import copy_policy, holds_progress, holds_run, policy_files, policy_path
+from cfp.experiment.folder import holds_progress, holds_run, policy_files, policy_path
 from cfp.experiment.loggers import ProgressTable, Tracker, check_trackers
 from cfp.experiment.process import StopSignals
 from cfp.files import read_json, write_atomically, write_json
 from cfp.tables import CSVTable
-from cfp.weights import is_of_another_task, read_policy
+from cfp.weights import copy_policy, is_of_another_task, read_policy
 from dittogym.render.frame import png
 
 
@@ -142,6 +142,8 @@ class TrainingRun:
                 if number < self.stages and read_policy(newest)[1]["stage"] == number:
                     copy_policy(newest, policy_path(self.folder, number))
                 self.position = Position(number, self.position.offset + algorithm.num_timesteps)
+        except NonFiniteError as error:
+            raise NonFiniteError(f"{error}; the last checkpoint is untouched") from error
         finally:
             self.seconds = self.checkpoint.seconds
             self.logger.close()
@@ -189,8 +191,8 @@ class TrainingRun:
             self.evaluation_seconds += evaluation.seconds
             bar.bar.close()
 
-    def finish(self) -> list[Result]:
-        """After training: the final table, ``results.json``, curve, video and page. Returns the table's rows."""
+    def finish(self) -> None:
+        """After training: print the final table, and write ``results.json``, curve, video and page."""
         device, files = choose_device(self.config.device), policy_files(self.folder, self.stages)
         policies = {name: self.algorithm.load(path, device) for name, path in files.items()}
         results = compare(self.config, policies, self.config.report.eval_episodes)
@@ -205,4 +207,6 @@ class TrainingRun:
         page = write_page(self.folder, self.config, preset, results, recording, self.seconds)
         print(f"all of it on one page: {page}")
         print(format_table(self.config, results))
-        return results
+        best = max(results[2:], key=lambda result: result.mean).name
+        if best != results[-1].name:
+            print(f"{best} has the highest mean return; its policy is {files[best]}")

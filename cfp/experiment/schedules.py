@@ -2,15 +2,8 @@
 
 import math
 
-from cfp.config import RunConfig
-
 FINAL_FRACTION = 0.1
 """Fraction of the learning rate that is left at the end of a stage."""
-
-
-def stage_progress(config: RunConfig, stage: int, num_timesteps: int) -> float:
-    """Fraction of a stage that is done, 0 to 1; a stage after one that ended early is longer, and stays at 1."""
-    return min(num_timesteps / config.stage_steps(stage), 1.0)
 
 
 def linear_decay(progress: float, final: float = FINAL_FRACTION) -> float:

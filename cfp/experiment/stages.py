@@ -15,7 +15,7 @@ from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm, Position
 from cfp.experiment.folder import policy_path
 from cfp.files import write_policy
-from cfp.weights import KIND, load, policy_for, read_policy, report_mismatch
+from cfp.weights import KIND, copy_policy, load, policy_for, read_policy, report_mismatch
 
 
 class CoarseToFineStages(Algorithm):
@@ -40,7 +40,7 @@ class CoarseToFineStages(Algorithm):
             raise ConfigError(f"start_from must have networks {allowed_spec}, got {policy.spec}")
         stage = stages if refine else stages + 1
         copy = start_path(folder) if refine else policy_path(folder, stages)
-        write_policy(copy, *read_policy(config.start_from))
+        copy_policy(config.start_from, copy)
         return Position(stage, (0, *config.handover)[stage - 1])
 
     @classmethod

@@ -53,7 +53,7 @@ class Command:
     out: Folder | None = None
     """Folder of the run; in runs/, named by algorithm, task, preset and seed, if not given."""
     resume: bool = False
-    """Continue the run in the folder; in an empty or missing folder, start a new run."""
+    """Continue the run in the folder; if it holds none, start a new one, which needs --task."""
     config: Path | None = None
     """JSON file with options, in the form of a run's config.json; it may hold only some of them."""
     dry_run: bool = False
@@ -186,7 +186,8 @@ def main(program: Program, arguments: Sequence[str] | None = None, started: str 
 
 def _train(program: Program, arguments: Sequence[str], started: str) -> None:
     command = parse(program, arguments, started)
-    algo = "" if command.run.algo == "cfp" or "distill" in started else f" --algo {command.run.algo}"
+    named = command.run.algo == "cfp" or started in ("python -m baselines.distill", "torchmpm teach")
+    algo = "" if named else f" --algo {command.run.algo}"
     train(program, command, f"resume with: {started} --resume --out {command.out}{algo}")
 
 

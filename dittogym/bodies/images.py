@@ -1,4 +1,4 @@
-"""What is drawn in pictures from files and arrays."""
+"""Reads drawings from image files and arrays."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class RasterInput(NamedTuple):
     velocity: Tensor  # (B, N, 2) doubled, clipped velocities; zero where hidden
     weight: Tensor  # (N,) full-size particles that each particle stands for
     visible: Tensor  # (B, N) bool, particles that are drawn
-    hidden_velocity: Tensor | None  # (N,) bool, particles that only the occupancy channel shows; None for none
+    hidden_velocity: Tensor | None  # (N,) bool, particles that only the occupancy channel shows; None if there are none
     row: Tensor  # First fine row of the crop, (B, 1)
     column: Tensor  # First fine column of the crop, (B, 1)
     background: Background | None = None  # What obstacles and goals set; None for nothing

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import tyro
 
-from dittogym.tasks import allowed_instead
+from dittogym.tasks import check_task
 
 #: Options of its training that a policy plays with, too, unless the command line says otherwise.
 FROM_POLICY = ("dt", "substeps", "dtype", "parity", "target", "variant")
@@ -63,8 +63,7 @@ def options(command: Command) -> dict[str, Any]:
         environment = known[command.policy]["environment"]
         chosen = {name: environment[name] for name in FROM_POLICY if environment.get(name) is not None}
     task = command.task or (known[command.policy]["task"] if command.policy else "run")
-    if (allowed := allowed_instead(task)) is not None:
-        raise ValueError(f"task must be one of {allowed}, got {task!r}")
+    check_task(task)
     names = [name for name, about in known.items() if about["task"] == task or name == command.policy]
     given = {name: getattr(command, name) for name in ("particles", "resolution", "seed", "policy", "target", "body")}
     chosen |= {name: value for name, value in given.items() if value is not None}

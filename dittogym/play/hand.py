@@ -1,9 +1,9 @@
-"""What a hand does to a robot: it pulls at matter, drives muscles near a point, and sends waves through them."""
+"""Interactive forces on a robot: pulling at matter, driving muscles near a point, and waves of contraction."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 from torch import Tensor
@@ -16,10 +16,12 @@ REACH = 0.045
 HASTE = 15.0
 #: Largest speed of matter that is pulled, m/s.
 LARGEST_SPEED = 2.0
-#: Distance over which the strength of driven muscles falls off, m; at least the width of a cell of the action image.
+#: Smallest distance over which the strength of driven muscles falls off, m.
 MUSCLE_REACH = 0.03
 #: Phase that a wave advances in a control step, and wavelengths in the action image.
 WAVE_SPEED, WAVE_NUMBER = 0.3, 2.0
+
+Direction: TypeAlias = Literal["left", "right", "up", "down"]
 
 
 @dataclass(frozen=True)
@@ -62,12 +64,21 @@ def press(point: np.ndarray, corner: np.ndarray, width: float, size: int) -> np.
     """
     along = (np.arange(size) + 0.5) * width / size
     x, y = corner[0] + along - point[0], corner[1] + along[::-1] - point[1]
-    reach = max(MUSCLE_REACH, 0.6 * width / size)
-    strength = np.exp(-(x**2 + y[:, None] ** 2) / (2 * reach**2))
+    strength = np.exp(-(x**2 + y[:, None] ** 2) / (2 * reach(width, size)["muscles"] ** 2))
     return np.broadcast_to(strength, (2, size, size))
 
 
-def wave(direction: Literal["left", "right", "up", "down"], step: int, size: int) -> np.ndarray:
+def reach(width: float, size: int) -> dict[str, float]:
+    """Distances from the pointer within which the hand pulls at matter, and over which its effect on muscles falls off.
+
+    Args:
+        width: Width of the action image, m.
+        size: Its rows and columns.
+    """
+    return {"pull": REACH, "muscles": max(MUSCLE_REACH, 0.6 * width / size)}
+
+
+def wave(direction: Direction, step: int, size: int) -> np.ndarray:
     """Action (2, size, size) of waves of contraction that travel in a direction, of vertical muscles a bit later."""
     along = np.arange(size) / size
     position = {"right": along, "left": -along, "up": -along[:, None], "down": along[:, None]}[direction]

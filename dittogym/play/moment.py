@@ -1,4 +1,4 @@
-"""What is saved of an episode: a moment to go back to, and its actions."""
+"""Saved moments of an episode, to which one can go back, and its actions."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ class Moment(NamedTuple):
     total: float  # Return
     terminated: bool
     truncated: bool
+    success: bool
+    invalid: bool
     seed: int  # Of the particles
     actions: list[np.ndarray]
     recording: Recording

@@ -1,4 +1,4 @@
-"""What page and server tell each other: JSON messages from the page, and binary frames to it."""
+"""The messages between page and server: JSON from the page, binary frames to it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import Annotated, Literal, TypeAlias
 import msgspec
 import numpy as np
 from msgspec import Meta
+
+from dittogym.play.hand import Direction
 
 #: Largest size of a message from the page, bytes.
 LARGEST_MESSAGE = 2**18
@@ -73,7 +75,7 @@ class Clear(Message, frozen=True):
 class Wave(Message, frozen=True):
     """Let waves of contraction travel through the robot, or stop them."""
 
-    direction: Literal["left", "right", "up", "down", None]
+    direction: Direction | None
 
 
 class Policy(Message, frozen=True):

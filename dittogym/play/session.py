@@ -19,7 +19,7 @@ from dittogym.geometry import NODES
 from dittogym.model import check_stability
 from dittogym.physics import check_effect, physics_values
 from dittogym.play import protocol
-from dittogym.play.hand import Grip, press, wave
+from dittogym.play.hand import Direction, Grip, press, reach, wave
 from dittogym.play.moment import Moment, stacked
 from dittogym.render.recording import Recording
 from dittogym.render.scene import Shot, describe
@@ -62,6 +62,7 @@ class Session:
     total: float
     shot: Shot
     grip: Grip | None
+    direction: Direction | None = None
     terms: Mapping[str, Tensor]
 
     def __init__(
@@ -80,7 +81,7 @@ class Session:
         self.colour = "deformation" if policy is None else "muscle"
         self.policy: Any = None
         self.policy_name: str | None = None
-        self.hand, self.direction = protocol.Hand(None), protocol.Wave(None).direction
+        self.hand = protocol.Hand(None)
         self.physics: dict[str, Any] = {}
         self.moment: Moment | None = None
         self.num_frames = self.num_steps = 0
@@ -97,6 +98,7 @@ class Session:
             "follow": spec.window.moves,
             "boxes": boxes,
             "patch": spec.patch / NODES,
+            "reach": reach(spec.patch / NODES, self.env.action_resolution),
             "matter": {"mu": spec.mu, "yield_stress": spec.yield_stress, "gravity": -spec.gravity[1]},
             "draws": ["body", *(["target"] if "target" in known else [])],
             "policies": list(self.policies),
@@ -219,7 +221,7 @@ class Session:
             self._note("pulled by hand")
 
     def _note(self, change: str) -> None:
-        """Remember why the actions do not tell the whole story of an episode."""
+        """Remember a change that replaying the actions of the episode does not reproduce."""
         if change not in self.touched:
             self.touched.append(change)
 
@@ -275,7 +277,7 @@ class Session:
             self.action = self.painted
         self.policy = policy.attached(self.env) if hasattr(policy, "attached") else policy
         self.policy_name, self.memory, self.gate = message.name, None, np.zeros((2, 0, 0), np.float32)
-        return [{"type": "policy", "name": message.name}]
+        return [{"type": "policy", "name": message.name, "reach": reach(self.env.spec.patch / NODES, resolution)}]
 
     def _apply_colour(self, message: protocol.Colour) -> None:
         self.colour = message.by
@@ -299,7 +301,7 @@ class Session:
     def _apply_save(self, message: protocol.Save) -> Answers:
         file, name = io.BytesIO(), f"{self.env.spec.name}-{self.shot.step}"
         if message.what == "moment":
-            name, ends = f"{name}.pt", (self.terminated, self.truncated)
+            name, ends = f"{name}.pt", (self.terminated, self.truncated, self.success, self.invalid)
             past = self.env.save(), self.total, *ends, self.seed, self.actions, self.recording, self.touched
             self.moment = Moment(*past).copy()
             torch.save(self.moment.snapshot, file)
@@ -319,11 +321,11 @@ class Session:
             raise ValueError("there is no moment to go back to: save one first")
         then = self.moment.copy()  # what came after it did not happen
         self.total, self.terminated, self.truncated = then.total, then.terminated, then.truncated
+        self.success, self.invalid = then.success, then.invalid
         self.seed, self.actions, self.recording = then.seed, then.actions, then.recording
         self.observation, state = self.env.load(then.snapshot), self.env.env_state
         values = physics_values(self.physics, 1, self.env.num_particles, state.centre[:, 0])
         self.env.env_state = replace(state, physics=values)
-        self.success = self.invalid = False
         self.grip, self.memory, self.shot = None, None, self.env.shot()
         self.touched = list(dict.fromkeys((*then.touched, *self.touched, "went back to a saved moment")))
 

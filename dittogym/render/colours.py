@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -13,9 +12,7 @@ from torch import Tensor
 from dittogym.action import place
 from dittogym.geometry import NODES
 from dittogym.model import EnvState, Model
-from dittogym.spec import BodySpec
 from dittogym.window import centre_in_window
-from torchmpm import Snow
 
 #: Red, green and blue, 0 to 255.
 Colour: TypeAlias = tuple[int, int, int]
@@ -32,7 +29,7 @@ class ColourScale(NamedTuple):
         low: Value of the first colour.
         high: Value of the last one; larger values have the same colour.
         stops: RGB colours at equal distances from ``low`` to ``high``, between which colours are interpolated.
-        robot_only: Whether other bodies do not have it; they have colours of their own, see :func:`body_colour`.
+        robot_only: Whether other bodies do not have it; they have colours of their own.
     """
 
     label: str
@@ -41,13 +38,6 @@ class ColourScale(NamedTuple):
     stops: tuple[Colour, ...]
     robot_only: bool = False
 
-    def colours(self, values: np.ndarray) -> np.ndarray:
-        """RGB colours (N, 3) of values (N,), as floating point numbers from 0 to 255; grey where they are NaN."""
-        at = np.clip((values - self.low) / (self.high - self.low), 0.0, 1.0)
-        stops = np.array(self.stops, np.float64)
-        mixed = [np.interp(at, np.linspace(0.0, 1.0, len(stops)), column) for column in stops.T]
-        return np.where(np.isnan(at)[:, None], 190.0, np.stack(mixed, axis=1))
-
     def codes(self, values: np.ndarray) -> np.ndarray:
         """Values (N,) as uint8, from 0 for ``low`` to 254 for ``high``; the middle where they are NaN."""
         at = np.clip((values - self.low) / (self.high - self.low), 0.0, 1.0)
@@ -55,7 +45,9 @@ class ColourScale(NamedTuple):
 
     def palette(self) -> np.ndarray:
         """The colour of each code, (255, 3) uint8."""
-        return self.colours(np.linspace(self.low, self.high, 255)).round().astype(np.uint8)
+        at, stops = np.linspace(0.0, 1.0, len(self.stops)), np.array(self.stops, np.float64)
+        mixed = [np.interp(np.linspace(0.0, 1.0, 255), at, column) for column in stops.T]
+        return np.stack(mixed, axis=1).round().astype(np.uint8)
 
 
 SCALES = {
@@ -65,11 +57,6 @@ SCALES = {
     ),
     "speed": ColourScale("speed, m/s", 0.0, 1.5, ((49, 54, 110), (78, 121, 190), (120, 200, 190), (253, 231, 130))),
 }
-
-
-def body_colour(body: BodySpec | None) -> Colour:
-    """The colour of an object, or of the robot, ``None``."""
-    return ROBOT if body is None else GROUND_BODY if isinstance(body.material, Snow) else OBJECT
 
 
 def muscle_activity(model: Model, state: EnvState, index: int, actuation: Tensor) -> np.ndarray:
@@ -93,7 +80,7 @@ def muscle_activity(model: Model, state: EnvState, index: int, actuation: Tensor
     return np.clip(nodes[at[:, 0], at[:, 1]] / (2 * strength), -1, 1) if strength else np.zeros(len(at))
 
 
-def shear_strain(model: Model, state: EnvState, index: int) -> np.ndarray:
+def shear_strain(state: EnvState, index: int) -> np.ndarray:
     """Norm of the deviator of the logarithmic elastic strain of each particle, (N,).
 
     Where it would exceed ``yield_stress / (2 mu)``, a robot flows.
@@ -103,21 +90,7 @@ def shear_strain(model: Model, state: EnvState, index: int) -> np.ndarray:
     return (math.sqrt(2.0) * torch.atanh((difference / total).clamp_max(1.0 - 1e-9))).numpy()
 
 
-def speed(model: Model, state: EnvState, index: int) -> np.ndarray:
+def speed(state: EnvState, index: int) -> np.ndarray:
     """Speed of each particle (N,), m/s."""
     x, y = state.particles.v[index].detach().unbind(-1)
     return torch.hypot(x, y).cpu().numpy()  # many times faster than Tensor.norm
-
-
-#: The quantities of :data:`SCALES` but ``"muscle"``, which needs the actuation.
-QUANTITIES: dict[str, Callable[[Model, EnvState, int], np.ndarray]] = {"deformation": shear_strain, "speed": speed}
-
-
-def particle_values(model: Model, state: EnvState, index: int, actuation: Tensor | None, by: str) -> np.ndarray:
-    """The quantity ``by``, a key of :data:`SCALES`, of each particle that has it: (N,), of the muscles (n,).
-
-    Without an actuation, (B, 2, P, P) in Pa, the muscles are at rest.
-    """
-    if by != "muscle":
-        return QUANTITIES[by](model, state, index)
-    return np.zeros(model.num_robot_particles) if actuation is None else muscle_activity(model, state, index, actuation)

@@ -1,4 +1,4 @@
-"""What pictures, films and replays show of a simulation, as arrays."""
+"""The arrays from which pictures, films and replays are drawn."""
 
 from __future__ import annotations
 
@@ -14,7 +14,16 @@ from torch import Tensor
 from dittogym.geometry import Box
 from dittogym.model import EnvState, Model
 from dittogym.observation.image import SIZE
-from dittogym.render.colours import SCALES, Colour, body_colour, particle_values
+from dittogym.render.colours import (
+    GROUND_BODY,
+    OBJECT,
+    ROBOT,
+    SCALES,
+    Colour,
+    muscle_activity,
+    shear_strain,
+    speed,
+)
 from dittogym.spec import TaskSpec
 from dittogym.window import centre_in_window
 from torchmpm import Snow, checks
@@ -115,8 +124,9 @@ def describe(model: Model) -> Scene:
     spec = model.spec
     matter = []
     for count, body in zip(model.camera.counts, spec.bodies, strict=True):
-        radius = GRAIN_RADIUS if isinstance(body.material, Snow) else RADIUS
-        colour = body_colour(None if body is spec.robot else body)
+        grains = isinstance(body.material, Snow)
+        radius = GRAIN_RADIUS if grains else RADIUS
+        colour = ROBOT if body is spec.robot else GROUND_BODY if grains else OBJECT
         matter.append(Matter(count, radius * math.sqrt(body.shape.area / count), colour))
     solids = tuple(
         Solid(box.left, box.right, box.bottom, box.top, bool(obstacle.observed_boxes) or box == Box(top=box.top))
@@ -148,11 +158,12 @@ def take(
     one = slice(index, index + 1)
     view = centre_in_window(model.spec.view, state.centre[one], state.origin[one])
     places = (value.detach().cpu().double().numpy()[0] for value in (state.origin[one], view, state.centre[one]))
-    values = {
-        by: SCALES[by].codes(particle_values(model, state, index, actuation, by))
-        for by in quantities
-        if by != "muscle" or actuation is not None
-    }
+    values = {}
+    for by in quantities:
+        if by != "muscle":
+            values[by] = SCALES[by].codes((shear_strain if by == "deformation" else speed)(state, index))
+        elif actuation is not None:
+            values[by] = SCALES[by].codes(muscle_activity(model, state, index, actuation))
     x = state.particles.x[index].detach().cpu().numpy().astype(np.float32)
     return Shot(x, values, next(places), next(places), next(places), int(state.steps[index]))
 

@@ -55,7 +55,17 @@ def fingerprint(task: str) -> str | None:
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def allowed_instead(task: object) -> str | None:
+def check_task(task: object) -> None:
+    """Check that a value names a task; a module that it names is imported.
+
+    Raises:
+        ValueError: There is no such task.
+    """
+    if (allowed := _allowed_instead(task)) is not None:
+        raise ValueError(f"task must be one of {allowed}, got {task!r}")
+
+
+def _allowed_instead(task: object) -> str | None:
     """What is allowed in place of something that is not a task; ``None`` where it is one."""
     allowed = f"{', '.join(sorted(TASKS))} or MODULE:NAME"
     if not isinstance(task, str):
@@ -102,8 +112,7 @@ def make_spec(
             )
         spec = task
     else:
-        if (allowed := allowed_instead(task)) is not None:
-            raise ValueError(f"task must be one of {allowed}, got {task!r}")
+        check_task(task)
         make = TASKS[task_name(task)]
         known = list(inspect.signature(make).parameters)
         if unknown := [name for name in options if name not in known]:

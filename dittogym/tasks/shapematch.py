@@ -2,11 +2,12 @@
 
 import torch
 
+from dittogym.bodies.images import PictureLike
 from dittogym.bodies.shapes import Disc
 from dittogym.contract import Moment, Outcome
 from dittogym.geometry import ceiling, floor
 from dittogym.spec import BodySpec, TaskSpec
-from dittogym.tasks.targets import TargetLike, load_target
+from dittogym.tasks.targets import load_target
 
 #: Intersection over union that counts as success (our definition).
 MATCH = 0.8
@@ -22,7 +23,7 @@ def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
     return Outcome(terms={"mismatch": -differing}, success=iou >= MATCH, info={"iou": iou})
 
 
-def shapematch(target: TargetLike = "star", fit: bool = True) -> TaskSpec:
+def shapematch(target: PictureLike = "star", fit: bool = True) -> TaskSpec:
     """The task SHAPE MATCH.
 
     Args:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -14,7 +13,6 @@ from dittogym.observation.image import SIZE
 from torchmpm import checks
 
 #: The name of a drawn target, the path of an image file, or an array.
-TargetLike: TypeAlias = PictureLike
 
 #: Pixels that the robot of SHAPE MATCH covers at the start.
 ROBOT_AREA = round(math.pi * 0.085**2 * (2 * SIZE) ** 2)
@@ -49,7 +47,7 @@ _OUTLINES: dict[str, list[list[tuple[int, int]]]] = {
 # fmt: on
 
 
-def load_target(target: TargetLike, fit: bool = True) -> np.ndarray:
+def load_target(target: PictureLike, fit: bool = True) -> np.ndarray:
     """A target as a (64, 64) bool array, row 0 at the top.
 
     Args:

@@ -9,8 +9,8 @@ gradients, and with every algorithm.
 
 # %%
 # The function gets a :class:`dittogym.contract.Moment` and returns named terms, one number for each simulation of the
-# batch. Each term is multiplied by its weight. The engine adds the terms that all tasks share: the action cost, the
-# penalty for a torn robot, and a constant for every step.
+# batch. Each term is multiplied by its weight. The environment adds the terms that all tasks share: the action cost,
+# the penalty for a torn robot, and a constant for every step.
 
 import dataclasses
 
@@ -62,14 +62,15 @@ for name, value in sums.items():
 #
 # The table above is the first thing to look at: the terms of an episode with random actions, already weighted.
 #
-# - **No term should drown the others.** Where the action cost exceeds what a good motion earns, the best policy rests.
+# - **No term should drown the others.** Where the action cost exceeds what a good motion earns,
+#   the best policy does not move at all.
 # - **Reward progress, not only the goal.** A term that is the same for all reachable states teaches nothing. Height
 #   pays as soon as the robot rises a little; a bonus for 3 cm alone would not.
 # - **Measure from the start** (``moment.start``), so that the return does not depend on where a robot was placed.
 # - **Bound what can be exploited**: a robot can throw single particles away, so use means over the robot, clip speeds,
 #   and keep the penalty ``split`` for a torn robot.
-# - **Keep success apart from the reward.** It is what you want; the reward is the way to teach it. An episode that ends
-#   with success earns nothing afterwards, so the bonus must exceed what staying would earn.
+# - **Keep success separate from the reward.** Success says what you want; the reward is what the policy is trained on.
+#   An episode that ends with success earns nothing afterwards, so the bonus must exceed what staying would earn.
 # - **Prefer smooth functions of the particles.** Then gradients exist; for counts and thresholds, ``moment.ops`` has
 #   operations with smooth versions.
 #

@@ -10,8 +10,8 @@ muscle actions with which it runs.
 # The body
 # --------
 #
-# Bright pixels belong to the robot. The body is scaled to the area of the task's own robot and placed where that one
-# stands, so that rewards and limits keep their meaning.
+# In this picture the bright pixels form the robot. The body is scaled to the area of the task's own robot and placed at
+# its initial position, so that rewards and limits remain meaningful.
 
 import dataclasses
 

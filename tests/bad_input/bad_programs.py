@@ -45,7 +45,7 @@ def planned(name, plan, *words):
 
 
 TRAIN = [
-    training("an unknown task", "--task swim", "task must be catch, dig"),
+    training("an unknown task", "--task swim", "task must be one of catch, dig"),
     training(
         "an unknown preset",
         "--preset slow",
@@ -173,7 +173,7 @@ OTHERS = [
     evaluating("disturbed, nowhere", "--policy run", "out must be given with a single policy", main=ROBUSTNESS),
     Case("compare into an unset variable", command(compare.main, "--out ''"), ("must name a folder, got ''",), Refused),
     evaluating("disturbed, into an unset variable", "--policy run --out ''", "must name a folder", main=ROBUSTNESS),
-    comparing("unknown tasks", "--tasks swim", "task must be catch"),
+    comparing("unknown tasks", "--tasks swim", "task must be one of catch"),
     comparing("unknown algorithms", "--algos alchemy", "algo must be one of cfp"),
     comparing("a seed twice", "--seeds 1 1", "seeds must be one or more different values, got 1 1"),
     comparing("parts of a GPU at home", "--gpus-per-run 0.5", "gpus_per_run must be 0 without --executor ray, got 0.5"),

@@ -55,6 +55,12 @@ def test_other_spellings_are_reported_under_the_name(tmp_path, capsys):
     assert capsys.readouterr().out.split()[:2] == ["0", "gnn-16-run-quick-0"]
 
 
+def test_a_plan_may_spell_algorithms_in_another_way(tmp_path):
+    (tmp_path / "plan.json").write_text('{"algos": {"gnn16": {"alpha": 0.5, "steps": 2560}}}')
+    config = resolve(Plan.read(tmp_path / "plan.json"), "gnn-16", "run", "quick", 0, None, "cpu")
+    assert config.alpha == 0.5 and config.learning.actor_start == 800 * 2560 // 51_200  # scaled with the steps
+
+
 def test_names_in_a_plan_that_mean_nothing_are_reported(tmp_path, capsys):
     algos = {"cfp": {"tasks": {"rnu": {"steps": 9600}, "run": {"steps": 6400}}}, "shac": {"tasks": {"kick": {}}}}
     assert compare(tmp_path / "out", "--dry-run", "--algos", "cfp", "--tasks", "run", plan={"algos": algos}) == 0

@@ -68,7 +68,7 @@ def test_learning_stops_with_the_episode() -> None:
             mpc.env.state.x[..., 0] -= 1.0
 
     mpc.learn(10, EachUpdate(behind_the_limit))
-    assert mpc.is_done and mpc.num_timesteps == 4 == len(mpc.actions) == len(seen)
+    assert mpc.finished and mpc.num_timesteps == 4 == len(mpc.actions) == len(seen)
     assert seen[-1]["train/return"] == mpc.total_reward and seen[-1]["train/plans"] == 4
     mpc.learn(5, EachUpdate(behind_the_limit))
     assert len(seen) == 4

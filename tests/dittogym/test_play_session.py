@@ -15,7 +15,7 @@ import cfp
 from cfp import ActorPolicy, ActorSpec
 from dittogym import TASKS, TorchEnv, make_spec
 from dittogym.play import protocol
-from dittogym.play.hand import press, wave
+from dittogym.play.hand import MUSCLE_REACH, REACH, press, wave
 from dittogym.play.protocol import HEAD, Draw, Hand, Matter, Paint, Reset, Save, Step, Wave, parse
 from dittogym.play.session import FLAGS, Session
 from dittogym.render.replay import encode
@@ -220,6 +220,23 @@ def test_moments() -> None:
     env = TorchEnv("run", **SMALL)
     env.load(snapshot)
     assert torch.equal(env.state.x, then)
+
+
+def test_going_back_restores_success_and_failure() -> None:
+    played = session()
+    played.advance()
+    played.success = played.invalid = True
+    played.apply(Save("moment"))
+    played.apply(Reset())
+    assert not played.success and not played.invalid
+    played.apply(protocol.Back())
+    played.apply(protocol.Play(True))
+    assert played.success and played.invalid and not played.playing
+
+
+def test_the_reach_of_the_hand_follows_the_resolution() -> None:
+    fine, coarse = (session(resolution=size).describe()["reach"] for size in (32, 8))
+    assert fine == {"pull": REACH, "muscles": MUSCLE_REACH} and coarse["muscles"] == pytest.approx(0.6 * 0.5 / 8)
 
 
 def test_files_after_going_back_are_of_what_led_there() -> None:

@@ -67,14 +67,6 @@ def test_a_saved_state_is_loaded_without_running_code(tmp_path: Path) -> None:
     assert_identical(torch.load(tmp_path / "state.pt", weights_only=True)["state"], state)
 
 
-def test_other_memory_for_a_field_is_seen() -> None:
-    for name in FIELDS:
-        state = robot(7).step(lively(7), substeps=1)
-        assert state.stack() is state.stack(), "no copy"
-        getattr(state, name).data = torch.zeros_like(getattr(state, name))
-        assert torch.equal(state.stack(), torch.stack(state.planes()))
-
-
 def test_the_fields_at_rest_have_memory_of_their_own() -> None:
     state = ParticleState.at_rest(torch.rand(2, 3, 2))
     state.F[1, 2].mul_(1.5)

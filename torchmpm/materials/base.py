@@ -1,4 +1,4 @@
-"""What all materials share: their interface, and the shapes of their constants."""
+"""The interface of materials, and the shapes of their constants."""
 
 from typing import Protocol, TypeAlias, runtime_checkable
 
@@ -67,7 +67,7 @@ def broadcast_plane(value: Value, like: Tensor, name: str = "value") -> Value:
         The number itself, or a tensor of shape (), (B, 1), (B, N) or (1, N).
 
     Raises:
-        ValueError: A tensor has a shape other than (), (B,), (B, N) or (1, N).
+        ValueError: A tensor has a shape other than (), (B,), (B, 1), (B, N) or (1, N).
     """
     if not isinstance(value, Tensor):
         return value

@@ -28,6 +28,12 @@ class Parts(NamedTuple):
     proper: Tensor  # whether the longer one belongs to the rotation, as it does where det F >= 0
 
 
+def safe_sqrt(square: Tensor) -> Tensor:
+    """Square root whose derivative is 0 at 0."""
+    zero = square == 0
+    return torch.where(zero, 0.0, torch.where(zero, 1.0, square).sqrt())
+
+
 def split(F: Mat2) -> Parts:
     """Rotation and reflection part of F."""
     a, b, c, d = F

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchmpm import checks
 from torchmpm.materials.base import Value, broadcast_plane, check_not_negative
 from torchmpm.materials.elastic import Elastic, corotated_energy, corotated_stress
-from torchmpm.materials.linalg import Mat2, Parts, Sym2, det, direction, join, split
+from torchmpm.materials.linalg import Mat2, Parts, Sym2, det, direction, join, safe_sqrt, split
 
 #: Jp stays below this. A grain that is pulled apart forever has lost all stiffness long before, at Jp = 1.23; without
 #: the bound its Jp would grow until it overflows, and spoil gradients.
@@ -32,7 +32,7 @@ def snow_return(F: Mat2, low: Value, high: Value, shear_cutoff: float = 0.0) -> 
         n1, n2 = torch.where(drop, along * cos, n1), torch.where(drop, along * sin, n2)
     square = n1.square() + n2.square()
     isotropic = square == 0  # equal stretches: any axes are principal, and no square root is taken of zero
-    difference = torch.where(isotropic, 0.0, torch.where(isotropic, 1.0, square).sqrt())
+    difference = safe_sqrt(square)
     stretches = 0.5 * (total + difference), 0.5 * (total - difference)
     major, minor = (_clamp(stretch, low, high) for stretch in stretches)
     # For equal stretches the ratio multiplies zeros; its value is the limit for a small difference.

@@ -1,4 +1,4 @@
-"""What the solver calls: whether the kernels can run, and a step through them."""
+"""Entry points of the solver: whether the kernels can run, and a step through them."""
 
 import functools
 import importlib.util

@@ -1,4 +1,4 @@
-"""What the kernels read: a solver as typed tables built once, a table of its constants, and the tensors of a call."""
+"""Inputs of the kernels: a solver as typed tables built once, a table of its constants, and the tensors of a call."""
 
 import ctypes
 import math

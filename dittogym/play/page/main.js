@@ -35,7 +35,7 @@ const link = new Link({
     if (!matterSet()) setMatter();
   },
   terms({ names }) { plot.setTerms(names); },
-  policy(message) { $("policy").value = message.name ?? ""; policy = message.name ?? policy; },
+  policy(message) { $("policy").value = message.name ?? ""; policy = message.name ?? policy; task.reach = message.reach; },
   reset() { plot.reset(); },
   notice(message) { toast(message.message); },
   error(message) { toast(message.message, "error"); },

@@ -189,9 +189,9 @@ export class Scene {
   }
 
   drawPointer({ pointer: [x, y], tool }) {
-    const { context, ratio } = this, [column, row] = this.toPixel(x, y);
+    const { context, ratio } = this, [column, row] = this.toPixel(x, y), { reach } = this.task;
     context.beginPath();
-    context.arc(column, row, (tool === "pull" ? 0.045 : 0.03) * this.scale, 0, 7);
+    context.arc(column, row, (tool === "pull" ? reach.pull : reach.muscles) * this.scale, 0, 7);
     context.strokeStyle = this.colour(tool === "expand" ? "accent" : tool === "pull" ? "text" : "alert");
     context.lineWidth = 1.5 * ratio;
     context.stroke();
