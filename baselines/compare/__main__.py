@@ -1,6 +1,5 @@
 """``python -m baselines.compare``: several algorithms, tasks and seeds, and one report about them."""
 
-import inspect
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +18,7 @@ from baselines.leaderboard.protocol import PROTOCOLS
 from baselines.registry import ALGORITHMS, ALIASES
 from cfp.config import Preset, RunConfig
 from cfp.errors import ConfigError
-from cfp.experiment.cli import program_name, read_options, run_command, with_examples
+from cfp.experiment.cli import program_name, read_options, run_command
 from cfp.experiment.folder import Folder, make_folder
 from cfp.experiment.process import Stopped, StopSignals
 from cfp.sections import Particles
@@ -184,8 +183,7 @@ def _carry_out(command: Command, jobs: Sequence[Job], signals: StopSignals) -> l
 
     def on_outcome(job: Job, outcome: Outcome) -> None:
         outcomes.append(outcome)
-        error = job.folder / "error.txt"
-        reason = f" ({error.read_text().strip()})" if outcome == "failed" and error.exists() else ""
+        reason = f" ({job.error})" if outcome == "failed" and job.error else ""
         print(f"[{len(outcomes)}/{len(jobs)}] {job.name}: {outcome}{reason}", flush=True)
 
     execute(command.make_executor(signals), jobs, signals, on_outcome)
@@ -212,16 +210,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry point; returns the exit code."""
     names = f"Algorithms: {', '.join(ALGORITHMS)}. Reference policies: {', '.join(REFERENCE_POLICIES)}."
     program = program_name("baselines.compare", arguments)
-    description = with_examples(
-        f"{names}\n\n{inspect.getdoc(Command)}",
-        program,
+    examples = (
         "--tasks shapematch --algos cfp shac --seeds 0 1",
         "--tasks run kick --algos zero gradient --out runs/reach --workers 2",
         "--out runs/reach --report-only",
         "--protocol v1 --policies run runs/mine/policy.safetensors --out runs/mine",
     )
-    about = {"prog": program, "description": description}
-    return run_command(lambda: compare(read_options(Command(), BASIC, args=arguments, **about)))
+    return run_command(
+        lambda: compare(read_options(Command(), BASIC, prog=program, about=names, examples=examples, args=arguments))
+    )
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from baselines.compare.jobs import Job
@@ -122,7 +121,7 @@ class LocalExecutor(Executor):
                 return run_process(job, self.threads, self.resources.lock_timeout, self._urgency)
             except ProcessKilled as error:
                 reason = f"{error} ({attempt + 1} times)"
-        write_text(job.folder / "error.txt", reason + "\n")
+        write_text(job.error_file, reason + "\n")
         return "failed"
 
     def _urgency(self) -> int:
@@ -162,7 +161,7 @@ class RayExecutor(Executor):
         """Queue a run, see `Executor.submit`."""
         reference, future = self._task.remote(job, self._threads, self._lock_timeout), Future[Outcome]()
         self._references.append(reference)
-        reference.future().add_done_callback(partial(self._finish, future, job.folder))
+        reference.future().add_done_callback(partial(self._finish, future, job))
         return future
 
     def stop(self) -> None:
@@ -177,14 +176,14 @@ class RayExecutor(Executor):
         if self._owned:
             self._ray.shutdown()
 
-    def _finish(self, future: Future[Outcome], folder: Path, done: Future[Outcome]) -> None:
+    def _finish(self, future: Future[Outcome], job: Job, done: Future[Outcome]) -> None:
         """Pass on the result of a task; an exception that a callback raised would be lost."""
         error = done.exception()
         try:
             if isinstance(error, self._ray.exceptions.TaskCancelledError):
                 future.set_result("stopped")
             elif isinstance(error, ProcessKilled | self._ray.exceptions.RayError):
-                write_text(folder / "error.txt", f"{type(error).__name__}: {' '.join(str(error).split())}\n")
+                write_text(job.error_file, f"{type(error).__name__}: {' '.join(str(error).split())}\n")
                 future.set_result("failed")
             else:
                 future.set_result(done.result())
@@ -201,7 +200,7 @@ def run_process(job: Job, threads: int, lock_timeout: float, urgency: Callable[[
     """
     folder = job.folder
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "error.txt").unlink(missing_ok=True)
+    job.error_file.unlink(missing_ok=True)
     environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ, "OMP_NUM_THREADS": str(threads)}
     with open(folder / "log.txt", "ab") as log:
         log_start = log.tell()
@@ -218,11 +217,11 @@ def run_process(job: Job, threads: int, lock_timeout: float, urgency: Callable[[
     if code < 0 and not urgency():
         raise ProcessKilled(f"killed by {signal.Signals(-code).name}; see log.txt")
     outcome: Outcome = "stopped" if code < 0 else {code: name for name, code in EXIT_CODES.items()}.get(code, "failed")
-    if outcome == "failed" and not (folder / "error.txt").exists():  # it failed outside of the run itself
+    if outcome == "failed" and not job.error_file.exists():  # it failed outside of the run itself
         with open(folder / "log.txt", "rb") as log:
             log.seek(log_start)
             last_line = log.read().decode(errors="replace").strip().rpartition("\n")[2]
-        write_text(folder / "error.txt", f"{last_line or 'no output'} (exit code {code}; see log.txt)\n")
+        write_text(job.error_file, f"{last_line or 'no output'} (exit code {code}; see log.txt)\n")
     return outcome
 
 

@@ -126,11 +126,21 @@ class Job:
         return finished or (self.folder / "results.json").exists()
 
     @property
+    def error_file(self) -> Path:
+        """Where the error of a run that has failed is written."""
+        return self.folder / "error.txt"
+
+    @property
+    def error(self) -> str:
+        """The error of a run that has failed, else nothing."""
+        return self.error_file.read_text().strip() if self.error_file.exists() else ""
+
+    @property
     def state(self) -> str:
         """One of finished, failed, begun, missing; the final evaluation is not looked at."""
         if self.trained:
             return "finished"
-        if (self.folder / "error.txt").exists():
+        if self.error:
             return "failed"
         return "begun" if holds_run(self.folder) else "missing"
 

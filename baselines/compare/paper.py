@@ -4,6 +4,7 @@ Values of figures were measured from the drawn curves: mean and half the width o
 the steps, three seeds, training returns. A resting robot was measured in the reference environment at full size.
 """
 
+from cfp.presets import TASKS
 from cfp.sections import Particles
 
 TIER: Particles = "full"
@@ -24,8 +25,7 @@ CURVES: dict[str, tuple[tuple[float, float], ...]] = {
 }
 """Task to return and band of every method."""
 
-_STEPS = (400_000, 550_000, 600_000, 550_000, 780_000, 700_000, 380_000, 600_000)
-STEPS: dict[str, int] = dict(zip(CURVES, _STEPS, strict=True))
+STEPS = {task: TASKS[task].steps for task in CURVES}
 """Task to environment steps of its curves."""
 
 EXPERTS: dict[str, dict[int, tuple[float, float]]] = {
@@ -62,7 +62,7 @@ _REST = (21, 2500, 3100, 890, -1500, 2400, -1900, 7000)
 REST: dict[str, float] = dict(zip(CURVES, _REST, strict=True))
 """Task to the return of a robot that does not move (SHAPE MATCH: 12 to 30, by the particles)."""
 
-WITHOUT_NOISE = ("shapematch",)
+WITHOUT_NOISE = tuple(task for task, numbers in TASKS.items() if numbers.deterministic)
 """Tasks in which the paper evaluates policies without action noise; in all others they act with it."""
 
 

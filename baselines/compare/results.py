@@ -89,12 +89,10 @@ class Group:
 
 def read_result(job: Job) -> RunResult:
     """Read the folder of a run."""
-    evaluation, state, error = read_evaluation(job.config, job.folder, job.protocol), job.state, ""
+    evaluation, state = read_evaluation(job.config, job.folder, job.protocol), job.state
     if state == "finished" and (evaluation is None or not evaluation.complete):
         state = "unevaluated"
-    if (job.folder / "error.txt").exists():
-        error = (job.folder / "error.txt").read_text().strip()
-    return RunResult(job, state, error, _read_curve(job.folder), read_cost(job.folder), evaluation)
+    return RunResult(job, state, job.error, _read_curve(job.folder), read_cost(job.folder), evaluation)
 
 
 def group_results(runs: Sequence[RunResult]) -> list[Group]:

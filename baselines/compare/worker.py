@@ -49,14 +49,14 @@ def carry_out(job: Job, signals: StopSignals, lock_timeout: float, *, own_proces
     """Do what is left of a run; an error is written to ``error.txt`` in its folder."""
     try:
         with run_lock(job.folder, lock_timeout):
-            (job.folder / "error.txt").unlink(missing_ok=True)
+            job.error_file.unlink(missing_ok=True)
             try:
                 _train_and_evaluate(job, signals, own_process)
             except (Stopped, KeyboardInterrupt):
                 raise
             except BaseException as error:
                 traceback.print_exc()
-                write_text(job.folder / "error.txt", f"{type(error).__name__}: {error}\n")
+                write_text(job.error_file, f"{type(error).__name__}: {error}\n")
                 return "failed"
     except FolderInUse as error:
         print(error)

@@ -88,7 +88,7 @@ class Collector(Stateful):
     """
 
     parts = ("episodes", "teacher")
-    values = ("steps_since_switch", "teacher_acts", "left_plan")
+    values = ("steps_since_switch", "teacher_acts", "restarted")
 
     def __init__(
         self, teacher: Teacher, episodes: Episodes, switch_every: int, dropout: float = 0.0, grid: int | None = None
@@ -97,7 +97,7 @@ class Collector(Stateful):
         self.dropout, self.grid = dropout, grid
         self.steps_since_switch = switch_every
         self.teacher_acts = torch.zeros(self.env.num_envs, dtype=torch.bool, device=self.env.device)
-        self.left_plan = self.teacher_acts.clone()  # the robot is no longer where the teacher's plan takes it
+        self.restarted = self.teacher_acts.clone()  # a new episode began since the teacher's plan was made
 
     @torch.no_grad()
     def collect(self, steps: int, beta: float, student: Callable[[Tensor], Tensor]) -> Labels:
@@ -112,13 +112,13 @@ class Collector(Stateful):
         for _ in range(steps):
             teacher_action = self.teacher.act(env, observation)
             if self.teacher.fresh:
-                self.left_plan = torch.zeros_like(self.left_plan)
+                self.restarted = torch.zeros_like(self.restarted)
                 if self.steps_since_switch >= self.switch_every:
                     draws = torch.rand(env.num_envs).to(env.device)
                     self.teacher_acts, self.steps_since_switch = draws < beta, 0
             self.steps_since_switch += 1
-            follows = self.teacher_acts & ~self.left_plan
-            valid = ~self.left_plan if self.teacher.fresh else follows
+            follows = self.teacher_acts & ~self.restarted
+            valid = ~self.restarted if self.teacher.fresh else follows
             images.append(observation[valid].cpu())
             actions.append(teacher_action[valid].cpu())
             student_action = student(drop_entries(observation, self.dropout))
@@ -135,6 +135,6 @@ class Collector(Stateful):
         done = self.episodes.record(reward, terminated)
         if bool(done.any()):
             self.episodes.restart(done, terminated, info["finite"])
-            self.left_plan = self.left_plan | done
+            self.restarted = self.restarted | done
             observation = dynamics.observe(self.env.model, self.env.env_state)
         return observation

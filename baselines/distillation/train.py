@@ -31,7 +31,7 @@ from cfp.experiment.algorithm import Position, Scalars
 from cfp.experiment.folder import policy_path
 from cfp.experiment.process import StopSignals
 from cfp.experiment.schedules import linear_decay
-from cfp.experiment.stages import CoarseToFineStages, place_over
+from cfp.experiment.stages import CoarseToFineStages, copy_coarse_weights
 from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
 from cfp.weights import load
@@ -78,7 +78,7 @@ class Distill(Stateful, CoarseToFineStages):
             self.actor = build_actor(self.spec)
         self.actor.fix_std()
         if start is not None:
-            place_over(self.actor, start.actor)
+            copy_coarse_weights(self.actor, start.actor)
         self.actor.to(self.env.device)
         self.adam = torch.optim.Adam(self.actor.trainable_parameters(), config.student_learning_rate)
         seed = config.seed + (stage - 1) * config.num_layouts

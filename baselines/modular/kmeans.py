@@ -9,10 +9,11 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from torch import Tensor
 
 from cfp.errors import ConfigError
+from dittogym.geometry import NODES
 
 LLOYD_ITERATIONS = 2
 """Iterations of Lloyd's algorithm in every step: the inertia stays within 1 % of a converged clustering."""
-BORDER = 0.75 / 128
+BORDER = 0.75 / NODES
 """Distance from the line half-way between two centres within which a particle is at their border, m (3/4 of a cell)."""
 MIN_BORDER_PARTICLES = 3
 """Particles at the border, on each side, from which on two segments are neighbours."""

@@ -9,13 +9,14 @@ from torch.nn.functional import pad
 from baselines.modular.kmeans import adjacency, segment_means, squared_distances
 from dittogym import TorchEnv
 from dittogym.action import from_grid_indexing, patch_corner
+from dittogym.geometry import FLOOR_NODE, NODES
 from dittogym.spec import TaskSpec
 from dittogym.window import centre_in_window
 from torchmpm import checks
 
 LENGTH_SCALE, SPEED_SCALE = 0.1, 0.5
 """Units of the features, m and m/s: most values lie within [-2, 2]."""
-FLOOR = 20 / 128
+FLOOR = (FLOOR_NODE + 1) / NODES
 """Height of the floor, m."""
 MAX_SPEED = 100.0
 """Speed along an axis at which the feature saturates, m/s."""

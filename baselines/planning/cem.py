@@ -9,7 +9,7 @@ from torch import Tensor
 
 from baselines.planning.base import BestPlans, Planner, PlannerConfig
 from cfp.errors import ConfigError
-from cfp.validation import check_positive
+from cfp.validation import check_decay, check_positive
 from dittogym import core
 from dittogym.action import bicubic
 from dittogym.model import EnvState
@@ -41,9 +41,7 @@ class CEMPlannerConfig(PlannerConfig):
         check_positive(iterations=self.iterations, initial_std=self.initial_std, noise_grid=self.noise_grid)
         if not 2 <= self.elites <= self.candidates:
             raise ConfigError(f"elites must be between 2 and candidates, {self.candidates}, got {self.elites}")
-        for name in ("noise_correlation", "momentum"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ConfigError(f"{name} must be at least 0 and less than 1, got {getattr(self, name)}")
+        check_decay(noise_correlation=self.noise_correlation, momentum=self.momentum)
 
     def check_grid(self, size: int) -> None:
         """Check that the noise has no more cells than an action grid of ``size`` rows and columns.

@@ -175,7 +175,7 @@ class CFP(SAC):
         with torch.no_grad():
             next_obs = self.policy.encode(batch.next_observations)
         if self.origin is not None:
-            obs = obs.detach()  # another encoder would change the policy that is refined, whatever its actor learns
+            obs = obs.detach()  # critics that train the encoder would change the policy that is refined
         scalars = self._update_critic(obs, next_obs, batch)
         own = self.hyperparameters
         if self.num_timesteps >= own.actor_start:

@@ -86,7 +86,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             torch.manual_seed(config.seed)
             actor = build_actor(config.actor_spec(stage)).to(choose_device(config.device))
-        trained = cls.begin(config, stage, folder, actor)
+        trained = cls.warm_start(config, stage, folder, actor)
         algorithm = cls(config, stage, actor)
         algorithm.starts_trained = trained
         return algorithm

@@ -11,7 +11,7 @@ import torch
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from cfp.config import RunConfig
-from cfp.envs.make import make_env
+from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
 from cfp.evaluation.episodes import SeededPolicy, attached
@@ -39,8 +39,7 @@ def record_episode(
     recorder: Callable[[TorchEnv, Act, int], Recorded],
 ) -> Recorded:
     """One episode of a policy with actions (2, size, size); torch's generator is left as it was."""
-    venv = make_env(config, size, 1).venv
-    assert isinstance(venv, TorchVecEnv)
+    venv = TorchVecEnv(make_torch_env(config, size, 1))
     acting, memory, start = SeededPolicy(attached(policy, venv), seed), None, np.array([True])
 
     def act(observation: np.ndarray) -> np.ndarray:

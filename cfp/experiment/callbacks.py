@@ -75,7 +75,10 @@ class Stage:
 
 
 class StageCallback(BaseCallback):
-    """Acts every so many environment steps: when all of them have been learned from, and at the end of the stage."""
+    """Acts when the number of environment steps has passed a multiple of ``every``, and at the end of the stage.
+
+    It acts before the next rollout, when all earlier steps have been learned from.
+    """
 
     def __init__(self, stage: Stage, every: int) -> None:
         super().__init__()

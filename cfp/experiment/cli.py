@@ -71,11 +71,15 @@ def read_command(
     return tyro.cli(kind, prog=program, description=about, args=args, **options)
 
 
-def read_options(default: Any, basic: Sequence[str], *, args: Sequence[str] | None, **about: Any) -> Any:
+def read_options(
+    default: Any, basic: Sequence[str], *, prog: str, about: str, examples: Sequence[str], args: Sequence[str] | None
+) -> Any:
     """Read a command line into a dataclass like ``default``; its help shows the options ``basic`` before the others."""
+    about = with_examples(f"{about}\n\n{inspect.getdoc(type(default))}", prog, *examples)
     if {"-h", "--help"} & set(sys.argv[1:] if args is None else args):
         default = _basic_first(default, basic)  # the help ends the program, so that nothing is read into it
-    return tyro.cli(type(default), default=default, args=args, config=(tyro.conf.OmitArgPrefixes,), **about)
+    options: Any = {"prog": prog, "description": about, "args": args, "config": (tyro.conf.OmitArgPrefixes,)}
+    return tyro.cli(type(default), default=default, **options)
 
 
 def _basic_first(options: Any, basic: Sequence[str]) -> Any:

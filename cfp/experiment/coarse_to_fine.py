@@ -141,7 +141,7 @@ class CoarseToFine(CoarseToFineStages, SACAlgorithm):
         env = make_env(config, config.action_size(stage), max_episode_steps=limit)
         model = cls.make_model(config, env, CFPPolicy, {"spec": spec}, cls.hyperparameters(config, stage, folder))
         algorithm = cls(config, stage, model)
-        algorithm.starts_trained = cls.begin(config, stage, folder, model.networks()[0])
+        algorithm.starts_trained = cls.warm_start(config, stage, folder, model.networks()[0])
         model.restart_average()
         if refines(config, folder, stage):
             model.origin = load(start_path(folder), str(model.device)).actor

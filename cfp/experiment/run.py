@@ -167,8 +167,9 @@ class TrainingRun:
         """Train a stage to its end, unless that was done in an earlier session."""
         bar = ProgressBarCallback(stage)
         evaluation = EvaluationCallback(stage, self.evaluations, self.tracker, bar)
-        # A process killed between the last step and the last evaluation has left nothing to do but the latter.
-        if evaluation.has_plateaued if stage.steps_left else not evaluation.is_missing:
+        # A process killed after the last step but before the last evaluation still has to evaluate.
+        done = evaluation.has_plateaued if stage.steps_left else not evaluation.is_missing
+        if done:
             return
         (self.folder / "results.json").unlink(missing_ok=True)  # of an earlier end of the run
         callbacks = CallbackList(

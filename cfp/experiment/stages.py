@@ -60,15 +60,15 @@ class CoarseToFineStages(Algorithm):
         return image_policy(spec, self.trained_actor, deterministic)
 
     @classmethod
-    def begin(cls, config: Any, stage: int, folder: Path, actor: Actor) -> bool:
-        """Give a freshly built ``actor`` the weights with which a stage begins; tell whether it is trained already."""
+    def warm_start(cls, config: Any, stage: int, folder: Path, actor: Actor) -> bool:
+        """Copy into a new ``actor`` the trained weights that its stage starts from; False if there are none."""
         device = str(next(actor.parameters()).device)
         if refines(config, folder, stage):
             actor.load_state_dict(load(start_path(folder), device).actor.state_dict())
         elif stage > 1:
             path = policy_path(folder, stage - 1)
             with report_mismatch(path):
-                place_over(actor, load(path, device).actor)
+                copy_coarse_weights(actor, load(path, device).actor)
         else:
             return False
         return True
@@ -79,8 +79,8 @@ class CoarseToFineStages(Algorithm):
         write_policy(path, self.trained_actor.state_dict(), description | {"kind": KIND, "network": network})
 
 
-def place_over(actor: Actor, coarse: Actor) -> None:
-    """Give a fresh actor the weights of the trained one below it, and its lean encoder to begin with."""
+def copy_coarse_weights(actor: Actor, coarse: Actor) -> None:
+    """Copy a trained coarse actor into the new stage above it, and its lean encoder too."""
     actor.get_submodule("coarse").load_state_dict(coarse.state_dict())
     if isinstance(actor.encoder, LeanEncoder):  # so that heads and critics that read it need not wait for its features
         actor.encoder.load_state_dict(coarse.encoder.state_dict())

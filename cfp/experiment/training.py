@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import inspect
 import json
 import os
 import sys
@@ -17,7 +16,7 @@ import tyro
 from cfp.config import CoarseToFineConfig, RunConfig, to_json
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm
-from cfp.experiment.cli import program_name, read_options, run_command, with_examples
+from cfp.experiment.cli import program_name, read_options, run_command
 from cfp.experiment.folder import Folder, holds_run, read_config
 from cfp.experiment.process import Stopped, StopSignals
 from cfp.experiment.run import TrainingRun, check_options
@@ -88,7 +87,8 @@ def parse(program: Program, arguments: Sequence[str], started: str | None = None
             Command(defaults),
             BASIC,
             prog=prog,
-            description=with_examples(f"{program.about}\n\n{inspect.getdoc(Command)}", prog, *program.examples),
+            about=program.about,
+            examples=program.examples,
             args=list(arguments),
         )
         # the command line may spell the name of the algorithm in another way

@@ -72,7 +72,7 @@ def test_second_stage_begins_with_the_lean_encoder_of_the_first(tmp_path):
         coarse, actor = (build_actor(config.actor_spec(stage)) for stage in (1, 2))
         (tmp_path / encoder).mkdir()
         save_actor(tmp_path / encoder / "stage1.safetensors", coarse, config, 1, 5)
-        assert CoarseToFine.begin(config, 2, tmp_path / encoder, actor)
+        assert CoarseToFine.warm_start(config, 2, tmp_path / encoder, actor)
         before, after = coarse.encoder.state_dict(), actor.encoder.state_dict()
         assert all(torch.equal(value, actor.coarse.encoder.state_dict()[key]) for key, value in before.items())
         same = before.keys() == after.keys() and all(torch.equal(value, after[key]) for key, value in before.items())
