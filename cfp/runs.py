@@ -19,7 +19,7 @@ from cfp.hub import Shareable
 from cfp.policy_protocols import Policy
 from cfp.tables import read_table
 from cfp.train import PROGRAM
-from dittogym.render.recording import Recording, check_wanted
+from dittogym.render.recording import Recording, check_film_options
 
 
 class Run:
@@ -85,7 +85,7 @@ class Run:
             path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
             options: Such as ``size``, ``speed`` and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
         """
-        check_wanted(path, options)  # before the episode
+        check_film_options(path, options)  # before the episode
         recording = record_policy(self.config, self.policy)
         if path is not None:
             recording.save(path, **options)

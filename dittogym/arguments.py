@@ -22,7 +22,7 @@ RESET_OPTIONS = ("physics", "positions", "reset_mask")
 
 
 def choice(name: str, given: Any, choices: Mapping[Any, Value]) -> Value:
-    """What one of a few choices stands for."""
+    """The value that a choice maps to; a ValueError if it is none of the ``choices``."""
     if given not in tuple(choices):
         raise ValueError(f"{name} must be one of {tuple(choices)}, got {given!r}")
     return choices[given]

@@ -101,7 +101,7 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
     finite: list[Tensor] = []  # where gradients may go back, known after the step
 
     def guard(value: Tensor) -> Tensor:
-        """Stop gradients of what is not finite, as NaN would reach all through what they share."""
+        """Stop gradients of what is not finite; NaN would spread through parameters that the batch shares."""
         if value.requires_grad:
             value = value.view_as(value)
             value.register_hook(lambda gradient: tree.where(finite[0], gradient, torch.zeros_like(gradient)))
@@ -120,7 +120,7 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
         finite.append(diagnostics.finite(particles))
     if learned and not transforming() and not bool(finite[0].all()):
         # All elements share the task's own constants, so no hook can tell them apart there. Step once more without
-        # those that are not finite: particles take no part if they are at no place.
+        # those that are not finite: particles with a NaN position take no part.
         nowhere = tree.map(lambda tensor: torch.full_like(tensor, math.nan), state.particles)
         again = advance(tree.where(finite[0], state.particles, nowhere), on_nodes)
         particles = tree.where(finite[0], again, particles.detach())

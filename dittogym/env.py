@@ -70,7 +70,7 @@ def first(value: Any) -> Any:
 
 
 class JsonSpec:
-    """Keeps Gymnasium's specification with options that ``to_json`` can write and that make the same again."""
+    """Stores Gymnasium's ``spec`` with options that `EnvSpec.to_json` can write and from which it can be made again."""
 
     _spec: EnvSpec | None = None
 

@@ -33,7 +33,7 @@ def nodes(left: float = -inf, right: float = inf, bottom: float = -inf, top: flo
     return Box(left / NODES, right / NODES, bottom / NODES, top / NODES, closed)
 
 
-def mark(point: tuple[float, float]) -> Box:
+def goal_box(point: tuple[float, float]) -> Box:
     """What the observation shows of a goal: fine pixels less than ten away in both directions."""
     (x, y), half = point, 10 / RASTER
     return Box(x - half, x + half, y - half, y + half)

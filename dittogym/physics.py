@@ -87,7 +87,7 @@ def check_effect(spec: TaskSpec, physics: Physics) -> None:
             warnings.warn(alone, stacklevel=4)  # where TorchEnv.reset is called
     if physics.keys() & {"mu", "lam"}:
         own = defaults(spec, next(iter(physics.values())))
-        mu, lam = _alike(*(physics.get(name, own[name]).detach() for name in ("mu", "lam")))
+        mu, lam = _broadcast_pair(*(physics.get(name, own[name]).detach() for name in ("mu", "lam")))
         if bool((low := lam < -mu).any()):
             least = f"-mu, {-mu[low][0].item():g}"
             raise ValueError(f"physics['lam'] must be at least {least}, got {lam[low][0].item():g}")
@@ -122,7 +122,7 @@ def merged(spec: TaskSpec, old: Physics, new: Physics, mask: Tensor, like: Tenso
     own = defaults(spec, like)
     names = [name for name in NAMES if name in old or name in new]
     pairs = {name: (new.get(name, own[name]), old.get(name, own[name])) for name in names}
-    return {name: tree.where(mask, *_alike(*pair)) for name, pair in pairs.items()}
+    return {name: tree.where(mask, *_broadcast_pair(*pair)) for name, pair in pairs.items()}
 
 
 def part_of(value: float | Tensor, particles: slice) -> float | Tensor:
@@ -130,7 +130,7 @@ def part_of(value: float | Tensor, particles: slice) -> float | Tensor:
     return value[:, particles] if isinstance(value, Tensor) and value.ndim == 2 else value
 
 
-def _alike(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+def _broadcast_pair(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
     """Values of one shape: where one has a value per particle, both have."""
     if one.ndim == other.ndim:
         return one, other

@@ -10,7 +10,7 @@ import numpy as np
 
 from dittogym.bodies.shapes import Shape
 from dittogym.contract import Memory, Moment, Outcome
-from dittogym.geometry import NODES, Box, Obstacle, mark
+from dittogym.geometry import NODES, Box, Obstacle, goal_box
 from dittogym.observation.image import SIZE
 from dittogym.window import Centre, Window
 from torchmpm import Material, checks
@@ -164,7 +164,7 @@ class TaskSpec:
     def observed_boxes(self) -> tuple[Box, ...]:
         """What the robot sees of obstacles and goal."""
         boxes = tuple(box for obstacle in self.obstacles for box in obstacle.observed_boxes)
-        return boxes if self.goal is None else (*boxes, mark(self.goal))
+        return boxes if self.goal is None else (*boxes, goal_box(self.goal))
 
 
 RewardFunction: TypeAlias = Callable[[Moment, TaskSpec], Outcome]

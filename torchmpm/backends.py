@@ -26,9 +26,10 @@ def compiler_found() -> bool:
 
 
 def missing(backend: str) -> str | None:
-    """What a backend lacks to run on this machine's CPU, which completes "backend 'native' ..."; else ``None``."""
-    found = {"native": provenance, "compile": find_compiler}.get(backend, lambda: True)()
-    return None if found else NO_COMPILER
+    """The end of the message "backend 'native' ..." if it cannot run on this machine's CPU; ``None`` if it can."""
+    if backend == "native":
+        return None if provenance() else NO_COMPILER
+    return NO_COMPILER if backend == "compile" and not compiler_found() else None
 
 
 def transforming() -> bool:

@@ -49,7 +49,7 @@ def stencil(grid: Grid, x: Tensor, y: Tensor, origin: Tensor) -> Stencil:
         u = (position - start) * (1.0 / grid.h)
         base = torch.trunc(u.detach() - 0.5)
         f = u - base
-        f = torch.where(torch.isnan(f), 1.0, f)  # of what is at no place; it must not spoil derivatives that all share
+        f = torch.where(torch.isnan(f), 1.0, f)  # with a NaN position; it must not spoil derivatives that all share
         fraction.append(f)
         weight.append(quadratic_weights(f))
         # Clamped before the conversion, which is undefined for large numbers; NaN goes to the low end: padding.

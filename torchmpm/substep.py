@@ -70,7 +70,7 @@ def particles_to_grid(scene: Scene, planes: Planes) -> Scattered:
     dt, grid = scene.dt, scene.grid
     inside = takes_part(grid, x, y, scene.origin)
     nodes = stencil(grid, x, y, scene.origin)
-    # Others get harmless numbers: zero times theirs, which may not be finite, would spoil derivatives that all share.
+    # Particles outside get neutral values: zero times NaN would reach the derivatives of constants that all share.
     zero, one = x.new_zeros(()), x.new_ones(())
     rest = (*[zero] * 6, one, zero, zero, one, one)
     still = (torch.where(inside, plane, number) for plane, number in zip(others, rest, strict=True))

@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 
 
 class Server:
-    """Serves the page to whom knows the token.
+    """Serves the page to clients that send the token.
 
     Args:
         new_session: Makes the simulation of a page that was opened.

@@ -199,7 +199,7 @@ def check_film(
     return path
 
 
-def check_wanted(path: Any, options: dict[str, Any]) -> None:
+def check_film_options(path: Any, options: dict[str, Any]) -> None:
     """Check the arguments of :meth:`Recording.save` for a single file, of which none may be without effect."""
     known = (*_OF_A_FILM, "pictures")
     if unknown := [name for name in options if name not in known]:
@@ -215,7 +215,7 @@ def check_wanted(path: Any, options: dict[str, Any]) -> None:
 
 def film(env: Any, act: Act, path: Any, seed: Any, index: int, options: dict[str, Any]) -> Recording:
     """Record an episode, see :func:`record`, and save it if a ``path`` is given, see :meth:`Recording.save`."""
-    check_wanted(path, options)  # before the episode
+    check_film_options(path, options)  # before the episode
     recording = record(env, act, seed, index)
     if path is not None:
         recording.save(path, **options)

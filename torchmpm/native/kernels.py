@@ -30,7 +30,7 @@ CUDA_TAPE_BYTES = 2**31
 
 @dataclass(frozen=True, eq=False)
 class Kernels:
-    """The kernels for one solver, whose fields these are; builds its tables once."""
+    """Native kernels of one solver, with the same fields; builds its tables once."""
 
     grid: Grid
     bodies: tuple[Body, ...]

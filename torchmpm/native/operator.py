@@ -32,7 +32,10 @@ def native_step(*arguments: Any) -> Tensor:
     ),
 )
 def native_step_backward(*arguments: Any) -> Bars:
-    """Replay the substeps, then go back: tensors, handle, substeps, whether field and values count -> derivatives."""
+    """Replay the substeps, then go back.
+
+    The arguments are tensors, handle, substeps, and whether to compute derivatives in the field and in the values.
+    """
     *tensors, handle, substeps, wants_field, wants_values = arguments
     inputs = tree.map(Tensor.contiguous, Inputs(*tensors))
     bars = inputs.empty_bars(wants_field, wants_values)

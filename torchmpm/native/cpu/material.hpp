@@ -68,12 +68,12 @@ INLINE Direction snow_return(const Values& m, Bounds bounds, Mat2& F, Real& Jp) 
     const bool drop = std::abs(v.n2 * R.cos - v.n1 * R.sin) < 2 * bounds.shear_cutoff;
     const Real n1 = drop ? along * R.cos : v.n1, n2 = drop ? along * R.sin : v.n2;
     const Real square2 = square(n1) + square(n2);
-    const bool round = square2 == 0;
-    const Real root = std::sqrt(round ? Real(1) : square2), difference = round ? Real(0) : root;
+    const bool isotropic = square2 == 0;
+    const Real root = std::sqrt(isotropic ? Real(1) : square2), difference = isotropic ? Real(0) : root;
     const Real first = Real(0.5) * (R.total + difference), second = Real(0.5) * (R.total - difference);
     const Real major = clamp(first, low, high), minor = clamp(second, low, high);
-    const Real kept = (first >= low) & (first <= high) ? Real(1) : Real(0);
-    const Real ratio = Real(0.5) * (round ? kept : (major - minor) / root), sum = Real(0.5) * (major + minor);
+    const Real inside = (first >= low) & (first <= high) ? Real(1) : Real(0);
+    const Real ratio = Real(0.5) * (isotropic ? inside : (major - minor) / root), sum = Real(0.5) * (major + minor);
     F = join({sum * R.cos, sum * R.sin, ratio * n1, ratio * n2, v.sign});
     const Real grown = Jp * (first * second / (major * minor));
     Jp = grown > LARGEST_JP ? LARGEST_JP : grown;

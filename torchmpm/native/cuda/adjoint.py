@@ -23,7 +23,7 @@ from torchmpm.native.cuda.transfer import (
 
 @triton.jit
 def position_adjoint(
-    answers, node, width, fx, fy, on, ux, uy, mvx, mvy, mass, cxx, cxy, cyx, cyy, pxx, pxy, pyx, pyy,
+    node_bars, node, width, fx, fy, on, ux, uy, mvx, mvy, mass, cxx, cxy, cyx, cyy, pxx, pxy, pyx, pyy,
     field, i, j, gx, gy, resolution, MUSCLE: tl.constexpr,
 ):  # fmt: skip
     """Derivatives in the distances (fx, fy), through all weights and offsets of a substep, and that in the mass.
@@ -35,7 +35,7 @@ def position_adjoint(
     fx_bar, fy_bar, masses = tl.zeros_like(fx), tl.zeros_like(fx), tl.zeros_like(fx)
     for p in tl.static_range(3):
         for q in tl.static_range(3):
-            at = answers + ADJOINT * (node + p * width + q)
+            at = node_bars + ADJOINT * (node + p * width + q)
             vx, vy = tl.load(at, on, other=0.0), tl.load(at + 1, on, other=0.0)
             px, py, m = tl.load(at + 2, on, other=0.0), tl.load(at + 3, on, other=0.0), tl.load(at + 4, on, other=0.0)
             value = ux * vx + uy * vy + mass * m + mvx * px + mvy * py
@@ -131,7 +131,7 @@ def drop_unresolved(bars, stride, c0, c1, c2, c3, bounds, mask, KIND: tl.constex
 
 @triton.jit(do_not_specialize=SIZES)
 def finish_adjoint(
-    state, bars, values_bar, field_bar, origin_bar, answers, field, origin, values, constants, bounds,
+    state, bars, values_bar, field_bar, origin_bar, node_bars, field, origin, values, constants, bounds,
     particles, stride, first, count, blocks, column, columns, values_batch, resolution, width,
     KIND: tl.constexpr, VARYING: tl.constexpr, MUSCLE: tl.constexpr, WANT_FIELD: tl.constexpr,
     WANT_VALUES: tl.constexpr, BLOCK: tl.constexpr,
@@ -148,12 +148,12 @@ def finish_adjoint(
     )
     on, i, j, fx, fy = locate(x, y, origin + 2 * element, valid, constants, resolution)
     node = i * width + j
-    answers += ADJOINT * element * width * width
+    node_bars += ADJOINT * element * width * width
     act_x, act_y = actuation_at(field, element, i, j, fx, fy, on, resolution, MUSCLE)
     field += 2 * resolution * resolution * element
     field_bar += 2 * resolution * resolution * element
     # Derivatives in the momentum (m v) and the affine momentum.
-    px_bar, py_bar, pxx_bar, pxy_bar, pyx_bar, pyy_bar = gather(answers + 2, node, width, fx, fy, on, ADJOINT)
+    px_bar, py_bar, pxx_bar, pxy_bar, pyx_bar, pyy_bar = gather(node_bars + 2, node, width, fx, fy, on, ADJOINT)
     pxx_bar, pxy_bar, pyx_bar, pyy_bar = h * pxx_bar, h * pxy_bar, h * pyx_bar, h * pyy_bar
     g0, g1, g2, g3 = 1.0 + dt * c0, dt * c1, dt * c2, 1.0 + dt * c3
     t0, t1, t2, t3 = matmul(g0, g1, g2, g3, f0, f1, f2, f3)
@@ -170,7 +170,7 @@ def finish_adjoint(
     d2, d3 = mass * pyx_bar + dt * d2, mass * pyy_bar + dt * d3
     scale = 4.0 * inverse_h
     fx_bar, fy_bar, masses = position_adjoint(
-        answers, node, width, fx, fy, on, vx_bar + dt * x_bar, vy_bar + dt * y_bar, mass * vx, mass * vy, mass,
+        node_bars, node, width, fx, fy, on, vx_bar + dt * x_bar, vy_bar + dt * y_bar, mass * vx, mass * vy, mass,
         scale * c0_bar, scale * c1_bar, scale * c2_bar, scale * c3_bar,
         h * (xx + mass * c0), h * (xy + mass * c1), h * (xy + mass * c2), h * (yy + mass * c3),
         field, i, j, act_x_bar, act_y_bar, resolution, MUSCLE,

@@ -11,7 +11,7 @@ from torchmpm.native.cuda.transfer import PAD, SIZES
 
 #: Numbers of a velocity rule, see :class:`torchmpm.native.cuda.tables.DeviceTables`.
 RULE = tl.constexpr(9)
-#: Numbers of a node: sums forward, and sums and answers of the adjoint.
+#: Numbers of a node: sums forward, and sums and node_bars of the adjoint.
 SUMS = tl.constexpr(4)
 ADJOINT = tl.constexpr(8)
 
@@ -81,7 +81,7 @@ def constrain_adjoint(rules, code, vx, vy, bar_x, bar_y, SLOT: tl.constexpr):
 
 
 @triton.jit
-def open_box(box):
+def unpack_box(box):
     """First row, first column, rows and columns of a box of :func:`torchmpm.native.cuda.transfer.include`."""
     i0, j0 = tl.load(box), tl.load(box + 1)
     return i0, j0, tl.maximum(3 - tl.load(box + 2) - i0, 0), tl.maximum(3 - tl.load(box + 3) - j0, 0)
@@ -106,7 +106,7 @@ def node_velocities(
     """Velocities (two numbers a node) from mass and momentum (four numbers a node), which become zero."""
     element = (tl.program_id(0) // programs).to(tl.int64)
     base = element * width * width
-    i0, j0, rows, columns = open_box(boxes + 4 * element)
+    i0, j0, rows, columns = unpack_box(boxes + 4 * element)
     for start in range(tl.program_id(0) % programs * BLOCK, rows * columns, programs * BLOCK):
         k = start + tl.arange(0, BLOCK)
         used = k < rows * columns
@@ -127,7 +127,7 @@ def node_velocities(
 
 @triton.jit(do_not_specialize=SIZES)
 def node_adjoint(
-    sums, answers, boxes, codes, rules, gravity, gravity_bar, constants, resolution, width, programs,
+    sums, node_bars, boxes, codes, rules, gravity, gravity_bar, constants, resolution, width, programs,
     SLOTS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Answers from the sums of the adjoint, which become zero.
@@ -136,7 +136,7 @@ def node_adjoint(
     """
     element = (tl.program_id(0) // programs).to(tl.int64)
     base = element * width * width
-    i0, j0, rows, columns = open_box(boxes + 4 * element)
+    i0, j0, rows, columns = unpack_box(boxes + 4 * element)
     for start in range(tl.program_id(0) % programs * BLOCK, rows * columns, programs * BLOCK):
         k = start + tl.arange(0, BLOCK)
         used = k < rows * columns
@@ -163,11 +163,11 @@ def node_adjoint(
         tl.atomic_add(gravity_bar + 2 * element + 1, dt * tl.sum(bar_y, axis=0), sem="relaxed")
         bar_x *= inverse
         bar_y *= inverse
-        answer = answers + ADJOINT * node
-        tl.store(answer, vx, used)
-        tl.store(answer + 1, vy, used)
-        tl.store(answer + 2, bar_x, used)
-        tl.store(answer + 3, bar_y, used)
-        tl.store(answer + 4, -(raw_x * bar_x + raw_y * bar_y), used)
+        node_bar = node_bars + ADJOINT * node
+        tl.store(node_bar, vx, used)
+        tl.store(node_bar + 1, vy, used)
+        tl.store(node_bar + 2, bar_x, used)
+        tl.store(node_bar + 3, bar_y, used)
+        tl.store(node_bar + 4, -(raw_x * bar_x + raw_y * bar_y), used)
         for r in tl.static_range(5):
             tl.store(at + r, tl.zeros_like(vx), used)

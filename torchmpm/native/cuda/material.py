@@ -61,14 +61,14 @@ def snow_parts(m1, m2, n1, n2, low, high, shear_cutoff):
     drop = tl.abs(n2 * cos - n1 * sin) < 2.0 * shear_cutoff
     n1, n2 = tl.where(drop, along * cos, n1), tl.where(drop, along * sin, n2)
     square = n1 * n1 + n2 * n2
-    even = square == 0
-    root = tl.sqrt(tl.where(even, 1.0, square))
-    difference = tl.where(even, 0.0, root)
+    isotropic = square == 0
+    root = tl.sqrt(tl.where(isotropic, 1.0, square))
+    difference = tl.where(isotropic, 0.0, root)
     first, second = 0.5 * (total + difference), 0.5 * (total - difference)
     major, minor = clamp(first, low, high), clamp(second, low, high)
-    kept = tl.where((first >= low) & (first <= high), 1.0, 0.0)
-    ratio = 0.5 * tl.where(even, kept, (major - minor) / root)
-    return n1, n2, along, drop, even, root, first, second, major, minor, ratio
+    inside = tl.where((first >= low) & (first <= high), 1.0, 0.0)
+    ratio = 0.5 * tl.where(isotropic, inside, (major - minor) / root)
+    return n1, n2, along, drop, isotropic, root, first, second, major, minor, ratio
 
 
 @triton.jit

@@ -97,27 +97,27 @@ def snow_adjoint(
     """From derivatives in the returned F, in R and Jp to those in the trial F (four), in Jp, and in low and high."""
     m1, m2, p1, p2, proper = split(a, b, c, d)
     _, inverse, cos, sin, empty = direction(m1, m2)
-    n1, n2, along, drop, even, root, first, second, major, minor, ratio = snow_parts(
+    n1, n2, along, drop, isotropic, root, first, second, major, minor, ratio = snow_parts(
         m1, m2, p1, p2, low, high, tl.load(bounds + 2)
     )
     sum = 0.5 * (major + minor)
-    squeezed = first * second / (major * minor)
-    Jp_bar = tl.where(Jp * squeezed > tl.load(constants + LARGEST_JP), 0.0, Jp_bar)
-    squeezed_bar = Jp_bar * Jp
+    reduction = first * second / (major * minor)
+    Jp_bar = tl.where(Jp * reduction > tl.load(constants + LARGEST_JP), 0.0, Jp_bar)
+    reduction_bar = Jp_bar * Jp
 
     m1_bar, m2_bar, n1_bar, n2_bar = join_adjoint(a_bar, b_bar, c_bar, d_bar, proper)
     sum_bar = m1_bar * cos + m2_bar * sin
-    ratio_bar = tl.where(even, 0.0, n1_bar * n1 + n2_bar * n2)
-    major_bar = 0.5 * (sum_bar + ratio_bar / root) - squeezed_bar * squeezed / major
-    minor_bar = 0.5 * (sum_bar - ratio_bar / root) - squeezed_bar * squeezed / minor
-    area = squeezed_bar / (major * minor)
+    ratio_bar = tl.where(isotropic, 0.0, n1_bar * n1 + n2_bar * n2)
+    major_bar = 0.5 * (sum_bar + ratio_bar / root) - reduction_bar * reduction / major
+    minor_bar = 0.5 * (sum_bar - ratio_bar / root) - reduction_bar * reduction / minor
+    area = reduction_bar / (major * minor)
     low1, high1, low2, high2 = first < low, first > high, second < low, second > high
     first_bar = area * second + tl.where(low1 | high1, 0.0, major_bar)
     second_bar = area * first + tl.where(low2 | high2, 0.0, minor_bar)
     low_bar = tl.where(low1, major_bar, 0.0) + tl.where(low2, minor_bar, 0.0)
     high_bar = tl.where(high1, major_bar, 0.0) + tl.where(high2, minor_bar, 0.0)
 
-    difference_bar = tl.where(even, 0.0, 0.5 * (first_bar - second_bar) - ratio_bar * ratio / root)
+    difference_bar = tl.where(isotropic, 0.0, 0.5 * (first_bar - second_bar) - ratio_bar * ratio / root)
     n1_bar = ratio * n1_bar + difference_bar * n1 / root
     n2_bar = ratio * n2_bar + difference_bar * n2 / root
     along_bar = n1_bar * cos + n2_bar * sin
@@ -127,7 +127,7 @@ def snow_adjoint(
     m1_bar, m2_bar = direction_adjoint(inverse, cos, sin, empty, total_bar, cos_bar, sin_bar)
     n1_bar, n2_bar = tl.where(drop, along_bar * cos, n1_bar), tl.where(drop, along_bar * sin, n2_bar)
     e, f, g, h = join(m1_bar, m2_bar, n1_bar, n2_bar, proper)
-    return e, f, g, h, Jp_bar * squeezed, low_bar, high_bar
+    return e, f, g, h, Jp_bar * reduction, low_bar, high_bar
 
 
 @triton.jit

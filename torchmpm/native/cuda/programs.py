@@ -76,14 +76,14 @@ class Program:
         last, flags = len(states) - 1, {"TAPE": TAPE}
         for s in range(last):
             around, box = (states[max(s - 1, 0)], states[s], states[s + 1]), self.boxes[s]
-            self.over_particles(particles_pass, *around, self.sums, velocity, box, ARRIVE=s > 0, LEAVE=True, **flags)
+            self.over_particles(particles_pass, *around, self.sums, velocity, box, FINISH=s > 0, BEGIN=True, **flags)
             self.over_nodes(node_velocities, self.sums, velocity, box)
         if last > 0:
             end = (states[last - 1], states[last], states[last], self.sums, velocity, self.boxes[0])
-            self.over_particles(particles_pass, *end, ARRIVE=True, LEAVE=False, **flags)
+            self.over_particles(particles_pass, *end, FINISH=True, BEGIN=False, **flags)
 
     def over_nodes(self, kernel: Any, *buffers: Tensor, bars: tuple[Tensor, ...] = ()) -> None:
-        """Launch a pass over the nodes: ``buffers`` are sums, answers, and the box of the substep."""
+        """Launch a pass over the nodes: ``buffers`` are sums, node_bars, and the box of the substep."""
         tables, inputs = self.tables, self.inputs
         programs = max(1, min(-(-self.cells // BLOCK), NODE_PROGRAMS // self.batch))
         tensors = (*buffers, self.codes, self.device_tables.rules, inputs.gravity, *bars, self.device_tables.constants)
@@ -121,7 +121,7 @@ class Backward(Program):
         planes = inputs.planes
         length = -(-planes.numel() // 4) * 4  # whole fours, see tables
         self.tape = planes.new_empty(substeps, length)[:, : planes.numel()].unflatten(1, planes.shape)
-        self.answers = planes.new_empty(self.batch * self.cells * ADJOINT.value)
+        self.node_bars = planes.new_empty(self.batch * self.cells * ADJOINT.value)
         self.results = inputs.empty_bars(wants_field, wants_values)
         self.bars, self.field_bar, self.origin_bar, self.gravity_bar, self.values_bar = self.results
 
@@ -130,15 +130,15 @@ class Backward(Program):
         assert self.inputs.result_bar is not None
         self.prepare()
         self.tape[0].copy_(self.inputs.planes)
-        self.advance(self.tape.unbind(), self.answers, TAPE=True)
+        self.advance(self.tape.unbind(), self.node_bars, TAPE=True)
         self.boxes.fill_(NOWHERE.value)
         self.bars.copy_(self.inputs.result_bar)
         for bar in self.results[1:]:
             bar.zero_()
         wants = {"WANT_FIELD": self.field_bar.numel() > 0, "WANT_VALUES": self.values_bar.numel() > 0}
-        buffers = (self.bars, self.values_bar, self.field_bar, self.origin_bar, self.answers)
+        buffers = (self.bars, self.values_bar, self.field_bar, self.origin_bar, self.node_bars)
         for s in range(self.substeps - 1, -1, -1):
             self.over_particles(begin_adjoint, self.tape[s], self.bars, self.sums, self.boxes[s])
-            self.over_nodes(node_adjoint, self.sums, self.answers, self.boxes[s], bars=(self.gravity_bar,))
+            self.over_nodes(node_adjoint, self.sums, self.node_bars, self.boxes[s], bars=(self.gravity_bar,))
             self.over_particles(finish_adjoint, self.tape[s], *buffers, **wants)
         return self.results

@@ -61,7 +61,7 @@ def particles_pass(
     before, now, after, sums, velocity, box, field, origin, values, constants, bounds,
     particles, stride, first, count, blocks, column, columns, values_batch, resolution, width,
     KIND: tl.constexpr, VARYING: tl.constexpr, MUSCLE: tl.constexpr,
-    ARRIVE: tl.constexpr, LEAVE: tl.constexpr, TAPE: tl.constexpr, BLOCK: tl.constexpr,
+    FINISH: tl.constexpr, BEGIN: tl.constexpr, TAPE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Move the particles of one body, then deform them and add their mass and momentum to the nodes.
 
@@ -77,7 +77,7 @@ def particles_pass(
     vx, vy = tl.load(before + 2 * stride + at, valid, other=0.0), tl.load(before + 3 * stride + at, valid, other=0.0)
     c0, c1, c2, c3 = load_matrix(before + 4 * stride + at, stride, valid)
     on, i, j, fx, fy = locate(x, y, origin, valid, constants, resolution)
-    if ARRIVE:
+    if FINISH:
         x, y, vx, vy, c0, c1, c2, c3 = advance(
             velocity + 2 * cells, i * width + j, width, fx, fy, on, x, y, vx, vy, c0, c1, c2, c3, dt, inverse_h
         )
@@ -86,12 +86,12 @@ def particles_pass(
         on, i, j, fx, fy = locate(x, y, origin, valid, constants, resolution)
         # Particles that take part in the next substep get a new velocity before this one is read.
         kept = valid
-        if LEAVE and not TAPE:
+        if BEGIN and not TAPE:
             kept = valid & (on == 0)
         tl.store(now + 2 * stride + at, vx, kept)
         tl.store(now + 3 * stride + at, vy, kept)
         store_matrix(now + 4 * stride + at, stride, c0, c1, c2, c3, kept)
-    if LEAVE:
+    if BEGIN:
         place = values_at(values, element, k, column, columns, values_batch, VARYING)
         mass, factor, mu2, lam, s0, s1, s2, s3 = read_values(values, values_batch, columns, place, valid)
         f0, f1, f2, f3 = load_matrix(now + 8 * stride + at, stride, valid)
