@@ -92,7 +92,7 @@ ON_SPEED = ("run", "obstacle")
 
 SAC: dict[str, dict[str, Any]] = {
     # Without gravity noise on cells drives the robot apart. In episodes of 30 steps one-step returns lead further.
-    "shapematch": {"learning": {"noise_cells": 0, "n_steps": 1, "actor_start": 800}},
+    "shapematch": {"learning": {"noise_cells": 0, "n_steps": 1, "actor_start": 600}},
     "obstacle": {"alpha": (0.005, 0.005)},  # that of RUN; with five times as much the robot does not reach the stairs
     # The way through the soil takes hundreds of steps. The paper's penalty closes the gate for good.
     "dig": {"learning": {"gamma": 0.99}, "gate_penalty": (0.01,)},
@@ -191,14 +191,14 @@ def _paper(task: str, numbers: TaskNumbers) -> Config:
 def _quick(task: str, numbers: TaskNumbers) -> Config:
     """Minutes instead of days: many small robots, small networks, coarser actions first."""
     paper, horizon, many = _paper(task, numbers), dittogym.make_spec(task).horizon, task in MANY_UPDATES
-    steps = 25_600 if many else 51_200
+    steps = 48_000 if many else 38_400
     coarse = numbers.resolutions[0]
     config = replace(
         paper,
         preset="quick",
         seed=0,
         steps=steps,
-        handover=(steps // 2,),
+        handover=(steps * 3 // 4,),
         resolutions=(coarse // 2, coarse) if coarse > 4 else numbers.resolutions,
         random_steps=(480, 100),
         alpha=(0.5 * numbers.alpha[0],) * 2,
@@ -211,7 +211,7 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
             tau=0.01,
             buffer_size=20_000 if many else 50_000,
             gradient_steps=16 if many else 4,
-            actor_start=800 if many else 4_000,
+            actor_start=800 if many else 3_000,
             noise_cells=4,
             noise_scale=(0.2, 1.0),
             final_rate=0.1,
@@ -227,7 +227,7 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
 def _long(task: str, numbers: TaskNumbers) -> Config:
     """A night of eight hours on two cores: more steps and a longer memory."""
     quick = _quick(task, numbers)
-    steps = 32 * quick.steps
+    steps = 819_200 if task in MANY_UPDATES else 1_638_400
     return replace(
         quick,
         preset="long",

@@ -14,8 +14,8 @@ def trained(tmp_path_factory):
     return make_trained(tmp_path_factory.mktemp("trained") / "run")
 
 
-def test_the_table_is_long_and_names_each_case_once():
-    assert len({case.name for case in CASES}) == len(CASES) >= 100
+def test_the_table_names_each_case_once():
+    assert len({case.name for case in CASES}) == len(CASES)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name.replace(" ", "-"))

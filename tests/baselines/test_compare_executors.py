@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from test_compare import COMMON, MPC, PLAN, compare, sessions
 
-from baselines.compare.__main__ import main
+from baselines.compare.__main__ import Command, main
 from baselines.compare.executor import LocalExecutor, RayExecutor, Resources, execute, run_process
 from baselines.compare.final_evaluation import Protocol
 from baselines.compare.jobs import Job
@@ -226,3 +226,24 @@ def test_comparison_that_is_killed_is_resumed(tmp_path):
     assert 0 < first["to"] == second["from"] < second["to"] == 30
     assert not first["finished"] and second["finished"]
     assert [row["step"] for row in read_table(folder / "progress.csv")] == ["10", "20", "30"]
+
+
+def test_the_worker_of_a_comparison_carries_out_a_run(tmp_path):
+    """As by default: a process of its own, with the real program."""
+    config = configure({"algo": "zero", "environment": {"particles": 100, "substeps": 1}})
+    job = Job("zero", config, tmp_path / "run", Protocol(1, 100, "none"))
+    assert outcomes(LocalExecutor(1, Resources(cpus=1)), job) == ["finished"]
+    assert job.trained and not job.error
+
+
+@pytest.mark.parametrize("cpus", [3, None])
+def test_a_worker_has_its_share_of_the_cores(job, use_program, cpus):
+    use_program("import os; open('threads', 'w').write(os.environ['OMP_NUM_THREADS'])")
+    outcomes(LocalExecutor(2, Resources(cpus=cpus)), job)
+    assert int(Path("threads").read_text()) == (cpus or max(1, (os.cpu_count() or 1) // 2))
+
+
+def test_the_command_line_says_how_runs_are_carried_out():
+    command = Command(cpus_per_run=3, retries=1, noise="with")
+    resources = command.make_executor(StopSignals()).resources
+    assert (resources.cpus, resources.retries, command.final_protocol.noise) == (3, 1, "with")

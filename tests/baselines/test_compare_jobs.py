@@ -56,9 +56,9 @@ def test_other_spellings_are_reported_under_the_name(tmp_path, capsys):
 
 
 def test_a_plan_may_spell_algorithms_in_another_way(tmp_path):
-    (tmp_path / "plan.json").write_text('{"algos": {"gnn16": {"alpha": 0.5, "steps": 2560}}}')
+    (tmp_path / "plan.json").write_text('{"algos": {"gnn16": {"alpha": 0.5, "steps": 3840}}}')
     config = resolve(Plan.read(tmp_path / "plan.json"), "gnn-16", "run", "quick", 0, None, "cpu")
-    assert config.alpha == 0.5 and config.learning.actor_start == 800 * 2560 // 51_200  # scaled with the steps
+    assert config.alpha == 0.5 and config.learning.actor_start == 80  # scaled with the steps
 
 
 def test_names_in_a_plan_that_mean_nothing_are_reported(tmp_path, capsys):
@@ -99,3 +99,9 @@ def test_plans_of_the_documentation_hold(path, tmp_path):
 def test_job_is_the_same_in_another_process(tmp_path, tier):
     job = Job("mine", configure({"algo": "cem", "task": "kick"}), tmp_path, Protocol(3, tier, "all", "with"))
     assert decode(encode(job, 1.5).decode()) == (job, 1.5)
+
+
+def test_steps_of_the_command_line_hold_where_the_plan_has_none():
+    assert resolve(Plan(), "shac", "run", "quick", 0, 960, "cpu").steps == 960
+    plan = Plan(algos={"shac": {"steps": 480}})
+    assert resolve(plan, "shac", "run", "quick", 0, 960, "cpu").steps == 480

@@ -1,6 +1,7 @@
 """The console command ``torchmpm``."""
 
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -91,3 +92,29 @@ def test_tasks_of_the_working_directory_are_found(tmp_path):
     command = [script, "train", "--task", "strolling:stroll", "--dry-run"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert '"task": "strolling:stroll"' in done.stdout, done.stderr
+
+
+MODULES = (
+    *(f"cfp.{name}" for name in ("train", "evaluate", "robustness")),
+    *(f"baselines.{name}" for name in ("train", "evaluate", "robustness", "distill", "compare", "leaderboard")),
+    *("baselines.gradlab", "dittogym.play"),
+)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_every_program_is_a_module(module, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [module, "--help"])
+    for loaded in (module, f"{module}.__main__"):  # else runpy warns that it is there already
+        monkeypatch.delitem(sys.modules, loaded, raising=False)
+    with pytest.raises(SystemExit) as stop:
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    assert not stop.value.code and f"usage: python -m {module}" in capsys.readouterr().out
+
+
+def test_the_version_is_the_same_everywhere(capsys):
+    texts = {name: (ROOT / name).read_text() for name in ("pyproject.toml", "CITATION.cff", "torchmpm/__init__.py")}
+    patterns = (r'^version = "(.*)"$', r"^version: (.*)$", r'^__version__ = "(.*)"$')
+    (version,) = {
+        re.search(pattern, text, re.MULTILINE)[1] for pattern, text in zip(patterns, texts.values(), strict=True)
+    }
+    assert output_of(capsys, "--version")[1] == f"torchmpm {version}\n"

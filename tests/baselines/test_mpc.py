@@ -10,7 +10,6 @@ from updates import EachUpdate
 from baselines import MPC, GradientPlannerConfig, OpenLoop, train
 from baselines.planning.mpc import MPCConfig
 from cfp.envs.make import make_torch_env
-from cfp.errors import ConfigError
 from cfp.experiment.folder import holds_run
 from cfp.sections import EnvironmentConfig
 from cfp.tables import read_table
@@ -82,15 +81,3 @@ def test_layout_of_the_reference_is_kept() -> None:
         (replace(ENVIRONMENT, parity="reference", action_layout="image"), "image"),
     ):
         assert MPC(replace(CONFIG, environment=environment)).planner.env.action_layout == layout
-
-
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        ({"environment": replace(ENVIRONMENT, num_envs=2)}, "num_envs"),
-        ({"planner": GradientPlannerConfig(horizon=4, commit=5)}, "commit"),
-    ],
-)
-def test_bad_options_are_named(change: dict, named: str) -> None:
-    with pytest.raises(ConfigError, match=named):
-        replace(CONFIG, **change).check()

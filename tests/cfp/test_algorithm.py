@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -204,22 +203,6 @@ def test_random_phase_and_start_of_updates_are_two_settings():
     assert min(updates) == 14  # more than 12 are stored
 
 
-def test_actor_waits_for_the_critics_and_has_a_rate_of_its_own():
-    model = make_model(ActorSpec((8,)), update_start=4, batch_size=4, random_steps=0, actor_start=10, actor_rate=1e-30)
-    actor, critic, _ = model.networks()
-    before = [[p.clone() for p in network.parameters()] for network in (actor, critic)]
-    same = lambda: [  # noqa: E731
-        all(map(torch.equal, old, network.parameters())) for old, network in zip(before, (actor, critic), strict=True)
-    ]
-    model.learn(8)
-    assert same() == [True, False] and not actor.optimizer.state
-    model.learn(12, reset_num_timesteps=False)
-    assert same() == [True, False] and actor.optimizer.state
-    model.hyperparameters = replace(model.hyperparameters, actor_rate=None)
-    model.learn(4, reset_num_timesteps=False)
-    assert same() == [False, False]
-
-
 def test_stage_two_starts_with_uniform_fine_actions():
     env = FakeEnv(num_envs=2, resolution=16)
     model = make_model(ActorSpec((8, 16), (-100.0,)), env, random_steps=4)
@@ -291,29 +274,6 @@ def test_time_limit_bootstraps_and_termination_does_not():
     assert ended[0, 1] == 1
     # The stored next observation is the episode's last, not the next one's first.
     assert buffer.next_observations[2, 0, 1].max() == 3
-
-
-@pytest.mark.slow
-def test_learning_improves_the_return():
-    def make_env():
-        return FakeEnv(num_envs=8, resolution=4, horizon=5, start=-0.4, push=1.0)
-
-    options = {"learning_rate": 1e-3, "gamma": 0.5, "tau": 0.05, "gradient_steps": 2, "batch_size": 16}
-    model = make_model(ActorSpec((4,)), make_env(), random_steps=80, update_start=64, alpha=0.0, **options)
-    probe = monitored(make_env())
-
-    def returns():
-        observation, total = probe.reset(), np.zeros(8)
-        for _ in range(5):
-            action, _ = model.predict(observation, deterministic=True)
-            observation, reward, _, _ = probe.step(action)
-            total += reward
-        return total.mean()
-
-    before = returns()
-    model.learn(400)
-    assert before < 2.5
-    assert returns() > 3.0  # 3.09 is the best that can be had
 
 
 def test_saved_archive_of_the_base_library_keeps_everything(tmp_path):

@@ -1,16 +1,13 @@
 """The learner `analytic`, on robots of a few hundred particles."""
 
-import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from tiny_runs import assert_same_run, at_step
 
 import cfp
 import dittogym
-from cfp import train
 from cfp.agent.actor import build_actor
 from cfp.agent.spec import ActorSpec
 from cfp.analytic.action_step import ActionStep
@@ -196,18 +193,6 @@ def test_gradients_of_a_window_are_those_of_its_return(tmp_path):
     after = window_return(improved)
     expected = -(gradient * (improved - leaf)).sum()
     assert (after - before).item() == pytest.approx(expected.item(), rel=0.2) and after > before
-
-
-def test_run_of_two_stages_and_the_same_run_with_an_interruption(tmp_path):
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    assert train.main([*TINY, "--out", str(whole)]) == 0
-    with at_step(56, lambda: signal.raise_signal(signal.SIGINT)):  # in the second stage
-        assert train.main([*TINY, "--out", str(parts)]) == 128 + signal.SIGINT
-    assert train.main(["--out", str(parts), "--resume"]) == 0
-    assert_same_run(whole, parts, ("progress.csv",))
-    policies = [cfp.load(folder) for folder in (whole, parts)]
-    assert torch.equal(parameters(policies[0]), parameters(policies[1]))
-    assert policies[0].spec.resolutions == (4, 8) and policies[0].description["trained_by"] == "analytic"
 
 
 def test_a_trained_policy_is_kept_until_the_critic_has_learned():

@@ -171,3 +171,7 @@ def test_a_policy_can_be_evaluated_with_other_substeps():
     assert (config.environment.dt, config.environment.substeps) == (2e-4, 50)
     with pytest.raises(ConfigError, match="dt must divide"):
         Selection(policy="run", dt=3e-4).open(PROGRAM)
+
+
+def test_the_seed_chooses_the_episodes():
+    assert [Selection(policy="run", seed=seed).open(PROGRAM)[0].seed for seed in (7, None)] == [7, 0]

@@ -11,6 +11,7 @@ from tiny_runs import assert_same_run, at_step, run
 
 import cfp
 from cfp import evaluate
+from cfp.experiment.callbacks import StopCallback
 from cfp.files import write_policy
 from cfp.weights import read_policy
 
@@ -63,3 +64,19 @@ def test_first_stage_of_other_resolutions_is_refused(finished, tmp_path, capsys)
         (folder / f"stage1.{suffix}").write_bytes((finished / f"stage1.{suffix}").read_bytes())
     assert run(folder, *options, "--steps", "50", "--resume") == 2
     assert "stage1.safetensors: weights and description do not match" in capsys.readouterr().err
+
+
+def test_a_training_that_diverges_says_that_its_checkpoint_is_whole(finished, tmp_path, capsys):
+    folder, on_step = tmp_path / "run", StopCallback._on_step
+
+    def act(callback):
+        if callback.stage.step == 50:
+            next(callback.stage.algorithm.model.actor.parameters()).data.fill_(torch.nan)
+        return on_step(callback)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(StopCallback, "_on_step", act)
+        assert run(folder) == 1
+    assert "; the last checkpoint is untouched" in capsys.readouterr().err
+    assert run(folder, "--resume") == 0
+    assert_same_run(folder, finished)

@@ -1,7 +1,5 @@
 """The options that make soft actor-critic cheaper and more stable, each on its own."""
 
-import os
-import signal
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +8,6 @@ import torch
 from fakes import FakeEnv
 from policy_files import save_actor
 from test_algorithm import make_batch, make_model
-from tiny_runs import assert_same_run, at_step, run
 from torch.nn import functional as F
 
 from cfp.agent.actor import build_actor
@@ -210,12 +207,6 @@ def test_larger_actions_are_averaged_over_the_cells_of_the_grid():
     assert [values.shape for values in critics(observation, torch.randn(3, 2, 18, 18))] == [(3, 1)] * 2
 
 
-def test_critics_take_actions_on_the_action_grid():
-    model = make_model(ActorSpec((4, 8), (0.0,), patch=18, encoder="lean"), FakeEnv(num_envs=2, resolution=18))
-    obs = model.policy.encode(make_batch(18).observations)
-    assert model.networks()[0].sample_for_critic(obs).action.shape[2:] == (8, 8)
-
-
 def test_actor_starts_after_the_critics_and_rates_fall():
     options = {"update_start": 4, "batch_size": 4, "actor_start": 10, "final_rate": 0.1, "actor_rate": 1e-4}
     model = make_model(ActorSpec((8,)), **options)
@@ -235,16 +226,6 @@ def test_actor_starts_after_the_critics_and_rates_fall():
     assert moved == [(steps, steps >= 10) for steps in range(6, 25, 2)]
     assert rates[-1] == pytest.approx([1e-5, 3e-5], rel=1e-6)
     assert rates == sorted(rates, reverse=True)
-
-
-def test_resumed_run_is_the_uninterrupted_one(tmp_path):
-    options = "--preset quick --steps 60 --handover 32 --eval-every 0 --gradient-steps 2".split()
-    assert run(tmp_path / "whole", *options) == 0
-    for step, folder in ((20, "first"), (50, "second")):
-        with at_step(step, lambda: os.kill(os.getpid(), signal.SIGTERM)):
-            assert run(tmp_path / folder, *options) == 128 + signal.SIGTERM
-        assert run(tmp_path / folder, *options, "--resume") == 0
-        assert_same_run(tmp_path / "whole", tmp_path / folder, ["progress.csv", "policy.safetensors"])
 
 
 def test_options_out_of_range_are_refused():

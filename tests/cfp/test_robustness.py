@@ -192,3 +192,17 @@ def test_ratios_need_a_positive_return():
     assert [row["ratio"] for row in rows] == [None, None]
     config = sac_preset("dig")
     assert "not positive" in robustness.make_table(config, rows).description
+
+
+def test_amounts_of_the_command_line_reach_the_cases(folder, tmp_path, monkeypatch):
+    seen = []
+
+    def note(config, policy, cases, *_, **__):
+        seen.extend(case.name for case in cases)
+        raise ConfigError("noted")
+
+    monkeypatch.setattr(robustness, "report", note)
+    words = "--dropout 0.5 --noise 0.3 --latency 3 --shift 0.4 --friction 0.7 --device cpu".split()
+    assert robustness.main([str(folder), *words, "--out", str(tmp_path / "out")]) == 2
+    assert {"action dropout 50%", "action noise 0.3", "latency 3 steps"} <= set(seen)
+    assert {"mu x 0.6", "yield stress x 1.4"} <= set(seen)

@@ -142,6 +142,7 @@ def test_elements_share_attributes_and_pictures_come_one_by_one():
     assert env.get_attr("push") == [0.1, 0.1]
     assert env.get_attr("push", 1) == [0.1]
     env.set_attr("push", 7)
+    assert env.get_attr("push") == [7, 7]
     assert env.env_method("render", 1)[0].max() == 1
     with pytest.raises(ValueError, match="indices"):
         env.set_attr("push", 7, indices=[0])

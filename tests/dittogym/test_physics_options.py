@@ -404,9 +404,3 @@ def test_every_episode_can_be_differentiated() -> None:
         reward = env.step(actions(env, 1)[0])[1].sum()
         gradients += torch.autograd.grad(reward, mu) if reward.requires_grad else [None]
     assert gradients[0] != 0 and gradients[0] == gradients[1] and gradients[2] is None
-
-
-@pytest.mark.parametrize("value", ["big", None, [1.0, [2.0]], 1j])
-def test_values_that_are_no_numbers(value: object) -> None:
-    with pytest.raises(ValueError, match=r"physics\['mu'\] must be (real )?numbers"):
-        tiny("run").reset(seed=0, options={"physics": {"mu": value}})

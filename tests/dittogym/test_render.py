@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from dittogym import TorchEnv, make_spec
+from dittogym import Env, TorchEnv, make_spec
 from dittogym.render.canvas import GROUND, SOLID, TARGET, Canvas
 from dittogym.render.colours import CONTRACT, EXPAND, RELAX, ROBOT, SCALES, shear_strain, speed
 from dittogym.render.scene import describe
@@ -100,3 +100,11 @@ def test_holes_of_a_target_stay_empty() -> None:
     canvas.target(describe(TorchEnv(spec, particles=100).model).target, np.array((0.5, 0.5)))
     for distance, colour in ((0, TARGET), (24, GROUND), (44, TARGET), (62, GROUND)):  # pixels of the picture
         assert tuple(canvas.image[128, 128 + distance]) == colour == tuple(canvas.image[128 - distance, 128])
+
+
+@pytest.mark.parametrize("muscles", [True, False])
+def test_muscles_are_coloured_unless_they_are_not_asked_for(muscles: bool) -> None:
+    env = Env("run", particles="lite", substeps=1, render_mode="rgb_array", render_muscles=muscles)
+    env.reset(seed=0)
+    env.step(np.ones(env.action_space.shape, np.float32))
+    assert (len(near(env.render(), CONTRACT)[0]) > 1000) == muscles

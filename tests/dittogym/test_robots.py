@@ -164,12 +164,12 @@ def test_a_dark_robot_on_bright_ground_is_recognised() -> None:
 COLOURS = {"black": 0, "white": 255, "red": (255, 0, 0), "green": (0, 255, 0), "blue": (0, 0, 255), "grey": 128}
 
 
-@pytest.mark.parametrize("ground", ["black", "white", "grey", "green"])
-@pytest.mark.parametrize("colour", ["red", "green", "blue", "white", "black"])
+@pytest.mark.parametrize(
+    ("colour", "ground"),
+    [("red", "black"), ("blue", "white"), ("green", "grey"), ("white", "green"), ("black", "white"), ("blue", "green")],
+)
 def test_the_order_of_colours_does_not_matter(colour: str, ground: str, tmp_path) -> None:
     """Arrays are RGB, OpenCV's BGR; a file is read as OpenCV has it."""
-    if colour == ground:
-        return
     drawn = np.pad(ELL, 3)[..., None]
     picture = np.where(drawn, COLOURS[colour], np.broadcast_to(COLOURS[ground], 3)).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "drawing.png"), picture[..., ::-1])

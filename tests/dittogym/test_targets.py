@@ -48,13 +48,6 @@ def test_bad_targets(target: object, message: str) -> None:
         dittogym.make_spec("shapematch", target=target)
 
 
-def test_unreadable_file(tmp_path) -> None:
-    path = tmp_path / "not_an_image.png"
-    path.write_text("hello")
-    with pytest.raises(ValueError, match="cannot be read as an image"):
-        load_target(path)
-
-
 def heart(pixels: int = 320, centre: tuple[float, float] = (0.5, 0.5), scale: float = 0.02) -> np.ndarray:
     """A heart as (H, W) bool; centre and scale in units of the picture."""
     t = np.linspace(0, 2 * np.pi, 200)

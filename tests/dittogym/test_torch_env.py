@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny import actions, forget
+from tiny import actions, forget, tiny
 
 import dittogym
 from dittogym import TorchEnv
@@ -267,3 +267,28 @@ def test_run_displacement_is_the_same_at_every_tier() -> None:
     assert (results["full"][0] - results["lite"][0]).abs().max() < 1e-3
     assert results["full"][1] == pytest.approx(results["lite"][1], abs=0.15)
     assert results["full"][2] == pytest.approx(results["lite"][2], abs=1e-3)
+
+
+@pytest.mark.parametrize("parity", ["clean", "reference"])
+def test_the_hand_of_catch_is_chosen_by_a_stale_position_with_parity(parity: str) -> None:
+    env = tiny("catch", parity=parity)
+    env.reset(seed=0)
+    with torch.no_grad():
+        env.state.x[:, env.model.num_robot_particles :] += 0.01
+        env.step(torch.zeros(1, *env.action_shape))
+    moved = env.env_state.memory["object_com"]
+    env.reset()
+    assert torch.equal(env.env_state.memory["object_com"], moved) == (parity == "reference")
+
+
+def test_random_generators_can_be_put_back() -> None:
+    env = tiny("run", 2, resample=True)
+    env.reset(seed=0)
+    before = env.generators
+    env.reset()
+    places = env.state.x
+    env.generators = before
+    env.reset()
+    assert torch.equal(env.state.x, places)
+    with pytest.raises(RuntimeError, match=r"call reset\(\) first: elements \[0, 1\] have no random generator yet"):
+        tiny("run", 2, resample=True).generators = before

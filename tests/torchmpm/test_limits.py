@@ -53,7 +53,7 @@ def part(state: ParticleState, k: int) -> ParticleState:
 def test_matter_at_every_edge(corner: tuple[int, int]) -> None:
     """Over the upper ends by a cell and on its way out, or at the lower ends and on its way in: nothing gets faster.
 
-    Below half a cell from the lower ends weights are extrapolated: see the lower end of the window in test_native.
+    Below half a cell from the lower ends weights are extrapolated.
     """
     places = torch.tensor([1.5 * H, 0.5, SIZE], dtype=torch.float64)
     numbers = torch.rand(1, 60, 2, generator=generator(1), dtype=torch.float64)

@@ -95,7 +95,19 @@ def test_damaged_file_is_replaced(quick_compiler: None, monkeypatch: pytest.Monk
     assert damaged.read_bytes() == file.read_bytes()
 
 
-def test_another_source_is_another_file(quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_another_source_or_header_is_another_file(quick_compiler: None, tmp_path: Path) -> None:
+    folder = tmp_path / "sources"
+    folder.mkdir()
+    for name, text in (("a.cpp", "// one"), ("a.cpp", "// two"), ("b.hpp", "// included")):
+        (folder / name).write_text(text)
+        forget()
+        library.build(folder / "a.cpp", "-DA")
+    assert runs(tmp_path) == 3
+
+
+def test_another_processor_or_option_is_another_file(
+    quick_compiler: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     library.load(torch.float32)
     for module, name, value in ((library, "processor", lambda: "another processor"), (compiler, "_FLAGS", ("-O0",))):
         monkeypatch.setattr(module, name, value)

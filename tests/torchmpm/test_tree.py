@@ -42,7 +42,7 @@ def test_map_reaches_every_tensor_of_nested_containers() -> None:
 def test_map_takes_trees_of_one_structure() -> None:
     both = tree.map(torch.add, nested(1), nested(2))
     assert torch.equal(both.state.x, nested(1).state.x + nested(2).state.x)
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="mismatch"):
         tree.map(torch.add, nested(1), nested(2).state)
 
 
