@@ -21,6 +21,23 @@ def normal(*shape: int, seed: int, dtype: torch.dtype = torch.float64) -> Tensor
     return torch.randn(shape, generator=generator(seed), dtype=dtype)
 
 
+def planes(F: Tensor) -> tuple[Tensor, ...]:
+    """The entries of matrices (..., 2, 2), row by row."""
+    return tuple(F.flatten(-2).unbind(-1))
+
+
+def matrix(planes: tuple[Tensor, ...]) -> Tensor:
+    """Inverse of `planes`."""
+    return torch.stack(planes, -1).unflatten(-1, (2, 2))
+
+
+def turn(angle: Tensor | float) -> Tensor:
+    """Rotations (..., 2, 2)."""
+    angle = torch.as_tensor(angle, dtype=torch.float64)
+    c, s = angle.cos(), angle.sin()
+    return matrix((c, -s, s, c))
+
+
 def positions(count: int, batch: int = 1, corner: tuple[float, float] = (0.35, 0.35), seed: int = 0) -> Tensor:
     """(B, N, 2) random positions in a box of 0.3 m, far from the ends of the window."""
     return torch.tensor(corner) + 0.3 * torch.rand(batch, count, 2, generator=generator(seed), dtype=torch.float64)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from scenes import normal
+from scenes import matrix, normal, planes, turn
 from torch import Tensor
 
 from torchmpm.materials import linalg
@@ -15,20 +15,8 @@ ENTRY = st.floats(-3.0, 3.0).filter(lambda number: number == 0.0 or abs(number) 
 MATRIX = st.tuples(ENTRY, ENTRY, ENTRY, ENTRY)
 
 
-def planes(matrix: Tensor) -> linalg.Mat2:
-    return tuple(matrix.flatten(-2).unbind(-1))
-
-
-def matrix(planes: linalg.Mat2) -> Tensor:
-    return torch.stack(planes, -1).unflatten(-1, (2, 2))
-
-
 def polar(F: Tensor) -> Tensor:
     return matrix(linalg.orthogonal(planes(F)))
-
-
-def turn(angle: float) -> Tensor:
-    return torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]], dtype=torch.float64)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

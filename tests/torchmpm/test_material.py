@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from scenes import generator, normal
+from scenes import generator, matrix, normal, planes, turn
 from torch import Tensor
 
 from torchmpm import Elastic, VonMises, lame
@@ -16,14 +16,6 @@ MU, LAM, YIELD = 500.0, 50.0, 62.0
 LIMIT = YIELD / (2 * MU)
 
 
-def planes(F: Tensor) -> tuple[Tensor, ...]:
-    return tuple(F.flatten(-2).unbind(-1))
-
-
-def matrix(planes: tuple[Tensor, ...]) -> Tensor:
-    return torch.stack(planes, -1).unflatten(-1, (2, 2))
-
-
 def symmetric(planes: tuple[Tensor, ...]) -> Tensor:
     xx, xy, yy = planes
     return torch.stack((xx, xy, xy, yy), -1).unflatten(-1, (2, 2))
@@ -31,12 +23,6 @@ def symmetric(planes: tuple[Tensor, ...]) -> Tensor:
 
 def returned(F: Tensor, limit: float | Tensor = LIMIT) -> Tensor:
     return matrix(von_mises_return(planes(F), limit))
-
-
-def turn(angle: Tensor | float) -> Tensor:
-    angle = torch.as_tensor(angle, dtype=torch.float64)
-    c, s = angle.cos(), angle.sin()
-    return torch.stack((c, -s, s, c), -1).unflatten(-1, (2, 2))
 
 
 def stretched(first: Tensor | float, second: Tensor | float, left: Tensor | float, right: Tensor | float) -> Tensor:
