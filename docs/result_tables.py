@@ -238,7 +238,7 @@ def rewards_figure(path: Path) -> None:
 
 
 def rewards_tasks_figure(path: Path) -> None:
-    """Draw the evaluations of the learner ``sac`` during training in all tasks, one line for each seed and stage."""
+    """Draw evaluations of the learner ``sac`` in all tasks, a line for each seed, and a diamond for the best policy."""
     rows = read("rewards-tasks.csv")
     drawing = Figure(figsize=(7.2, 4.4), layout="constrained")
     FigureCanvasSVG(drawing)
@@ -246,10 +246,11 @@ def rewards_tasks_figure(path: Path) -> None:
         axis.axhline(float(shipped(task, "zero")["mean"]), color="0.65", zorder=0)
         axis.axhline(paper.CURVES[task][0][0], color="#b03a2e", linestyle="--", zorder=0)
         for index, seed in enumerate(dict.fromkeys(row["seed"] for row in rows if row["task"] == task)):
-            for stage, line in (("1", ":"), ("2", "-")):
-                own = [row for row in rows if (row["task"], row["seed"], row["stage"]) == (task, seed, stage)]
-                points = [int(row["steps"]) / 1000 for row in own], [float(row["mean"]) for row in own]
-                axis.plot(*points, line, marker="o", ms=3, color=f"C{index}")
+            own = [row for row in rows if (row["task"], row["seed"]) == (task, seed)]
+            steps = [int(row["steps"]) / 1000 for row in own if row["steps"]]
+            means = [float(row["mean"]) for row in own]
+            axis.plot(steps, means[:-1], marker="o", ms=3, color=f"C{index}")
+            axis.plot(1.06 * steps[-1], means[-1], "D", ms=4, color=f"C{index}")
         axis.set_xlim(left=0)
         axis.set_title(headline(task)[0], fontsize=9)
         axis.tick_params(labelsize=8)
