@@ -92,7 +92,7 @@ class Outcome(NamedTuple):
     Attributes:
         terms: Reward terms (B,) by name. The environment multiplies each by its weight in ``TaskSpec.weights`` and adds
             the terms ``split``, ``action``, ``alive`` and ``failure``.
-        terminated: (B,) bool, the task's own reasons to end the episode; ``None`` for none.
+        terminated: (B,) bool, the task's own reasons to end the episode; ``None`` if there are none.
         success: (B,) bool; ``None`` where success is not defined.
         info: Further quantities for ``info``, with a leading B.
         memory: Replaces the memory, leading B, with the same names and shapes; ``None`` keeps it. Tensors of int64 of

@@ -40,8 +40,8 @@ class RewardOps:
 
         Args:
             z: Of any shape.
-            low: Least value; ``None`` for none.
-            high: Largest value; ``None`` for none.
+            low: Least value; ``None``: unbounded.
+            high: Largest value; ``None``: unbounded.
             width: w, in units of ``z``; ``None``: a twentieth of the limit's size, for a limit of 0 of the other's.
 
         Raises:

@@ -78,9 +78,9 @@ class TaskSpec:
         reach: Centre of the patch of nodes on which actions act.
         patch: Its width in nodes.
         obstacles: Static geometry, in order of precedence.
-        goal: Point in the world that the observation marks by a square of 19 fine pixels, m; ``None`` for none.
+        goal: Point in the world that the observation marks by a square of 19 fine pixels, m; ``None``: no goal.
         coarse, fine: Action resolutions.
-        split_limit: Spread at which the episode ends, m; ``None`` for never.
+        split_limit: Spread at which the episode ends, m; ``None``: it never does.
         initial_memory: What to remember from the start of an episode, tensors with a leading B.
         stale_memory: Entries of the memory that a reset leaves as they are with ``parity="reference"``.
         target: (64, 64) bool picture to match, centred on the robot, row 0 at the top; for pictures of the task.

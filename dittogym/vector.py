@@ -57,7 +57,7 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             ``info["final_info"]`` are the last ones), or ``DISABLED``.
         render_mode: ``None`` or ``"rgb_array"``.
         render_muscles: Colour the robots by their muscles in pictures.
-        max_episode_steps: Horizon instead of the task's; -1 for none.
+        max_episode_steps: Horizon instead of the task's; -1: unlimited.
         options: All other arguments of :class:`dittogym.TorchEnv`.
 
     Raises:

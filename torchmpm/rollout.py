@@ -18,7 +18,7 @@ State = TypeVar("State")
 Input = TypeVar("Input")
 Output = TypeVar("Output")
 
-#: Substeps between checkpoints; ``None`` for none, ``"auto"`` to leave it to the backend.
+#: Substeps between checkpoints; ``None``: no checkpoints; ``"auto"`` leaves it to the backend.
 Segment: TypeAlias = int | Literal["auto"] | None
 #: Segment of ``"auto"`` where only checkpoints bound the memory.
 SEGMENT = 10

@@ -38,7 +38,7 @@ from cfp.weights import load
 from dittogym import make_spec
 
 METRICS: dict[str, str] = {
-    "rollout/return": "mean undiscounted return of the episodes that ended in the last round; empty for none",
+    "rollout/return": "mean undiscounted return of the episodes that ended in the last round; empty if none did",
     "train/loss": "mean squared difference from the teacher's actions, mean over the round's updates",
     "train/fresh_loss": "the same on the labels of the round before the student learned from them, None for no labels",
     "train/beta": "the probability with which the teacher acted in the round",

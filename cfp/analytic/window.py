@@ -21,7 +21,7 @@ from dittogym.spec import TaskSpec
 from torchmpm import tree
 
 WINDOW_METRICS = {
-    "rollout/return": "mean undiscounted true return of the episodes that ended since the last row; empty for none",
+    "rollout/return": "mean undiscounted true return of the episodes that ended since the last row; empty if none did",
     "train/reward": "mean training reward of a step, before its scale",
     "train/true_reward": "mean true reward of a step, at the particle count of training",
     "train/value": "mean value that the target critic gives to the window's states",

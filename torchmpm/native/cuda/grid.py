@@ -18,7 +18,7 @@ ADJOINT = tl.constexpr(8)
 
 @triton.jit(do_not_specialize=SIZES)
 def rule_codes(codes, rules, shift, rule_count, width, cells, programs, BLOCK: tl.constexpr):
-    """Which rule holds on each node: one byte per slot, 0 for none, else its index plus one."""
+    """Which rule holds on each node: one byte per slot, 0 where there is no rule, else its index plus one."""
     element = (tl.program_id(0) // programs).to(tl.int64)
     node = tl.program_id(0) % programs * BLOCK + tl.arange(0, BLOCK)
     i, j = (node // width - PAD).to(tl.float64), (node % width - PAD).to(tl.float64)
