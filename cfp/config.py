@@ -15,7 +15,7 @@ from cfp.agent.spec import ActorSpec
 from cfp.errors import ConfigError
 from cfp.from_dict import differences, flatten
 from cfp.sections import EnvironmentConfig, NetworkConfig, Particles, ReportConfig
-from cfp.validation import check_at_least
+from cfp.validation import check_at_least, check_decay
 from dittogym import make_spec
 from dittogym.spec import TaskSpec
 from dittogym.tasks import task_name
@@ -269,6 +269,8 @@ class Config(CoarseToFineConfig):
     """Entropy temperature of each stage."""
     gate_penalty: tuple[float, ...]
     """Weight of the gate penalty (one less than stages)."""
+    critics_first: float = 0.0
+    """Fraction of every stage but the first in which only the critics learn, if that is more than actor_start."""
     learning: LearningConfig = field(default_factory=LearningConfig)
 
     own_learner: ClassVar[Learner] = "sac"
@@ -283,8 +285,11 @@ class Config(CoarseToFineConfig):
 
     def hyperparameters(self, stage: int) -> Hyperparameters:
         """Hyperparameters of a stage."""
+        own = dict(vars(self.learning))
+        if stage > 1:
+            own["actor_start"] = max(own["actor_start"], round(self.critics_first * self.stage_steps(stage)))
         return Hyperparameters(
-            **vars(self.learning),
+            **own,
             alpha=self.alpha[stage - 1],
             gate_penalty=self.gate_penalty[stage - 2] if stage > 1 else 0.0,
             random_steps=self.random_steps[stage - 1],
@@ -294,13 +299,15 @@ class Config(CoarseToFineConfig):
         """Options that require a policy to refine, or noise on cells."""
         anchor = {} if self.refine else {"learning.anchor": "refine"}
         noise = {} if self.learning.noise_cells else {"learning.noise_scale": "noise_cells"}
-        return super().ineffective() | anchor | noise
+        single = {"critics_first": "several resolutions"} if len(self.resolutions) == 1 else {}
+        return super().ineffective() | anchor | noise | single
 
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
         for name in ("random_steps", "alpha", "gate_penalty"):
             check_at_least(0, **{name: min(getattr(self, name), default=0)})
+        check_decay(critics_first=self.critics_first)
         if (cells := self.learning.noise_cells) > (coarsest := self.resolutions[0]):
             raise ConfigError(f"noise_cells must be at most {coarsest}, the coarsest of resolutions, got {cells}")
 

@@ -193,6 +193,7 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
     paper, horizon, many = _paper(task, numbers), dittogym.make_spec(task).horizon, task in MANY_UPDATES
     steps = 48_000 if many else 38_400
     coarse = numbers.resolutions[0]
+    # A second stage keeps what the first has learned if its gate begins nearly closed and its critics learn first.
     config = replace(
         paper,
         preset="quick",
@@ -202,6 +203,8 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
         resolutions=(coarse // 2, coarse) if coarse > 4 else numbers.resolutions,
         random_steps=(480, 100),
         alpha=(0.5 * numbers.alpha[0],) * 2,
+        gate_bias=(-3.0,),
+        critics_first=0.5,
         environment=EnvironmentConfig(),
         network=replace(paper.network, interpolation="half_pixel", encoder="lean"),
         learning=LearningConfig(

@@ -32,7 +32,7 @@ def check_fraction(**values: float) -> None:
 
 
 def check_decay(**values: float) -> None:
-    """Check that each decay of an average, given by the name of its option, is below 1: with 1 it never changes."""
+    """Check that each value, given by the name of its option, is at least 0 and below 1, as decays of averages are."""
     for name, value in values.items():
         if not 0 <= value < 1:
             raise ConfigError(f"{name} must be at least 0 and less than 1, got {value}")

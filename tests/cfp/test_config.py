@@ -123,6 +123,15 @@ def test_fewer_steps_shorten_every_stage(tmp_path):
     assert longer.learning == config.learning
 
 
+def test_critics_of_later_stages_learn_first():
+    config = replace(sac_preset("run"), critics_first=0.25)
+    starts = [config.hyperparameters(stage).actor_start for stage in (1, 2)]
+    assert starts == [config.learning.actor_start, max(config.learning.actor_start, config.stage_steps(2) // 4)]
+    assert sac_preset("run", "paper").hyperparameters(2).actor_start == 0
+    with pytest.raises(ConfigError, match="critics_first must be at least 0 and less than 1, got 1"):
+        replace(config, critics_first=1.0).check()
+
+
 def test_another_number_of_stages_stretches_what_each_has_one_of():
     five = parse(PROGRAM, "--learner sac --resolutions 4 8 16 32 64 --steps 5000".split()).run
     assert five.handover == (1000, 2000, 3000, 4000)
