@@ -136,7 +136,7 @@ def test_another_number_of_stages_stretches_what_each_has_one_of():
     five = parse(PROGRAM, "--learner sac --resolutions 4 8 16 32 64 --steps 5000".split()).run
     assert five.handover == (1000, 2000, 3000, 4000)
     assert five.alpha == (0.005,) * 5
-    assert five.gate_bias == (-2.0,) * 4 and five.gate_penalty == (0.8,) * 4
+    assert five.gate_bias == (-3.0,) * 4 and five.gate_penalty == (0.8,) * 4
     assert five.random_steps == (480, 100, 100, 100, 100)
     three = parse(PROGRAM, "--learner sac --resolutions 4 8 16 --alpha 1 2 3 --handover 100 200".split()).run
     assert (three.alpha, three.handover) == ((1.0, 2.0, 3.0), (100, 200))
