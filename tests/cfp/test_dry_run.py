@@ -19,7 +19,7 @@ def test_dry_run_prints_the_options_and_writes_nothing(tmp_path, capsys, monkeyp
     assert train.main([*TINY, "--dry-run"]) == 0
     assert not list(tmp_path.iterdir())
     config: Config = update_from_dict(sac_preset("shapematch"), json.loads(capsys.readouterr().out))
-    assert (config.steps, config.handover, config.environment.particles) == (400, (200,), 100)
+    assert (config.steps, config.handover, config.environment.particles) == (400, (300,), 100)
 
 
 def test_stages_that_learn_nothing_are_named(tmp_path):
@@ -28,8 +28,8 @@ def test_stages_that_learn_nothing_are_named(tmp_path):
         return CoarseToFine.warnings(config, tmp_path, first_stage)
 
     assert warnings() == [
-        "stage 1: all its 200 steps are random (--random-steps 480)",
-        "stage 2: no update in its 200 steps (--update-start 256)",
+        "stage 1: all its 300 steps are random (--random-steps 480)",
+        "stage 2: no update in its 100 steps (--update-start 256)",
     ]
     assert warnings(first_stage=2) == warnings()[1:]
     learns = "--random-steps 9 0 --update-start 50 --actor-start 0".split()
