@@ -27,11 +27,11 @@ def test_stages_that_learn_nothing_are_named(tmp_path):
         config = parse(train.PROGRAM, [*TINY, "--task", "run", *options]).run
         return CoarseToFine.warnings(config, tmp_path, first_stage)
 
-    assert warnings() == [
-        "stage 1: all its 300 steps are random (--random-steps 480)",
-        "stage 2: no update in its 100 steps (--update-start 256)",
+    assert warnings("--handover", "200") == [
+        "stage 1: all its 200 steps are random (--random-steps 480)",
+        "stage 2: no update in its 200 steps (--update-start 256)",
     ]
-    assert warnings(first_stage=2) == warnings()[1:]
+    assert warnings("--handover", "200", first_stage=2) == warnings("--handover", "200")[1:]
     learns = "--random-steps 9 0 --update-start 50 --actor-start 0".split()
     assert warnings(*learns) == []
     late = "stage 2: no actor update in its 180 steps (--actor-start 200)"
