@@ -193,7 +193,7 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
     paper, horizon, many = _paper(task, numbers), dittogym.make_spec(task).horizon, task in MANY_UPDATES
     steps = 48_000 if many else 38_400
     coarse = numbers.resolutions[0]
-    # A second stage keeps what the first has learned if its gate begins nearly closed and its critics learn first.
+    # A gate that begins nearly closed and critics that learn first disturb the policy of the first stage least.
     config = replace(
         paper,
         preset="quick",
