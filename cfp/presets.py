@@ -214,7 +214,7 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
             tau=0.01,
             buffer_size=20_000 if many else 50_000,
             gradient_steps=16 if many else 4,
-            actor_start=800 if many else 3_000,
+            actor_start=800 if many else 2_250,
             noise_cells=4,
             noise_scale=(0.2, 1.0),
             final_rate=0.1,
