@@ -99,8 +99,8 @@ SAC: dict[str, dict[str, Any]] = {
 }
 """Options of the presets ``quick`` and ``long`` of the learner ``sac`` that differ from task to task."""
 MANY_UPDATES = ("kick", "obstacle", "grow", "slot", "dig")
-"""Tasks in which `quick` makes one update of the networks for each step. With fewer, KICK and DIG learned less in the
-same time; the others were not tried with fewer."""
+"""Tasks in which `quick` makes one update of the networks for each step. With fewer, KICK, OBSTACLE, GROW and DIG
+learned less in the same time; SLOT was not tried with fewer."""
 DEFAULT_TASK = "shapematch"
 """Task of a command line that names none."""
 CUSTOM_TASK = TASKS["run"]
@@ -236,6 +236,7 @@ def _long(task: str, numbers: TaskNumbers) -> Config:
         preset="long",
         steps=steps,
         handover=(steps // 2,),
+        critics_first=0.01,  # about as many steps as in quick
         learning=replace(quick.learning, buffer_size=100_000),
         report=replace(quick.report, eval_every=steps // 40, checkpoint_every=steps // 80, log_every=4_800),
     )

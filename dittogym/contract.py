@@ -13,9 +13,9 @@ from torchmpm import ParticleState
 from torchmpm.materials.linalg import safe_sqrt
 
 #: Terms that the environment adds to those of a task.
-ENGINE_TERMS = frozenset({"split", "action", "alive", "failure"})
+RESERVED_TERMS = frozenset({"split", "action", "alive", "failure"})
 #: What the environment puts into ``info``.
-ENGINE_INFO = frozenset({"com", "split", "finite", "object_com", "reward_terms", "is_success", "true_reward"})
+RESERVED_INFO = frozenset({"com", "split", "finite", "object_com", "reward_terms", "is_success", "true_reward"})
 
 
 class Measurement(NamedTuple):
@@ -130,7 +130,7 @@ def check_outcome(task: str, outcome: object, memory: Memory, weights: Mapping[s
             raise TypeError(f"{who} must return {what} by name, got {_kind(values)}")
     flags = {"terminated": outcome.terminated, "success": outcome.success}
     info = outcome.info or {}
-    for part, taken in (("terms", ENGINE_TERMS & outcome.terms.keys()), ("info", ENGINE_INFO & info.keys())):
+    for part, taken in (("terms", RESERVED_TERMS & outcome.terms.keys()), ("info", RESERVED_INFO & info.keys())):
         if taken:
             raise ValueError(f"{who} must not return the environment's own {part}, got {sorted(taken)}")
     if missing := [name for name in outcome.terms if name not in weights]:
@@ -138,7 +138,7 @@ def check_outcome(task: str, outcome: object, memory: Memory, weights: Mapping[s
     for name, value in outcome.terms.items():
         if not isinstance(value, Tensor) or value.shape != (batch,) or value.is_complex():
             raise ValueError(f"{who} must return terms of shape (B,) in real numbers, got {_kind(value)} for {name!r}")
-    weighted = {*outcome.terms, *ENGINE_TERMS} - {"failure"}  # the penalty of a failure has its own amount
+    weighted = {*outcome.terms, *RESERVED_TERMS} - {"failure"}  # the penalty of a failure has its own amount
     if unknown := sorted(weights.keys() - weighted):
         allowed = sorted(weighted)
         raise ValueError(f"weights of task {task!r} must be of the terms {allowed}, got {unknown}")

@@ -25,7 +25,7 @@ FORBIDDEN = {
     "dittogym.observation": ("dittogym.core", "dittogym.tasks"),
     "baselines.common": ("baselines.compare", "baselines.registry"),
 }
-LARGEST_FOLDER, LONGEST_FUNCTION, LONGEST_FILE = 16, 60, 400
+LARGEST_FOLDER, LONGEST_FUNCTION, LONGEST_FILE = 16, 60, 350
 #: Packages that touch nothing that the whole process shares.
 PURE = ("torchmpm", "dittogym")
 #: Loading these formats can run code from the file; naming their errors is harmless.

@@ -1,1 +1,1 @@
-"""Shared by several algorithms: the training protocol, episodes, rollouts and reference policies."""
+"""Shared by several algorithms: options, policies and rollouts; reference policies, and the single stages of CFP."""

@@ -208,6 +208,6 @@ class TrainingRun:
         page = write_page(self.folder, self.config, preset, results, recording, self.seconds)
         print(f"all of it on one page: {page}")
         print(format_table(self.config, results))
-        best = max(results[2:], key=lambda result: result.mean).name
-        if best != results[-1].name:
+        best = max((result for result in results if result.name in files), key=lambda result: result.mean).name
+        if best != list(files)[-1]:
             print(f"{best} has the highest mean return; its policy is {files[best]}")

@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from policy_files import save_actor
 from tiny_runs import TABLES, TINY, assert_same_run, at_step, run
 
 import cfp
+import cfp.experiment.run
 import dittogym
 import torchmpm
 from cfp import evaluate, train
@@ -61,6 +63,22 @@ def test_another_seed_gives_another_run(tmp_path):
     first, second = (read_table(tmp_path / seed / "progress.csv")[-1] for seed in "01")
     assert first["train/learning_rate"] == second["train/learning_rate"]
     assert first["train/critic_loss"] != second["train/critic_loss"]
+
+
+def test_the_end_of_a_run_names_an_earlier_stage_that_returns_more(finished, tmp_path, monkeypatch, capsys):
+    folder, real = tmp_path / "run", cfp.experiment.run.compare
+    shutil.copytree(finished, folder)
+
+    def end(stage, **returns):
+        def adjusted(*arguments):
+            return [replace(result, returns=returns.get(result.name[-1], (0.0,))) for result in real(*arguments)]
+
+        monkeypatch.setattr("cfp.experiment.run.compare", adjusted)
+        assert train.main(["--out", str(folder), "--resume"]) == 0
+        return f"{stage} has the highest mean return" in capsys.readouterr().out
+
+    assert end("stage 1", **{"1": (2.0,), "2": (1.0,), "n": (9.0,)})  # whatever zero and random action return
+    assert not end("stage", **{"1": (1.0,), "2": (2.0,)})
 
 
 def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, capsys):

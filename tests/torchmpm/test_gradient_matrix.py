@@ -67,6 +67,7 @@ def test_against_central_differences(point: str) -> None:
     leaves = {name: given[name].clone().requires_grad_() for name in INPUTS}
     gradients = torch.autograd.grad(loss(given | leaves), list(leaves.values()), materialize_grads=True)
     for name, found in zip(INPUTS, gradients, strict=True):
+        torch.testing.assert_close(gradient(given, name), found, rtol=1e-12, atol=1e-12 * float(found.abs().max()))
         direction = normal(*given[name].shape, seed=20)
         slope = (found * direction).sum().item()
         step = 1e-6 * max(given[name].abs().max().item(), 1.0)
