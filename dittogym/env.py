@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 import torch
 from gymnasium.envs.registration import EnvSpec
 
-from dittogym.bodies.drawings import body_values
+from dittogym.bodies.json_values import to_values
 from dittogym.model import Snapshot
 from dittogym.render.frame import frame, pace
 from dittogym.render.recording import Recording, as_function, film
@@ -81,17 +80,7 @@ class JsonSpec:
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = spec and replace(spec, kwargs={name: _plain(value) for name, value in spec.kwargs.items()})
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, torch.dtype | torch.device | os.PathLike):
-        return str(value)
-    if not isinstance(value, np.ndarray):
-        return body_values(value)
-    if value.dtype.kind == "u" and value.shape[1:] != (2,):  # a picture; lists of whole numbers are outlines
-        value = (value // 257 if value.dtype == np.uint16 else value) / 255
-    return value.tolist()
+        self._spec = spec and replace(spec, kwargs={name: to_values(value) for name, value in spec.kwargs.items()})
 
 
 class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):

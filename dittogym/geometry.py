@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import inf, isinf
-from typing import Any
 
 from dittogym.observation.image import RASTER
 from torchmpm import VelocityRule, checks
@@ -90,19 +89,6 @@ class Obstacle:
         if self.rules is None:
             return replace(self, friction=friction)
         return replace(self, rules=tuple(replace(rule, friction=friction) for rule in self.rules))
-
-
-def obstacle_from(values: Any) -> Any:
-    """An obstacle from nested dictionaries, as ``dataclasses.asdict`` and JSON leave it; anything else as it is."""
-    if not isinstance(values, Mapping):
-        return values
-    boxes = {name: [Box(**box) for box in values[name]] for name in ("boxes", "observed") if values.get(name)}
-    rules = values.get("rules") and [
-        VelocityRule(**{**rule, "i": tuple(rule["i"]), "j": tuple(rule["j"])}) for rule in values["rules"]
-    ]
-    made: dict[str, Any] = {**values, **boxes, "rules": rules}
-    made = {name: tuple(value) if isinstance(value, list) else value for name, value in made.items()}
-    return Obstacle(**made)
 
 
 def _faces(box: Box, friction: float) -> Iterator[VelocityRule]:

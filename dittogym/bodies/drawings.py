@@ -4,53 +4,22 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
-from typing import Any, TypeAlias
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeAlias
 
 import cv2
 import numpy as np
 
 from dittogym.bodies.images import PictureLike, read_mask
-from dittogym.bodies.shapes import Disc, Figure, Lattice, Rectangle, Shape
+from dittogym.bodies.shapes import Figure, Shape
 from dittogym.spec import BodySpec, TaskSpec
-from torchmpm import Elastic, Snow, VonMises
 
 #: A path or an array (picture), (K, 2) corners (outline), a shape, or a body.
 BodyLike: TypeAlias = "PictureLike | Sequence[tuple[float, float]] | Shape | BodySpec"
 
 #: Pixels along the longer side of an outline.
 OUTLINE_PIXELS = 512
-#: What :func:`body_values` can write down, by name.
-PARTS: dict[str, Any] = {
-    kind.__name__: kind for kind in (BodySpec, Disc, Rectangle, Lattice, Figure, Elastic, Snow, VonMises)
-}
-
-
-def body_values(body: Any) -> Any:
-    """A body or a shape as values for JSON, from which :func:`body_from` makes it again; anything else as it is."""
-    if PARTS.get(type(body).__name__) is type(body):
-        named = {each.name: body_values(getattr(body, each.name)) for each in fields(body)}
-        return {"kind": type(body).__name__, **named}
-    return body.tolist() if isinstance(body, np.ndarray) else body
-
-
-def body_from(values: Any) -> Any:
-    """A body or a shape from what :func:`body_values` and JSON leave of it; anything else as it is.
-
-    Raises:
-        ValueError: It is a mapping of another kind.
-    """
-    if isinstance(values, list):
-        return tuple(values)
-    if not isinstance(values, Mapping):
-        return values
-    if values.get("kind") not in PARTS:
-        raise ValueError(f"body of a specification must have a kind of {', '.join(PARTS)}, got {dict(values)!r}")
-    made = {name: body_from(value) for name, value in values.items() if name != "kind"}
-    if "mask" in made:
-        made["mask"] = np.array(made["mask"], dtype=bool)
-    return PARTS[values["kind"]](**made)
 
 
 def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
@@ -69,7 +38,7 @@ def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
     Raises:
         ValueError: Not readable as one of these, or empty.
     """
-    own, body = spec.robot, body_from(body) if isinstance(body, Mapping) else body
+    own = spec.robot
     if isinstance(body, Shape):
         body = replace(own, shape=body, count=max(1, round(own.count * body.area / own.shape.area)))
     elif not isinstance(body, BodySpec):

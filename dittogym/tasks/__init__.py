@@ -5,14 +5,15 @@ from __future__ import annotations
 import hashlib
 import importlib
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from dittogym.bodies.drawings import BodyLike, with_body
+from dittogym.bodies.json_values import from_values
 from dittogym.bodies.place import check_place
-from dittogym.geometry import Obstacle, obstacle_from
+from dittogym.geometry import Obstacle
 from dittogym.spec import TaskSpec
 from dittogym.tasks.catch import catch
 from dittogym.tasks.dig import dig
@@ -121,9 +122,10 @@ def make_spec(
             raise TypeError(f"task {task!r} got an unexpected keyword argument {unknown[0]!r}; {names}")
         spec = make(**options)
     if obstacles is not None:
-        obstacles = [obstacle_from(each) for each in obstacles] if isinstance(obstacles, list | tuple) else obstacles
+        obstacles = [from_values(each) for each in obstacles] if isinstance(obstacles, list | tuple) else obstacles
         checks.instances("obstacles", obstacles, Obstacle)
         spec = replace(spec, obstacles=tuple(obstacles))
-    spec = spec if body is None else with_body(spec, body)
+    if body is not None:
+        spec = with_body(spec, from_values(body) if isinstance(body, Mapping) else body)
     check_place(spec)
     return spec
