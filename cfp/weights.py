@@ -176,7 +176,9 @@ def load(path: str | Path, device: str = "cpu") -> ActorPolicy:
     """
     tensors, description = read_policy(path, device)
     if description["kind"] != KIND:
-        raise CheckpointError(f"{policy_file(path)}: kind must be {KIND!r}, got {description['kind']!r}")
+        raise CheckpointError(
+            f"{policy_file(path)}: kind must be {KIND!r}, got {description['kind']!r}; see baselines.load"
+        )
     with report_mismatch(path):
         spec = update_from_dict(ActorSpec(resolutions=RESOLUTIONS[:1]), description["network"], "network")
         policy = ActorPolicy(spec, description["deterministic"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import inf, isinf
+from numbers import Integral
 
 from dittogym.observation.image import RASTER
 from torchmpm import VelocityRule, checks
@@ -146,8 +147,8 @@ def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True, fric
             four nodes.
     """
     for axis, given in (("i", i), ("j", j)):
-        kinds, open_ends = ({int}, "") if axis == "i" else ({int, type(None)}, ", None for an open end")
-        if not isinstance(given, tuple) or len(given) != 2 or not {type(end) for end in given} <= kinds:
+        kind, open_ends = (Integral, "") if axis == "i" else (Integral | None, ", None for an open end")
+        if not isinstance(given, tuple | list) or len(given) != 2 or not all(isinstance(end, kind) for end in given):
             raise ValueError(f"{axis} must be a range (low, high) of node indices{open_ends}, got {given!r}")
         first, last = given
         if first is not None and last is not None and first > last:

@@ -58,17 +58,13 @@ class Snapshot:
     """A moment of an environment, see :meth:`dittogym.TorchEnv.save`.
 
     Attributes:
-        task: Name of the task.
-        counts: Particles of each body.
-        particle_weight: By body, the full-size particles that one particle stands for.
+        kind: See :attr:`Model.kind`.
         state: Everything that moves.
         observation: (B, 3, 64, 64) uint8.
         constants: What else the environment that loads it must share, see :attr:`Model.constants`.
     """
 
-    task: str
-    counts: tuple[int, ...]
-    particle_weight: tuple[float, ...]
+    kind: tuple[str, tuple[int, ...], tuple[float, ...]]
     state: EnvState
     observation: Tensor
     constants: Mapping[str, str]
@@ -99,6 +95,11 @@ class Model:
     def num_robot_particles(self) -> int:
         """The robot's particles come first."""
         return self.solver.bodies[0].count
+
+    @property
+    def kind(self) -> tuple[str, tuple[int, ...], tuple[float, ...]]:
+        """The task's name, the particles of each body, and the full-size particles that one of them stands for."""
+        return self.spec.name, self.camera.counts, self.camera.particle_weight
 
     @functools.cached_property
     def constants(self) -> dict[str, str]:
@@ -184,20 +185,20 @@ def check_stability(model: Model, physics: Physics) -> None:
     solver = model.solver_for(physics)
     limit = solver.stable_dt(physics.get("max_actuation", model.spec.max_actuation))
     if solver.dt > limit:
-        matter = "matter of these mu, lam, max_actuation and mass"
+        matter = "the mu, lam, max_actuation and mass that are given"
         raise ValueError(f"dt must be at most {limit} s to be stable with {matter}, got {solver.dt}")
 
 
 def check_snapshot(model: Model, snapshot: Snapshot, like: Tensor) -> None:
     """Refuse a snapshot that does not fit the model and B simulations of dtype and device of ``like`` (B,)."""
     x, size = snapshot.state.particles.x, len(snapshot.state.steps)
-    own = model.spec.name, model.camera.counts, model.camera.particle_weight, like.dtype, like.device
-    kind = snapshot.task, snapshot.counts, snapshot.particle_weight, x.dtype, x.device
-    if kind != own or size not in (1, len(like)):
-        raise ValueError(
-            f"snapshot must hold 1 or {len(like)} simulations of {own}, got {size} of {kind} "
-            "(task, particles, what each stands for, dtype, device)"
-        )
+    if size not in (1, len(like)):
+        raise ValueError(f"snapshot must hold 1 simulation or as many as num_envs, {len(like)}, got {size}")
+    own, theirs = (*model.kind, like.dtype, like.device), (*snapshot.kind, x.dtype, x.device)
+    names = "task", "particles", "particle weights", "dtype", "device"
+    for name, mine, given in zip(names, own, theirs, strict=True):
+        if mine != given:
+            raise ValueError(f"snapshot must have the environment's {name}, {mine}, got {given}")
     if others := [name for name, text in model.constants.items() if snapshot.constants.get(name) != text]:
         raise ValueError(f"snapshot must be of an environment with the same {', '.join(others)}, got another")
 

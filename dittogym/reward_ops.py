@@ -45,19 +45,18 @@ class RewardOps:
             width: w, in units of ``z``; ``None``: a twentieth of the limit's size, for a limit of 0 of the other's.
 
         Raises:
-            ValueError: ``width`` is not positive, or all limits are 0 and it is not given (smooth form only).
+            ValueError: ``width`` is not positive, or is not given and all limits are 0.
         """
-        if not self.smooth:
-            return z.clamp(low, high)
+        limits = [(limit, sign) for limit, sign in ((high, 1.0), (low, -1.0)) if limit is not None]
         if width is not None:
             checks.number("width", width, above=0.0)
-        largest = max((abs(limit) for limit in (low, high) if limit is not None), default=0.0)
-        for limit, sign in ((high, 1.0), (low, -1.0)):
-            if limit is None:
-                continue
+        elif limits and not any(limit for limit, _ in limits):
+            raise ValueError(f"width must be given where all limits are 0, got None with low {low}, high {high}")
+        if not self.smooth:
+            return z.clamp(low, high)
+        largest = max((abs(limit) for limit, _ in limits), default=0.0)
+        for limit, sign in limits:
             w = width or RELATIVE_WIDTH * (abs(limit) or largest)
-            if not w:
-                raise ValueError(f"width must be given where all limits are 0, got None with low {low}, high {high}")
             z = z - sign * w * softplus(sign * (z - limit) / w)
         return z
 

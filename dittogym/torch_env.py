@@ -31,9 +31,8 @@ class TorchEnv:
     """``num_envs`` independent simulations of one task, advanced together.
 
     Rewards and states keep their autograd graph as long as gradients are enabled; :meth:`detach` cuts it. The
-    observation is an integer image and has no gradient. Elements are not reset automatically: one that has ended
-    continues until :meth:`reset` is called with a mask. Element i of a batch reset with seed s is the single
-    environment reset with seed s + i.
+    observation is an integer image and has no gradient. Elements are not reset automatically: one that has ended goes
+    on until :meth:`reset`. Element i of a batch reset with seed s is the single environment reset with seed s + i.
 
     Args:
         task: A task name or a :class:`dittogym.spec.TaskSpec`.
@@ -121,6 +120,9 @@ class TorchEnv:
         self._observation: Tensor | None = None
         self._actuation: Tensor | None = None
 
+    def __repr__(self) -> str:
+        return f"TorchEnv({self.spec.name!r}, {self.num_envs}, {self.action_resolution}, device={str(self.device)!r})"
+
     @property
     def num_particles(self) -> int:
         """N, particles of all bodies."""
@@ -180,9 +182,7 @@ class TorchEnv:
     def save(self) -> Snapshot:
         """A copy of the present moment, to which :meth:`load` returns; keeps the autograd graph."""
         state, observation = tree.map(Tensor.clone, (self.env_state, self._present_observation()))
-        camera = self.model.camera
-        kind = self.spec.name, camera.counts, camera.particle_weight
-        return Snapshot(*kind, state, observation, self.model.constants)
+        return Snapshot(self.model.kind, state, observation, self.model.constants)
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
         """Continue from a saved moment, to the last bit as if nothing had happened since.

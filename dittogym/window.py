@@ -20,8 +20,11 @@ class Window:
     """Where the window lies in the world.
 
     Attributes:
-        left: Its left end for a fixed window, m.
-        follow: For a moving window the distance of the robot's centre from its left end, m; then ``left`` is unused.
+        left: The left end of a fixed window, m.
+        follow: Of a moving window, the distance of the robot's centre from its left end, m.
+
+    Raises:
+        ValueError: Both are given.
     """
 
     left: float = 0.0
@@ -31,6 +34,8 @@ class Window:
         checks.number("left", self.left)
         if self.follow is not None:
             checks.number("follow", self.follow)
+            if self.left:
+                raise ValueError(f"left must not be given with follow, got {self.left} and {self.follow}")
 
     @property
     def moves(self) -> bool:

@@ -23,6 +23,7 @@ from cfp.analytic.regression import ImageMemory, Regression
 from cfp.analytic.stateful import Stateful
 from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
 from cfp.envs.make import choose_device, make_torch_env
+from cfp.errors import NonFiniteError
 from cfp.evaluation.pictures import policy_pictures
 from cfp.experiment.algorithm import Scalars
 from cfp.experiment.schedules import linear_decay
@@ -39,6 +40,8 @@ METRICS: dict[str, str] = {
     "train/limited": "gradients of single actions that were shortened as outliers",
 }
 """Every scalar that `AnalyticLearner.update` logs, and what it means."""
+#: Training stops after so many windows in a row without any gradient.
+MOST_EMPTY_WINDOWS = 10
 
 
 class AnalyticLearner(Stateful, CoarseToFineStages):
@@ -68,6 +71,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         episodes = Episodes(self.env, config.seed, config.max_episode_steps, config.num_layouts)
         self.collector = WindowCollector(episodes, lambda: features(self.env).float(), config)
         self.action_step = ActionStep()
+        self.empty_windows = 0
         self.generator = torch.Generator().manual_seed(config.seed)  # on the CPU, so that a run can change its device
         image = self._image()
         with torch.no_grad():
@@ -109,7 +113,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         """Play one window and learn from it.
 
         Raises:
-            NonFiniteError: Actions are not finite.
+            NonFiniteError: Actions are not finite, or no gradient of the last windows was.
         """
         config, progress = self.config, self.progress
         learning_rate = config.learning_rate * linear_decay(progress)
@@ -158,9 +162,15 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         actions = torch.stack(leaves).detach()
         if not step_size:
             return torch.cat(images), actions, window
-        gradients = torch.autograd.grad(short_horizon_loss(window, self.config.gamma), leaves)
+        gradients = torch.stack(torch.autograd.grad(short_horizon_loss(window, self.config.gamma), leaves))
         self.env.detach()
-        improved = self.action_step(actions, torch.stack(gradients), step_size)
+        self.empty_windows = 0 if gradients.any() else self.empty_windows + 1
+        if self.empty_windows >= MOST_EMPTY_WINDOWS:
+            raise NonFiniteError(
+                f"all gradients of {self.empty_windows} windows in a row are NaN, infinite or 0; a term of the reward "
+                f"of {self.config.task} may have no finite derivative, such as the square root at 0"
+            )
+        improved = self.action_step(actions, gradients, step_size)
         return torch.cat(images), improved, window
 
     def row(self) -> Scalars:

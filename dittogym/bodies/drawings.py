@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeAlias
@@ -20,6 +21,8 @@ BodyLike: TypeAlias = "PictureLike | Sequence[tuple[float, float]] | Shape | Bod
 
 #: Pixels along the longer side of an outline.
 OUTLINE_PIXELS = 512
+#: Parts of a drawing that count as parts, as a fraction of its area.
+SMALLEST_PART = 0.02
 
 
 def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
@@ -49,6 +52,9 @@ def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
 def _figure(body: PictureLike | Sequence[tuple[float, float]], own: Shape) -> Figure:
     """A picture or an outline with the area and in the place of another shape."""
     mask = _mask(body)
+    areas = cv2.connectedComponentsWithStats(mask.astype(np.uint8))[2][1:, cv2.CC_STAT_AREA]
+    if (parts := int((areas >= SMALLEST_PART * mask.sum()).sum())) > 1:
+        warnings.warn(f"the robot falls apart from the start: its drawing has {parts} separate parts", stacklevel=4)
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     mask = mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     pixel = math.sqrt(own.area / mask.sum())

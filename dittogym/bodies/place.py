@@ -15,10 +15,11 @@ PROBE = 4096
 
 
 def check_place(spec: TaskSpec) -> None:
-    """Refuse bodies that leave the window or overlap an obstacle, and a robot in the object or torn from the start.
+    """Refuse what cannot start where it is.
 
     Raises:
-        ValueError: There is such a body.
+        ValueError: A body leaves the window or overlaps an obstacle, the robot lies in the object or is torn from the
+            start, or the goal lies outside a fixed window.
     """
     numbers = sampling.sobol(PROBE, seed=0)
     points = spec.robot.shape.positions(numbers)
@@ -29,11 +30,13 @@ def check_place(spec: TaskSpec) -> None:
         low = np.array(other.shape.corner)
         high = low + other.shape.size
         if _any_inside(points, low, high):
-            free = f"{low.round(4).tolist()} to {high.round(4).tolist()}"
+            free = f"{low[0]:.3f} < x < {high[0]:.3f}, {low[1]:.3f} < y < {high[1]:.3f}"
             raise ValueError(f"robot must leave the place of the object free, {free}, got {place}")
     split, limit = float(np.sqrt(points.var(0).sum())), spec.split_limit
     if limit is not None and split >= limit:
         raise ValueError(f"robot must be more compact: its spread is {split:.3f} m, and {spec.name} ends at {limit} m")
+    if spec.goal is not None and not spec.window.moves and not bool(contains(origin.new_tensor([[spec.goal]]), origin)):
+        raise ValueError(f"goal must lie inside the window ({_window(origin)}), got {spec.goal}")
 
 
 def _checked_place(spec: TaskSpec, name: str, body: BodySpec, points: np.ndarray, origin: torch.Tensor) -> str:
@@ -42,14 +45,17 @@ def _checked_place(spec: TaskSpec, name: str, body: BodySpec, points: np.ndarray
     place = f"{left:.3f} < x < {left + width:.3f}, {bottom:.3f} < y < {bottom + height:.3f}"
     corners = origin.new_tensor([[(left, bottom), (left + width, bottom + height)]])
     if not bool(contains(corners, origin).all()):
-        window = f"{origin[0, 0]:.3f} < x < {origin[0, 0] + 1:.3f}, 0 < y < 1"
-        raise ValueError(f"{name} must lie inside the window ({window}), got {place}")
+        raise ValueError(f"{name} must lie inside the window ({_window(origin)}), got {place}")
     for obstacle in spec.obstacles:
         for box in obstacle.boxes:
             if _any_inside(points, (box.left, box.bottom), (box.right, box.top)):
                 solid = f"{box.left:.4g} < x < {box.right:.4g}, {box.bottom:.4g} < y < {box.top:.4g}"
                 raise ValueError(f"{name} must start outside the obstacle {obstacle.name!r} ({solid}), got {place}")
     return place
+
+
+def _window(origin: torch.Tensor) -> str:
+    return f"{origin[0, 0]:.3f} < x < {origin[0, 0] + 1:.3f}, 0 < y < 1"
 
 
 def _any_inside(points: np.ndarray, low: npt.ArrayLike, high: npt.ArrayLike) -> bool:

@@ -55,7 +55,8 @@ class Canvas:
             dark = self.image[-font, min(column, self.pixels - 1)].mean() < 150
             colour = (235, 235, 235) if dark else SOLID
             cv2.line(self.image, (column, self.pixels - font // 2), (column, self.pixels), colour, 2)
-            self.text(f"{x + 0.0:.1f} m", (column, self.pixels - 5 * font // 3), font, colour, 0.5)
+            middle = min(max(column, 2 * font), self.pixels - 2 * font)  # so that all of it is in the picture
+            self.text(f"{x + 0.0:.1f} m", (middle, self.pixels - 5 * font // 3), font, colour, 0.5)
 
     def box(self, box: Solid) -> None:
         """A box, or only its outline."""

@@ -34,7 +34,7 @@ SPEEDS = tuple(mantissa / 10**exponent for exponent in range(6) for mantissa in 
 SHORTEST = 4.0
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Recording:
     """One episode of one simulation, as :meth:`dittogym.TorchEnv.film` returns it. A notebook shows its replay.
 
@@ -51,6 +51,10 @@ class Recording:
     rewards: list[float] = field(default_factory=list)
     observation: np.ndarray | None = None
     success: bool | None = None
+
+    def __repr__(self) -> str:
+        """Task, steps and return; the data would fill pages."""
+        return f"Recording({self.scene.task!r}, steps={len(self.rewards)}, total_reward={sum(self.rewards):.1f})"
 
     @property
     def duration(self) -> float:
@@ -236,7 +240,11 @@ def record(env: Any, act: Act, seed: Any = 0, index: int = 0) -> Recording:
         recording, ended = Recording(describe(env.model), [env.shot(index, SHOWN)]), False
         info: dict[str, Any] = {}
         while not ended:
-            action = torch.as_tensor(act(observation.cpu().numpy()), device=env.device)
+            chosen = act(observation.cpu().numpy())
+            try:
+                action = torch.as_tensor(chosen, device=env.device)
+            except (RuntimeError, TypeError, ValueError) as error:
+                raise ValueError(f"policy must return actions, got {type(chosen).__name__}") from error
             observation, reward, terminated, truncated, info = env.step(action)
             recording.shots.append(env.shot(index, SHOWN))
             recording.rewards.append(float(reward[index]))

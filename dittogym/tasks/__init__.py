@@ -70,7 +70,7 @@ def _allowed_instead(task: object) -> str | None:
     """What is allowed in place of something that is not a task; ``None`` where it is one."""
     allowed = f"{', '.join(sorted(TASKS))} or MODULE:NAME"
     if not isinstance(task, str):
-        return allowed
+        return f"{allowed}; dittogym.register gives a function a name" if callable(task) else allowed
     module, colon, name = task.rpartition(":")
     if colon:
         try:
@@ -109,7 +109,7 @@ def make_spec(
             name = next(iter(options))
             raise TypeError(
                 f"task {task.name!r} got an unexpected keyword argument {name!r}; a TaskSpec takes body and "
-                "obstacles alone"
+                "obstacles alone, other options are for the function that makes it"
             )
         spec = task
     else:

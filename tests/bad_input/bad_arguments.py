@@ -13,6 +13,7 @@ from dittogym import Outcome, TorchEnv, make_spec
 from dittogym.bodies.shapes import Disc, Figure
 from dittogym.geometry import solid
 from dittogym.spec import BodySpec as RobotBody
+from dittogym.window import Window
 from torchmpm import (
     Body,
     Elastic,
@@ -259,6 +260,18 @@ ENVIRONMENT = table(
         ("sparse action", lambda: step(single(), torch.zeros(2, 8, 8).to_sparse()), ("action must be num", "Sparse")),
         ("actions for three", lambda: step(batch(), np.zeros((3, 2, 8, 8))), ("(2, 2, 8, 8)", "(3, 2, 8, 8)")),
         ("autoreset sometimes", lambda: batch(autoreset_mode="x"), ("autoreset_mode must be one of", "got 'x'")),
+        (
+            "task, window of both kinds",
+            lambda: Window(left=0.1, follow=0.4),
+            "left must not be given with follow",
+        ),
+        (
+            "goal outside of the window",
+            lambda: env(task=replace(make_spec("grow"), goal=(9.0, 0.0))),
+            ("goal must lie inside the window (-0.500 < x < 0.500", "got (9.0, 0.0)"),
+        ),
+        ("task of a function", lambda: env(task=make_spec), ("task must be one of", "dittogym.register gives a")),
+        ("policy of nothing", lambda: env().film(lambda seen: None), "policy must return actions, got NoneType"),
         ("task, patch too wide", lambda: spec(patch=200), "patch must be at most 128, got 200"),
         ("task, two objects", lambda: spec(objects=(spec().robot,) * 2), "objects must be at most one body, got 2"),
         (

@@ -17,7 +17,7 @@ from cfp.analytic.learner import METRICS, AnalyticLearner
 from cfp.analytic.regression import ImageMemory, Regression
 from cfp.analytic.reward import RewardConfig
 from cfp.analytic.window import WindowCollector, reward_warnings
-from cfp.errors import ConfigError
+from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.folder import policy_path
 from cfp.sections import EnvironmentConfig
 from cfp.weights import describe_run
@@ -49,6 +49,22 @@ def test_a_reward_without_gradient_is_noticed(monkeypatch):
     config = make(reward=RewardConfig("task"))
     assert reward_warnings(config) == []
     assert "the reward of count has no gradient in the actions" in reward_warnings(replace(config, task="count"))[0]
+
+
+def without_derivative(moment, spec):
+    x = moment.now.com[:, 0]
+    return Outcome({"far": (x - x.detach()).square().sqrt()})  # 0, and its derivative is NaN
+
+
+def test_gradients_that_are_never_finite_end_the_training(monkeypatch):
+    spec = replace(dittogym.make_spec("run"), name="nan", reward_fn=without_derivative, weights={"far": 1.0})
+    monkeypatch.setitem(dittogym.TASKS, "nan", lambda: spec)
+    config = replace(make(reward=RewardConfig("task")), task="nan")
+    learner = AnalyticLearner(config, 1, build_actor(config.actor_spec(1)))
+    for _ in range(9):
+        learner.update()
+    with pytest.raises(NonFiniteError, match="all gradients of 10 windows in a row are NaN, infinite or 0; a term of"):
+        learner.update()
 
 
 def test_can_train_with_longer_substeps_than_it_is_evaluated_with():

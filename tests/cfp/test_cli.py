@@ -1,6 +1,8 @@
 """Exit codes and error lines of all programs."""
 
 import signal
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -42,6 +44,14 @@ def test_stopped_program_tells_how_to_continue(capsys):
 
     assert run_command(command) == 128 + signal.SIGTERM
     assert capsys.readouterr().out == "stopped by SIGTERM; resume with: the same command\n"
+
+
+def test_output_that_nobody_reads_any_more_is_no_error():
+    command = [sys.executable, "-m", "cfp.train", "--dry-run"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as program:
+        program.stdout.close()
+        assert program.stderr.read() == b""
+    assert program.returncode == 128 + signal.SIGPIPE
 
 
 def test_second_interrupt_stops_at_once(capsys):

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 
 import dittogym
@@ -29,6 +30,10 @@ def test_bad_geometry() -> None:
 def test_another_friction(obstacle: Obstacle) -> None:
     rules = obstacle.with_friction(0.3).velocity_rules
     assert rules == tuple(dataclasses.replace(rule, friction=0.3) for rule in obstacle.velocity_rules)
+
+
+def test_ranges_may_be_lists_and_numbers_of_numpy() -> None:
+    assert solid("box", [60, np.int64(66)], [None, 24]) == solid("box", (60, 66), (None, 24))
 
 
 def test_specifications_take_no_options() -> None:

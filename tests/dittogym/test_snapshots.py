@@ -181,10 +181,10 @@ def test_physics_travels_with_a_moment() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"task": "grow"}, "got 2 of \\('grow', "),
-        ({"particles": 119}, "snapshot must hold 1 or 2 simulations"),
-        ({"dtype": "float32"}, "torch.float32"),
-        ({"num_envs": 3}, "snapshot must hold 1 or 2 simulations .* got 3 of"),
+        ({"task": "grow"}, "snapshot must have the environment's task, run, got grow"),
+        ({"particles": 119}, r"the environment's particles, \(120,\), got \(119,\)"),
+        ({"dtype": "float32"}, "the environment's dtype, torch.float64, got torch.float32"),
+        ({"num_envs": 3}, "snapshot must hold 1 simulation or as many as num_envs, 2, got 3"),
         ({"substeps": 3}, "snapshot must be of an environment with the same substeps, got another"),
         ({"dt": 5e-5}, "an environment with the same dt, got another"),
         ({"obstacles": ()}, "an environment with the same obstacles, got another"),
