@@ -55,10 +55,10 @@ def entries(
 
     They must be at least ``least``, above ``above`` and below ``below``, where these are given.
 
-    Under the transforms of ``torch.func``, where nothing can depend on them, they are not looked at.
+    Under ``torch.func`` and ``torch.compile``, where nothing can depend on them, they are not looked at.
     """
     if isinstance(given, Tensor):
-        if not transforming() and not given.is_meta:
+        if not (transforming() or torch.compiler.is_compiling() or given.is_meta):
             for extreme in torch.aminmax(given.detach()):  # NaN if one is among them
                 entries(name, extreme.item(), least=least, above=above, below=below)
         return

@@ -97,7 +97,7 @@ def _state(start: Start) -> ParticleState:
     if isinstance(start, ParticleState):
         return start
     if not isinstance(start, tuple) or len(start) != 3 or start[2] not in (torch.float32, torch.float64):
-        raise TypeError(f"state must be a ParticleState, or (B, N, torch.float32 or torch.float64), got {start!r}")
+        raise TypeError(f"state must be a ParticleState, or (B, N, torch.float32 or torch.float64), got {start!r:.60}")
     batch, count = checks.whole("B of the state", start[0], 1), checks.whole("N of the state", start[1], 1)
     return ParticleState.from_stack(torch.empty(PLANES, batch, count, dtype=start[2]))
 

@@ -17,6 +17,7 @@ from torchmpm.backends import transforming
 State = TypeVar("State")
 Input = TypeVar("Input")
 Output = TypeVar("Output")
+Shared = TypeVar("Shared")
 
 #: Substeps between checkpoints; ``None``: no checkpoints; ``"auto"`` leaves it to the backend.
 Segment: TypeAlias = int | Literal["auto"] | None
@@ -61,6 +62,55 @@ def _base(tensor: Tensor) -> Tensor:
     return tensor if tensor._base is None else tensor._base
 
 
+def _check_versions(before: Reads) -> None:
+    """Raise an error if a tensor was changed in place since its version was noted."""
+    for name, reference, version in before:
+        tensor = reference()
+        if tensor is not None and tensor._version != version:
+            raise RuntimeError(
+                f"{name} was changed in place after a step had read it, and the backward pass replays that step: "
+                "give each step tensors of its own, such as a clone, or keep the whole graph (checkpointed=False, "
+                "segment=None)"
+            )
+
+
+class _Replay(torch.autograd.Function):
+    """A function of tensors that runs without a graph now, and with one in the backward pass.
+
+    Without reentry, ``torch.utils.checkpoint`` builds the graph in the forward pass too, and keeps its nodes: it takes
+    twice as long, and its memory grows with every operation. But it finds the tensors that a function reads by
+    itself, while this function has to get all of them as arguments.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, function: Callable[..., tuple[Tensor, ...]], before: Reads, *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Call ``function(*tensors)``, and note what it reads."""
+        ctx.function, ctx.before = function, before
+        ctx.save_for_backward(*tensors)
+        ctx.set_materialize_grads(False)
+        return function(*tensors)
+
+    @staticmethod
+    def backward(ctx: Any, *bars: Tensor | None) -> tuple[Tensor | None, ...]:
+        """Derivatives in the tensors from those in the results."""
+        _check_versions(ctx.before)
+        again = torch.is_grad_enabled()  # with create_graph=True
+        # Tensors of its own: derivatives must end at them, although one argument may depend on another.
+        tensors = [t.view_as(t) if again else t.detach().requires_grad_(t.requires_grad) for t in ctx.saved_tensors]
+        with torch.enable_grad():
+            results = ctx.function(*tensors)
+        pairs = [(r, bar) for r, bar in zip(results, bars, strict=True) if bar is not None and r.requires_grad]
+        wanted = [tensor for tensor in tensors if tensor.requires_grad]
+        found: Iterable[Tensor | None] = [None] * len(wanted)
+        if pairs:
+            ends, their_bars = zip(*pairs, strict=True)
+            found = torch.autograd.grad(ends, wanted, their_bars, create_graph=again, allow_unused=True)
+        derivatives = iter(found)
+        return None, None, *(next(derivatives) if tensor.requires_grad else None for tensor in tensors)
+
+
 def _checkpointed(function: Callable[[State], State], state: State, reads: Mapping[str, Any]) -> State:
     """Run a function so that autograd keeps only its input and replays it in the backward pass.
 
@@ -80,14 +130,7 @@ def _checkpointed(function: Callable[[State], State], state: State, reads: Mappi
                 return function(state)
             finally:
                 _running.reset(token)
-        for name, reference, version in before:
-            tensor = reference()
-            if tensor is not None and tensor._version != version:
-                raise RuntimeError(
-                    f"{name} was changed in place after a step had read it, and the backward pass replays that step: "
-                    "give each step tensors of its own, such as a clone, or keep the whole graph (checkpointed=False, "
-                    "segment=None)"
-                )
+        _check_versions(before)
         return function(state)
 
     return cast(State, checkpoint(replayable, state, use_reentrant=False, preserve_rng_state=False))
@@ -128,6 +171,47 @@ def repeated(
         length = min(segment, times - start)
         state = _checkpointed(partial(repeated, step, times=length), state, reads or {})
     return state
+
+
+def replayed(
+    step: Callable[[Shared, tuple[Tensor, ...]], tuple[Tensor, ...]],
+    shared: Shared,
+    state: tuple[Tensor, ...],
+    times: int,
+    segment: Segment,
+    reads: Mapping[str, Any],
+) -> tuple[Tensor, ...]:
+    """The same as :func:`repeated`, in half the time, for a step whose tensors are all in a tree ``shared``.
+
+    Without gradients, and where ``torch.func`` or ``torch.compile`` is at work, it keeps no checkpoints.
+    """
+    segment = SEGMENT if segment == "auto" else segment
+    keeps = torch.is_grad_enabled() and not transforming() and not torch.compiler.is_compiling()
+    if segment is None or segment >= times or not keeps:
+        for _ in range(times):
+            state = step(shared, state)
+        return state
+    for start in range(0, times, segment):
+        state = _replayed(step, shared, state, min(segment, times - start), reads)
+    return state
+
+
+def _replayed(
+    step: Callable[[Shared, tuple[Tensor, ...]], tuple[Tensor, ...]],
+    shared: Shared,
+    state: tuple[Tensor, ...],
+    times: int,
+    reads: Mapping[str, Any],
+) -> tuple[Tensor, ...]:
+    tensors, rebuild = tree.flatten((shared, state))
+
+    def run(*tensors: Tensor) -> tuple[Tensor, ...]:
+        shared, state = rebuild(tensors)
+        for _ in range(times):
+            state = step(shared, state)
+        return state
+
+    return cast(tuple[Tensor, ...], _Replay.apply(run, _versions({"state": state, **reads}), *tensors))
 
 
 def trajectory(

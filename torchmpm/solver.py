@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 from torch.nn.functional import pad
 
-from torchmpm import checks, stability
+from torchmpm import checks, stability, tree
 from torchmpm.backends import BACKENDS, compiled, missing, transforming, warn_eager
 from torchmpm.boundary import VelocityRule, faces
 from torchmpm.grid import PAD, Grid
@@ -19,7 +19,7 @@ from torchmpm.materials.base import Value
 from torchmpm.materials.body import Body, per_particle
 from torchmpm.native.cpu.library import load
 from torchmpm.native.kernels import Kernels
-from torchmpm.rollout import Segment, check_repetition, note_reads, repeated
+from torchmpm.rollout import Segment, check_repetition, note_reads, repeated, replayed
 from torchmpm.state import ParticleState
 from torchmpm.substep import Planes, Scene, substep
 
@@ -107,12 +107,11 @@ class Solver:
         lack = missing(self.backend)
         if lack is not None and not torch.cuda.is_available():
             raise ValueError(f"backend {self.backend!r} {lack}")
-        if not self.allow_unstable:
-            self._check_stability()
         for name, tensor in self.constants.items():
             if tensor.is_floating_point() and tensor.numel():  # a material may have tensors of all kinds
                 checks.entries(name, tensor, above=0.0 if name.endswith(("].mass", "].volume")) else None)
         if not self.allow_unstable:
+            self._check_stability()
             largest = self.grid.h / self.dt**2  # with it, a particle at rest crosses a cell within a substep
             for part in (self.gravity,) if isinstance(self.gravity, Tensor) else self.gravity:
                 checks.entries("gravity", part, above=-largest, below=largest)
@@ -228,8 +227,12 @@ class Solver:
         if self.runs_native(state, actuation, origin):
             return self.kernels.step(state, actuation, origin, self.gravity, substeps, segment)
         function: Any = compiled(type(self).substep) if self.backend == "compile" else type(self).substep
-        run = partial(function, self, self.scene(state, actuation, origin))
-        return ParticleState.from_planes(repeated(run, state.planes(), substeps, segment=segment, reads=reads))
+        scene, run, planes = self.scene(state, actuation, origin), partial(function, self), state.planes()
+        if self._can_replay(state, actuation, origin):
+            planes = replayed(run, scene, planes, substeps, segment, reads)
+        else:
+            planes = repeated(partial(run, scene), planes, substeps, segment=segment, reads=reads)
+        return ParticleState.from_planes(planes)
 
     def substep(self, scene: Scene, planes: Planes) -> Planes:
         """One substep of a scene, from 13 planes (B, N) to new ones; a subclass may compute it in another way."""
@@ -246,8 +249,7 @@ class Solver:
         """
         if self.backend == "eager":
             return False
-        tensors = (state.x, state.v, state.C, state.F, state.Jp, *fields, *self.constants.values())
-        tangents = not transforming() and any(unpack_dual(t).tangent is not None for t in tensors if t is not None)
+        tangents = self._has_tangents(state, *fields)
         if self.backend == "compile":
             if tangents:
                 raise ValueError("backend 'compile' loses the tangents of forward_ad; use 'eager', or torch.func.jvp")
@@ -267,6 +269,17 @@ class Solver:
         if reason is not None:
             warn_eager("the physics", reason)
         return reason is None
+
+    def _can_replay(self, state: ParticleState, *fields: Tensor | None) -> bool:
+        """Whether all tensors that a substep reads are known; custom materials and substeps may read others."""
+        if self.backend == "compile" or type(self).substep is not Solver.substep or torch.compiler.is_compiling():
+            return False
+        return tree.is_open(self.bodies) and not self._has_tangents(state, *fields)
+
+    def _has_tangents(self, state: ParticleState, *fields: Tensor | None) -> bool:
+        """Whether a tensor that a step reads carries a tangent of ``torch.autograd.forward_ad``."""
+        tensors = (state.x, state.v, state.C, state.F, state.Jp, *fields, *self.constants.values())
+        return not transforming() and any(unpack_dual(t).tangent is not None for t in tensors if t is not None)
 
     def _not_native(self, device: torch.device, tangents: bool) -> str | None:
         """Why the kernels cannot run a step on a device, or ``None`` if they can."""

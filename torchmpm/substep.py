@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchmpm import transfer
+from torchmpm import transfer, tree
 from torchmpm.boundary import Face, constrain
 from torchmpm.grid import Grid
 from torchmpm.materials.base import broadcast_plane
@@ -26,6 +26,7 @@ MASS_EPSILON = 1e-10
 Planes = tuple[Tensor, ...]
 
 
+@tree.register
 @dataclass(frozen=True, eq=False)
 class Scene:
     """What stays the same during one step, in the form that a substep needs."""

@@ -5,7 +5,7 @@ that ``torch.func``, ``torch.utils.checkpoint`` and ``torch.compile`` consult. I
 release of torch offers it under a public name, and a second registry would not be seen by those functions.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
 from typing import Any, TypeVar
 
@@ -61,6 +61,25 @@ def map(function: Callable[..., Any], tree: Tree, *others: Tree) -> Tree:
 def leaves(tree: Any) -> list[Tensor]:
     """All tensors (B, ...) of a tree, in order."""
     return [leaf for leaf in pytree.tree_leaves(tree) if isinstance(leaf, Tensor)]
+
+
+def is_open(tree: Any) -> bool:
+    """Whether all leaves of a tree are tensors, numbers, texts or None, so that none hides tensors of its own."""
+    return all(isinstance(leaf, Tensor | int | float | str | None) for leaf in pytree.tree_leaves(tree))
+
+
+def flatten(tree: Tree) -> tuple[list[Tensor], Callable[[Iterable[Tensor]], Tree]]:
+    """All tensors of a tree, in order, and a function that makes the tree from as many others."""
+    entries, structure = pytree.tree_flatten(tree)
+    tensors = [entry for entry in entries if isinstance(entry, Tensor)]
+    others = [None if isinstance(entry, Tensor) else (entry,) for entry in entries]  # does not keep the tensors alive
+
+    def rebuild(replacements: Iterable[Tensor]) -> Tree:
+        new = iter(replacements)
+        made: Tree = pytree.tree_unflatten([next(new) if other is None else other[0] for other in others], structure)
+        return made
+
+    return tensors, rebuild
 
 
 def detach(tree: Tree) -> Tree:

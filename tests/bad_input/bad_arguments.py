@@ -128,6 +128,11 @@ SOLVER = table(
         ("Grid all margin", lambda: Grid(16, margin=0.5), "margin must be below half the window's width, 0.5, got 0.5"),
         ("Grid, margin not a number", lambda: Grid(16, margin=math.nan), "margin must not be negative, got nan"),
         ("rule on one index", lambda: VelocityRule("-y", 3), "i must be an inclusive range (low, high)"),
+        (
+            "mass of other particles",
+            lambda: diagnostics.mass(solver(), ParticleState.at_rest(torch.zeros(1, 3, 2))),
+            "state has 3 particles, the solver's bodies 5",
+        ),
         ("body, half a particle", lambda: body(count=2.5), "count must be a whole number, got 2.5"),
         ("body, masses in a list", lambda: body(mass=[1.0]), "mass must be a number or a tensor, got [1.0]"),
         ("Elastic, stiff", lambda: Elastic("stiff", 1.0), "mu must be a number or a tensor, got 'stiff'"),
@@ -184,6 +189,11 @@ SOLVER = table(
     ]
 ) + table(
     [
+        (
+            "body of a class",
+            lambda: body(material=Elastic),
+            "material must be a Material, got the class Elastic",
+        ),
         (
             "body of jelly",
             lambda: body(material="jelly"),

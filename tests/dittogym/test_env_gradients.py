@@ -154,7 +154,8 @@ def assert_near(found: dict[str, Leaves], expected: dict[str, Leaves], tolerance
 
 @pytest.mark.parametrize("task", TASKS)
 def test_checkpoints_make_no_difference(task: str) -> None:
-    assert_near(gradients(task, False, "eager", segment=4), plain(task), 1e-12)
+    # Derivatives in constants are summed by segment, which rounds differently.
+    assert_near(gradients(task, False, "eager", segment=4), plain(task), 1e-11)
 
 
 @pytest.mark.skipif(not compiler_found(), reason="no C++ compiler")

@@ -77,7 +77,8 @@ def broadcast_plane(value: Value, like: Tensor, name: str = "value") -> Value:
         return value[:, None]
     if value.ndim == 0 or (value.ndim == 2 and value.shape[0] in (1, batch) and value.shape[1] in (1, count)):
         return value
-    raise ValueError(f"{name} must be a number or have shape (), ({batch},) or ({batch}, {count}), got {value.shape}")
+    shapes = f"(), ({batch},), ({batch}, 1), ({batch}, {count}) or (1, {count})"
+    raise ValueError(f"{name} must be a number or have shape {shapes}, got {tuple(value.shape)}")
 
 
 def detached_column(value: Value) -> Value:

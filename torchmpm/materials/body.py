@@ -2,17 +2,19 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torchmpm import checks
+from torchmpm import checks, tree
 from torchmpm.materials.base import Material, Value, broadcast_plane
 
 METHODS = ("return_map", "stress", "energy", "stiffness")
 """Methods of a :class:`torchmpm.Material`."""
 
 
+@tree.register
 @dataclass(frozen=True, eq=False)
 class Body:
     """A run of consecutive particles of one material.
@@ -37,6 +39,8 @@ class Body:
 
     def __post_init__(self) -> None:
         checks.whole("count", self.count, 1)
+        if isinstance(self.material, type):
+            raise TypeError(f"material must be a Material, got the class {self.material.__name__}")
         if lacking := [name for name in METHODS if not callable(getattr(self.material, name, None))]:
             found = f"{self.material!r:.60}, which has no method {', '.join(lacking)}"
             raise TypeError(f"material must be a Material, got {found}")
@@ -47,13 +51,23 @@ class Body:
     def constants(self) -> dict[str, Value]:
         """Constants of the body and its material by name, such as ``material.mu``; numbers, (), (B,) or (B, count)."""
         own = {name: getattr(self, name) for name in ("mass", "volume")}
-        law = self.material
-        if isinstance(law, nn.Module):
-            values = dict(law.named_parameters())
+        return own | dict(_constants("material", self.material))
+
+
+def _constants(name: str, holder: Any) -> Iterator[tuple[str, Value]]:
+    """Numbers and tensors of a material, and of the modules and dataclasses that it holds."""
+    if isinstance(holder, nn.Module):
+        for part, module in holder.named_modules(prefix=name):
+            tensors = (*module.named_parameters(part, recurse=False), *module.named_buffers(part, recurse=False))
+            yield from (*tensors, *((f"{part}.{key}", v) for key, v in vars(module).items() if isinstance(v, Tensor)))
+        return
+    names = [each.name for each in fields(holder)] if is_dataclass(holder) else vars(holder)
+    for key in names:
+        value = getattr(holder, key)
+        if isinstance(value, nn.Module) or (is_dataclass(value) and not isinstance(value, type)):
+            yield from _constants(f"{name}.{key}", value)
         else:
-            names = [each.name for each in fields(law)] if is_dataclass(law) else vars(law)
-            values = {name: getattr(law, name) for name in names}
-        return own | {f"material.{name}": value for name, value in values.items()}
+            yield f"{name}.{key}", value
 
 
 def slices(bodies: Sequence[Body]) -> Iterator[tuple[Body, slice]]:

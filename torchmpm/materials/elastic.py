@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchmpm import checks
+from torchmpm import checks, tree
 from torchmpm.materials.base import Value, broadcast_plane, check_not_negative, detached_column
 from torchmpm.materials.linalg import Mat2, Sym2, det, orthogonal
 
@@ -27,6 +27,7 @@ def corotated_energy(F: Mat2, mu: Value, lam: Value, J: Tensor | None = None) ->
     return mu * distance + 0.5 * lam * ((det(F) if J is None else J) - 1.0).square()
 
 
+@tree.register
 @dataclass(frozen=True, eq=False)
 class Elastic:
     """Fixed corotated elastic solid.
@@ -38,7 +39,7 @@ class Elastic:
         lam: First Lame parameter, Pa; negative for a negative Poisson's ratio, but not below -mu.
 
     Raises:
-        ValueError: ``mu`` is negative, or ``lam`` below -mu.
+        ValueError: ``mu`` is negative, or ``lam`` below -mu (for tensors: when the solver is made).
     """
 
     mu: Value

@@ -7,7 +7,7 @@ from numbers import Real
 import torch
 from torch import Tensor
 
-from torchmpm import checks
+from torchmpm import checks, tree
 from torchmpm.materials.base import Value, broadcast_plane, check_not_negative
 from torchmpm.materials.elastic import Elastic, corotated_energy, corotated_stress
 from torchmpm.materials.linalg import Mat2, Parts, Sym2, det, direction, join, safe_sqrt, split
@@ -48,6 +48,7 @@ def _clamp(stretch: Tensor, low: Value, high: Value) -> Tensor:
     return torch.where(stretch < low, low, torch.where(stretch > high, high, stretch))
 
 
+@tree.register
 @dataclass(frozen=True, eq=False)
 class Snow(Elastic):
     """Snow or loose ground: stretches leave a narrow range plastically, and compaction hardens.

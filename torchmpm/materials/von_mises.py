@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchmpm import checks
+from torchmpm import checks, tree
 from torchmpm.materials.base import Value, broadcast_plane, check_not_negative
 from torchmpm.materials.elastic import Elastic
 from torchmpm.materials.linalg import Mat2, Parts, join, split
@@ -82,6 +82,7 @@ def von_mises_return(F: Mat2, limit: Value) -> Mat2:
     return a, b, c, d
 
 
+@tree.register
 @dataclass(frozen=True, eq=False)
 class VonMises(Elastic):
     """Fixed corotated solid that flows plastically once its deviatoric strain reaches a limit.
