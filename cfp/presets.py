@@ -93,8 +93,6 @@ ON_SPEED = ("run", "obstacle")
 SAC: dict[str, dict[str, Any]] = {
     # Without gravity noise on cells drives the robot apart. In episodes of 30 steps one-step returns lead further.
     "shapematch": {"learning": {"noise_cells": 0, "n_steps": 1, "actor_start": 600}},
-    # A robot that runs faster tears sooner, and is slow from then on, which episodes of 200 steps hardly show.
-    "run": {"learning": {"split_weight": 4_000.0, "split_margin": 0.72}},
     "obstacle": {"alpha": (0.005, 0.005)},  # that of RUN; with five times as much the robot does not reach the stairs
     # The way through the soil takes hundreds of steps. The paper's penalty closes the gate for good.
     "dig": {"learning": {"gamma": 0.99}, "gate_penalty": (0.01,)},

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, cast, get_args
 
+from stable_baselines3.common.vec_env import VecMonitor
+
 from baselines.modular.env import SegmentedEnv
 from baselines.modular.networks import Kind, ModularActor, ModularCritics, SegmentPolicy
 from baselines.modular.nodes import Nodes
@@ -14,7 +16,7 @@ from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
 from cfp.agent.policies import NetworkPolicy
 from cfp.config import RunConfig, scale_start
 from cfp.envs.make import make_torch_env
-from cfp.envs.vec_env import monitored
+from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Sees
 from cfp.experiment.coarse_to_fine import SACAlgorithm
@@ -141,7 +143,7 @@ class Modular(SACAlgorithm):
         """The algorithm at the beginning of its only stage."""
         env = SegmentedEnv(make_torch_env(config, config.resolution(stage)), config.nodes)
         networks = {"kind": config.kind, "features": config.nodes.num_features(env.env.spec)}
-        monitor = monitored(env, spaces=env.spaces, **config.learning.episodes())
+        monitor = VecMonitor(TorchVecEnv(env, env.spaces, config.learning.max_episode_steps))
         model = cls.make_model(config, monitor, ModularPolicy, networks, cls.hyperparameters(config, stage, folder))
         return cls(config, stage, model)
 

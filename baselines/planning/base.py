@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from baselines.common.rollout import StepFunction, rollout, soft_step
+from cfp.analytic.reward import split_cost
 from cfp.analytic.stateful import Stateful
-from cfp.envs.split import split_cost
 from cfp.errors import ConfigError
 from cfp.validation import check_at_least
 from dittogym import TorchEnv

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from cfp.agent.spec import RESOLUTIONS
 from cfp.errors import ConfigError
@@ -52,15 +51,6 @@ class LearningConfig:
     max_episode_steps: int | None = None
     """Steps after which training episodes are truncated, if the task's horizon is not shorter; robots begin at
     different ages. None: the horizon, and all begin together."""
-    split_weight: float = 0.0
-    """Cost in training of the square by which the robot's spread, as a fraction of the task's limit, exceeds
-    split_margin."""
-    split_margin: float = 0.7
-    """Fraction of the limit on the spread from which it costs; no effect in tasks without a limit."""
-
-    def episodes(self) -> dict[str, Any]:
-        """Options of the environment in training, see `cfp.envs.vec_env.TorchVecEnv`."""
-        return {name: getattr(self, name) for name in ("max_episode_steps", "split_weight", "split_margin")}
 
     def check(self) -> None:
         """Raise a `ConfigError` for values out of range."""
@@ -81,7 +71,6 @@ class LearningConfig:
         if self.actor_rate is not None:
             check_positive(actor_rate=self.actor_rate)
         check_at_least(0, actor_start=self.actor_start, anchor=self.anchor)
-        check_at_least(0, split_weight=self.split_weight, split_margin=self.split_margin)
         if self.noise_cells not in (allowed := (0, 1, 2, *RESOLUTIONS)):
             raise ConfigError(f"noise_cells must be one of {allowed}, got {self.noise_cells}")
         for scale in self.noise_scale:

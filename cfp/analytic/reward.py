@@ -8,7 +8,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from cfp.envs.split import split_cost
 from cfp.validation import check_at_least, check_positive
 from dittogym import TorchEnv
 from torchmpm import tree
@@ -82,6 +81,11 @@ class Neighbours:
         distance = (gap.square().sum(-1) + 1e-12).sqrt()
         excess = ((distance - self.distance) / RADIUS - TOLERANCE).clamp_min(0.0) * self.is_close
         return excess.square().sum((1, 2)) / self.is_close.sum((1, 2)).clamp_min(1)
+
+
+def split_cost(split: Tensor, limit: float, margin: float, weight: float) -> Tensor:
+    """Cost (B,) of robots' spread (B,), m, beyond a fraction ``margin`` of the ``limit`` at which they are torn."""
+    return weight * (split / limit - margin).clamp_min(0.0).square()
 
 
 def training_reward(

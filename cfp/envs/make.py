@@ -27,9 +27,11 @@ def choose_device(name: str) -> str:
     return name
 
 
-def make_env(config: RunConfig, resolution: int, num_envs: int | None = None, **options: Any) -> VecMonitor:
-    """Create the environment of a run for stable-baselines3, with ``options`` of `TorchVecEnv`."""
-    return monitored(make_torch_env(config, resolution, num_envs), **options)
+def make_env(
+    config: RunConfig, resolution: int, num_envs: int | None = None, max_episode_steps: int | None = None
+) -> VecMonitor:
+    """Create the environment of a run for stable-baselines3, see `make_torch_env` and `TorchVecEnv`."""
+    return monitored(make_torch_env(config, resolution, num_envs), max_episode_steps)
 
 
 def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = None, **changes: Any) -> TorchEnv:

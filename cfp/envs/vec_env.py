@@ -13,7 +13,6 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 from torch import Tensor
 
-from cfp.envs.split import split_cost
 from cfp.errors import NonFiniteError
 from dittogym import env as dittogym_env
 from dittogym.vector import autoreset_step
@@ -33,8 +32,6 @@ class TorchVecEnv(VecEnv):
         max_episode_steps: Steps after which episodes are truncated, at most the task's horizon; None: the horizon.
             After a reset of all elements, the first episode of element i is truncated after a fraction
             ``(i + 1) / B`` of them already, so that a batch always holds beginnings and ends of episodes.
-        split_weight: Weight of the cost of a robot that begins to tear, see `cfp.envs.split.split_cost`; 0: none.
-        split_margin: Fraction of the task's limit on the spread from which it costs.
     """
 
     def __init__(
@@ -42,10 +39,8 @@ class TorchVecEnv(VecEnv):
         env: Any,
         spaces: tuple[Space[Any], Space[Any]] | None = None,
         max_episode_steps: int | None = None,
-        split_weight: float = 0.0,
-        split_margin: float = 0.0,
     ) -> None:
-        self.torch_env, self.split_weight, self.split_margin = env, split_weight, split_margin
+        self.torch_env = env
         self.max_episode_steps = None if max_episode_steps is None else min(max_episode_steps, env.spec.horizon)
         self.render_mode = "rgb_array"
         super().__init__(env.num_envs, *(spaces or dittogym_env.spaces(env)))
@@ -95,15 +90,13 @@ class TorchVecEnv(VecEnv):
         self._actions = None
         if self._limits is not None and self.max_episode_steps is not None:
             self._limits = torch.where(step.done, self.max_episode_steps, self._limits)
-        infos, done, reward = self._split_info(step.info), _to_numpy(step.done), step.reward
-        if self.split_weight and (limit := self.torch_env.spec.split_limit) is not None:
-            reward = reward - split_cost(step.info["split"], limit, self.split_margin, self.split_weight)
+        infos, done = self._split_info(step.info), _to_numpy(step.done)
         if done.any():
             finals, timed_out = _to_numpy(step.final_observation), _to_numpy(step.truncated)
             for index in np.flatnonzero(done):
                 infos[index]["terminal_observation"] = finals[index]
                 infos[index]["TimeLimit.truncated"] = bool(timed_out[index])
-        return _to_numpy(step.observation), _to_numpy(reward.float()), done, infos
+        return _to_numpy(step.observation), _to_numpy(step.reward.float()), done, infos
 
     def _split_info(self, info: dict[str, Any]) -> list[dict[str, Any]]:
         """Turn one dictionary of tensors with leading B into B dictionaries of numbers."""
@@ -184,9 +177,6 @@ def first_limits(num_envs: int, max_steps: int, device: torch.device) -> Tensor:
     return (torch.arange(1, num_envs + 1, device=device) * max_steps // num_envs).clamp(min=1)
 
 
-def monitored(env: Any, **options: Any) -> VecMonitor:
-    """Wrap an environment for training or `evaluate_policy`, with ``options`` of `TorchVecEnv`.
-
-    Adds return and length as ``info["episode"]``.
-    """
-    return VecMonitor(TorchVecEnv(env, **options))
+def monitored(env: Any, max_episode_steps: int | None = None) -> VecMonitor:
+    """Wrap an environment for training or `evaluate_policy`; adds return and length as ``info["episode"]``."""
+    return VecMonitor(TorchVecEnv(env, max_episode_steps=max_episode_steps))

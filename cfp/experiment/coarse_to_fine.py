@@ -26,7 +26,7 @@ from cfp.presets import sac_preset
 from cfp.weights import load
 
 ROLLOUT_METRICS: dict[str, str] = {
-    "rollout/return": "mean undiscounted return of the last training episodes, with noise, less the cost of tearing",
+    "rollout/return": "mean undiscounted return of the last training episodes (with action noise)",
     "rollout/length": "their mean length in environment steps",
     "rollout/success": "share of successes among them, where the task defines success",
     "rollout/episodes": "episodes finished in this stage",
@@ -137,7 +137,8 @@ class CoarseToFine(CoarseToFineStages, SACAlgorithm):
     @classmethod
     def create(cls, config: Config, stage: int, folder: Path, resumed: bool = False) -> CoarseToFine:
         """Networks, replay memory and environment of a stage."""
-        spec, env = config.actor_spec(stage), make_env(config, config.action_size(stage), **config.learning.episodes())
+        limit, spec = config.learning.max_episode_steps, config.actor_spec(stage)
+        env = make_env(config, config.action_size(stage), max_episode_steps=limit)
         model = cls.make_model(config, env, CFPPolicy, {"spec": spec}, cls.hyperparameters(config, stage, folder))
         algorithm = cls(config, stage, model)
         algorithm.starts_trained = cls.warm_start(config, stage, folder, model.networks()[0])

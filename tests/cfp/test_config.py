@@ -34,8 +34,7 @@ def test_a_task_of_ones_own_is_trained_on_its_own_grids(monkeypatch):
     config = sac_preset("hop")
     config.check()
     assert (config.task, config.resolutions) == ("hop", (4, 32))
-    own = replace(config.learning, split_weight=4_000.0, split_margin=0.72)  # measured in RUN alone
-    assert replace(config, task="run", resolutions=(4, 8), learning=own) == sac_preset("run")
+    assert replace(config, task="run", resolutions=(4, 8)) == sac_preset("run")
     with pytest.raises(ConfigError, match="preset must be one of quick, long for hop, got 'paper'"):
         sac_preset("hop", "paper")
 

@@ -1,11 +1,8 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 from fakes import FakeEnv
 
-import dittogym
 from cfp.envs.vec_env import TorchVecEnv
 
 
@@ -56,25 +53,6 @@ def test_episodes_are_never_longer_than_the_horizon():
     env.reset()
     ends = [step for step in range(13) if env.step(actions(env))[2][1]]
     assert ends == [5, 11]
-
-
-def test_robots_that_begin_to_tear_cost_in_training():
-    def rewards(**options):
-        env = TorchVecEnv(dittogym.TorchEnv("run", 3, particles=200, substeps=4), **options)
-        env.seed(0)
-        env.reset()
-        state = env.torch_env.state
-        wide = state.x.clone()
-        wide[:, :, 0] = wide[:, :, :1].mean(1) + torch.tensor([[1.0], [1.3], [1.6]]) * (wide[:, :, 0] - wide[:, :1, 0])
-        env.torch_env.env_state = replace(env.torch_env.env_state, particles=replace(state, x=wide))
-        _, reward, _, infos = env.step(np.zeros((3, 2, 8, 8), np.float32))
-        return reward, np.array([info["split"] for info in infos])
-
-    plain, split = rewards()
-    costly, _ = rewards(split_weight=50.0, split_margin=0.7)
-    assert split[0] < 0.07 < split[1] < split[2]
-    expected = 50.0 * np.maximum(split / 0.1 - 0.7, 0.0) ** 2
-    np.testing.assert_allclose(plain - costly, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_only_the_element_that_ended_is_reset():
