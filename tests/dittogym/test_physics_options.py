@@ -368,7 +368,7 @@ def test_matter_too_stiff_for_the_substeps_is_refused() -> None:
     before = env.state
     limit = 1.0 / 128 / math.sqrt(2 * (9000.0 + 50.0 + 45.0) / 2.0)
     for physics in ({"mu": [9000.0, 650.0]}, {"mu": 650.0, "mass": 0.05}, {"max_actuation": 1e4}, {"lam": 1e4}):
-        message = r"dt must be at most (\S+) s .* mu, lam, max_actuation and mass, got 0\.0001"
+        message = r"dt must be at most (\S+) s .* mu, lam, max_actuation and mass that are given, got 0\.0001"
         with pytest.raises(ValueError, match=message) as raised:
             env.reset(options={"physics": physics})
         if "mu" in physics and "mass" not in physics:
