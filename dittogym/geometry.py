@@ -148,7 +148,8 @@ def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True, fric
     """
     for axis, given in (("i", i), ("j", j)):
         kind, open_ends = (Integral, "") if axis == "i" else (Integral | None, ", None for an open end")
-        if not isinstance(given, tuple | list) or len(given) != 2 or not all(isinstance(end, kind) for end in given):
+        ends = given if isinstance(given, tuple | list) else ()
+        if len(ends) != 2 or not all(isinstance(end, kind) and not isinstance(end, bool) for end in ends):
             raise ValueError(f"{axis} must be a range (low, high) of node indices{open_ends}, got {given!r}")
         first, last = given
         if first is not None and last is not None and first > last:

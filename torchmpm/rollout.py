@@ -102,11 +102,11 @@ class _Replay(torch.autograd.Function):
         with torch.enable_grad():
             results = ctx.function(*tensors)
         pairs = [(r, bar) for r, bar in zip(results, bars, strict=True) if bar is not None and r.requires_grad]
-        wanted = [tensor for tensor in tensors if tensor.requires_grad]
-        found: Iterable[Tensor | None] = [None] * len(wanted)
+        inputs = [tensor for tensor in tensors if tensor.requires_grad]
+        found: Iterable[Tensor | None] = [None] * len(inputs)
         if pairs:
             ends, their_bars = zip(*pairs, strict=True)
-            found = torch.autograd.grad(ends, wanted, their_bars, create_graph=again, allow_unused=True)
+            found = torch.autograd.grad(ends, inputs, their_bars, create_graph=again, allow_unused=True)
         derivatives = iter(found)
         return None, None, *(next(derivatives) if tensor.requires_grad else None for tensor in tensors)
 

@@ -39,7 +39,7 @@ def run_command(command: Callable[[], int | None]) -> int:
         return 128 + signal.SIGINT
     except BrokenPipeError:  # what reads the output, such as head, has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at the end of the program
-        return 128 + signal.SIGPIPE
+        return 141  # 128 + SIGPIPE, which Windows does not name
     except (CFPError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1 if isinstance(error, NonFiniteError | OSError) else 2

@@ -294,6 +294,7 @@ ENVIRONMENT = table(
         ("robot of nothing", lambda: RobotBody(Disc((0.4, 0.2), 0.1), 0), "count must be at least 1, got 0"),
         ("robot of no area", lambda: env(body=[(0, 0), (1, 1), (2, 2)]), "body must have corners that enclose an area"),
         ("box at a name", lambda: solid("box", ("a", "b"), (0, 9)), "i must be a range (low, high) of node indices"),
+        ("box at a truth", lambda: solid("box", (True, 9), (0, 9)), "i must be a range (low, high) of node indices"),
         ("box from 9 to 0", lambda: solid("box", (9, 0), (0, 9)), "i must be a range (low, high) with low <= high"),
         ("namespace of two words", lambda: dittogym.register("x", spec, namespace="a b"), ("namespace must", "'a b'")),
         ("target of a number", lambda: make_spec("shapematch", target=3), ("target must be 'star'", "got int")),
