@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import inf, isinf
 from numbers import Integral
+from typing import Any
 
 from dittogym.observation.image import RASTER
 from torchmpm import VelocityRule, checks
@@ -148,7 +149,7 @@ def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True, fric
     """
     for axis, given in (("i", i), ("j", j)):
         kind, open_ends = (Integral, "") if axis == "i" else (Integral | None, ", None for an open end")
-        ends = given if isinstance(given, tuple | list) else ()
+        ends: Any = given if isinstance(given, tuple | list) else ()
         if len(ends) != 2 or not all(isinstance(end, kind) and not isinstance(end, bool) for end in ends):
             raise ValueError(f"{axis} must be a range (low, high) of node indices{open_ends}, got {given!r}")
         first, last = given

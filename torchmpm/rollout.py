@@ -192,26 +192,18 @@ def replayed(
             state = step(shared, state)
         return state
     for start in range(0, times, segment):
-        state = _replayed(step, shared, state, min(segment, times - start), reads)
+        tensors, rebuild = tree.flatten((shared, state))
+        run = partial(_run, step, rebuild, min(segment, times - start))
+        state = cast(tuple[Tensor, ...], _Replay.apply(run, _versions({"state": state, **reads}), *tensors))
     return state
 
 
-def _replayed(
-    step: Callable[[Shared, tuple[Tensor, ...]], tuple[Tensor, ...]],
-    shared: Shared,
-    state: tuple[Tensor, ...],
-    times: int,
-    reads: Mapping[str, Any],
-) -> tuple[Tensor, ...]:
-    tensors, rebuild = tree.flatten((shared, state))
-
-    def run(*tensors: Tensor) -> tuple[Tensor, ...]:
-        shared, state = rebuild(tensors)
-        for _ in range(times):
-            state = step(shared, state)
-        return state
-
-    return cast(tuple[Tensor, ...], _Replay.apply(run, _versions({"state": state, **reads}), *tensors))
+def _run(step: Callable[..., Any], rebuild: Callable[..., Any], times: int, *tensors: Tensor) -> tuple[Tensor, ...]:
+    """Apply ``step`` again and again, from the tensors of what it shares and of the state."""
+    shared, state = rebuild(tensors)
+    for _ in range(times):
+        state = step(shared, state)
+    return cast(tuple[Tensor, ...], state)
 
 
 def trajectory(
