@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from baselines.runs import Run as Run
     from baselines.runs import fit as fit
 
+#: Where each public name is; its module is imported when it is used, so that ``torchmpm --help`` is quick.
 _MODULES = {
     "ALGORITHMS": "baselines.registry",
     "Algorithm": "cfp.experiment.algorithm",
@@ -34,7 +35,6 @@ _MODULES = {
     "fit": "baselines.runs",
     "load": "baselines.registry",
 }
-"""Where each public name is; its module is imported when it is used, so that ``torchmpm --help`` is quick."""
 
 __all__ = [*_MODULES]
 

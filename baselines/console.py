@@ -5,6 +5,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
+#: Module of each program, with a function ``main``, and what it does.
 PROGRAMS = {
     "train": ("baselines.train", "train a policy on a task, by the coarse-to-fine method or another --algo"),
     "evaluate": ("baselines.evaluate", "returns of a trained policy, with films, replays and recorded trajectories"),
@@ -15,7 +16,6 @@ PROGRAMS = {
     "teach": ("baselines.distill", "let an image policy learn from a teacher that observes more"),
     "gradlab": ("baselines.gradlab.__main__", "measure up to which horizon gradients are useful"),
 }
-"""Module of each program, with a function ``main``, and what it does."""
 EXAMPLES = """Examples:
   torchmpm train --task run --out runs/run
   torchmpm evaluate runs/run --video run.mp4

@@ -14,6 +14,7 @@ from cfp.policy_protocols import Policy
 from cfp.presets import like_start
 from cfp.weights import policy_file, read_policy
 
+#: ``"module:Class"`` of each algorithm, a subclass of `cfp.experiment.algorithm.Algorithm`.
 ALGORITHMS: dict[str, str] = {
     "cfp": "cfp.experiment.coarse_to_fine:CoarseToFine",
     "analytic": "cfp.analytic.learner:AnalyticLearner",
@@ -29,10 +30,9 @@ ALGORITHMS: dict[str, str] = {
     "cem": "baselines.planning.mpc:CEM",
     "shac": "baselines.shac.train:Shac",
 }
-"""``"module:Class"`` of each algorithm, a subclass of `cfp.experiment.algorithm.Algorithm`."""
 
+#: Other spellings: gnn16 for gnn-16.
 ALIASES = {name.replace("-", ""): name for name in ALGORITHMS if "-" in name}
-"""Other spellings: gnn16 for gnn-16."""
 
 
 def find(name: str) -> type[Algorithm]:

@@ -35,8 +35,8 @@ LAYOUTS, PLANNED_LAYOUTS = 6, 4
 WAVE_STEPS, PLANNED_STEPS = 100, 64
 WINDOW, WARMUP, ACTION_RANGE = 16, 8, 0.3
 
+#: From observations (B, 3, 64, 64) and the step to actions (B, 2, R, R).
 Act = Callable[[Tensor, int], Tensor]
-"""From observations (B, 3, 64, 64) and the step to actions (B, 2, R, R)."""
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from dittogym.observation.image import silhouette
 from dittogym.tasks.targets import load_target
 
 LAYOUTS = 3
+#: Pixels of a drawn letter; a robot at rest has 355.
 AREA = 380
-"""Pixels of a drawn letter; a robot at rest has 355."""
 SCALE = 5
 
 

@@ -16,8 +16,8 @@ from cfp.evaluation.episodes import Trial
 from cfp.evaluation.evaluate import evaluate, evaluation_seed
 from dittogym import TorchEnv, make_spec
 
+#: Episodes between two reports.
 BATCH = 20
-"""Episodes between two reports."""
 
 
 def main() -> None:

@@ -13,8 +13,8 @@ import safetensors.torch
 from torch import Tensor
 
 LARGEST_JSON = 2**20  # bytes
+#: Key of the description in the metadata of a policy file.
 FORMAT = "cfp-policy"
-"""Key of the description in the metadata of a policy file."""
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], Any]) -> None:

@@ -17,8 +17,8 @@ from cfp.files import write_text
 SCHEME = "hf://"
 FORM = f"{SCHEME}OWNER/NAME[@REVISION][?sha256=HASH]"
 _ADDRESS = re.compile(rf"{SCHEME}([\w.-]+/[\w.-]+)(?:@([\w./-]+))?(?:\?sha256=([0-9a-f]{{64}}))?")
+#: Files of a repository, beside ``policy.json``; the hashes are as ``sha256sum`` writes them.
 POLICY, SUMS, CARD = "policy.safetensors", "SHA256SUMS", "README.md"
-"""Files of a repository, beside ``policy.json``; the hashes are as ``sha256sum`` writes them."""
 
 
 def is_address(path: object) -> bool:

@@ -64,6 +64,8 @@ _LONG_MEMORY: dict[str, Any] = {
     "num_layouts": 256,
     "environment": EnvironmentConfig(num_envs=8),
 }
+#: Options of the learner ``analytic`` that differ from task to task; found by the experiments that the documentation
+#: reports.
 ANALYTIC: dict[str, dict[str, Any]] = {
     "shapematch": {
         "steps": 4_800,
@@ -85,11 +87,10 @@ ANALYTIC: dict[str, dict[str, Any]] = {
     "catch": {"steps": 28_800, "handover": (25_600,), "max_episode_steps": 300},
     "dig": {"steps": 28_800, "handover": (25_600,), "weight_average": 0.98},
 }
-"""Options of the learner ``analytic`` that differ from task to task; found by the experiments that the documentation
-reports."""
+#: Tasks in which gradient methods are trained on speed to the right instead of the task's reward.
 ON_SPEED = ("run", "obstacle")
-"""Tasks in which gradient methods are trained on speed to the right instead of the task's reward."""
 
+#: Options of the presets ``quick`` and ``long`` of the learner ``sac`` that differ from task to task.
 SAC: dict[str, dict[str, Any]] = {
     # Without gravity noise on cells drives the robot apart. In episodes of 30 steps one-step returns lead further.
     "shapematch": {"learning": {"noise_cells": 0, "n_steps": 1, "actor_start": 600}},
@@ -97,14 +98,13 @@ SAC: dict[str, dict[str, Any]] = {
     # The way through the soil takes hundreds of steps. The paper's penalty closes the gate for good.
     "dig": {"learning": {"gamma": 0.99}, "gate_penalty": (0.01,)},
 }
-"""Options of the presets ``quick`` and ``long`` of the learner ``sac`` that differ from task to task."""
+#: Tasks in which ``quick`` makes one update of the networks for each step. With fewer, KICK, OBSTACLE, GROW and DIG
+#: learned less in the same time; SLOT was not tried with fewer.
 MANY_UPDATES = ("kick", "obstacle", "grow", "slot", "dig")
-"""Tasks in which `quick` makes one update of the networks for each step. With fewer, KICK, OBSTACLE, GROW and DIG
-learned less in the same time; SLOT was not tried with fewer."""
+#: Task of a command line that names none.
 DEFAULT_TASK = "shapematch"
-"""Task of a command line that names none."""
+#: Numbers of a custom task, for which nothing was published; its action grids are its own.
 CUSTOM_TASK = TASKS["run"]
-"""Numbers of a custom task, for which nothing was published; its action grids are its own."""
 
 
 def preset(task: str, name: Preset = "quick", learner: Learner | None = None) -> CoarseToFineConfig:

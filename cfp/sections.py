@@ -11,16 +11,16 @@ from cfp.errors import ConfigError
 from cfp.validation import check_at_least, check_positive
 from dittogym.spec import CONTROL_STEP, DT
 
+#: Particle count: the paper's, about 2,000, a number, or one number for the robot and one for the object.
 Particles: TypeAlias = Literal["full", "lite"] | int | tuple[int, int]
-"""Particle count: the paper's, about 2,000, a number, or one number for the robot and one for the object."""
 
+#: Fields of ``EnvironmentConfig`` that are options of some tasks only.
 TASK_OPTIONS = ("target", "variant")
-"""Fields of `EnvironmentConfig` that are options of some tasks only."""
 
+#: Duration of a substep, s, in the simulations of gradient methods and planners in ``LONG_DT_TASKS``.
 LONG_DT = 2e-4
-"""Duration of a substep, s, in the simulations of gradient methods and planners in `LONG_DT_TASKS`."""
+#: Tasks in which it changes no more than another layout of particles does (benchmarks/long_substeps.py).
 LONG_DT_TASKS = ("run",)
-"""Tasks in which it changes no more than another layout of particles does (benchmarks/long_substeps.py)."""
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from dittogym.tasks import fingerprint
 
 VERSION = 1
 KIND = "cfp"
+#: Types, or values, of the entries of a description; only policies for one initial position have a layout.
 _DESCRIBED: dict[str, type | range] = {
     "kind": str,
     "task": str,
@@ -42,12 +43,11 @@ _DESCRIBED: dict[str, type | range] = {
     "layout": range(LARGEST_SEED + 1),
     "task_file": str,
 }
-"""Types, or values, of the entries of a description; only policies for one initial position have a layout."""
 _OPTIONAL = ("layout", "task_file")
+#: Characters shown of an error of torch, which lists every layer.
 MAX_REASON = 300
-"""Characters shown of an error of torch, which lists every layer."""
+#: Folder of the policies that come with the package.
 SHIPPED = Path(__file__).parent / "pretrained"
-"""Folder of the policies that come with the package."""
 
 
 def describe_run(config: RunConfig, kind: str, stage: int, steps: int) -> dict[str, Any]:

@@ -77,6 +77,6 @@ def place(actuation: Tensor, centre: Tensor, nodes: int) -> Tensor:
 
 @cached_tensors
 def _patch_ids(patch: int, nodes: int, device: torch.device) -> Tensor:
-    """Indices (P P) among all nodes of a patch in the corner of the window."""
+    """Indices (P * P,) among all nodes of a patch in the corner of the window."""
     along = torch.arange(patch, device=device)
     return (along[:, None] * nodes + along).flatten()

@@ -78,7 +78,7 @@ def find_device(device: str | torch.device) -> torch.device:
 
 
 def reset_options(options: Any) -> dict[str, Any]:
-    """The options of a reset, of which there are :data:`RESET_OPTIONS`."""
+    """The options of a reset; the allowed names are :data:`RESET_OPTIONS`."""
     options = {} if options is None else options
     if not isinstance(options, Mapping):
         raise ValueError(f"options must be a mapping that may hold {', '.join(RESET_OPTIONS)}, got {options!r}")

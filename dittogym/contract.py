@@ -96,7 +96,7 @@ class Outcome(NamedTuple):
         success: (B,) bool; ``None`` where success is not defined.
         info: Further quantities for ``info``, with a leading B.
         memory: Replaces the memory, leading B, with the same names and shapes; ``None`` keeps it. Tensors of int64 of
-            shape (B, K) hold numbers of particles, which planners with fewer particles translate.
+            shape (B, K) hold particle indices, which planners with fewer particles translate.
     """
 
     terms: Mapping[str, Tensor]

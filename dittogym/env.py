@@ -12,6 +12,7 @@ import torch
 from gymnasium.envs.registration import EnvSpec
 
 from dittogym.bodies.json_values import to_values
+from dittogym.bodies.positions import MAX_SEED
 from dittogym.model import Snapshot
 from dittogym.render.frame import frame, pace
 from dittogym.render.recording import Recording, as_function, film
@@ -140,9 +141,10 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         Returns:
             The observation (3, 64, 64) uint8, and ``info``.
         """
+        seed = None if seed is None else checks.whole("seed", seed, 0, MAX_SEED)
         with torch.no_grad():
             observation, info = self.torch_env.reset(seed=seed, options=options)
-        super().reset(seed=None if seed is None else int(seed))
+        super().reset(seed=seed)
         self._return = 0.0
         self._show()
         return first(as_numpy(observation)), first(as_numpy(info))

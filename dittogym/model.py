@@ -105,7 +105,7 @@ class Model:
     def constants(self) -> dict[str, str]:
         """By name what determines an episode besides its state, as texts that are equal for equal values.
 
-        Tensors that require gradients are told by their shape alone: they are learned, and change as one learns.
+        Tensors that require gradients are identified by their shape alone, because training changes their values.
         """
         names = [each.name for each in fields(self.spec) if each.name not in ("coarse", "fine")]
         spec = {name: _as_text(getattr(self.spec, name)) for name in names}

@@ -35,8 +35,8 @@ class RewardOps:
     ) -> Tensor:
         """Bring ``z`` into [low, high].
 
-        The smooth form subtracts ``w ln(1 + exp((z - high) / w))``, at most w ln 2 at the limit, and adds the like at
-        ``low``.
+        The smooth form subtracts ``w ln(1 + exp((z - high) / w))``, at most w ln 2 at the limit, and adds the
+        corresponding term at ``low``.
 
         Args:
             z: Of any shape.
@@ -53,7 +53,7 @@ class RewardOps:
         elif limits and not any(limit for limit, _ in limits):
             raise ValueError(f"width must be given where all limits are 0, got None with low {low}, high {high}")
         if not self.smooth:
-            return z.clamp(low, high)
+            return z.clamp(low, high) if limits else z
         largest = max((abs(limit) for limit, _ in limits), default=0.0)
         for limit, sign in limits:
             w = width or RELATIVE_WIDTH * (abs(limit) or largest)

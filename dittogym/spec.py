@@ -43,10 +43,10 @@ class BodySpec:
 
     def __post_init__(self) -> None:
         checks.instance("shape", self.shape, Shape)
-        checks.whole("count", self.count, 1)
+        object.__setattr__(self, "count", checks.whole("count", self.count, 1))
         checks.number("mass", self.mass, above=0.0)
         if self.lite is not None:
-            checks.whole("lite", self.lite, 1)
+            object.__setattr__(self, "lite", checks.whole("lite", self.lite, 1))
 
 
 def no_memory(moment: Moment, spec: TaskSpec) -> Memory:
@@ -133,16 +133,15 @@ class TaskSpec:
     def _check_numbers(self) -> None:
         for name, value in self.weights.items():
             checks.number(f"weights[{name!r}]", value)
-        checks.whole("horizon", self.horizon, 1)
         checks.number("mu", self.mu, above=0.0)
         checks.number("lam", self.lam)
         for name in ("yield_stress", "max_actuation", "damping"):
             checks.number(name, getattr(self, name), least=0.0)
         if self.split_limit is not None:
             checks.number("split_limit", self.split_limit, above=0.0)
-        checks.whole("patch", self.patch, 4, NODES)
-        for name in ("coarse", "fine"):
-            checks.whole(name, getattr(self, name), 1, self.patch)
+        object.__setattr__(self, "patch", checks.whole("patch", self.patch, 4, NODES))
+        for name, most in (("horizon", None), ("coarse", self.patch), ("fine", self.patch)):
+            object.__setattr__(self, name, checks.whole(name, getattr(self, name), 1, most))
         checks.pair("gravity", self.gravity)
         if self.goal is not None:
             checks.pair("goal", self.goal)

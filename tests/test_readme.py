@@ -67,8 +67,8 @@ PAGES = {
 }
 
 
+#: Pages whose samples take up to a minute; README.md does some of the same in less time.
 SLOW = {"docs/start.md", "docs/films.md", "docs/custom-tasks.md", "docs/concepts/planning.md", "docs/develop/adding.md"}
-"""Pages whose samples take up to a minute; README.md does some of the same in less time."""
 
 
 @pytest.mark.parametrize("page", [pytest.param(p, marks=[pytest.mark.slow] * (p in SLOW)) for p in PAGES])

@@ -100,7 +100,10 @@ def limits(ends: Range) -> tuple[int | float, int | float]:
 
 def node_shift(grid: Grid, origin: Tensor) -> Tensor:
     """Whole nodes between the world's origin and the window's, truncated towards zero, (B, 2) int64."""
-    return torch.trunc(origin.detach() * (1.0 / grid.h)).to(torch.int64)
+    nodes = origin.detach() * (1.0 / grid.h)
+    nearest = nodes.round()
+    whole = (nodes - nearest).abs() <= 4 * torch.finfo(nodes.dtype).eps * nearest.abs()  # but for rounding errors
+    return torch.where(whole, nearest, nodes.trunc()).to(torch.int64)
 
 
 def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Face, ...]:
@@ -137,7 +140,7 @@ def faces(rules: Sequence[VelocityRule], grid: Grid, origin: Tensor) -> tuple[Fa
 def constrain(faces: Sequence[Face], velocity: Tensor) -> Tensor:
     """Apply the rules to node velocities (2, B, cells), m/s.
 
-    Rules of different directions commute as long as none has a finite friction, so the order of directions only
+    Rules of different directions commute unless one has a positive finite friction, so the order of directions only
     matters in a corner between two walls with friction.
     """
     component = list(velocity.unbind(0))

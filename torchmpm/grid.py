@@ -35,7 +35,7 @@ class Grid:
     margin: float = 1e-5
 
     def __post_init__(self) -> None:
-        checks.whole("resolution", self.resolution, 4, LARGEST)
+        object.__setattr__(self, "resolution", checks.whole("resolution", self.resolution, 4, LARGEST))
         if self.spacing is not None:
             checks.number("spacing", self.spacing, above=0.0)
         checks.number("margin", self.margin, least=0.0)
@@ -58,6 +58,6 @@ class Grid:
         return self.resolution * self.h - self.margin
 
     def contains(self, x: Tensor, origin_x: Tensor) -> Tensor:
-        """Whether particles at x (B, N), m, take part: inside of the window from origin_x (B, 1), m; false for NaN."""
+        """Whether x (B, N), m, lies between the ends of the window from origin_x (B, 1), m; false for NaN."""
         offset = x - origin_x
         return (offset > self.margin) & (offset < self.extent)

@@ -1,5 +1,6 @@
 """Memory that gradients need, estimated before they are computed."""
 
+from bisect import bisect
 from collections.abc import Callable
 
 import torch
@@ -15,8 +16,11 @@ from torchmpm.substep import Planes, substep
 PLANES = 13
 #: Largest temporary memory of an eager substep, in units of the graph that it leaves.
 TEMPORARY = 0.4
-#: Numbers of a node in the grids of a native step.
-GRIDS = 16
+#: Particles of a block of the native kernels, and the numbers of blocks from which on they sum over particles in 2, 4
+#: and 8 parts, each with grids of its own (``native/cpu/scene.hpp``).
+BLOCK, PARTS = 64, (16, 128, 512)
+#: Numbers of a node in the grids that all parts share, and in those of a part, without and with muscles.
+SHARED_GRIDS, PART_GRIDS = 8, (16, 24)
 
 #: Where a step starts, or (B, N, dtype) of a state on the CPU.
 Start = ParticleState | tuple[int, int, torch.dtype]
@@ -93,13 +97,13 @@ def segment_for(solver: Solver, state: Start, *, substeps: int, budget: int, env
 
 
 def _state(start: Start) -> ParticleState:
-    """The state where a step starts; for sizes alone one whose memory is never written to, so it takes none."""
+    """The state where a step starts; for sizes alone one whose tensors are a single number, expanded."""
     if isinstance(start, ParticleState):
         return start
     if not isinstance(start, tuple) or len(start) != 3 or start[2] not in (torch.float32, torch.float64):
         raise TypeError(f"state must be a ParticleState, or (B, N, torch.float32 or torch.float64), got {start!r:.60}")
     batch, count = checks.whole("B of the state", start[0], 1), checks.whole("N of the state", start[1], 1)
-    return ParticleState.from_stack(torch.empty(PLANES, batch, count, dtype=start[2]))
+    return ParticleState.from_stack(torch.empty((), dtype=start[2]).expand(PLANES, batch, count))
 
 
 def _estimate(solver: Solver, start: Start, substeps: int, env_steps: int) -> Need:
@@ -114,7 +118,7 @@ def _estimate(solver: Solver, start: Start, substeps: int, env_steps: int) -> Ne
         return _eager(solver, state, substeps, env_steps)
     if state.device.type != "cpu":
         raise ValueError(f"state must be on the CPU for the memory of backend 'native', got {state.device}")
-    return _native(solver, state, substeps, env_steps, 1.0 if start is not state else _occupied(solver, state))
+    return _native(solver, state, substeps, env_steps, sizes_alone=start is not state)
 
 
 def _sizes(solver: Solver, state: ParticleState) -> tuple[int, int]:
@@ -157,20 +161,25 @@ def _graph_bytes(solver: Solver, state: ParticleState) -> int:
     return sizes[1] - sizes[0]
 
 
-def _occupied(solver: Solver, state: ParticleState) -> float:
-    """Share of the nodes that a state reaches, with a margin for a step's motion."""
-    if not bool(state.x.isfinite().all()):
+def _reached(solver: Solver, x: Tensor) -> float:
+    """Share of the nodes that particles at ``x`` (B, n, 2), m, reach, with a margin for a step's motion."""
+    if not bool(x.isfinite().all()):
         return 1.0
-    extent = state.x.detach().amax(1) - state.x.detach().amin(1)
+    extent = x.detach().amax(1) - x.detach().amin(1)
     nodes = (extent / solver.grid.h + 5.0).clamp(max=solver.grid.width)
     return float(nodes.prod(1).max() / solver.grid.width**2)
 
 
-def _native(solver: Solver, state: ParticleState, substeps: int, env_steps: int, share: float) -> Need:
-    planes, (state_bytes, field_bytes) = state.stack(), _sizes(solver, state)
+def _native(solver: Solver, state: ParticleState, substeps: int, env_steps: int, sizes_alone: bool) -> Need:
+    state_bytes, field_bytes = _sizes(solver, state)
+    planes = state.x.new_empty(()).expand(PLANES, *state.Jp.shape)  # for its sizes alone
+    parts = 2 ** bisect(PARTS, sum(-(-body.count // BLOCK) for body in solver.bodies))
+    share = 1.0 if sizes_alone else _reached(solver, state.x)
+    part_shares = [1.0] * parts if sizes_alone else [_reached(solver, x) for x in state.x.chunk(parts, dim=1)]
     # Each team of threads has two states of its own, some grids, and a tape. Memory of nodes that no particle comes
     # near is never written to and takes none.
-    team = 2 * state_bytes // state.batch_size + int(share * GRIDS * solver.grid.width**2 * planes.element_size())
+    numbers = SHARED_GRIDS * share + PART_GRIDS[any(body.muscle for body in solver.bodies)] * sum(part_shares)
+    team = 2 * state_bytes // state.batch_size + int(numbers * solver.grid.width**2) * planes.element_size()
     wants_values = any(value.requires_grad for name, value in solver.constants.items() if name != "gravity")
     # Alive at once in a backward pass: every call's start, one result, and derivatives in both on their way.
     others = 4 * state_bytes + env_steps * field_bytes + (8 * state_bytes // PLANES if wants_values else 0)

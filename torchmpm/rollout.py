@@ -83,11 +83,9 @@ class _Replay(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        ctx: Any, function: Callable[..., tuple[Tensor, ...]], before: Reads, *tensors: Tensor
-    ) -> tuple[Tensor, ...]:
-        """Call ``function(*tensors)``, and note what it reads."""
-        ctx.function, ctx.before = function, before
+    def forward(ctx: Any, function: Callable[..., tuple[Tensor, ...]], *tensors: Tensor) -> tuple[Tensor, ...]:
+        """Call ``function(*tensors)``; torch notices if one of them is changed in place before the backward pass."""
+        ctx.function = function
         ctx.save_for_backward(*tensors)
         ctx.set_materialize_grads(False)
         return function(*tensors)
@@ -95,7 +93,6 @@ class _Replay(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *bars: Tensor | None) -> tuple[Tensor | None, ...]:
         """Derivatives in the tensors from those in the results."""
-        _check_versions(ctx.before)
         again = torch.is_grad_enabled()  # with create_graph=True
         # Tensors of its own: derivatives must end at them, although one argument may depend on another.
         tensors = [t.view_as(t) if again else t.detach().requires_grad_(t.requires_grad) for t in ctx.saved_tensors]
@@ -108,7 +105,7 @@ class _Replay(torch.autograd.Function):
             ends, their_bars = zip(*pairs, strict=True)
             found = torch.autograd.grad(ends, inputs, their_bars, create_graph=again, allow_unused=True)
         derivatives = iter(found)
-        return None, None, *(next(derivatives) if tensor.requires_grad else None for tensor in tensors)
+        return None, *(next(derivatives) if tensor.requires_grad else None for tensor in tensors)
 
 
 def _checkpointed(function: Callable[[State], State], state: State, reads: Mapping[str, Any]) -> State:
@@ -179,7 +176,6 @@ def replayed(
     state: tuple[Tensor, ...],
     times: int,
     segment: Segment,
-    reads: Mapping[str, Any],
 ) -> tuple[Tensor, ...]:
     """The same as :func:`repeated`, in half the time, for a step whose tensors are all in a tree ``shared``.
 
@@ -194,7 +190,7 @@ def replayed(
     for start in range(0, times, segment):
         tensors, rebuild = tree.flatten((shared, state))
         run = partial(_run, step, rebuild, min(segment, times - start))
-        state = cast(tuple[Tensor, ...], _Replay.apply(run, _versions({"state": state, **reads}), *tensors))
+        state = cast(tuple[Tensor, ...], _Replay.apply(run, *tensors))
     return state
 
 

@@ -136,8 +136,8 @@ class Solver:
     def with_constants(self, bodies: tuple[Body, ...], gravity: tuple[float, float] | Tensor) -> "Solver":
         """The same solver with other constants, for those that change in every step.
 
-        The checks of the constructor are skipped, that of the largest stable ``dt`` too; :meth:`step` checks the shapes
-        that it reads.
+        The checks of the solver's constructor are skipped, that of the largest stable ``dt`` too; those of bodies and
+        materials were made when they were built, and :meth:`step` checks the shapes that it reads.
 
         Args:
             bodies: Bodies of the same counts.
@@ -229,7 +229,7 @@ class Solver:
         function: Any = compiled(type(self).substep) if self.backend == "compile" else type(self).substep
         scene, run, planes = self.scene(state, actuation, origin), partial(function, self), state.planes()
         if self._can_replay(state, actuation, origin):
-            planes = replayed(run, scene, planes, substeps, segment, reads)
+            planes = replayed(run, scene, planes, substeps, segment)
         else:
             planes = repeated(partial(run, scene), planes, substeps, segment=segment, reads=reads)
         return ParticleState.from_planes(planes)

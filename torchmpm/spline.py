@@ -64,7 +64,7 @@ def scatter(stencil: Stencil, values: Tensor) -> Tensor:
     """Add particle contributions to nodes: (R, B, 3, 3, N) -> (R, B, cells)."""
     rows, batch = values.shape[:2]
     target = values.new_zeros(rows, batch, stencil.cells)
-    return target.scatter_add(-1, stencil.ids.expand(rows, -1, -1), values.reshape(rows, batch, -1))
+    return target.scatter_add(-1, stencil.ids.expand(rows, -1, -1), values.flatten(2))
 
 
 def gather(stencil: Stencil, field: Tensor) -> Tensor:

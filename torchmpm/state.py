@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from numbers import Integral
 from typing import Any
 
@@ -115,7 +115,7 @@ class ParticleState:
             ValueError: The dtype is neither float32 nor float64.
         """
         moved: ParticleState = tree.map(lambda t: t.to(*args, **kwargs), self)
-        return ParticleState(*(getattr(moved, field.name) for field in fields(moved)))
+        return replace(moved)
 
     def detach(self) -> ParticleState:
         """The same numbers, cut off from the autograd graph."""

@@ -23,7 +23,7 @@ def register(cls: type[Tree]) -> type[Tree]:
     leaves of other shapes in their place.
 
     Args:
-        cls: A dataclass all of whose fields are containers of tensors.
+        cls: A dataclass whose fields are tensors, containers of tensors, or plain values, which are leaves.
     """
     names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
 
@@ -59,7 +59,7 @@ def map(function: Callable[..., Any], tree: Tree, *others: Tree) -> Tree:
 
 
 def leaves(tree: Any) -> list[Tensor]:
-    """All tensors (B, ...) of a tree, in order."""
+    """All tensors of a tree, in order."""
     return [leaf for leaf in pytree.tree_leaves(tree) if isinstance(leaf, Tensor)]
 
 
@@ -69,7 +69,7 @@ def is_open(tree: Any) -> bool:
 
 
 def flatten(tree: Tree) -> tuple[list[Tensor], Callable[[Iterable[Tensor]], Tree]]:
-    """All tensors (B, ...) of a tree, in order, and a function that makes the tree from as many others."""
+    """All tensors of a tree, in order, and a function that makes the tree from as many others."""
     entries, structure = pytree.tree_flatten(tree)
     tensors = [entry for entry in entries if isinstance(entry, Tensor)]
     others = [None if isinstance(entry, Tensor) else (entry,) for entry in entries]  # does not keep the tensors alive

@@ -6,8 +6,8 @@ from typing import Literal
 from cfp.config import COUNTED_LAYOUTS, RunConfig
 from dittogym import make_spec
 
+#: Action grid R: coarse, fine (the task's), or a number.
 Grid = int | Literal["coarse", "fine"]
-"""Action grid R: coarse, fine (the task's), or a number."""
 
 
 def grid_size(task: str, grid: Grid) -> int:

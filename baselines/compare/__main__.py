@@ -24,10 +24,10 @@ from cfp.experiment.process import Stopped, StopSignals
 from cfp.sections import Particles
 from cfp.validation import check_at_least
 
+#: Options that the help shows first.
 BASIC = ("tasks", "algos", "seeds", "preset", "steps", "device", "workers", "episodes", "out", "report_only")
-"""Options that the help shows first."""
+#: Seconds to wait for another process that holds a run folder; file servers take a while to give up a lost machine.
 LOCK_TIMEOUT, CLUSTER_LOCK_TIMEOUT = 30.0, 300.0
-"""Seconds to wait for another process that holds a run folder; file servers take a while to give up a lost machine."""
 
 
 @dataclass(frozen=True)

@@ -22,15 +22,15 @@ from cfp.robustness import report
 from cfp.sections import Particles
 
 RECORD = "final_evaluation.json"
+#: Episodes side by side; whole batches are kept when an evaluation is stopped, or more episodes are asked for.
 BATCH = 10
-"""Episodes side by side; whole batches are kept when an evaluation is stopped, or more episodes are asked for."""
+#: How many of `make_cases` the paper reports: unperturbed, action dropout, observation dropout.
 PAPER_CASES = 3
-"""How many of `make_cases` the paper reports: unperturbed, action dropout, observation dropout."""
 
 Noise = Literal["paper", "with", "without"]
 Robustness = Literal["none", "paper", "all"]
+#: ``returns`` of some episodes, and how many of them were ``successes`` (None if the task does not define success).
 Entry = dict[str, Any]
-"""``returns`` of some episodes, and how many of them were ``successes`` (None if the task does not define success)."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,8 @@ class FinalEvaluation:
         return float(np.mean(self.returns))
 
 
+#: Bytes of the largest record that is read; one return takes about 28.
 LARGEST_RECORD = 2**26
-"""Bytes of the largest record that is read; one return takes about 28."""
 
 
 class Record:

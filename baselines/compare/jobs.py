@@ -20,15 +20,15 @@ from cfp.weights import is_of_another_task, is_same_task, read_policy
 from dittogym.tasks import task_name
 
 LARGEST_COMPARED_SEED = EVALUATION_SEED - 1001  # larger ones would train on the layouts of the final evaluation
+#: Options that change neither what a run learns nor which policy it keeps.
 IRRELEVANT_OPTIONS = ("device", "environment.backend", "report.video", "report.checkpoint_every", "report.log_every")
-"""Options that change neither what a run learns nor which policy it keeps."""
+#: Options of the environment on which all algorithms of a task must agree.
 TASK_DEFINING_OPTIONS = ("substeps", "dt", "dtype", "parity", "resample", "target", "variant")
-"""Options of the environment on which all algorithms of a task must agree."""
+#: Options of a run by name, in the form of its ``config.json``.
 Options = dict[str, Any]
-"""Options of a run by name, in the form of its ``config.json``."""
 
+#: Options that the command line gives to all runs, or by which it distinguishes them.
 COMMAND_LINE_OPTIONS = ("device", "preset", "seed", "task")
-"""Options that the command line gives to all runs, or by which it distinguishes them."""
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,13 @@ the steps, three seeds, training returns. A resting robot was measured in the re
 from cfp.presets import TASKS
 from cfp.sections import Particles
 
+#: Particles of the paper's figures.
 TIER: Particles = "full"
-"""Particles of the paper's figures."""
 
+#: Names that the paper's methods have here, in the order of ``CURVES``.
 COLUMNS = ("cfp", "coarse", "fine", "gnn-16", "gnn-64", "transformer-16", "transformer-64")
-"""Names that the paper's methods have here, in the order of `CURVES`."""
 
+#: Task to return and band of every method.
 CURVES: dict[str, tuple[tuple[float, float], ...]] = {
     "shapematch": ((306, 4), (285, 6), (154, 10), (55, 4), (57, 3), (69, 3), (71, 2)),
     "run": ((8650, 420), (6870, 960), (2750, 630), (2520, 110), (2420, 20), (1820, 2060), (2200, 1480)),
@@ -23,11 +24,11 @@ CURVES: dict[str, tuple[tuple[float, float], ...]] = {
     "catch": ((6890, 460), (6420, 1790), (1780, 1290), (3610, 460), (5980, 1410), (5530, 1520), (7200, 1260)),
     "slot": ((65000, 2600), (49800, 9300), (12800, 2100), (6480, 2310), (5120, 1610), (26000, 5400), (23300, 6600)),
 }
-"""Task to return and band of every method."""
 
+#: Task to environment steps of its curves.
 STEPS = {task: TASKS[task].steps for task in CURVES}
-"""Task to environment steps of its curves."""
 
+#: Task to action grid to the best return of "expert policies" and its error bar. Grids of SHAPE MATCH are doubtful.
 EXPERTS: dict[str, dict[int, tuple[float, float]]] = {
     "shapematch": {4: (255, 6), 8: (297, 7), 16: (317, 5)},
     "run": {4: (4940, 1070), 8: (9210, 890), 16: (9790, 430)},
@@ -38,14 +39,14 @@ EXPERTS: dict[str, dict[int, tuple[float, float]]] = {
     "catch": {4: (8150, 1150), 8: (11300, 680), 16: (9720, 530)},
     "slot": {4: (15100, 2600), 8: (53800, 8600), 16: (73200, 1500)},
 }
-"""Task to action grid to the best return of "expert policies" and its error bar. Grids of SHAPE MATCH are doubtful."""
 
+#: Seconds of an average training episode in RUN, and memory (MB), on an RTX 4090.
 COST: dict[str, tuple[float, float]] = {"cfp": (54, 4053), "transformer-64": (104, 6895), "gnn-64": (83, 4199)}
-"""Seconds of an average training episode in RUN, and memory (MB), on an RTX 4090."""
 
+#: Share of successful episodes in SLOT; of how many is not said.
 SUCCESS: dict[str, float] = {"cfp": 0.154, "transformer-64": 0.059, "gnn-64": 0.0}
-"""Share of successful episodes in SLOT; of how many is not said."""
 
+#: Ratio to the unperturbed return of CFP when 20 % of the observation, of the action are set to zero.
 DROPOUT_RATIOS: dict[str, tuple[float, float]] = {
     "shapematch": (0.932, 0.911),
     "run": (0.877, 0.954),
@@ -56,14 +57,13 @@ DROPOUT_RATIOS: dict[str, tuple[float, float]] = {
     "catch": (0.915, 0.989),
     "slot": (0.941, 0.970),
 }
-"""Ratio to the unperturbed return of CFP when 20 % of the observation, of the action are set to zero."""
 
 _REST = (21, 2500, 3100, 890, -1500, 2400, -1900, 7000)
+#: Task to the return of a robot that does not move (SHAPE MATCH: 12 to 30, by the particles).
 REST: dict[str, float] = dict(zip(CURVES, _REST, strict=True))
-"""Task to the return of a robot that does not move (SHAPE MATCH: 12 to 30, by the particles)."""
 
+#: Tasks in which the paper evaluates policies without action noise; in all others they act with it.
 WITHOUT_NOISE = tuple(task for task, numbers in TASKS.items() if numbers.deterministic)
-"""Tasks in which the paper evaluates policies without action noise; in all others they act with it."""
 
 
 def curve(algo: str, task: str) -> tuple[float, float] | None:

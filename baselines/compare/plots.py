@@ -14,16 +14,16 @@ from baselines.compare.stats import align_curves, bootstrap_interval, interquart
 COLOURS = (
     "#0173b2 #de8f05 #029e73 #d55e00 #cc78bc #ca9161 #56b4e9 #949494 #8c564b #bcbd22 #17becf #7f3c8d #e377c2 #1b5e20"
 ).split()
+#: Line and marker by what is observed.
 LINES: dict[str, tuple[Any, str]] = {
     "image": ("-", "o"),
     "state": ("--", "s"),
     "simulator": (":", "^"),
     "nothing": ((0, (1, 4)), "v"),
 }
-"""Line and marker by what is observed."""
 BAND_RESAMPLES = 2_000
+#: Keywords of matplotlib's lines, by algorithm and observation.
 Styles = dict[tuple[str, str], dict[str, Any]]
-"""Keywords of matplotlib's lines, by algorithm and observation."""
 
 
 def _styles(groups: Sequence[Group]) -> Styles:

@@ -14,8 +14,8 @@ from cfp.experiment.algorithm import Sees
 from cfp.sections import Particles
 from cfp.tables import read_table
 
+#: What policies observe, in the order of tables.
 OBSERVATIONS = get_args(Sees)
-"""What policies observe, in the order of tables."""
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.stats
 
+#: Steps (N,), increasing, and values (N,).
 Curve = tuple[np.ndarray, np.ndarray]
-"""Steps (N,), increasing, and values (N,)."""
 
 
 def interquartile_mean(scores: np.ndarray | Sequence[float], axis: int = 0) -> np.ndarray:

@@ -12,8 +12,8 @@ from cfp.evaluation.table import Column, Row, Table, columns, make_row
 from cfp.sections import Particles
 from dittogym import make_spec
 
+#: Fractions of the way from a resting robot to the best curve, for sample efficiency.
 MILESTONES = (0.5, 0.75, 0.9)
-"""Fractions of the way from a resting robot to the best curve, for sample efficiency."""
 GROUP = (
     Column("task", "task", value=lambda group: group.task),
     Column("sees", "observes", value=lambda group: group.observes),

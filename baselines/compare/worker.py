@@ -26,8 +26,8 @@ from cfp.experiment.run_lock import FolderInUse, run_lock
 from cfp.files import write_json, write_text
 from cfp.from_dict import update_from_dict
 
+#: How a run ended; busy: another process holds its folder.
 Outcome = Literal["finished", "failed", "busy", "stopped"]
-"""How a run ended; busy: another process holds its folder."""
 EXIT_CODES: dict[Outcome, int] = {"finished": 0, "failed": 1, "busy": 3, "stopped": 4}
 
 

@@ -28,8 +28,8 @@ from cfp.weights import check_trained_for, copy_policy, read_policy, shipped
 from dittogym import TorchEnv
 from dittogym.action import ActionIndexing, bicubic_matrix, from_grid_indexing, to_grid_indexing
 
+#: Teachers that are trained first if only their algorithm is named.
 TRAINED = ("shac", "gradient")
-"""Teachers that are trained first if only their algorithm is named."""
 
 
 class Teacher(Stateful, ABC):

@@ -37,6 +37,7 @@ from cfp.sections import EnvironmentConfig
 from cfp.weights import load
 from dittogym import make_spec
 
+#: Every scalar that ``Distill.update`` logs, and what it means.
 METRICS: dict[str, str] = {
     "rollout/return": "mean undiscounted return of the episodes that ended in the last round; empty if none did",
     "train/loss": "mean squared difference from the teacher's actions, mean over the round's updates",
@@ -48,7 +49,6 @@ METRICS: dict[str, str] = {
     "train/terminated": "training episodes of this stage that terminated early",
     "train/nonfinite": "simulations that were not finite and were reset",
 }
-"""Every scalar that `Distill.update` logs, and what it means."""
 
 
 class Distill(Stateful, CoarseToFineStages):

@@ -22,10 +22,10 @@ from dittogym import TorchEnv
 from dittogym.spec import DT
 from dittogym.tasks import task_name
 
+#: Actions are drawn uniformly from [-ACTION_RANGE, ACTION_RANGE].
 ACTION_RANGE = 0.3
-"""Actions are drawn uniformly from [-ACTION_RANGE, ACTION_RANGE]."""
+#: Random directions of the finite differences.
 DIRECTIONS = 4
-"""Random directions of the finite differences."""
 
 
 @dataclass(frozen=True)

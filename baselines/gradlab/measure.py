@@ -14,15 +14,15 @@ from tqdm import tqdm
 from baselines.common.rollout import check_differentiable, repeat, rollout, to_dtype
 from dittogym.model import EnvState, Model
 
+#: Step sizes of the finite differences, root mean square per action value.
 STEP_SIZES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
-"""Step sizes of the finite differences, root mean square per action value."""
+#: Standard deviation of the action noise under which first- and zeroth-order estimates are compared.
 NOISE_STD = 0.1
-"""Standard deviation of the action noise under which first- and zeroth-order estimates are compared."""
+#: Largest number of simulations at a time; it bounds the memory.
 BATCH_SIZE = 16
-"""Largest number of simulations at a time; it bounds the memory."""
 
+#: Measurements at one horizon, by the names of ``COLUMNS``.
 Result = dict[str, Any]
-"""Measurements at one horizon, by the names of `COLUMNS`."""
 COLUMNS = {
     "horizon": "control steps",
     "norm": "norm of the gradient in all actions",

@@ -14,8 +14,8 @@ from cfp.evaluation.plots import write_figure
 from cfp.files import write_json, write_text
 from cfp.tables import csv_text
 
+#: Largest error of finite differences, and smallest cosine between precisions, of a gradient taken to be right.
 MAX_DIFFERENCE_ERROR, MIN_COSINE = 0.05, 0.99
-"""Largest error of finite differences, and smallest cosine between precisions, of a gradient taken to be right."""
 
 
 def objections(result: Result) -> list[str]:

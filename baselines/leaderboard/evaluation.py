@@ -23,8 +23,8 @@ from cfp.policy_protocols import Policy
 from cfp.sections import EnvironmentConfig
 from cfp.weights import check_trained_for, policy_file, shipped
 
+#: Name under which the policies that come with the package are submitted, one for each task.
 PRETRAINED = "pretrained"
-"""Name under which the policies that come with the package are submitted, one for each task."""
 
 
 @dataclass(frozen=True)

@@ -56,5 +56,5 @@ V1 = FixedProtocol(
     device="cpu",  # there an episode does not depend on those that are played beside it, to the last bit
 )
 
+#: All protocols by name.
 PROTOCOLS = {protocol.version: protocol for protocol in (V1,)}
-"""All protocols by name."""

@@ -15,8 +15,8 @@ from cfp.experiment.algorithm import Sees
 from cfp.files import read_json
 from cfp.from_dict import update_from_dict
 
+#: Of recomputed scores, which are rounded to three decimals.
 TOLERANCE = 0.0015
-"""Of recomputed scores, which are rounded to three decimals."""
 NAME = re.compile(r"[\w .,+()-]{1,60}", re.ASCII)
 VERSION, HASH = re.compile(r"\d+(\.\d+)+[\w.+-]*", re.ASCII), re.compile(r"[0-9a-f]{64}")
 

@@ -11,12 +11,12 @@ from torch import Tensor
 from cfp.errors import ConfigError
 from dittogym.geometry import NODES
 
+#: Iterations of Lloyd's algorithm in every step: the inertia stays within 1 % of a converged clustering.
 LLOYD_ITERATIONS = 2
-"""Iterations of Lloyd's algorithm in every step: the inertia stays within 1 % of a converged clustering."""
+#: Distance from the line half-way between two centres within which a particle is at their border, m (3/4 of a cell).
 BORDER = 0.75 / NODES
-"""Distance from the line half-way between two centres within which a particle is at their border, m (3/4 of a cell)."""
+#: Particles at the border, on each side, from which on two segments are neighbours.
 MIN_BORDER_PARTICLES = 3
-"""Particles at the border, on each side, from which on two segments are neighbours."""
 
 
 def fit(x: Tensor, count: int, seed: int = 0) -> Tensor:

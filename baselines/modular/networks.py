@@ -26,12 +26,12 @@ from dittogym import TorchEnv
 from dittogym.spec import TaskSpec
 
 Kind = Literal["gnn", "transformer"]
+#: Width of the hidden layers.
 WIDTH = 128
-"""Width of the hidden layers."""
+#: Rounds of messages, or layers of attention.
 LAYERS = 3
-"""Rounds of messages, or layers of attention."""
+#: Attention heads.
 HEADS = 4
-"""Attention heads."""
 
 
 class GraphTrunk(nn.Module):

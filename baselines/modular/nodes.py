@@ -14,18 +14,18 @@ from dittogym.spec import TaskSpec
 from dittogym.window import centre_in_window
 from torchmpm import checks
 
+#: Units of the features, m and m/s: most values lie within [-2, 2].
 LENGTH_SCALE, SPEED_SCALE = 0.1, 0.5
-"""Units of the features, m and m/s: most values lie within [-2, 2]."""
+#: Height of the floor, m.
 FLOOR = (FLOOR_NODE + 1) / NODES
-"""Height of the floor, m."""
+#: Speed along an axis at which the feature saturates, m/s.
 MAX_SPEED = 100.0
-"""Speed along an axis at which the feature saturates, m/s."""
+#: Distance from the window at which positions saturate, m: torn-off matter can fly as far as 1e20.
 MAX_DISTANCE = 1.0
-"""Distance from the window at which positions saturate, m: torn-off matter can fly as far as 1e20."""
+#: Largest number of segments.
 MAX_SEGMENTS = 4096
-"""Largest number of segments."""
+#: Neighbours packed into one float32 of a node's row; integers up to 2^24 are exact there.
 BITS = 16
-"""Neighbours packed into one float32 of a node's row; integers up to 2^24 are exact there."""
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from dittogym.core import StepResult
 from dittogym.model import EnvState, Model
 from torchmpm import tree
 
+#: Fraction of the task's limit on the robot's spread from which a spread costs.
 SPLIT_MARGIN = 0.8
-"""Fraction of the task's limit on the robot's spread from which a spread costs."""
 
 
 @dataclass(frozen=True)

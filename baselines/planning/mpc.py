@@ -20,13 +20,13 @@ from cfp.presets import sac_preset
 from cfp.sections import ReportConfig
 from dittogym import make_spec
 
+#: Every scalar that ``MPC.update`` logs, and what it means.
 METRICS: dict[str, str] = {
     "train/return": "sum of the rewards of the episode so far",
     "train/reward": "reward of the last step",
     "train/plans": "plans evaluated so far; each is a simulation of the planner's horizon",
     "train/failed": "plans so far that were not finite; they are never carried out",
 }
-"""Every scalar that `MPC.update` logs, and what it means."""
 
 
 @dataclass(frozen=True)

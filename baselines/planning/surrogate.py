@@ -11,8 +11,8 @@ from dittogym.model import EnvState
 from dittogym.physics import PER_PARTICLE
 from torchmpm import tree
 
+#: Nearest particles among which each particle looks for one that is not taken yet.
 NEIGHBOURS = 16
-"""Nearest particles among which each particle looks for one that is not taken yet."""
 
 
 class Surrogate:

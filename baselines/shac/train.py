@@ -29,9 +29,10 @@ from cfp.sections import ReportConfig
 from cfp.validation import check_at_least
 from cfp.weights import KIND, load, policy_for, read_policy
 
+#: Updates in a row without a finite gradient after which training gives up.
 PATIENCE = 10
-"""Updates in a row without a finite gradient after which training gives up."""
 
+#: Every scalar that ``Shac.update`` logs, and what it means.
 METRICS: dict[str, str] = {
     **WINDOW_METRICS,
     "train/critic_loss": "mean squared error of the critic in the last of its updates",
@@ -39,7 +40,6 @@ METRICS: dict[str, str] = {
     "train/learning_rate": "Adam's step size",
     "train/skipped": "updates without a finite gradient, which were not made",
 }
-"""Every scalar that `Shac.update` logs, and what it means."""
 
 
 @dataclass(frozen=True)

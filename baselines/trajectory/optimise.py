@@ -23,16 +23,17 @@ from cfp.sections import EnvironmentConfig, Particles, ReportConfig
 from cfp.validation import check_at_least, check_positive
 from dittogym import make_spec
 
+#: Of Adam.
 BETAS = (0.9, 0.98)
-"""Of Adam."""
+#: A step's gradient is clipped to this multiple of its running mean norm, which has this momentum.
 CLIP, NORM_MOMENTUM = 3.0, 0.9
-"""A step's gradient is clipped to this multiple of its running mean norm, which has this momentum."""
+#: An iteration whose loss exceeds the best one by this fraction of its size is undone, and the learning rate is
+#: multiplied by this factor.
 MAX_RISE, BACKOFF = 0.1, 0.7
-"""An iteration whose loss exceeds the best one by this fraction of its size is undone, and the learning rate is
-multiplied by this factor."""
+#: Failed iterations in a row after which training gives up.
 PATIENCE = 10
-"""Failed iterations in a row after which training gives up."""
 
+#: Every scalar that ``Gradient.update`` logs, and what it means.
 METRICS: dict[str, str] = {
     "train/loss": "the objective, mean over layouts and steps",
     "train/return": "mean return of the iteration's episodes, at the particle count of training",
@@ -41,7 +42,6 @@ METRICS: dict[str, str] = {
     "train/learning_rate": "Adam's step size in the next iteration",
     "train/failed": "iterations of this stage that were undone",
 }
-"""Every scalar that `Gradient.update` logs, and what it means."""
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,12 @@ from cfp.agent.lean import LeanEncoder, NetworkInput, Trunk, image_of
 from cfp.agent.networks import IMAGE_SIZE, Encoder, PairEncoder, initialise, make_head, normalise_image, upsample
 from cfp.agent.spec import ActorSpec
 
+#: Bounds of the standard deviation before tanh; the lower one keeps sampling stochastic.
 STD_BOUNDS = (0.1, 6.0)
-"""Bounds of the standard deviation before tanh; the lower one keeps sampling stochastic."""
 
 
+#: Bias of a standard deviation that is not trained: 0.105 before tanh, near the smallest that is allowed.
 STD_BIAS = -0.4
-"""Bias of a standard deviation that is not trained: 0.105 before tanh, near the smallest that is allowed."""
 
 
 class Outputs(NamedTuple):

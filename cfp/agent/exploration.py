@@ -16,8 +16,8 @@ from torch import Tensor
 
 from cfp.errors import ConfigError
 
+#: Of the zeta distribution of the number of steps for which noise is held: its exponent, and its largest value.
 EXPONENT, LONGEST = 2.0, 16
-"""Of the zeta distribution of the number of steps for which noise is held: its exponent, and its largest value."""
 
 
 class CellNoise:

@@ -16,8 +16,8 @@ from torch.nn import functional as F
 from cfp.agent import fused
 from cfp.agent.networks import IMAGE_SIZE, LATENT, Encoder, initialise, perceptron
 
+#: Channels of the encoder's features (B, 16, 4, 4), and of those of an action.
 WIDTH = 16
-"""Channels of the encoder's features (B, 16, 4, 4), and of those of an action."""
 
 
 class Encoded(NamedTuple):

@@ -16,11 +16,11 @@ from cfp.agent import fused
 from cfp.agent.spec import Interpolation
 from dittogym.action import bicubic
 
+#: Rows and columns of the observation, and of actions as input of the paper's encoders.
 IMAGE_SIZE = 64
-"""Rows and columns of the observation, and of actions as input of the paper's encoders."""
 
+#: Number of entries of a latent image.
 LATENT = 32 * 4 * 4
-"""Number of entries of a latent image."""
 
 _DOUBLE, _KEEP = (4, 2, 1), (3, 1, 1)  # (kernel, stride, padding) that double or keep the size
 _DECODERS: dict[int, tuple[tuple[tuple[int, int, int], ...], tuple[int, ...]]] = {

@@ -33,6 +33,7 @@ from cfp.agent.replay import ReplayRing
 from cfp.agent.reward_statistics import RewardStatistics
 from cfp.errors import NonFiniteError
 
+#: Scalars that ``CFP.train`` logs.
 METRICS: dict[str, str] = {
     "train/critic_loss": "sum of both critics' mean squared errors, in normalised rewards",
     "train/actor_loss": "mean of alpha log pi - min Q, plus the gate penalty, and with refine anchor times train/drift",
@@ -47,16 +48,15 @@ METRICS: dict[str, str] = {
     "train/learning_rate": "learning rate of the critics, and of the actor unless it has its own",
     "train/drift": "where a policy is refined: mean square by which sampled actions differ from its mean ones",
 }
-"""Scalars that `CFP.train` logs."""
 
 
+#: Hyperparameters that stable-baselines3 knows by the same name.
 SHARED = ("buffer_size", "batch_size", "tau", "gamma", "gradient_steps")
-"""Hyperparameters that stable-baselines3 knows by the same name."""
+#: Arguments of stable-baselines3's SAC that ``Hyperparameters`` holds.
 FROM_HYPERPARAMETERS = {*SHARED, "learning_rate", "learning_starts", "ent_coef", "n_steps"}
-"""Arguments of stable-baselines3's SAC that `Hyperparameters` holds."""
+#: Arguments of SAC that CFP does not take: targets follow each update, the temperature is a constant, and exploration
+#: noise and replay buffer are its own.
 UNUSED = {"target_update_interval", "target_entropy", "action_noise", "replay_buffer_class"}
-"""Arguments of SAC that CFP does not take: targets follow each update, the temperature is a constant, and exploration
-noise and replay buffer are its own."""
 
 
 def falling_rate(rate: float, final: float, remaining: float) -> float:

@@ -11,8 +11,8 @@ from dittogym.geometry import NODES
 Interpolation = Literal["half_pixel", "aligned"]
 EncoderKind = Literal["full", "lean"]
 
+#: Action grids R for which ``cfp.agent.networks.make_head`` has a decoder.
 RESOLUTIONS = (4, 8, 16, 32, 64)
-"""Action grids R for which `cfp.agent.networks.make_head` has a decoder."""
 
 
 @dataclass(frozen=True)

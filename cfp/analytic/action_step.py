@@ -12,12 +12,12 @@ from torch import Tensor
 
 from cfp.analytic.stateful import Stateful
 
+#: Gradients of single actions longer than this many running medians are shortened to it.
 OUTLIER = 3.0
-"""Gradients of single actions longer than this many running medians are shortened to it."""
+#: Latest norms that the median is taken of.
 HISTORY = 2_000
-"""Latest norms that the median is taken of."""
+#: Largest magnitude of an improved mean, whose tanh is 0.987, and of an improved gate logit before its bias.
 BOUND = 2.5
-"""Largest magnitude of an improved mean, whose tanh is 0.987, and of an improved gate logit before its bias."""
 
 
 class ActionStep(Stateful):

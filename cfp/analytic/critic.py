@@ -12,10 +12,10 @@ from cfp.analytic.config import WindowConfig
 from cfp.analytic.stateful import Stateful
 from cfp.analytic.window import Window, td_lambda_targets
 
+#: Width of the hidden layers.
 WIDTH = 128
-"""Width of the hidden layers."""
+#: Of Adam.
 BETAS = (0.7, 0.95)
-"""Of Adam."""
 
 
 def mlp(inputs: int, outputs: int) -> nn.Sequential:

@@ -12,10 +12,10 @@ from dittogym import TorchEnv
 from dittogym.window import centre_in_window
 from torchmpm.spline import quadratic_weights
 
+#: Cells per axis of the rasters.
 CELLS = 16
-"""Cells per axis of the rasters."""
+#: Periods of the clock, in control steps.
 PERIODS = (8, 4, 2)
-"""Periods of the clock, in control steps."""
 _PADDING = 2
 
 

@@ -31,6 +31,7 @@ from cfp.experiment.stages import CoarseToFineStages, refines
 from cfp.presets import analytic_preset
 from dittogym import core
 
+#: Every scalar that ``AnalyticLearner.update`` logs, and what it means.
 METRICS: dict[str, str] = {
     **WINDOW_METRICS,
     "train/critic_loss": "mean squared error of the critic in the last of its updates",
@@ -39,7 +40,6 @@ METRICS: dict[str, str] = {
     "train/learning_rate": "Adam's step size",
     "train/limited": "gradients of single actions that were shortened as outliers",
 }
-"""Every scalar that `AnalyticLearner.update` logs, and what it means."""
 #: Training stops after so many windows in a row without any gradient.
 MOST_EMPTY_WINDOWS = 10
 

@@ -13,8 +13,8 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from cfp.agent.actor import Actor
 from cfp.analytic.stateful import Stateful
 
+#: Of Adam.
 BETAS = (0.9, 0.95)
-"""Of Adam."""
 
 
 class ImageMemory(Stateful):

@@ -12,14 +12,14 @@ from cfp.validation import check_at_least, check_positive
 from dittogym import TorchEnv
 from torchmpm import tree
 
+#: Reward for a mean speed of 1 m/s.
 SPEED_WEIGHT = 60.0
-"""Reward for a mean speed of 1 m/s."""
+#: Neighbours of each sampled particle whose distance is tracked, and how many particles are sampled at most.
 NEIGHBOURS, MAX_SAMPLES = 6, 500
-"""Neighbours of each sampled particle whose distance is tracked, and how many particles are sampled at most."""
+#: Particles nearer than this, m, belong together.
 RADIUS = 0.03
-"""Particles nearer than this, m, belong together."""
+#: Fraction of ``RADIUS`` by which they may drift apart at no cost.
 TOLERANCE = 0.25
-"""Fraction of `RADIUS` by which they may drift apart at no cost."""
 
 
 @dataclass(frozen=True)

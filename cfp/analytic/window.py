@@ -20,6 +20,7 @@ from dittogym.contract import Moment, Outcome
 from dittogym.spec import TaskSpec
 from torchmpm import tree
 
+#: What ``WindowCollector.scalars`` returns, and what it means.
 WINDOW_METRICS = {
     "rollout/return": "mean undiscounted true return of the episodes that ended since the last row; empty if none did",
     "train/reward": "mean training reward of a step, before its scale",
@@ -30,7 +31,6 @@ WINDOW_METRICS = {
     "train/nonfinite": "simulations that were not finite and were reset",
     "train/dropped": "gradients of single actions that were not finite and were left out",
 }
-"""What `WindowCollector.scalars` returns, and what it means."""
 
 
 class Window(NamedTuple):

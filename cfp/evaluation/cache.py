@@ -23,8 +23,8 @@ from cfp.files import read_json, write_json
 from dittogym.tasks import fingerprint
 from torchmpm.native.cpu.library import cache_folder, processor, provenance
 
+#: Environment variable that names the folder; empty: nothing is kept.
 VARIABLE = "TORCHMPM_EPISODES"
-"""Environment variable that names the folder; empty: nothing is kept."""
 _logger = logging.getLogger(__name__)
 
 

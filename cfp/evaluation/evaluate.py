@@ -18,8 +18,8 @@ from cfp.evaluation.episodes import Trial, play
 from cfp.evaluation.untrained import UntrainedPolicy
 from cfp.policy_protocols import Policy
 
+#: With action noise or without; default: as the run that trained a policy evaluates it.
 Noise = Literal["default", "with", "without", "both"]
-"""With action noise or without; default: as the run that trained a policy evaluates it."""
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,15 @@ from dittogym.observation.image import silhouette
 from dittogym.render.canvas import GROUND, TARGET
 from dittogym.render.colours import ROBOT
 
+#: Pictures of every evaluation (TensorBoard only), and what they show.
 PICTURES: dict[str, str] = {
     "picture/observation": "what the first training robot shows: red occupancy, green and blue velocity in x and y",
     "picture/action": "the mean action for it, x-muscles left, y-muscles right: red contracts, blue expands",
     "picture/gate": "the gate of a residual actor in the same way: white keeps the coarse action, red replaces it",
 }
-"""Pictures of every evaluation (TensorBoard only), and what they show."""
 
+#: Colour of the robot's pixels outside the target.
 MISPLACED = (206, 60, 52)
-"""Colour of the robot's pixels outside the target."""
 SIZE = 192  # rows of a picture, pixels
 
 

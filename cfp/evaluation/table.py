@@ -7,8 +7,8 @@ from typing import Any
 
 from cfp.tables import csv_text
 
+#: Values by the key of their column; None, or a missing key, is a value that does not exist.
 Row = Mapping[str, Any]
-"""Values by the key of their column; None, or a missing key, is a value that does not exist."""
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,11 @@ from cfp.experiment.folder import policy_path
 from cfp.experiment.process import StopSignals
 from cfp.policy_protocols import Policy
 
+#: What a policy may look at: the observation; the full state; the simulator, to plan with; nothing.
 Sees = Literal["image", "state", "simulator", "nothing"]
-"""What a policy may look at: the observation; the full state; the simulator, to plan with; nothing."""
 
+#: Values to log by name; None for those that do not exist yet.
 Scalars = Mapping[str, float | None]
-"""Values to log by name; None for those that do not exist yet."""
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,12 @@ from cfp.tables import CSVTable
 from cfp.weights import describe_run
 from dittogym.render.recording import record
 
+#: Scalars that every algorithm logs beside its own.
 LOG_METRICS: dict[str, str] = {
     "stage": "stage in training, 1 is the first",
     "time/steps_per_second": "environment steps per second of wall time since the last point (TensorBoard only)",
 }
-"""Scalars that every algorithm logs beside its own."""
+#: Columns of ``evaluations.csv``.
 EVALUATION_COLUMNS: dict[str, str] = {
     "step": "environment steps of the run so far",
     "stage": "stage in training, 1 is the first",
@@ -37,7 +38,6 @@ EVALUATION_COLUMNS: dict[str, str] = {
     "highest": "highest return",
     "success": "share of successes, where the task defines success",
 }
-"""Columns of ``evaluations.csv``."""
 
 
 class StageFinished(Exception):

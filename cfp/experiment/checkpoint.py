@@ -19,8 +19,8 @@ from cfp.files import parse_json, write_atomically
 from cfp.from_dict import differences
 
 VERSION = 2
+#: What torch raises for damaged files, besides ``pickle.UnpicklingError``.
 UNREADABLE = (OSError, RuntimeError, ValueError, LookupError, AttributeError, EOFError)
-"""What torch raises for damaged files, besides `pickle.UnpicklingError`."""
 
 
 class Checkpoint:

@@ -25,13 +25,13 @@ from cfp.experiment.stages import CoarseToFineStages, refines, start_path
 from cfp.presets import sac_preset
 from cfp.weights import load
 
+#: Scalars logged beside ``cfp.agent.sac.METRICS`` and ``cfp.experiment.callbacks.LOG_METRICS``.
 ROLLOUT_METRICS: dict[str, str] = {
     "rollout/return": "mean undiscounted return of the last training episodes (with action noise)",
     "rollout/length": "their mean length in environment steps",
     "rollout/success": "share of successes among them, where the task defines success",
     "rollout/episodes": "episodes finished in this stage",
 }
-"""Scalars logged beside `cfp.agent.sac.METRICS` and `cfp.experiment.callbacks.LOG_METRICS`."""
 
 
 class SACAlgorithm(Algorithm):

@@ -18,12 +18,12 @@ from cfp.files import write_text
 from cfp.tables import CSVTable
 from dittogym.render.film import available
 
+#: Scalars of an evaluation in TensorBoard.
 EVALUATION_METRICS: dict[str, str] = {
     "eval/return": "mean undiscounted return of an evaluation's episodes (the column mean of evaluations.csv)",
     "eval/std": "standard deviation of these returns",
     "eval/success": "share of successes among them, where the task defines success",
 }
-"""Scalars of an evaluation in TensorBoard."""
 
 
 class ProgressTable(KVWriter):

@@ -2,8 +2,8 @@
 
 import math
 
+#: Fraction of the learning rate that is left at the end of a stage.
 FINAL_FRACTION = 0.1
-"""Fraction of the learning rate that is left at the end of a stage."""
 
 
 def linear_decay(progress: float, final: float = FINAL_FRACTION) -> float:

@@ -25,8 +25,8 @@ from cfp.files import read_json
 from cfp.from_dict import flatten, leaf_names, update_from_dict
 from cfp.policy_protocols import Policy
 
+#: Options that the help shows first.
 BASIC = ("task", "target", "algo", "preset", "learner", "steps", "seed", "device", "out", "resume")
-"""Options that the help shows first."""
 
 
 @dataclass(frozen=True)

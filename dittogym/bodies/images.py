@@ -69,9 +69,11 @@ def _read(picture: PictureLike, name: str, others: str) -> np.ndarray:
     if path.lower().endswith((".svg", ".svgz")):
         raise ValueError(f"{name} must be made of pixels, got the vector drawing {path!r}; export it as PNG")
     try:
-        width, height = _claimed_size(path)
+        (width, height), transparent = _claims(path)
         small = width * height <= LARGEST
-        image = cv2.imread(path, cv2.IMREAD_UNCHANGED) if small else None
+        # Without transparency OpenCV turns photographs as their EXIF orientation says.
+        flags = cv2.IMREAD_UNCHANGED if transparent else cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
+        image = cv2.imread(path, flags) if small else None
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, cv2.error) as error:
         raise ValueError(f"{name} {path!r} cannot be read as an image ({error})") from error
     if not small:
@@ -81,14 +83,14 @@ def _read(picture: PictureLike, name: str, others: str) -> np.ndarray:
     return _as_bytes(image, name)
 
 
-def _claimed_size(path: str) -> tuple[int, int]:
-    """Width and height from the head of a file: a few bytes may claim to be what fills the memory."""
+def _claims(path: str) -> tuple[tuple[int, int], bool]:
+    """Size and transparency from the head of a file: a few bytes may claim to be what fills the memory."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Pillow's own about large pictures; there is a limit of ours
         with Image.open(path) as image:
-            size = image.size
+            size, transparent = image.size, image.has_transparency_data
             image.verify()  # OpenCV takes memory for whatever length a chunk of a PNG claims
-            return size
+            return size, transparent
 
 
 def _as_bytes(image: np.ndarray, name: str) -> np.ndarray:

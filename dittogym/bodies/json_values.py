@@ -32,6 +32,8 @@ def to_values(value: Any) -> Any:
         return [to_values(each) for each in value]
     if isinstance(value, torch.dtype | torch.device | os.PathLike):
         return str(value)
+    if isinstance(value, np.generic):
+        return value.item()
     if not isinstance(value, np.ndarray):
         return value
     if value.dtype.kind == "u" and value.shape[1:] != (2,):  # a picture; lists of whole numbers are outlines

@@ -18,8 +18,8 @@ def check_place(spec: TaskSpec) -> None:
     """Refuse what cannot start where it is.
 
     Raises:
-        ValueError: A body leaves the window or overlaps an obstacle, the robot lies in the object or is torn from the
-            start, or the goal lies outside a fixed window.
+        ValueError: A body leaves the window or overlaps an obstacle, the robot reaches into the bounding box of the
+            object or is torn from the start, or the goal lies outside a fixed window.
     """
     numbers = sampling.sobol(PROBE, seed=0)
     points = spec.robot.shape.positions(numbers)
@@ -36,7 +36,7 @@ def check_place(spec: TaskSpec) -> None:
     if limit is not None and split >= limit:
         raise ValueError(f"robot must be more compact: its spread is {split:.3f} m, and {spec.name} ends at {limit} m")
     if spec.goal is not None and not spec.window.moves and not bool(contains(origin.new_tensor([[spec.goal]]), origin)):
-        raise ValueError(f"goal must lie inside the window ({_window(origin)}), got {spec.goal}")
+        raise ValueError(f"goal must lie inside the window ({window_range(origin)}), got {spec.goal}")
 
 
 def _checked_place(spec: TaskSpec, name: str, body: BodySpec, points: np.ndarray, origin: torch.Tensor) -> str:
@@ -45,7 +45,7 @@ def _checked_place(spec: TaskSpec, name: str, body: BodySpec, points: np.ndarray
     place = f"{left:.3f} < x < {left + width:.3f}, {bottom:.3f} < y < {bottom + height:.3f}"
     corners = origin.new_tensor([[(left, bottom), (left + width, bottom + height)]])
     if not bool(contains(corners, origin).all()):
-        raise ValueError(f"{name} must lie inside the window ({_window(origin)}), got {place}")
+        raise ValueError(f"{name} must lie inside the window ({window_range(origin)}), got {place}")
     for obstacle in spec.obstacles:
         for box in obstacle.boxes:
             if _any_inside(points, (box.left, box.bottom), (box.right, box.top)):
@@ -54,7 +54,8 @@ def _checked_place(spec: TaskSpec, name: str, body: BodySpec, points: np.ndarray
     return place
 
 
-def _window(origin: torch.Tensor) -> str:
+def window_range(origin: torch.Tensor) -> str:
+    """What lies inside a window at ``origin`` (1, 2), m, for messages."""
     return f"{origin[0, 0]:.3f} < x < {origin[0, 0] + 1:.3f}, 0 < y < 1"
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dittogym.bodies.place import window_range
 from dittogym.physics import real_tensor
 from dittogym.spec import BodySpec, TaskSpec
 from dittogym.window import contains
@@ -80,15 +81,25 @@ def body_positions(body: BodySpec, count: int, generator: np.random.RandomState,
 
 @dataclass(frozen=True)
 class InitialPositions:
-    """Initial positions of a batch; a draw returns a new object, so that a reset that fails changes nothing."""
+    """Initial positions of a batch; a draw returns a new object, so that a reset that fails changes nothing.
 
-    spec: TaskSpec  # The task
-    counts: tuple[int, ...]  # Particles of each body
-    num_envs: int  # Number B of simulations
-    random: bool  # Random positions instead of evenly spread ones, see :func:`body_positions`
-    resample: bool  # Draw anew at every reset
-    generators: Mapping[int, np.random.RandomState] = field(default_factory=dict)  # By element
-    positions: Tensor | None = None  # (B, N, 2) in the world, m; None before the first draw
+    Attributes:
+        spec: The task.
+        counts: Particles of each body.
+        num_envs: Number B of simulations.
+        random: Random positions instead of evenly spread ones, see :func:`body_positions`.
+        resample: Draw anew at every reset.
+        generators: By element of the batch.
+        positions: (B, N, 2) in the world, m; ``None`` before the first draw.
+    """
+
+    spec: TaskSpec
+    counts: tuple[int, ...]
+    num_envs: int
+    random: bool
+    resample: bool
+    generators: Mapping[int, np.random.RandomState] = field(default_factory=dict)
+    positions: Tensor | None = None
 
     def draw(self, seed: Seed, mask: np.ndarray, given: Any, like: Tensor) -> InitialPositions:
         """The initial positions of the next episodes; elements outside ``mask`` (B,) keep theirs."""
@@ -144,6 +155,6 @@ class InitialPositions:
         inside = contains(positions, origin)
         if not bool(inside.all()):
             element, particle = (~inside).nonzero()[0].tolist()
-            window = f"{origin[element, 0]:.3f} < x < {origin[element, 0] + 1:.3f}, 0 < y < 1"
+            window = window_range(origin[element : element + 1])
             where = f"{positions[element, particle].tolist()} for particle {particle} of element {element}"
             raise ValueError(f"positions must lie inside the window ({window}), got {where}")

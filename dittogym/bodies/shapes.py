@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -76,11 +76,12 @@ class Rectangle:
     Attributes:
         corner: Lower left corner in the world, m.
         size: Width and height, m.
+        draws: See :class:`Shape`.
     """
 
     corner: tuple[float, float]
     size: tuple[float, float]
-    draws: ClassVar[int] = 4
+    draws: int = field(default=4, kw_only=True)
 
     def __post_init__(self) -> None:
         checks.pair("corner", self.corner)
@@ -100,7 +101,7 @@ class Rectangle:
 class Lattice(Rectangle):
     """Box with evenly spaced particles in rows from the bottom up, without any randomness."""
 
-    draws: ClassVar[int] = 0
+    draws: int = field(default=0, kw_only=True)
 
     def positions(self, numbers: Points) -> Points:
         """World positions (N, 2) in m, in rows that differ by at most one particle."""

@@ -90,7 +90,7 @@ class Server:
         self._server.should_exit = True
 
     async def page(self, request: Request) -> Response:
-        """Answer who asks for the page."""
+        """Serve the page."""
         if not has_token(request.query_params, self.token):
             return PlainTextResponse("Open the address that the program printed; it ends in a token.", 403)
         return FileResponse(PAGE / "index.html", headers=HEADERS)

@@ -47,7 +47,7 @@ class Recording:
     """
 
     scene: Scene
-    shots: list[Shot]
+    shots: list[Shot] = field(default_factory=list)
     rewards: list[float] = field(default_factory=list)
     observation: np.ndarray | None = None
     success: bool | None = None
@@ -235,23 +235,42 @@ def record(env: Any, act: Act, seed: Any = 0, index: int = 0) -> Recording:
         seed: Of the reset.
         index: Which element of the batch is recorded, until its episode ends.
     """
-    with torch.no_grad():
-        observation, _ = env.reset(seed=seed)
-        recording, ended = Recording(describe(env.model), [env.shot(index, SHOWN)]), False
-        info: dict[str, Any] = {}
-        while not ended:
-            chosen = act(observation.cpu().numpy())
-            try:
-                action = torch.as_tensor(chosen, device=env.device)
-            except (RuntimeError, TypeError, ValueError) as error:
-                raise ValueError(f"policy must return actions, got {type(chosen).__name__}") from error
-            observation, reward, terminated, truncated, info = env.step(action)
-            recording.shots.append(env.shot(index, SHOWN))
+    recording = Recording(describe(env.model))
+    for observation, _, end in play(env, act, seed, index):
+        recording.shots.append(env.shot(index, SHOWN))
+        recording.observation = observation[index]
+        if end is not None:
+            reward, _, _, info = end
             recording.rewards.append(float(reward[index]))
-            ended = bool(terminated[index] | truncated[index])
-    recording.observation = observation[index].cpu().numpy()
-    recording.success = bool(info["is_success"][index]) if "is_success" in info else None
+            recording.success = bool(info["is_success"][index]) if "is_success" in info else None
     return recording
+
+
+@torch.no_grad()
+def play(env: Any, act: Act, seed: Any, index: int = 0) -> Iterator[tuple[np.ndarray, np.ndarray | None, Any]]:
+    """Play an episode: after the reset and after each step the observations, the actions, and what else it returned.
+
+    Args:
+        env: A :class:`dittogym.TorchEnv`, which is reset.
+        act: Chooses the actions.
+        seed: Of the reset.
+        index: Which element of the batch to play to the end of its episode.
+
+    Raises:
+        ValueError: ``act`` returns something else than actions.
+    """
+    observation, _ = env.reset(seed=seed)
+    images, ended = observation.cpu().numpy(), False
+    yield images, None, None
+    while not ended:
+        chosen = act(images)
+        try:
+            action = torch.as_tensor(chosen, device=env.device)
+        except (RuntimeError, TypeError, ValueError) as error:
+            raise ValueError(f"policy must return actions, got {type(chosen).__name__}") from error
+        observation, *end = env.step(action)
+        images, ended = observation.cpu().numpy(), bool(end[1][index] | end[2][index])
+        yield images, action.cpu().numpy(), end
 
 
 def as_function(policy: Any) -> Act:

@@ -101,7 +101,7 @@ def make_spec(
 
     Raises:
         ValueError: There is no such task, one of its bodies leaves the window or overlaps an obstacle, or its robot
-            overlaps the object or counts as torn from the start.
+            reaches into the bounding box of the object or counts as torn from the start.
         TypeError: The task has no such option, or the obstacles are not a sequence of Obstacle.
     """
     if isinstance(task, TaskSpec):
@@ -115,8 +115,10 @@ def make_spec(
     else:
         check_task(task)
         make = TASKS[task_name(task)]
-        known = list(inspect.signature(make).parameters)
-        if unknown := [name for name in options if name not in known]:
+        parameters = inspect.signature(make).parameters.values()
+        known = [each.name for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)]
+        takes_all = any(each.kind is each.VAR_KEYWORD for each in parameters)
+        if unknown := [name for name in options if name not in known and not takes_all]:
             # The words are Python's own, which programs that try out options look for.
             names = f"it takes the arguments of TorchEnv, and {', '.join(('body', 'obstacles', *known))}"
             raise TypeError(f"task {task!r} got an unexpected keyword argument {unknown[0]!r}; {names}")

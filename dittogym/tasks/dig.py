@@ -1,7 +1,5 @@
 """DIG: get through loose soil to a point in it."""
 
-from typing import ClassVar
-
 from dittogym.bodies.shapes import Disc, Rectangle
 from dittogym.contract import Moment, Outcome
 from dittogym.geometry import ceiling, floor, side_walls
@@ -16,13 +14,8 @@ REACHED = 0.1
 SNOW = Snow(*lame(5000.0, 0.2))
 
 
-class SoilPlace(Rectangle):
-    """A box whose particles the reference implementation draws with two numbers each."""
-
-    draws: ClassVar[int] = 2
-
-
-SOIL = BodySpec(SoilPlace((-0.25, 0.16), (0.5, 0.33)), count=8000, lite=3400, material=SNOW, hidden_velocity=True)
+SOIL_PLACE = Rectangle((-0.25, 0.16), (0.5, 0.33), draws=2)
+SOIL = BodySpec(SOIL_PLACE, count=8000, lite=3400, material=SNOW, hidden_velocity=True)
 
 
 def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:

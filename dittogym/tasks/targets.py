@@ -12,8 +12,6 @@ from dittogym.bodies.images import PictureLike, read_mask
 from dittogym.observation.image import SIZE
 from torchmpm import checks
 
-#: The name of a drawn target, the path of an image file, or an array.
-
 #: Pixels that the robot of SHAPE MATCH covers at the start.
 ROBOT_AREA = round(math.pi * 0.085**2 * (2 * SIZE) ** 2)
 #: Areas of targets that a robot can take, as shares of that one: matter flows, but is neither made nor lost.

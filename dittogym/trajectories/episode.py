@@ -8,15 +8,14 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 
 from dittogym.env import Env, as_tensor
-from dittogym.render.recording import Act, as_function
+from dittogym.render.recording import Act, as_function, play
 from dittogym.torch_env import TorchEnv
 from torchmpm import checks
 
+#: Attributes of :class:`torchmpm.ParticleState`.
 FIELDS = ("x", "v", "C", "F", "Jp")
-"""Attributes of :class:`torchmpm.ParticleState`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,17 +76,13 @@ def record_batch(env: TorchEnv, act: Act, seed: int, fields: Sequence[str]) -> E
     def state() -> list[np.ndarray]:
         return [getattr(env.state, name)[0].cpu().numpy().copy() for name in fields]
 
-    with torch.no_grad():
-        observation, _ = env.reset(seed=seed)
-        ends: list[list[Any]] = []
-        observations, actions, states = [observation.cpu().numpy()], [], [state()]
-        while not ends or not (ends[-1][1] or ends[-1][2]):
-            action = torch.as_tensor(act(observations[-1]), device=env.device)
-            observation, *end, _ = env.step(action)
-            observations.append(observation.cpu().numpy().copy())
-            actions.append(action.cpu().numpy().copy())
-            ends.append([value.item() for value in end])
-            states.append(state())
+    observations, actions, ends, states = [], [], [], []
+    for images, chosen, end in play(env, act, seed):
+        observations.append(images.copy())
+        states.append(state())
+        if chosen is not None:
+            actions.append(chosen.copy())
+            ends.append([value.item() for value in end[:3]])
     rewards, terminations, truncations = (np.array(values) for values in zip(*ends, strict=True))
     particles = {name: np.stack(values) for name, values in zip(fields, zip(*states, strict=True), strict=True)}
     images, done = np.concatenate(observations), (terminations, truncations)

@@ -18,8 +18,8 @@ from dittogym.trajectories.episode import Episode
 from torchmpm import checks
 
 FORMAT, VERSION = "dittogym-episodes", 1
+#: What zipfile raises for damaged archives, besides ``OSError`` and ``EOFError``.
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, NotImplementedError)
-"""What zipfile raises for damaged archives, besides `OSError` and `EOFError`."""
 ARRAYS = ("observations", "actions", "rewards", "terminations", "truncations")
 
 
@@ -35,7 +35,7 @@ def save_episodes(path: str | os.PathLike[str], episodes: Sequence[Episode]) -> 
 
     Raises:
         ValueError: The file has another suffix, or there is no episode.
-        TypeError: One of them is none.
+        TypeError: An item is not an :class:`Episode`.
     """
     file = check_archive(path)
     if not episodes:
@@ -106,11 +106,13 @@ def save_minari(dataset_id: str, episodes: Sequence[Episode], env: gymnasium.Env
 
     Raises:
         ImportError: Minari or h5py is not installed.
-        ValueError: There is no episode.
+        ValueError: There is no episode, or they are of several tasks.
     """
     minari = _minari()
     if not episodes:
         raise ValueError("episodes must be at least one, got none")
+    if len(tasks := {episode.task for episode in episodes}) > 1:
+        raise ValueError(f"episodes must be of one task, got {', '.join(sorted(tasks))}")
     buffers = [
         minari.data_collector.EpisodeBuffer(
             id=i,
@@ -125,14 +127,16 @@ def save_minari(dataset_id: str, episodes: Sequence[Episode], env: gymnasium.Env
         for i, episode in enumerate(episodes)
     ]
     options = {"data_format": "hdf5", "jpeg_encoding": False, "description": episodes[0].task} | metadata
-    return minari.create_dataset_from_buffers(dataset_id, buffers, env=env, **options)
+    dataset = minari.create_dataset_from_buffers(dataset_id, buffers, env=env, **options)
+    dataset.storage.update_metadata({"task": episodes[0].task})
+    return dataset
 
 
 def load_minari(dataset_id: str) -> list[Episode]:
     """Read what :func:`save_minari` wrote: the dataset ``dataset_id``. Needs the extra ``minari``."""
     dataset = _minari().load_dataset(dataset_id)
     seeds = [about["seed"] for about in dataset.storage.get_episode_metadata(dataset.episode_indices)]
-    task = dataset.storage.metadata["description"]
+    task = dataset.storage.metadata["task"]
     return [
         Episode(
             **{name: np.asarray(getattr(episode, name)) for name in ARRAYS},

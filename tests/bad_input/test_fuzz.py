@@ -20,8 +20,8 @@ from cfp.files import write_policy
 from cfp.presets import sac_preset
 from dittogym.tasks.targets import load_target
 
+#: Bytes by which the memory may grow at most while a file of a few kilobytes is refused.
 LARGEST_GROWTH = 2**30
-"""Bytes by which the memory may grow at most while a file of a few kilobytes is refused."""
 FUZZ = settings(max_examples=60, deadline=20_000, suppress_health_check=list(HealthCheck))
 SCALARS = (
     st.none()

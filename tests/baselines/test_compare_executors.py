@@ -24,12 +24,12 @@ from cfp.tables import read_table
 
 RETRIES = 2
 KILLED = "import os; open('count', 'a').write('x'); os.kill(os.getpid(), 9)"
+#: Stops with a checkpoint when it is asked to.
 PATIENT = (
     "import signal, sys, time\n"
     "signal.signal(signal.SIGTERM, lambda *_: (open('ended', 'w').write('checkpoint'), sys.exit(4)))\n"
     "open('ready', 'w').close(); time.sleep(60)"
 )
-"""Stops with a checkpoint when it is asked to."""
 
 
 @pytest.fixture

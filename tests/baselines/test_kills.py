@@ -18,10 +18,10 @@ from cfp.experiment.checkpoint import Checkpoint
 from cfp.tables import read_table
 
 KILLS = int(os.environ.get("KILLS", "3"))
+#: Seconds after its first words within which a training is killed.
 SPAN = 3.0
-"""Seconds after its first words within which a training is killed."""
+#: Long enough that most kills hit the training itself.
 STEPS = {"cfp": "--steps 160 --handover 80", "shac": "--steps 480", "distill": "--steps 160 --handover 80"}
-"""Long enough that most kills hit the training itself."""
 TABLES = ("evaluations.csv", "progress.csv", "results.json")
 
 

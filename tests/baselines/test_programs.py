@@ -76,10 +76,10 @@ TINY = {
     "transformer-16": (MODULAR, 44, ["stage 1"]),
     "transformer-64": (MODULAR, 44, ["stage 1"]),
 }
+#: Action grids that are not 8.
 PATCHES = {algo: 64 for algo in TINY if "-" in algo}
-"""Action grids that are not 8."""
+#: Algorithms whose policies are those of ``cfp``.
 LEVELS = ("analytic", "cfp", "coarse", "distill", "fine")
-"""Algorithms whose policies are those of `cfp`."""
 
 
 def run(algo, folder, *more):
@@ -90,8 +90,8 @@ def test_every_algorithm_is_tried_here():
     assert set(TINY) == set(baselines.ALGORITHMS)
 
 
+#: The same programs as with 16 segments, and several times slower; and as coarse, with another grid.
 LARGE = {"gnn-64", "transformer-64", "fine"}
-"""The same programs as with 16 segments, and several times slower; and as coarse, with another grid."""
 
 
 @pytest.fixture(scope="module", params=[pytest.param(a, marks=[pytest.mark.slow] * (a in LARGE)) for a in TINY])

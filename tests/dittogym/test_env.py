@@ -110,6 +110,14 @@ def test_actions_of_another_resolution(batch: tuple[int, ...]) -> None:
             env.step(np.zeros((*batch, 2, *size), np.float32))
 
 
+def test_a_reset_with_a_list_of_seeds_is_refused_and_changes_nothing() -> None:
+    env = gymnasium.make("dittogym/run-coarse-v0", **SMALL)
+    before, _ = env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"seed must be a whole number, got \[5\]"):
+        env.reset(seed=[5])
+    assert np.array_equal(env.reset()[0], before)
+
+
 def test_seeds_in_an_array_are_those_of_a_list() -> None:
     env = make_vec()
     assert np.array_equal(env.reset(seed=np.array([3, 9]))[0], env.reset(seed=[3, 9])[0])

@@ -553,7 +553,8 @@ def test_centres_of_windows_may_be_lists() -> None:
         ("run", {"body": Disc((0.1, 0.16), 0.15)}),
         ("run", {"body": Lattice((0.1, 0.16), (0.15, 0.15))}),
         ("run", {"body": Figure(np.tri(6, dtype=bool), (0.1, 0.16), 0.03)}),
-        ("dig", {"body": BodySpec(Rectangle((-0.2, 0.5), (0.14, 0.14)), 900, 3.0, Elastic(300.0, 50.0))}),
+        ("dig", {"body": BodySpec(Rectangle((-0.2, 0.5), (0.14, 0.14)), np.int16(900), 3.0, Elastic(300.0, 50.0))}),
+        ("dig", {"body": BodySpec(Rectangle((-0.2, 0.5), (0.14, 0.14), draws=2), 900), "segment": np.int64(5)}),
         ("dig", {"body": BodySpec(Disc((-0.2, 0.5), 0.14), 900, material=Snow(300.0, 50.0, hardening_range=(1, 2)))}),
     ],
 )
@@ -579,6 +580,17 @@ def test_what_json_cannot_write_of_a_body_is_refused() -> None:
     spec = gymnasium.make("dittogym/run-coarse-v0", body=Own((0.1, 0.16), 0.15), **SMALL).spec
     with pytest.raises(ValueError, match=r"kind of a body or an obstacle must be one of BodySpec.* got {'corner'"):
         gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(spec.to_json()))
+
+
+def test_a_function_with_any_options_takes_them() -> None:
+    def stretched(horizon: int = 30, **others: float):
+        return dataclasses.replace(hop(), name="stretched", horizon=horizon, **others)
+
+    dittogym.register("stretched", stretched)
+    spec = dittogym.make_spec("stretched", horizon=40, mu=900.0)
+    assert (spec.horizon, spec.mu) == (40, 900.0)
+    with pytest.raises(TypeError, match="others"):  # of dataclasses.replace
+        dittogym.make_spec("stretched", others=1.0)
 
 
 def test_its_title_is_its_name() -> None:

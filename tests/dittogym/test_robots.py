@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from tiny import TASKS, tiny
 
 import dittogym
@@ -195,6 +196,16 @@ def test_a_photograph_is_told_apart_by_what_most_of_it_shows() -> None:
     picture[eye] = 0
     found = read_mask(picture, "body", "")
     assert np.array_equal(found, bird & ~eye)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
+def test_a_photograph_is_turned_as_its_orientation_says(suffix: str, tmp_path) -> None:
+    orientation = Image.Exif()
+    orientation[0x0112] = 6  # the camera was held upright: a quarter turn to the right
+    drawn = np.kron(np.pad(ELL, 3), np.ones((16, 16), bool))
+    picture = Image.fromarray(np.where(drawn[..., None], 0, 255).astype(np.uint8).repeat(3, axis=2))
+    picture.save(tmp_path / f"photograph.{suffix}", exif=orientation)
+    assert np.array_equal(read_mask(tmp_path / f"photograph.{suffix}", "body", ""), np.rot90(drawn, -1))
 
 
 def wall(i: tuple[int, int] = (32, 38), *, visible: bool = True):

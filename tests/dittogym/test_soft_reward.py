@@ -172,6 +172,7 @@ def test_soft_limits() -> None:
     assert soft[40].item() == pytest.approx(0.0, abs=1e-7)
     assert (soft.diff() > 0).all()
     assert torch.equal(EXACT.clamp(z, high=30.0), z.clamp_max(30.0))
+    assert EXACT.clamp(z) is z and SMOOTH.clamp(z) is z
     zero = SMOOTH.clamp(z / 50.0, 0.0, 1.0)
     assert (zero - (z / 50.0).clamp(0.0, 1.0)).abs().max().item() == pytest.approx(0.05 * math.log(2))
     relu = SMOOTH.clamp(z, 0.0, width=2.0)

@@ -1,5 +1,6 @@
 """Recorded episodes: they are what happened, and files give them back."""
 
+import dataclasses
 import sys
 from unittest.mock import Mock
 
@@ -83,6 +84,7 @@ def test_minari_gives_the_same_back(env, episodes, tmp_path, monkeypatch):
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     about = {"algorithm_name": "noise", "author": "a", "author_email": "b", "code_permalink": "c", "eval_env": env.spec}
+    about["description"] = "Actions without a plan."
     dataset = trajectories.save_minari("dittogym/shapematch/noise-v0", episodes, env, **about)
     assert dataset.total_steps == 60 and (tmp_path / "dittogym/shapematch/noise-v0/data/main_data.hdf5").exists()
     for episode, again in zip(episodes, trajectories.load_minari("dittogym/shapematch/noise-v0"), strict=True):
@@ -90,6 +92,9 @@ def test_minari_gives_the_same_back(env, episodes, tmp_path, monkeypatch):
     read = minari.load_dataset("dittogym/shapematch/noise-v0")  # as its own users read it
     assert np.array_equal(next(read.iterate_episodes()).actions, episodes[0].actions)
     assert read.recover_environment().spec.kwargs["particles"] == 100
+    assert read.storage.metadata["description"] == "Actions without a plan."
+    with pytest.raises(ValueError, match="episodes must be of one task, got run, shapematch"):
+        trajectories.save_minari("a/b-v0", [*episodes, dataclasses.replace(episodes[0], task="run")], env)
 
 
 @pytest.mark.parametrize(

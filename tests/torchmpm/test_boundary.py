@@ -12,7 +12,7 @@ from scenes import normal
 from torch import Tensor
 
 from torchmpm import Grid, VelocityRule, fixed
-from torchmpm.boundary import constrain, faces
+from torchmpm.boundary import constrain, faces, node_shift
 from torchmpm.grid import PAD
 
 R = 8
@@ -98,6 +98,16 @@ def test_world_rules_stay_while_the_window_moves(axis: int, cells: float) -> Non
         assert (line == 0).tolist() == [3 <= node + offset <= 4 for node in range(R)]
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("resolution", [96, 100, 128])
+def test_windows_at_whole_nodes(resolution: int, dtype: torch.dtype) -> None:
+    """Although 1/96 and 1/100 are no binary numbers; between two nodes the shift is truncated."""
+    grid, nodes = Grid(resolution), torch.arange(-300, 300)
+    origin = (nodes.to(torch.float64) * grid.h).to(dtype)[:, None].expand(-1, 2)
+    assert torch.equal(node_shift(grid, origin), nodes[:, None].expand(-1, 2))
+    assert torch.equal(node_shift(grid, origin + 0.99 * grid.h)[300:], nodes[300:, None].expand(-1, 2))
+
+
 def test_each_simulation_has_its_origin() -> None:
     origin = torch.tensor([[0.0, 0.0], [2.0, 0.0], [-1.0, 0.0]], dtype=torch.float64) * GRID.h
     rules = (VelocityRule("-y", i=(3, 4), friction=0.5), VelocityRule("+x", i=(0, 0), friction=STICK))
@@ -163,7 +173,8 @@ def compare(listed: tuple[VelocityRule, ...], cells: tuple[float, float], seed: 
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-15)
 
 
-ORIGIN = st.tuples(st.floats(-6.0, 6.0), st.floats(-6.0, 6.0))
+CELLS = st.floats(-6.0, 6.0).map(lambda cells: round(cells, 9))  # closer to a whole number they count as one
+ORIGIN = st.tuples(CELLS, CELLS)
 
 
 @settings(max_examples=40)

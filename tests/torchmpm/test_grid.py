@@ -2,10 +2,11 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
-from torchmpm import Grid
+from torchmpm import Body, Elastic, Grid, Solver
 
 
 def test_default_window_is_one_metre() -> None:
@@ -43,3 +44,10 @@ def test_contains_tests_the_open_interval_inside_the_margin(origin: float) -> No
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
 def test_what_is_no_number_is_outside(number: float) -> None:
     assert not Grid(8).contains(torch.tensor([[number]]), torch.zeros(1, 1)).any()
+
+
+def test_small_integers_of_numpy_become_python_integers() -> None:
+    """Else sums and squares of them would overflow."""
+    assert Grid(np.uint8(128)).width ** 2 == 134**2
+    solver = Solver(Grid(np.int16(200)), (Body(np.int16(20000), Elastic(300.0, 50.0)),) * 2)
+    assert solver.num_particles == 40000

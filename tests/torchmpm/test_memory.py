@@ -11,7 +11,7 @@ import torch
 from peak_memory import PeakMemory
 from scenes import lively, normal, robot, robot_and_ball
 
-from torchmpm import Solver, estimate_memory, segment_for, trajectory
+from torchmpm import Body, Grid, ParticleState, Solver, VonMises, estimate_memory, segment_for, trajectory
 from torchmpm.backends import compiler_found
 from torchmpm.native.cpu import call
 
@@ -88,6 +88,29 @@ def test_resident_memory_of_a_process(backend: str, count: int, substeps: int) -
     predicted, used = map(int, done.stdout.split())
     assert used > 1e7
     assert predicted == pytest.approx(used, rel=0.25)
+
+
+@needs_compiler
+@pytest.mark.parametrize(("count", "nodes"), [(300, 128), (4000, 256), (10000, 128), (33000, 128)])
+def test_scratch_of_the_kernels(count: int, nodes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With one, two, four and eight parts; the estimate adds what tensors take."""
+    body = Body(count, VonMises(500.0, 50.0, 60.0), muscle=True)
+    solver = Solver(Grid(nodes), (body,), backend="native", allow_unstable=True)
+    sizes: list[int] = []
+    scratch = call._scratch
+    monkeypatch.setattr(call, "_scratch", lambda size: (sizes.append(size), scratch(size))[1])
+    state = ParticleState.at_rest(0.005 + 0.99 * torch.rand(1, count, 2, generator=torch.Generator().manual_seed(0)))
+    field = torch.zeros(1, 2, nodes, nodes, requires_grad=True)
+    solver.step(state, field, substeps=3).x.square().sum().backward()
+    tensors = 5 * 13 * 4 * count + 4 * field.numel()  # start, states, and their derivatives
+    for start in (state, (1, count, torch.float32)):
+        assert estimate_memory(solver, start, substeps=3) == pytest.approx(max(sizes) + tensors, rel=0.1)
+
+
+def test_an_estimate_takes_no_memory_itself() -> None:
+    """The state would have 500 TB."""
+    for backend in ("eager", "auto"):
+        assert estimate_memory(robot(10**4, backend=backend), (10**9, 10**4, torch.float32), substeps=2) > 5e14
 
 
 def test_the_segment_follows_the_budget() -> None:

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from torchmpm import checks, tree
 from torchmpm.materials.base import Material, Value, broadcast_plane
 
+#: Methods of a :class:`torchmpm.Material`.
 METHODS = ("return_map", "stress", "energy", "stiffness")
-"""Methods of a :class:`torchmpm.Material`."""
 
 
 @tree.register
@@ -22,7 +22,8 @@ class Body:
     Attributes:
         count: Number of particles.
         material: Constitutive law, such as :class:`torchmpm.VonMises`.
-        mass: Mass of a particle, kg; a number or a tensor of shape (), (B,), (B, 1), (B, count) or (1, count).
+        mass: Mass of a particle, kg; a number or a tensor of shape (), (B,), (B, 1), (B, count) or (1, count). With
+            less than about 1e-6 kg particles lose momentum, as 1e-10 kg are added to the mass of each node.
         volume: Undeformed volume of a particle, m^2 (two-dimensional); a number or a tensor of those shapes.
         muscle: Whether the actuation field acts on it.
 
@@ -38,7 +39,7 @@ class Body:
     muscle: bool = False
 
     def __post_init__(self) -> None:
-        checks.whole("count", self.count, 1)
+        object.__setattr__(self, "count", checks.whole("count", self.count, 1))
         if isinstance(self.material, type):
             raise TypeError(f"material must be a Material, got the class {self.material.__name__}")
         if lacking := [name for name in METHODS if not callable(getattr(self.material, name, None))]:
@@ -61,7 +62,7 @@ def _constants(name: str, holder: Any) -> Iterator[tuple[str, Value]]:
             tensors = (*module.named_parameters(part, recurse=False), *module.named_buffers(part, recurse=False))
             yield from (*tensors, *((f"{part}.{key}", v) for key, v in vars(module).items() if isinstance(v, Tensor)))
         return
-    names = [each.name for each in fields(holder)] if is_dataclass(holder) else vars(holder)
+    names = [each.name for each in fields(holder)] if is_dataclass(holder) else getattr(holder, "__dict__", {})
     for key in names:
         value = getattr(holder, key)
         if isinstance(value, nn.Module) or (is_dataclass(value) and not isinstance(value, type)):

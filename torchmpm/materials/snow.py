@@ -12,7 +12,7 @@ from torchmpm.materials.base import Value, broadcast_plane, check_not_negative
 from torchmpm.materials.elastic import Elastic, corotated_energy, corotated_stress
 from torchmpm.materials.linalg import Mat2, Parts, Sym2, det, direction, join, safe_sqrt, split
 
-#: Jp stays below this. A grain that is pulled apart forever has lost all stiffness long before, at Jp = 1.23; without
+#: Jp stays below this. A grain that is pulled apart forever reaches the least stiffness, a tenth, at Jp = 1.23; without
 #: the bound its Jp would grow until it overflows, and spoil gradients.
 LARGEST_JP = 1e30
 
