@@ -1,4 +1,4 @@
-"""``python -m baselines.evaluate RUN_FOLDER``: how good is a policy of any algorithm, those of `cfp` included."""
+"""``python -m baselines.evaluate RUN_FOLDER``: evaluate a policy of any algorithm, those of `cfp` included."""
 
 import sys
 from functools import partial

@@ -26,7 +26,7 @@ Learner = Literal["analytic", "sac"]
 LARGEST_SEED = 2**31 - 1
 #: Added to a run's seed for evaluations, so that they start from initial positions that are not trained on.
 EVALUATION_SEED = 10_000
-#: What ``RunConfig.ineffective`` says where every episode begins on a layout that is counted from the seed.
+#: Entry of ``RunConfig.ineffective`` where every episode begins on a layout that is counted from the seed.
 COUNTED_LAYOUTS = {"environment.resample": "soft actor-critic (cfp, coarse, fine, gnn-*, transformer-*)"}
 
 

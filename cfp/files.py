@@ -20,7 +20,7 @@ FORMAT = "cfp-policy"
 def write_atomically(path: Path, write: Callable[[BinaryIO], Any]) -> None:
     """Write a file aside, flush it to disk, and move it into place; an `OSError` leaves the old file untouched."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".part")
+    aside = path.with_name(f"{path.name}.{os.getpid()}.part")  # another process may write the same file
     aside.unlink(missing_ok=True)  # where it is a link, its target must not be written to
     try:
         with names_file(path), open(aside, "xb") as file:

@@ -74,7 +74,7 @@ class Command(Selection):
             raise ConfigError("out must be given with a single policy: the folder to write into")
         for name in ("dropout", "shift"):
             if not 0 < getattr(self, name) < 1:
-                raise ConfigError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
+                raise ConfigError(f"{name} must be above 0 and below 1, got {getattr(self, name)}")
         if not 0 < self.noise < math.inf:
             raise ConfigError(f"noise must be positive and finite, got {self.noise}")
         if not all(value >= 0 for value in self.friction):

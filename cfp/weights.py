@@ -84,9 +84,9 @@ def policy_file(path: str | Path) -> Path:
     if is_address(path):
         return download(str(path))
     file = Path(path)
-    if not file.exists() and str(path) in shipped():
-        file = SHIPPED / str(path)
     file = file / "policy.safetensors" if file.is_dir() else file.with_suffix(".safetensors")
+    if not file.exists() and str(path) in shipped():
+        file = SHIPPED / f"{path}.safetensors"
     if not file.exists():
         raise CheckpointError(f"{file}: there is no policy, and no shipped one has that name ({', '.join(shipped())})")
     return file

@@ -19,7 +19,8 @@ from cfp.sections import TASK_OPTIONS
 from cfp.weights import is_of_another_task, is_same_task, read_policy
 from dittogym.tasks import task_name
 
-LARGEST_COMPARED_SEED = EVALUATION_SEED - 1001  # larger ones would train on the layouts of the final evaluation
+#: The layouts of training count on from the seed, and those of evaluations from ``EVALUATION_SEED``.
+LARGEST_COMPARED_SEED = EVALUATION_SEED - 1001
 #: Options that change neither what a run learns nor which policy it keeps.
 IRRELEVANT_OPTIONS = ("device", "environment.backend", "report.video", "report.checkpoint_every", "report.log_every")
 #: Options of the environment on which all algorithms of a task must agree.

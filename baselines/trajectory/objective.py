@@ -10,7 +10,7 @@ from dittogym.tasks.shapematch import reward_fn as overlap
 
 
 class Objective:
-    """The negative reward; with that of SHAPE MATCH, which has no gradient, the difference from the target picture.
+    """The negative smooth reward; in SHAPE MATCH, whose reward has no gradient, the difference from the target picture.
 
     This is the mean absolute difference of the soft silhouette and the target, both blurred. A wide blur pulls matter
     towards a target that it does not touch, a narrow one shapes the outline.

@@ -117,9 +117,9 @@ class Gradient(Stateful, OpenLoopAlgorithm):
     """Adam on the actions of a whole episode, through the simulation.
 
     Actions are ``tanh(theta)``; theta (T, 2, R, R) starts at zero. Steps after the end of an episode do not count. An
-    iteration whose loss, gradient or state is not finite, or whose loss is far above the best one (a robot that breaks
-    into pieces has no way back), is undone: theta returns to the best point under the present blur, Adam's momentum is
-    reset, and the learning rate falls for good.
+    iteration whose loss, gradient or state is not finite, whose gradient is zero, or whose loss is far above the best
+    one (a robot that breaks into pieces has no way back), is undone: theta returns to the best point under the present
+    blur, Adam's momentum is reset, and the learning rate falls for good.
     """
 
     sees: ClassVar[Sees] = "nothing"
@@ -155,8 +155,8 @@ class Gradient(Stateful, OpenLoopAlgorithm):
             self.best_loss, self.phase = math.inf, phase
         loss, size, total, gradient = self.play(progress)
         scalars = {"train/learning_rate": learning_rate, "train/loss": loss, "train/return": total}
-        finite = math.isfinite(loss) and bool(torch.isfinite(gradient).all())
-        if finite and loss <= self.best_loss + MAX_RISE * self.best_size:
+        useful = math.isfinite(loss) and bool(torch.isfinite(gradient).all() and gradient.any())
+        if useful and loss <= self.best_loss + MAX_RISE * self.best_size:
             if loss < self.best_loss:
                 self.best_loss, self.best_size, self.best = loss, size, self.theta.detach().clone()
             scalars["train/gradient_norm"] = float(gradient.norm())
@@ -175,15 +175,16 @@ class Gradient(Stateful, OpenLoopAlgorithm):
         env.load(self.initial)
         running = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
         loss = size = total = 0.0
+        soft = self.objective.target is None
         window_loss = torch.zeros((), device=env.device)
         for step in range(self.horizon):
-            _, reward, terminated, _, info = env.step(actions[step].expand(env.num_envs, -1, -1, -1))
+            _, reward, terminated, _, info = env.step(actions[step].expand(env.num_envs, -1, -1, -1), soft=soft)
             if not bool((info["finite"] | ~running).all()):
                 return Episode(math.nan, math.nan, math.nan, actions)
             value = torch.where(running, self.objective(env, reward, progress), 0.0)
             window_loss = window_loss + value.mean() / self.horizon
             size += float(value.detach().abs().mean()) / self.horizon
-            total += float(torch.where(running, reward.detach(), 0.0).mean())
+            total += float(torch.where(running, info.get("true_reward", reward).detach(), 0.0).mean())
             running = running & ~terminated
             is_last = step + 1 == self.horizon or not bool(running.any())
             if is_last or (step + 1) % window == 0:

@@ -104,8 +104,8 @@ class ActorPolicy(nn.Module, Shareable):
             deterministic: Act without noise.
 
         Returns:
-            Actions (B, 2, R, R) float32, and the gate of the last stage (B, 2, R, R), 0 where the coarser action is
-            kept; ``None`` for a policy of one stage.
+            Actions (B, 2, A, A) float32, A the policy's resolution, and the gate of the last stage (B, 2, R, R), 0
+            where the coarser action is kept; ``None`` for a policy of one stage.
         """
         batch = torch.as_tensor(observation, device=next(self.parameters()).device)
         sample = self.actor.sample(batch, deterministic)

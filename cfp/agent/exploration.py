@@ -7,7 +7,6 @@ noise (Eberhard et al., ICLR 2023) is a relative. Another scale for each robot i
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
@@ -53,10 +52,10 @@ class CellNoise:
 
     def state_dict(self) -> dict[str, Any]:
         """Noise, steps left, and state of the generator."""
-        generator = json.dumps(self.generator.bit_generator.state)
+        generator = self.generator.bit_generator.state
         return {"values": torch.from_numpy(self.values), "left": torch.from_numpy(self.left), "generator": generator}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Undo `state_dict`."""
         self.values, self.left = (state[name].numpy().copy() for name in ("values", "left"))
-        self.generator.bit_generator.state = json.loads(state["generator"])
+        self.generator.bit_generator.state = state["generator"]

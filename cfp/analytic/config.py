@@ -86,8 +86,8 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
     @property
     def training_environment(self) -> EnvironmentConfig:
         """Options of the simulations in training."""
-        dt = self.environment.dt if self.train_dt is None else self.train_dt
-        return self.environment.for_optimisation(self.task, self.train_particles, dt)
+        environment = self.environment.for_training(self.train_particles)
+        return environment if self.train_dt is None else environment.with_dt(self.train_dt, "train_dt")
 
     def ineffective(self) -> dict[str, str]:
         """Options without effect: layouts are counted from the seed."""

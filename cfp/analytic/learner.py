@@ -53,7 +53,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
 
     config: AnalyticConfig
     parts = ("regression", "memory", "critic", "collector", "action_step")
-    values = ("generator",)
+    values = ("generator", "empty_windows")
     presets = ("quick",)
 
     def __init__(self, config: AnalyticConfig, stage: int, actor: Actor) -> None:
@@ -106,6 +106,11 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
                 lines.append(f"stage {stage}: only the critic learns in its {steps:,} steps ({option})")
         return lines
 
+    @property
+    def steps_without_change(self) -> int:
+        """Environment steps of the warm-up, in which only the critic of a trained policy learns."""
+        return self.config.warmup * self.config.update_every
+
     def _image(self) -> Tensor:
         return core.observe(self.env.model, self.env.env_state)
 
@@ -119,7 +124,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         learning_rate = config.learning_rate * linear_decay(progress)
         step_size = config.action_step[self.stage - 1] * linear_decay(progress, config.final_step)
         minibatches = config.minibatches
-        if self.starts_trained and self.memory.count < config.warmup * config.update_every:
+        if self.starts_trained and self.num_timesteps < self.steps_without_change:
             # steps towards the values of an untrained critic, fitted to a few windows, would spoil the policy
             step_size, minibatches = 0.0, 0
         images, improved, window = self._improve(step_size)

@@ -99,6 +99,8 @@ def command_words(config: RunConfig, preset: RunConfig) -> list[str]:
     given = {name: value for name, value in decisive.items() if value and (name, value) != ("algo", "cfp")}
     given |= {"task": config.task, "preset": config.preset, "seed": config.seed}
     changed = {name.rpartition(".")[2]: value for name, (value, _) in changed_options(config, preset).items()}
+    derived = config.with_derived(preset, changed.keys())  # what training would compute from the others
+    changed |= {name.rpartition(".")[2]: value for name, (value, _) in changed_options(config, derived).items()}
     words = ["python", "-m", f"{package}.train"]
     for name, value in (given | changed).items():
         option = name.replace("_", "-")

@@ -95,7 +95,7 @@ class Algorithm(ABC):
 
     @classmethod
     def warnings(cls, config: Any, folder: Path, first_stage: int) -> list[str]:
-        """What the user may not expect of the stages from ``first_stage`` on, a line each."""
+        """One line for each stage, from ``first_stage`` on, that will not train as one may expect."""
         return []
 
     @classmethod
@@ -106,6 +106,11 @@ class Algorithm(ABC):
     def set_logger(self, logger: Logger) -> None:
         """Set where scalars go."""
         self.logger = logger
+
+    @property
+    def steps_without_change(self) -> int:
+        """Environment steps at the beginning of the stage in which its policy does not learn yet."""
+        return 0
 
     @property
     def progress(self) -> float:

@@ -75,9 +75,9 @@ class Stage:
 
 
 class StageCallback(BaseCallback):
-    """Acts when the number of environment steps has passed a multiple of ``every``, and at the end of the stage.
+    """Acts before a rollout, or at the end of a stage, where the steps have passed a multiple of ``every``.
 
-    It acts before the next rollout, when all earlier steps have been learned from.
+    All earlier steps have been learned from then.
     """
 
     def __init__(self, stage: Stage, every: int) -> None:
@@ -160,7 +160,10 @@ class LogCallback(StageCallback):
 
 
 class EvaluationCallback(StageCallback):
-    """Evaluates the policy, a trained one also before its first step, and keeps the best of the stage."""
+    """Evaluates the policy and keeps the best of the stage.
+
+    A trained one is evaluated before its first step, and then not again until it learns.
+    """
 
     def __init__(self, stage: Stage, table: CSVTable, tracker: Tracker, bar: ProgressBarCallback) -> None:
         super().__init__(stage, stage.config.report.eval_every)
@@ -180,6 +183,11 @@ class EvaluationCallback(StageCallback):
         """Whether the best evaluation is as many evaluations ago as the run is patient."""
         patience, means = self.stage.config.report.patience, self.means
         return bool(patience and means) and len(means) - 1 - means.index(max(means)) >= patience
+
+    def _is_due(self) -> bool:
+        algorithm = self.stage.algorithm
+        initial = algorithm.starts_trained and algorithm.num_timesteps <= algorithm.steps_without_change
+        return super()._is_due() and not (initial and self.means)
 
     def _act(self) -> None:
         start, stage, config = time.perf_counter(), self.stage, self.stage.config

@@ -114,4 +114,4 @@ def _option(name: str, hint: Any, value: Any) -> tuple[str, Any, Any]:
 def _descriptions(kind: type) -> dict[str, str]:
     """The strings below the fields of a dataclass and of those that it extends."""
     bases = map(docstring_parser.parse_from_object, reversed(kind.__mro__[:-1]))
-    return {each.arg_name: inspect.cleandoc(each.description or "") for base in bases for each in base.params}
+    return {each.arg_name: " ".join((each.description or "").split()) for base in bases for each in base.params}

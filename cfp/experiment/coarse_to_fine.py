@@ -52,6 +52,11 @@ class SACAlgorithm(Algorithm):
     def num_timesteps(self, value: int) -> None:
         self.model.num_timesteps = value
 
+    @property
+    def steps_without_change(self) -> int:
+        """Environment steps at the beginning of the stage before the actor's updates."""
+        return max(self.model.hyperparameters.actor_start, self.model.hyperparameters.update_start)
+
     @classmethod
     def make_model(
         cls,

@@ -114,6 +114,6 @@ class Tracker:
         self._logger.dump(step)
 
     def film(self, step: int, path: Path) -> None:
-        """Show a video to those who take files; TensorBoard does not."""
+        """Send a video to Weights & Biases, if asked for; TensorBoard takes no files."""
         if self.wandb:
             self.wandb.film(path, step)

@@ -62,4 +62,7 @@ class StopSignals:
         if self.number:
             raise KeyboardInterrupt
         self.number = number
-        print("\nstopping after this step, with a checkpoint (again: at once, without)", file=sys.stderr)
+        print(
+            "\nstopping after this step, with a checkpoint (press Ctrl-C again to stop at once, without one)",
+            file=sys.stderr,
+        )

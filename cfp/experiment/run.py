@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
 from tqdm import tqdm
 
-from cfp.config import OptimisationConfig, RunConfig, to_json
+from cfp.config import CoarseToFineConfig, OptimisationConfig, RunConfig, to_json
 from cfp.envs.make import choose_device, make_env
 from cfp.errors import CFPError, CheckpointError, ConfigError, NonFiniteError
 from cfp.evaluation.evaluate import compare
@@ -37,6 +38,7 @@ from cfp.experiment.folder import holds_progress, holds_run, policy_files, polic
 from cfp.experiment.loggers import ProgressTable, Tracker, check_trackers
 from cfp.experiment.process import StopSignals
 from cfp.files import read_json, write_atomically, write_json
+from cfp.presets import like_start
 from cfp.tables import CSVTable
 from cfp.weights import copy_policy, is_of_another_task, read_policy
 from dittogym.render.frame import png
@@ -204,7 +206,11 @@ class TrainingRun:
         if self.config.report.video:
             recording = record_policy(self.config, list(policies.values())[-1])
             save_media(recording, {"video": self.folder / "video.mp4", "replay": self.folder / "replay.html"})
-        preset = self.algorithm.preset(self.config.task, self.config.preset)
+        config = self.config
+        preset = self.algorithm.preset(config.task, config.preset)
+        if isinstance(config, CoarseToFineConfig) and config.start_from is not None:
+            with suppress(CheckpointError):  # it may be gone by now
+                preset = like_start(preset, {"start_from": config.start_from, "refine": config.refine})
         page = write_page(self.folder, self.config, preset, results, recording, self.seconds)
         print(f"all of it on one page: {page}")
         print(format_table(self.config, results))

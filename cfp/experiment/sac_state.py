@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import deque
 from typing import Any
 
@@ -87,8 +86,8 @@ def _random_state(model: CFP) -> dict[str, Any]:
     assert isinstance(model.replay_buffer, ReplayRing)
     state: dict[str, Any] = {
         "torch": torch.get_rng_state(),
-        "replay": json.dumps(model.replay_buffer.generator.bit_generator.state),
-        "actions": json.dumps(model.action_space.np_random.bit_generator.state),
+        "replay": model.replay_buffer.generator.bit_generator.state,
+        "actions": model.action_space.np_random.bit_generator.state,
     }
     if model.device.type == "cuda":
         state["cuda"] = torch.cuda.get_rng_state(model.device)
@@ -98,7 +97,7 @@ def _random_state(model: CFP) -> dict[str, Any]:
 def _restore_random(model: CFP, state: dict[str, Any]) -> None:
     assert isinstance(model.replay_buffer, ReplayRing)
     torch.set_rng_state(state["torch"])
-    model.replay_buffer.generator.bit_generator.state = json.loads(state["replay"])
-    model.action_space.np_random.bit_generator.state = json.loads(state["actions"])
+    model.replay_buffer.generator.bit_generator.state = state["replay"]
+    model.action_space.np_random.bit_generator.state = state["actions"]
     if "cuda" in state and model.device.type == "cuda":
         torch.cuda.set_rng_state(state["cuda"], model.device)

@@ -82,7 +82,7 @@ class CoarseToFineStages(Algorithm):
 def copy_coarse_weights(actor: Actor, coarse: Actor) -> None:
     """Copy a trained coarse actor into the new stage above it, and its lean encoder too."""
     actor.get_submodule("coarse").load_state_dict(coarse.state_dict())
-    if isinstance(actor.encoder, LeanEncoder):  # so that heads and critics that read it need not wait for its features
+    if isinstance(actor.encoder, LeanEncoder):  # heads and critics start from trained features
         actor.encoder.load_state_dict(coarse.encoder.state_dict())
 
 

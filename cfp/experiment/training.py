@@ -186,8 +186,8 @@ def main(program: Program, arguments: Sequence[str] | None = None, started: str 
 
 def _train(program: Program, arguments: Sequence[str], started: str) -> None:
     command = parse(program, arguments, started)
-    named = command.run.algo == "cfp" or started in ("python -m baselines.distill", "torchmpm teach")
-    algo = "" if named else f" --algo {command.run.algo}"
+    needed = started == "torchmpm train" and command.run.algo != "cfp"  # else it would start cfp.train
+    algo = f" --algo {command.run.algo}" if needed else ""
     train(program, command, f"resume with: {started} --resume --out {command.out}{algo}")
 
 
@@ -197,12 +197,12 @@ def train(program: Program, command: Command, hint: str) -> None:
     assert folder is not None
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"out must be a folder, got the file {folder}")
-    if command.resume and not holds_run(folder):
-        print(f"{folder} holds no run yet: starting a new one")
     if command.dry_run:
         check_options(config)
         print(json.dumps(to_json(config), indent=2))
         return
+    if command.resume and not holds_run(folder):
+        print(f"{folder} holds no run yet: starting a new one")
     learner = f", learner {config.learner}" if isinstance(config, CoarseToFineConfig) else ""
     print(f"{config.algo} on {config.task}{learner}, preset {config.preset}, seed {config.seed} -> {folder}")
     with run_lock(folder):

@@ -3,13 +3,17 @@
 import json
 from dataclasses import replace
 
+import pytest
+
+from baselines import train as modular
 from cfp import train
 from cfp.analytic.learner import AnalyticLearner
 from cfp.config import Config
+from cfp.evaluation.page import command_words
 from cfp.experiment.coarse_to_fine import CoarseToFine
 from cfp.experiment.training import parse
 from cfp.from_dict import update_from_dict
-from cfp.presets import sac_preset
+from cfp.presets import like_start, sac_preset
 
 TINY = "--learner sac --particles 100 --substeps 1 --num-envs 2 --device cpu --steps 400 --batch-size 4".split()
 
@@ -20,6 +24,28 @@ def test_dry_run_prints_the_options_and_writes_nothing(tmp_path, capsys, monkeyp
     assert not list(tmp_path.iterdir())
     config: Config = update_from_dict(sac_preset("shapematch"), json.loads(capsys.readouterr().out))
     assert (config.steps, config.handover, config.environment.particles) == (400, (300,), 100)
+    assert train.main([*TINY, "--task", "run", "--resume", "--dry-run"]) == 0
+    assert json.loads(capsys.readouterr().out)["task"] == "run"
+
+
+@pytest.mark.parametrize(
+    ("program", "options"),
+    [
+        (train.PROGRAM, "--task run --steps 16000 --handover 9600"),
+        (train.PROGRAM, "--task kick --learner sac --steps 19200 --actor-start 2250 --no-video"),
+        (train.PROGRAM, "--task run --learner sac --start-from run --batch-size 128"),
+        (train.PROGRAM, "--task run --start-from run --refine --action-step 0.05 --resolutions 8 --seed 3"),
+        (modular.PROGRAM, "--algo gnn-16 --task run --steps 19200 --actor-start 800"),
+    ],
+)
+def test_the_command_that_repeats_a_run(program, options):
+    """Some options follow from others; they are named where they do not."""
+    config = parse(program, options.split()).run
+    preset = program.find(config).preset(config.task, config.preset)
+    if getattr(config, "start_from", None):
+        preset = like_start(preset, {"start_from": config.start_from, "refine": config.refine})
+    words = command_words(config, preset)
+    assert parse(program, words[3:]).run == config
 
 
 def test_stages_that_learn_nothing_are_named(tmp_path):

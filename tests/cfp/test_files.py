@@ -26,6 +26,20 @@ def test_interrupted_write_leaves_the_old_file(tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["value.json"]
 
 
+def test_two_processes_may_write_the_same_file(tmp_path, monkeypatch):
+    path = tmp_path / "value.json"
+
+    def write(file):
+        file.write(b'{"a": ')
+        with monkeypatch.context() as patch:
+            patch.setattr("cfp.files.os.getpid", lambda: 1)
+            write_json(path, {"a": 1})
+        file.write(b"2}")
+
+    write_atomically(path, write)
+    assert json.loads(path.read_text()) == {"a": 2} and [item.name for item in tmp_path.iterdir()] == ["value.json"]
+
+
 def test_table_grows_rows_and_columns(tmp_path):
     table = CSVTable(tmp_path / "t.csv")
     table.add({"step": 1, "a": 0.5})

@@ -33,15 +33,24 @@ def scripted(monkeypatch):
 
 def test_plateau_hands_over_and_ends_the_run(scripted, tmp_path, capsys):
     folder = tmp_path / "run"
-    assert run(folder, "--eval-every", "10", "--patience", "2") == 0
+    options = "--eval-every 10 --patience 2 --critics-first 0".split()
+    assert run(folder, *options) == 0
     rows = [(int(row["step"]), int(row["stage"])) for row in read_table(folder / "evaluations.csv")]
     # The second of four evaluations is stage 1's best; stage 2 begins with one at 40, which stays its best.
     assert rows == [(10, 1), (20, 1), (30, 1), (40, 1), (40, 2), (50, 2), (60, 2)]
     assert capsys.readouterr().out.count("ends early: 2 evaluations without a new best") == 2
     stages = [json.loads((folder / name).read_text()) for name in ("stage1.json", "policy.json")]
     assert [(stage["stage"], stage["steps"]) for stage in stages] == [(1, 20), (2, 40)]
-    assert run(folder, "--eval-every", "10", "--patience", "2", "--resume") == 0
+    assert run(folder, *options, "--resume") == 0
     assert rows == [(int(row["step"]), int(row["stage"])) for row in read_table(folder / "evaluations.csv")]
+
+
+def test_patience_begins_when_the_policy_learns(scripted, tmp_path):
+    """Stage 2 begins at 40; in its first 64 steps only the critics learn, and the policy stays the same."""
+    folder = tmp_path / "run"
+    assert run(folder, "--eval-every", "10", "--patience", "2", "--critics-first", "0.8") == 0
+    rows = [int(row["step"]) for row in read_table(folder / "evaluations.csv") if row["stage"] == "2"]
+    assert rows == [40, 110, 120]
 
 
 @pytest.fixture(scope="module")
@@ -146,9 +155,9 @@ def test_refining_goes_on_with_the_weights_of_a_policy(coarse, tmp_path):
     assert run(tmp_path / "a", "--start-from", str(coarse), *options) == 0
     assert all(not row.get("train/drift") for row in read_table(tmp_path / "a" / "progress.csv"))
     rows = read_table(tmp_path / "a" / "evaluations.csv")
-    assert [(row["step"], row["stage"]) for row in rows[:2]] == [("0", "1"), ("10", "1")]  # judged before it learns
-    # Nothing but the critics has learned in the 30 steps of the first stage, and nothing was random.
-    assert [row["mean"] for row in rows[:4]] == [rows[0]["mean"]] * 4
+    # Judged before it learns, and at the end of the first stage, in which nothing but the critics has learned.
+    assert [(row["step"], row["stage"]) for row in rows[:3]] == [("0", "1"), ("70", "1"), ("70", "2")]
+    assert rows[0]["mean"] == rows[1]["mean"]
     begun, given = (PROGRAM.load(place).actor.state_dict() for place in (tmp_path / "a" / "stage1.json", coarse))
     assert all(torch.equal(begun[key], value) for key, value in given.items())
     again = [*"--refine --steps 110 --eval-every 0 --eval-episodes 1 --start-from".split(), str(tmp_path / "a")]

@@ -140,6 +140,12 @@ def test_shipped_policies_act_as_when_they_were_shipped(name, first, total):
     assert actions.sum(dtype=np.float64) == pytest.approx(total, abs=1e-3, rel=1e-6)
 
 
+def test_a_folder_without_a_policy_hides_no_shipped_one(tmp_path, monkeypatch):
+    (tmp_path / "run").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert cfp.load("run").description["task"] == "run"
+
+
 def test_the_policy_of_an_actor_is_an_independent_copy_made_without_random_numbers():
     spec = ActorSpec((4, 8), (-1.0,))
     actor, state = build_actor(spec), torch.get_rng_state()
