@@ -69,7 +69,7 @@ def is_open(tree: Any) -> bool:
 
 
 def flatten(tree: Tree) -> tuple[list[Tensor], Callable[[Iterable[Tensor]], Tree]]:
-    """All tensors of a tree, of shapes () or others, in order, and a function that makes it anew from as many others."""
+    """All tensors of a tree, of shapes () or others, in order, and a function that makes it from as many others."""
     entries, structure = pytree.tree_flatten(tree)
     tensors = [entry for entry in entries if isinstance(entry, Tensor)]
     others = [None if isinstance(entry, Tensor) else (entry,) for entry in entries]  # does not keep the tensors alive
