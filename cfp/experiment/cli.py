@@ -103,6 +103,7 @@ def _basic_first(options: Any, basic: Sequence[str]) -> Any:
         return dataclasses.make_dataclass(type(group).__name__, others, namespace={"__doc__": type(group).__doc__})()
 
     advanced = remaining(options)
+    type(advanced).__doc__ = ""  # what the description says already
     first.sort(key=lambda option: basic.index(option[0]))
     return dataclasses.make_dataclass("Options", [*first, _option("advanced", type(advanced), advanced)])()
 
