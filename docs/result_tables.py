@@ -282,21 +282,22 @@ def rewards_ablation_figure(path: Path) -> None:
 
 
 def rewards_stages_figure(path: Path) -> None:
-    """Draw evaluations in SHAPE MATCH of the learner ``sac`` with both stages or a single one, a line for each seed."""
+    """Draw evaluations of the learner ``sac`` with both stages or a single one, and of others, a line for each seed."""
     rows = read("rewards-stages.csv")
     drawing = Figure(figsize=(7.2, 3.2), layout="constrained")
     FigureCanvasSVG(drawing)
-    axis = drawing.subplots()
-    for index, algorithm in enumerate(dict.fromkeys(row["algorithm"] for row in rows)):
-        own = [row for row in rows if row["algorithm"] == algorithm]
-        for number, seed in enumerate(dict.fromkeys(row["seed"] for row in own)):
-            points = [row for row in own if row["seed"] == seed]
-            steps, means = ([float(row[column]) for row in points] for column in ("steps", "mean"))
-            label = None if number else algorithm
-            axis.plot(steps, means, marker="o", ms=3, lw=1, color=f"C{index}", label=label)
-    axis.set(xlabel="environment steps", ylabel="return in SHAPE MATCH", xlim=(0, None))
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.legend(fontsize=9, frameon=False)
+    algorithms = list(dict.fromkeys(row["algorithm"] for row in rows))
+    for axis, task in zip(drawing.subplots(1, 2), ("shapematch", "run"), strict=True):
+        for index, algorithm in enumerate(algorithms):
+            own = [row for row in rows if (row["task"], row["algorithm"]) == (task, algorithm)]
+            for number, seed in enumerate(dict.fromkeys(row["seed"] for row in own)):
+                points = [row for row in own if row["seed"] == seed]
+                steps, means = ([float(row[column]) for row in points] for column in ("steps", "mean"))
+                label = None if number else algorithm
+                axis.plot(steps, means, marker="o", ms=3, lw=1, color=f"C{index}", label=label)
+        axis.set(xlabel="environment steps", ylabel=f"return in {headline(task)[0]}", xlim=(0, None))
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.legend(fontsize=8, frameon=False)
     drawing.savefig(path, metadata={"Date": None})
 
 
