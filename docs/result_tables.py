@@ -309,10 +309,14 @@ def ablation_figure(path: Path) -> None:
     FigureCanvasSVG(drawing)
     for axis, part in zip(drawing.subplots(2, 3, sharex=True, sharey=True).flat, parts, strict=True):
         for value in dict.fromkeys(row["value"] for row in rows if row["part"] in (part, "default")):
-            own = [row for row in rows if row["value"] == value and row["part"] in (part, "default")]
-            points = [int(row["steps"]) for row in own], [float(row["evaluated"]) for row in own]
-            colour = {"color": "0.3"} if value == "default" else {}
-            axis.plot(*points, marker="o", ms=3, lw=1.2, label=value, **colour)
+            colour = "0.3" if value == "default" else None
+            for seed, style in (("0", "-"), ("1", ":")):
+                own = [row for row in rows if (row["value"], row["seed"]) == (value, seed)]
+                own = [row for row in own if row["part"] in (part, "default")]
+                points = [int(row["steps"]) for row in own], [float(row["evaluated"]) for row in own]
+                label = value if seed == "0" else None
+                (line,) = axis.plot(*points, style, marker="o", ms=3, lw=1.2, label=label, color=colour)
+                colour = line.get_color()
         axis.set_title(part, fontsize=10)
         axis.set_ylim(0, 420)
         axis.spines[["top", "right"]].set_visible(False)
@@ -324,10 +328,17 @@ def ablation_figure(path: Path) -> None:
 
 def ablation() -> str:
     """Final returns of the same runs."""
-    rows = sorted((row for row in read("analytic-shapematch.csv") if row["final"]), key=lambda row: -int(row["final"]))
+    rows = [row for row in read("analytic-shapematch.csv") if row["final"]]
+    found = {
+        (row["part"], row["value"], row["seed"]): f"{row['final']} ({row['lowest']} to {row['highest']})"
+        for row in rows
+    }
+    names = [
+        (row["part"], row["value"]) for row in sorted(rows, key=lambda row: -int(row["final"])) if row["seed"] == "0"
+    ]
     return markdown(
-        ("Changed", "To", "Return", "Lowest and highest layout"),
-        ([row["part"], row["value"], row["final"], f"{row['lowest']}, {row['highest']}"] for row in rows),
+        ("Changed", "To", "Return, seed 0", "Return, seed 1"),
+        ([part, value, *(found.get((part, value, seed), "") for seed in "01")] for part, value in names),
     )
 
 
