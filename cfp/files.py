@@ -17,10 +17,17 @@ LARGEST_JSON = 2**20  # bytes
 FORMAT = "cfp-policy"
 
 
-def write_atomically(path: Path, write: Callable[[BinaryIO], Any]) -> None:
-    """Write a file aside, flush it to disk, and move it into place; an `OSError` leaves the old file untouched."""
+def write_atomically(path: Path, write: Callable[[BinaryIO], Any], shared: bool = False) -> None:
+    """Write a file aside, flush it to disk, and move it into place; an `OSError` leaves the old file untouched.
+
+    Args:
+        path: The file.
+        write: Writes its content.
+        shared: Other processes may write it at the same time. Otherwise what a killed program has left of the file
+            aside is overwritten.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f"{path.name}.{os.getpid()}.part")  # another process may write the same file
+    aside = path.with_name(f"{path.name}.{os.getpid()}.part" if shared else f"{path.name}.part")
     aside.unlink(missing_ok=True)  # where it is a link, its target must not be written to
     try:
         with names_file(path), open(aside, "xb") as file:
@@ -77,9 +84,10 @@ def parse_json(text: str) -> Any:
         raise ValueError("it is nested too deeply") from error
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON with an indent, atomically."""
-    write_text(path, json.dumps(value, indent=2) + "\n")
+def write_json(path: Path, value: Any, shared: bool = False) -> None:
+    """Write JSON with an indent, see `write_atomically`."""
+    content = (json.dumps(value, indent=2) + "\n").encode()
+    write_atomically(path, lambda file: file.write(content), shared)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -65,7 +65,7 @@ class EpisodeCache:
     def write(self, layout: int, episode: Episode) -> None:
         """Keep an episode, if the folder can be written."""
         try:
-            write_json(self._file(layout), dataclasses.asdict(episode))
+            write_json(self._file(layout), dataclasses.asdict(episode), shared=True)
         except OSError as error:
             _logger.info("episodes cannot be kept in %s (%s)", self.folder, error)
 

@@ -33,10 +33,10 @@ def test_two_processes_may_write_the_same_file(tmp_path, monkeypatch):
         file.write(b'{"a": ')
         with monkeypatch.context() as patch:
             patch.setattr("cfp.files.os.getpid", lambda: 1)
-            write_json(path, {"a": 1})
+            write_atomically(path, lambda other: other.write(b'{"a": 1}'), shared=True)
         file.write(b"2}")
 
-    write_atomically(path, write)
+    write_atomically(path, write, shared=True)
     assert json.loads(path.read_text()) == {"a": 2} and [item.name for item in tmp_path.iterdir()] == ["value.json"]
 
 
