@@ -86,13 +86,12 @@ def parse_json(text: str) -> Any:
 
 def write_json(path: Path, value: Any, shared: bool = False) -> None:
     """Write JSON with an indent, see `write_atomically`."""
-    content = (json.dumps(value, indent=2) + "\n").encode()
-    write_atomically(path, lambda file: file.write(content), shared)
+    write_text(path, json.dumps(value, indent=2) + "\n", shared)
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text, atomically."""
-    write_atomically(path, lambda file: file.write(text.encode()))
+def write_text(path: Path, text: str, shared: bool = False) -> None:
+    """Write UTF-8 text, see `write_atomically`."""
+    write_atomically(path, lambda file: file.write(text.encode()), shared)
 
 
 def write_policy(path: Path, tensors: Mapping[str, Tensor], description: dict[str, Any]) -> None:

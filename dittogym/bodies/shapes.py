@@ -76,8 +76,10 @@ class Rectangle:
     Attributes:
         corner: Lower left corner in the world, m.
         size: Width and height, m.
-        draws: See :class:`Shape`.
+        draws: See :class:`Shape`; 2 or 4.
     """
+
+    allowed_draws: ClassVar[tuple[int, ...]] = (2, 4)
 
     corner: tuple[float, float]
     size: tuple[float, float]
@@ -86,6 +88,8 @@ class Rectangle:
     def __post_init__(self) -> None:
         checks.pair("corner", self.corner)
         checks.pair("size", self.size, above=0.0)
+        if self.draws not in self.allowed_draws:
+            raise ValueError(f"draws must be one of {self.allowed_draws}, got {self.draws!r}")
 
     @property
     def area(self) -> float:
@@ -101,6 +105,7 @@ class Rectangle:
 class Lattice(Rectangle):
     """Box with evenly spaced particles in rows from the bottom up, without any randomness."""
 
+    allowed_draws: ClassVar[tuple[int, ...]] = (0,)
     draws: int = field(default=0, kw_only=True)
 
     def positions(self, numbers: Points) -> Points:

@@ -10,7 +10,7 @@ from bad_cases import Case
 
 import dittogym
 from dittogym import Outcome, TorchEnv, make_spec
-from dittogym.bodies.shapes import Disc, Figure
+from dittogym.bodies.shapes import Disc, Figure, Rectangle
 from dittogym.geometry import solid
 from dittogym.spec import BodySpec as RobotBody
 from dittogym.window import Window
@@ -290,6 +290,7 @@ ENVIRONMENT = table(
             ("reward_fn of task 'run' must return terms of shape (B,)", "(3,) for 'velocity'"),
         ),
         ("disc at a name", lambda: Disc("home", 0.1), "corner must be two numbers (x, y), got 'home'"),
+        ("box that draws nothing", lambda: Rectangle((0, 0), (1, 1), draws=0), "draws must be one of (2, 4), got 0"),
         ("figure of no pixels", lambda: Figure(np.zeros((3, 3), bool), (0.4, 0.2), 0.1), "mask must be an array"),
         ("robot of nothing", lambda: RobotBody(Disc((0.4, 0.2), 0.1), 0), "count must be at least 1, got 0"),
         ("robot of no area", lambda: env(body=[(0, 0), (1, 1), (2, 2)]), "body must have corners that enclose an area"),

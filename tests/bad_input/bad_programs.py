@@ -167,7 +167,12 @@ OTHERS = [
         "cases must be words of action dropout 20%",
         main=ROBUSTNESS,
     ),
-    evaluating("without most actions", "{folder} --dropout 1.5", "dropout must be above 0", main=ROBUSTNESS),
+    evaluating(
+        "without most actions",
+        "{folder} --dropout 1.5",
+        "dropout must be above 0 and below 1, got 1.5",
+        main=ROBUSTNESS,
+    ),
     evaluating("under noise of NaN", "{folder} --noise nan", "noise must be positive", main=ROBUSTNESS),
     evaluating("on ice that pushes", "{folder} --friction -1", "friction must be at least 0", main=ROBUSTNESS),
     evaluating("disturbed, nowhere", "--policy run", "out must be given with a single policy", main=ROBUSTNESS),

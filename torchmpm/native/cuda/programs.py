@@ -59,9 +59,8 @@ class Program:
     def over_particles(self, kernel: Any, *buffers: Tensor, **flags: bool) -> None:
         """Launch a pass over the particles for each body."""
         inputs, tables = self.inputs, self.tables
-        field = (
-            inputs.origin if inputs.field is None else inputs.field
-        )  # unused without a field, but a kernel needs some pointer
+        # Without actuation the field is not read, but a kernel needs some pointer.
+        field = inputs.origin if inputs.field is None else inputs.field
         values_batch, columns = inputs.values.shape[1:]
         for k, body in enumerate(self.device_tables.bodies):
             blocks = -(-body.count // BLOCK)
