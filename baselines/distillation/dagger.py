@@ -1,16 +1,14 @@
 """Dataset aggregation (DAgger; Ross et al., AISTATS 2011): the student acts, the teacher labels the visited states."""
 
-import zlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from baselines.distillation.teachers import Teacher, project
 from cfp.analytic.episodes import Episodes
-from cfp.analytic.stateful import Stateful
+from cfp.analytic.stateful import Stateful, compress, decompress
 from cfp.envs import disturbances
 from dittogym import TorchEnv
 from dittogym import core as dynamics
@@ -30,7 +28,7 @@ class Dataset:
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
         self.rounds: list[Labels] = []
-        self._compressed: list[bytes | None] = []
+        self._compressed: list[Tensor | None] = []
 
     def __len__(self) -> int:
         """Number of labels."""
@@ -54,21 +52,17 @@ class Dataset:
         return Labels(*(torch.stack([labels[part][row] for labels, row in chosen]) for part in (0, 1)))
 
     def state_dict(self) -> dict[str, Any]:
-        """All labels. Images are compressed, thirtyfold, and each round only once."""
+        """All labels; the images of each round are compressed once."""
         for index, labels in enumerate(self.rounds):
             if self._compressed[index] is None:
-                self._compressed[index] = zlib.compress(labels.observations.numpy().tobytes(), 1)
-        images = [torch.frombuffer(bytearray(content or b""), dtype=torch.uint8) for content in self._compressed]
-        return {"observations": images, "actions": [labels.actions for labels in self.rounds]}
+                self._compressed[index] = compress(labels.observations)
+        return {"observations": list(self._compressed), "actions": [labels.actions for labels in self.rounds]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state of `state_dict`."""
-        self._compressed = [images.numpy().tobytes() for images in state["observations"]]
-        self.rounds = []
-        for content, actions in zip(self._compressed, state["actions"], strict=True):
-            assert content is not None
-            pixels = np.frombuffer(bytearray(zlib.decompress(content)), np.uint8)
-            self.rounds.append(Labels(torch.from_numpy(pixels.reshape(-1, *TorchEnv.observation_shape)), actions))
+        self._compressed = list(state["observations"])
+        images = [decompress(content, TorchEnv.observation_shape) for content in state["observations"]]
+        self.rounds = [Labels(*pair) for pair in zip(images, state["actions"], strict=True)]
 
 
 def drop_entries(values: Tensor, probability: float, grid: int | None = None) -> Tensor:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -34,6 +33,7 @@ from cfp.experiment.schedules import linear_decay
 from cfp.experiment.stages import CoarseToFineStages, copy_coarse_weights
 from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
+from cfp.seeding import seeded
 from cfp.weights import load
 from dittogym import make_spec
 
@@ -98,13 +98,10 @@ class Distill(Stateful, CoarseToFineStages):
         trained_in = EnvironmentConfig(**policy.description["environment"])
         return PolicyTeacher(policy, trained_in.action_indexing, config.environment.action_indexing)
 
-    @contextmanager
-    def _seeded(self) -> Iterator[None]:
-        """Seed torch's generator by run, stage and step, and restore it afterwards."""
-        with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
-            source = np.random.SeedSequence((self.config.seed, self.stage - 1, self.num_timesteps))
-            torch.manual_seed(int(source.generate_state(1)[0]))
-            yield
+    def _seeded(self) -> AbstractContextManager[None]:
+        """Seed torch's generators by run, stage and step, and restore them afterwards."""
+        source = np.random.SeedSequence((self.config.seed, self.stage - 1, self.num_timesteps))
+        return seeded(int(source.generate_state(1)[0]))
 
     def update(self) -> Scalars:
         """Collect the labels of a round, and learn from all; a `NonFiniteError` if the loss is not finite."""

@@ -13,7 +13,6 @@ from baselines.shac.networks import ImageActor, StateActor, StatePolicy, image_c
 from cfp.agent.actor_policy import ActorPolicy, image_policy
 from cfp.analytic.config import WindowConfig
 from cfp.analytic.critic import BETAS, Critic, mlp
-from cfp.analytic.episodes import Episodes
 from cfp.analytic.features import StateFeatures
 from cfp.analytic.reward import RewardConfig
 from cfp.analytic.stateful import Stateful
@@ -26,6 +25,7 @@ from cfp.experiment.schedules import linear_decay
 from cfp.policy_protocols import Policy
 from cfp.presets import ON_SPEED, sac_preset
 from cfp.sections import ReportConfig
+from cfp.seeding import seeded
 from cfp.validation import check_at_least
 from cfp.weights import KIND, load, policy_for, read_policy
 
@@ -102,8 +102,7 @@ class Shac(Stateful, Algorithm):
         training = replace(config, environment=config.training_environment)
         self.env = make_torch_env(training, config.resolution(stage))
         self.features = StateFeatures(config.deformation, config.clock, config.displacement)
-        with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
-            torch.manual_seed(config.seed)
+        with seeded(config.seed):
             self.actor, critic = self._make_networks()
         if start is not None:
             assert isinstance(self.actor, ImageActor) and isinstance(start, ActorPolicy)
@@ -114,8 +113,7 @@ class Shac(Stateful, Algorithm):
         self.actor_adam = torch.optim.Adam(trained, config.learning_rate, BETAS)
         self.skipped, self.skipped_in_a_row = 0, 0
         self.generator = torch.Generator().manual_seed(config.seed)
-        episodes = Episodes(self.env, config.seed, config.max_episode_steps, config.num_layouts)
-        self.collector = WindowCollector(episodes, self.observe, config)
+        self.collector = WindowCollector(self.env, self.observe, config)
 
     def _make_networks(self) -> tuple[StateActor | ImageActor, nn.Module]:
         grid, device = self.env.action_resolution, self.env.device

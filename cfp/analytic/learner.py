@@ -17,7 +17,6 @@ from cfp.agent.actor import Actor, build_actor
 from cfp.analytic.action_step import BOUND, ActionStep
 from cfp.analytic.config import AnalyticConfig
 from cfp.analytic.critic import Critic, mlp
-from cfp.analytic.episodes import Episodes
 from cfp.analytic.features import StateFeatures
 from cfp.analytic.regression import ImageMemory, Regression
 from cfp.analytic.stateful import Stateful
@@ -29,6 +28,7 @@ from cfp.experiment.algorithm import Scalars
 from cfp.experiment.schedules import linear_decay
 from cfp.experiment.stages import CoarseToFineStages, refines
 from cfp.presets import analytic_preset
+from cfp.seeding import seeded
 from dittogym import core
 
 #: Every scalar that ``AnalyticLearner.update`` logs, and what it means.
@@ -64,12 +64,10 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         self.actor = actor
         self.regression = Regression(actor, config.learning_rate, config.weight_average, config.max_grad_norm)
         features = StateFeatures(displacement=config.displacement)
-        with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
-            torch.manual_seed(config.seed)
+        with seeded(config.seed):
             critic = mlp(features.size(len(self.env.spec.bodies) - 1), 1).to(self.env.device)
         self.critic = Critic(critic, config)
-        episodes = Episodes(self.env, config.seed, config.max_episode_steps, config.num_layouts)
-        self.collector = WindowCollector(episodes, lambda: features(self.env).float(), config)
+        self.collector = WindowCollector(self.env, lambda: features(self.env).float(), config)
         self.action_step = ActionStep()
         self.empty_windows = 0
         self.generator = torch.Generator().manual_seed(config.seed)  # on the CPU, so that a run can change its device
@@ -87,8 +85,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
     @classmethod
     def create(cls, config: AnalyticConfig, stage: int, folder: Path, resumed: bool = False) -> AnalyticLearner:
         """Networks, memory and environment of a stage."""
-        with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
-            torch.manual_seed(config.seed)
+        with seeded(config.seed):
             actor = build_actor(config.actor_spec(stage)).to(choose_device(config.device))
         trained = cls.warm_start(config, stage, folder, actor)
         algorithm = cls(config, stage, actor)

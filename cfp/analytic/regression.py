@@ -5,13 +5,15 @@ As in D.Va (NeurIPS 2025) no gradient passes through the rendering: images are i
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cfp.agent.actor import Actor
-from cfp.analytic.stateful import Stateful
+from cfp.analytic.stateful import Stateful, compress, decompress
 
 #: Of Adam.
 BETAS = (0.9, 0.95)
@@ -25,7 +27,7 @@ class ImageMemory(Stateful):
         example: An image and a location, for shapes, types and device.
     """
 
-    values = ("images", "locations", "count")
+    values = ("locations", "count")
 
     def __init__(self, capacity: int, example: tuple[Tensor, Tensor]) -> None:
         self.images, self.locations = (part.new_zeros(capacity, *part.shape) for part in example)
@@ -42,6 +44,15 @@ class ImageMemory(Stateful):
         stored = min(self.count, len(self.images))
         index = torch.randint(stored, (size,), generator=generator).to(self.images.device)
         return self.images[index], self.locations[index]
+
+    def state_dict(self) -> dict[str, Any]:
+        """All pairs, the images compressed."""
+        return super().state_dict() | {"images": compress(self.images)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state of `state_dict`."""
+        super().load_state_dict(state)
+        self.images = decompress(state["images"], self.images.shape[1:]).to(self.images.device)
 
 
 class Regression(Stateful):

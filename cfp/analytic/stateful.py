@@ -1,6 +1,7 @@
 """State of objects whose training can be interrupted."""
 
 import copy
+import zlib
 from typing import Any, ClassVar
 
 import torch
@@ -30,6 +31,16 @@ class Stateful:
                 present.data.copy_(value)
             else:
                 setattr(self, name, value.to(present) if isinstance(present, Tensor) else copy.copy(value))
+
+
+def compress(images: Tensor) -> Tensor:
+    """Bytes (n,) of uint8 images, which take about a thirtieth of the memory; on the CPU."""
+    return torch.frombuffer(bytearray(zlib.compress(images.cpu().numpy().tobytes(), 1)), dtype=torch.uint8)
+
+
+def decompress(content: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """The images (N, *shape) that `compress` was given."""
+    return torch.frombuffer(bytearray(zlib.decompress(content.numpy().tobytes())), dtype=torch.uint8).view(-1, *shape)
 
 
 def _plain(value: Any) -> Any:

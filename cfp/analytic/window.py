@@ -15,7 +15,7 @@ from cfp.analytic.reward import Neighbours, training_reward
 from cfp.analytic.stateful import Stateful
 from cfp.envs.make import make_torch_env
 from cfp.errors import NonFiniteError
-from dittogym import core
+from dittogym import TorchEnv, core
 from dittogym.contract import Moment, Outcome
 from dittogym.spec import TaskSpec
 from torchmpm import tree
@@ -49,15 +49,17 @@ class WindowCollector(Stateful):
     Gradients with respect to the action of one simulation in one step that are not finite are left out and counted.
 
     Args:
-        episodes: Of the environment.
+        env: The environment; its episodes begin here.
         observe: Inputs (B, ...) of the critic in the present state.
-        config: Training reward, control steps T of a window, and discount factor.
+        config: Seed, layouts and length of the episodes, training reward, control steps T of a window, and discount
+            factor.
     """
 
     parts = ("episodes",)
 
-    def __init__(self, episodes: Episodes, observe: Callable[[], Tensor], config: WindowConfig) -> None:
-        self.env, self.episodes, self.observe = episodes.env, episodes, observe
+    def __init__(self, env: TorchEnv, observe: Callable[[], Tensor], config: WindowConfig) -> None:
+        self.env, self.observe = env, observe
+        self.episodes = Episodes(env, config.seed, config.max_episode_steps, config.num_layouts)
         self.reward, self.steps = config.reward, config.window
         self.success_value = config.reward.success_value(config.gamma)
         self.episodes.counts["dropped"] = 0

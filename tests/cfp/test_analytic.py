@@ -12,7 +12,6 @@ from cfp.agent.actor import build_actor
 from cfp.agent.spec import ActorSpec
 from cfp.analytic.action_step import ActionStep
 from cfp.analytic.config import WindowConfig
-from cfp.analytic.episodes import Episodes
 from cfp.analytic.learner import METRICS, AnalyticLearner
 from cfp.analytic.regression import ImageMemory, Regression
 from cfp.analytic.reward import RewardConfig
@@ -147,14 +146,16 @@ def test_outlying_gradient_does_not_drown_the_others():
     assert norms.min() > 0.2 * norms.median()
 
 
-def test_memory_keeps_the_latest_pairs():
+def test_memory_keeps_the_latest_pairs_and_survives_a_checkpoint():
     image, location = torch.zeros(3, 64, 64, dtype=torch.uint8), torch.zeros(2, 4, 4)
-    memory = ImageMemory(6, (image, location))
+    memory, copy = ImageMemory(6, (image, location)), ImageMemory(6, (image, location))
     for value in range(5):
         memory.add((image + value).expand(2, -1, -1, -1), (location + value).expand(2, -1, -1, -1))
-    images, locations = memory.sample(200, torch.Generator().manual_seed(0))
-    assert set(images.unique().tolist()) == {2, 3, 4}
-    assert torch.equal(images[:, 0, 0, 0].float(), locations[:, 0, 0, 0])
+    copy.load_state_dict(memory.state_dict())
+    for each in (memory, copy):
+        images, locations = each.sample(200, torch.Generator().manual_seed(0))
+        assert set(images.unique().tolist()) == {2, 3, 4}
+        assert torch.equal(images[:, 0, 0, 0].float(), locations[:, 0, 0, 0])
 
 
 @pytest.mark.parametrize("grids", [(4,), (4, 8)])
@@ -232,10 +233,8 @@ def test_an_episode_that_ends_in_success_has_the_value_of_the_option(success, ex
 
     spec = replace(dittogym.make_spec("run"), reward_fn=ends_at_once, weights={"alive": 1.0})
     env = dittogym.TorchEnv(spec, 2, particles=300, substeps=4)
-    episodes = Episodes(env, seed=0, max_episode_steps=10, num_layouts=2)
     reward = RewardConfig(success_reward=2.0)  # times the scale 0.05, for 1 / (1 - gamma) = 10 steps
-    collector = WindowCollector(
-        episodes, lambda: torch.zeros(2, 1), WindowConfig(task="run", reward=reward, window=1, gamma=0.9)
-    )
+    config = WindowConfig(task="run", reward=reward, window=1, gamma=0.9, max_episode_steps=10)
+    collector = WindowCollector(env, lambda: torch.zeros(2, 1), config)
     window = collector.collect(lambda _: torch.zeros(2, *env.action_shape), lambda seen: seen[:, 0] + 7.0)
     assert window.next_values.tolist() == [[pytest.approx(expected)] * 2]
