@@ -55,7 +55,7 @@ class Command(Selection):
     """Folder to write into; the run's own if not given."""
     dropout: float = 0.2
     """Share of action entries, and of observation entries, set to zero in every step."""
-    noise: float = 0.2
+    action_noise: float = 0.2
     """Standard deviation of Gaussian noise on every action entry."""
     latency: int = 1
     """Control steps by which actions come late."""
@@ -75,8 +75,8 @@ class Command(Selection):
         for name in ("dropout", "shift"):
             if not 0 < getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be above 0 and below 1, got {getattr(self, name)}")
-        if not 0 < self.noise < math.inf:
-            raise ConfigError(f"noise must be positive and finite, got {self.noise}")
+        if not 0 < self.action_noise < math.inf:
+            raise ConfigError(f"action_noise must be positive and finite, got {self.action_noise}")
         if not all(value >= 0 for value in self.friction):
             raise ConfigError(f"friction must be at least 0 (inf sticks), got {self.friction}")
 
@@ -166,7 +166,7 @@ def draw(config: RunConfig, results: Sequence[Result]) -> Figure:
 def run(program: Program, command: Command) -> str:
     """Evaluate all cases, write the files, and return the table."""
     command.check()
-    cases = make_cases(command.dropout, command.noise, command.latency, command.shift, command.friction)
+    cases = make_cases(command.dropout, command.action_noise, command.latency, command.shift, command.friction)
     config, policies = command.open(program)
     policy, folder = list(policies.values())[-1], command.out or command.folder
     assert folder is not None

@@ -56,7 +56,7 @@ class Command:
     """cpu, cuda, or auto."""
     episodes: int = 10
     """Episodes of the final evaluation of each policy."""
-    tier: Particles = "lite"
+    particles: Particles = "lite"
     """Particles of the final evaluation, for all policies."""
     noise: Noise = "paper"
     """Action noise of all policies in the final evaluation: with, without, or as in the paper, that is without in
@@ -114,7 +114,7 @@ class Command:
     @property
     def final_protocol(self) -> Protocol:
         """How policies are evaluated."""
-        return Protocol(self.episodes, self.tier, self.robustness, self.noise)
+        return Protocol(self.episodes, self.particles, self.robustness, self.noise)
 
     def protocol_of(self, config: RunConfig) -> Protocol:
         """How the policy of a run is evaluated: SLOT has more episodes."""

@@ -38,7 +38,7 @@ class Protocol:
     """How policies are evaluated; but for the episodes in SLOT the same for all policies of a comparison."""
 
     episodes: int  # on the same layouts for all policies
-    tier: Particles = "lite"
+    particles: Particles = "lite"
     robustness: Robustness = "paper"
     noise: Noise = "paper"  # whether policies act with their noise; paper: except in `paper.WITHOUT_NOISE`
 
@@ -54,7 +54,7 @@ class Protocol:
     def key(self, task: str, layouts: str, case: Case | None = None) -> str:
         """Key of an entry in the record; other particles or other noise make another entry."""
         noise = "without" if self.deterministic(task) else "with"
-        return f"{f'{case.name}, ' if case else ''}{layouts}, particles {self.tier}, {noise} noise"
+        return f"{f'{case.name}, ' if case else ''}{layouts}, particles {self.particles}, {noise} noise"
 
     def batches(self, task: str, case: Case | None = None) -> dict[str, tuple[int, int]]:
         """First layout and number of layouts of each batch of episodes, by the key of its entry."""
@@ -114,9 +114,9 @@ def read_record(path: Path, **types: type) -> dict[str, Any]:
     return record
 
 
-def evaluation_config(config: RunConfig, tier: Particles) -> RunConfig:
-    """Options of a final evaluation: seed 0 and the particles of ``tier``, so that all runs play the same episodes."""
-    return replace(config, seed=0, environment=config.environment.for_evaluation(tier))
+def evaluation_config(config: RunConfig, particles: Particles) -> RunConfig:
+    """Options of a final evaluation: seed 0 and the ``particles``, so that all runs play the same episodes."""
+    return replace(config, seed=0, environment=config.environment.for_evaluation(particles))
 
 
 def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop: Callable[[], None]) -> None:
@@ -126,7 +126,7 @@ def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop
         policy = reference_policy(config)
     else:
         policy = load(folder / "policy.safetensors", choose_device(config.device))
-    config = evaluation_config(config, protocol.tier)
+    config = evaluation_config(config, protocol.particles)
 
     def play(seed: int, count: int) -> Entry:
         trial = make_trial(config, "", policy, policy.resolution, count, deterministic=deterministic, seed=seed)

@@ -8,7 +8,7 @@ from cfp.presets import TASKS
 from cfp.sections import Particles
 
 #: Particles of the paper's figures.
-TIER: Particles = "full"
+PARTICLES: Particles = "full"
 
 #: Names that the paper's methods have here, in the order of ``CURVES``.
 COLUMNS = ("cfp", "coarse", "fine", "gnn-16", "gnn-64", "transformer-16", "transformer-64")

@@ -51,12 +51,12 @@ def write_report(folder: Path, runs: Sequence[RunResult], protocol: Protocol, de
 
 def make_tables(runs: Sequence[RunResult], groups: Sequence[Group], protocol: Protocol) -> list[Table]:
     """All tables, in the order of the report; those with the paper's returns have rows at its size only."""
-    comparable = groups if protocol.tier == paper.TIER else []
+    comparable = groups if protocol.particles == paper.PARTICLES else []
     return [
         tables.runs_table(runs),
         tables.returns_table(groups, protocol.episodes),
         tables.aggregate_table(comparable),
-        tables.efficiency_table(groups, protocol.tier),
+        tables.efficiency_table(groups, protocol.particles),
         tables.cost_table(groups),
         tables.success_table(groups),
         tables.robustness_table(groups),
@@ -67,11 +67,11 @@ def make_tables(runs: Sequence[RunResult], groups: Sequence[Group], protocol: Pr
 def _describe_protocol(protocol: Protocol) -> str:
     rule = f"action noise as in the paper: none in {', '.join(paper.WITHOUT_NOISE)}, that of the policy elsewhere"
     noise = {"paper": rule, "with": "action noise", "without": "no action noise"}[protocol.noise]
-    text = f"Final evaluations with {protocol.tier} particles and {noise}."
-    if protocol.tier != paper.TIER:
+    text = f"Final evaluations with {protocol.particles} particles and {noise}."
+    if protocol.particles != paper.PARTICLES:
         text += (
             " They are not compared with the paper's returns, which were measured with full particles "
-            "(--tier full evaluates the same policies with as many)."
+            "(--particles full evaluates the same policies with as many)."
         )
     return text
 

@@ -142,18 +142,18 @@ EFFICIENCY = (
 )
 
 
-def efficiency_table(groups: Sequence[Group], tier: Particles) -> Table:
-    """Steps until evaluations with ``tier`` particles reach the milestones between rest and the best curve."""
+def efficiency_table(groups: Sequence[Group], particles: Particles) -> Table:
+    """Steps until evaluations with ``particles`` particles reach the milestones between rest and the best curve."""
     rest = {group.task: group.iqm for group in groups if group.job.config.algo == "zero"}
     trained = [group for group in groups if group.curves and not group.job.untrained]
     best: dict[tuple[str, str], float] = {}
     for group in trained:
-        if group.particles == tier:
+        if group.particles == particles:
             key = group.task, group.observes
             best[key] = max(best.get(key, -np.inf), highest_point(group))
     rows = []
     for group in trained:
-        low, high = rest.get(group.task), best[group.task, group.observes] if group.particles == tier else None
+        low, high = rest.get(group.task), best[group.task, group.observes] if group.particles == particles else None
         row = make_row(GROUP, group) | {"seeds": len(group.curves), "rest": low, "best": high}
         if low is not None and high is not None and high > low:
             row |= _milestones(group, low, high)
@@ -165,8 +165,8 @@ def efficiency_table(groups: Sequence[Group], tier: Particles) -> Table:
     )
     if unknown := ", ".join(dict.fromkeys(group.task for group in trained if rest.get(group.task) is None)):
         description += f" The return at rest is unknown in {unknown}: add zero to --algos."
-    if others := _labels(group for group in trained if group.particles != tier):
-        description += f" No entry for {others}, evaluated during training with particles other than {tier}."
+    if others := _labels(group for group in trained if group.particles != particles):
+        description += f" No entry for {others}, evaluated during training with particles other than {particles}."
     return Table("efficiency", "Sample efficiency", description, EFFICIENCY, rows)
 
 

@@ -29,7 +29,7 @@ PLAN = {
         "broken": {"algo": "mpc", **MPC, "environment": {"particles": -3}},
     },
 }
-COMMON = "--device cpu --episodes 2 --tier 100 --robustness none --workers 0".split()
+COMMON = "--device cpu --episodes 2 --particles 100 --robustness none --workers 0".split()
 
 
 def compare(out, *more, plan=PLAN):

@@ -57,7 +57,7 @@ def test_runs_of_a_lost_node_are_finished_elsewhere_and_none_twice(cluster, tmp_
     killer = threading.Thread(target=kill)
     killer.start()
     options = f"--algos mpc --seeds 0 1 2 --plan {tmp_path / 'plan.json'} --out {tmp_path / 'out'} --device cpu"
-    protocol = "--episodes 1 --tier 100 --robustness none"
+    protocol = "--episodes 1 --particles 100 --robustness none"
     code = main([*options.split(), *protocol.split(), "--executor", "ray", "--address", made.address])
     over.set()
     killer.join()

@@ -161,10 +161,9 @@ def test_runs_of_a_comparison_are_submitted_once(tiny, tmp_path, monkeypatch, ca
     options = {"grid": 8, "planner": {"horizon": 3, "commit": 2, "iterations": 1}, "report": {"eval_every": 12}}
     plan = {"common": {"environment": {"particles": 100, "substeps": 1, "num_envs": 1}}, "algos": {"mpc": options}}
     (tmp_path / "plan.json").write_text(json.dumps(plan))
-    words = (
-        "--protocol v1 --algos zero mpc --seeds 0 --device cpu --episodes 1 --tier 100 --robustness none --workers 0"
-    )
-    words = [*words.split(), "--plan", str(tmp_path / "plan.json"), "--out", str(tmp_path)]
+    words = "--protocol v1 --algos zero mpc --seeds 0 --device cpu --episodes 1 --particles 100".split()
+    words += "--robustness none --workers 0".split()
+    words += ["--plan", str(tmp_path / "plan.json"), "--out", str(tmp_path)]
     assert compare(words) == 0
     paths = sorted((tmp_path / "submissions").iterdir())
     assert [path.name for path in paths] == ["shapematch-mpc-shapematch-quick-0.json", "shapematch-zero.json"]

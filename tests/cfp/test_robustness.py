@@ -202,7 +202,7 @@ def test_amounts_of_the_command_line_reach_the_cases(folder, tmp_path, monkeypat
         raise ConfigError("noted")
 
     monkeypatch.setattr(robustness, "report", note)
-    words = "--dropout 0.5 --noise 0.3 --latency 3 --shift 0.4 --friction 0.7 --device cpu".split()
+    words = "--dropout 0.5 --action-noise 0.3 --latency 3 --shift 0.4 --friction 0.7 --device cpu".split()
     assert robustness.main([str(folder), *words, "--out", str(tmp_path / "out")]) == 2
     assert {"action dropout 50%", "action noise 0.3", "latency 3 steps"} <= set(seen)
     assert {"mu x 0.6", "yield stress x 1.4"} <= set(seen)
