@@ -185,7 +185,7 @@ class TorchEnv:
         return Snapshot(self.model.kind, state, observation, self.model.constants)
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
-        """Continue from a saved moment, to the last bit as if nothing had happened since.
+        """Restore a snapshot; the simulation continues bit for bit as it did before.
 
         Positions and physics of the next reset, a ``TimeLimit``'s count, and learned materials are not part of it.
 

@@ -68,15 +68,21 @@ def number(text: str) -> str:
 
 def spread(row: Row) -> str:
     """What is known about the spread of the episodes: lowest and highest, or standard deviation."""
-    if row.get("lowest"):
+    if row.get("lowest") and row["lowest"] != row["highest"]:
         return f" ({number(row['lowest'])} to {number(row['highest'])})"
-    return f" ± {number(row['std'])}" if row.get("std") else ""
+    return f" ± {number(row['std'])}" if float(row.get("std") or 0) else ""
 
 
 def success(row: Row) -> str:
     """Share of successful episodes."""
-    share = row.get("success") or ""
-    return f"{float(share):.0%}" if share and " of " not in share else share
+    count, _, total = (row.get("success") or "").partition(" of ")
+    return f"{float(count) / float(total or 1):.0%}" if count else ""
+
+
+def exceeds(row: Row, value: float) -> bool:
+    """Whether a mean lies above a value by more than the half of its 95 % interval."""
+    half = 1.96 * float(row["std"]) / int(row["episodes"]) ** 0.5 if row["std"] else 0.0
+    return float(row["mean"]) - half > value
 
 
 def markdown(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -102,15 +108,17 @@ def overview() -> str:
             [
                 f"[{headline(task)[0]}](generated/{task}.md)",
                 *(number(shipped(task, name)["mean"]) for name in ("zero", "random")),
-                (f"**{value}**" if float(ours["mean"]) > theirs else value) + f"<br>{spread(ours).strip(' ()')}",
+                f"**{value}**" if exceeds(ours, theirs) else value,
+                spread(ours).strip(" ()"),
+                success(ours),
                 number(str(theirs)),
                 number(training["steps"]),
                 f"{paper.STEPS[task]:,}",
                 training["minutes"],
             ]
         )
-    columns = ("Task", "Zero", "Random", "This package", "Paper's CFP", "Steps", "Paper's steps", "Minutes")
-    return markdown(columns, rows)
+    ours = ("This package", "Range", "Success")
+    return markdown(("Task", "Zero", "Random", *ours, "Paper's CFP", "Steps", "Paper's steps", "Minutes"), rows)
 
 
 def planning() -> str:
@@ -189,7 +197,7 @@ def normalised(task: str, name: str, key: str) -> float:
 def figure(path: Path) -> None:
     """Draw the normalised returns of all tasks."""
     tasks = [row["task"] for row in read("training.csv")]
-    drawing = Figure(figsize=(7.2, 3.9), layout="constrained")
+    drawing = Figure(figsize=(7.2, 4.2), layout="constrained")
     FigureCanvasSVG(drawing)
     axis = drawing.subplots()
     axis.axvline(0, color="0.8", zorder=0)
@@ -210,7 +218,7 @@ def figure(path: Path) -> None:
         Line2D([], [], marker="|", ms=11, mew=2, lw=0, color="0.65", label="zero actions"),
         Line2D([], [], marker="|", ms=11, mew=2, lw=0, color="0.35", label="random actions"),
     ]
-    axis.legend(handles=entries, loc="lower right", fontsize=9, frameon=False)
+    drawing.legend(handles=entries, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     drawing.savefig(path, metadata={"Date": None})
 
 

@@ -1,7 +1,7 @@
 """Batched, differentiable two-dimensional material point method in PyTorch.
 
-State goes in, state comes out: :class:`ParticleState` holds everything that moves, and :class:`Solver`, a frozen
-description of grid, bodies and boundary, advances it. ``substep`` is the algorithm, ``materials`` holds the
+:class:`ParticleState` holds everything that moves. :meth:`Solver.step` takes a state and returns a new one; the solver
+is a frozen description of grid, bodies and boundary. ``substep`` is the algorithm, ``materials`` holds the
 constitutive laws, and ``native`` the same substep as fused kernels. This package imports torch, NumPy and jaxtyping,
 and Triton for the CUDA kernels.
 """

@@ -50,7 +50,7 @@ class Solver:
         TypeError: ``grid``, a body or a rule has another type.
 
     Examples:
-        A drop of gel falls for 10 ms; the velocity that it had at the start determines where it is then.
+        A drop of gel falls for 10 ms. The gradient of its position with respect to its initial velocity is that time.
 
         >>> import torch, torchmpm
         >>> gel = torchmpm.Elastic(*torchmpm.lame(young=4e4, poisson=0.3))

@@ -16,7 +16,7 @@ from cfp.weights import read_policy, report_mismatch
 
 
 class OpenLoop(Shareable):
-    """Plays a sequence of actions from the beginning of an episode; afterwards muscles are slack.
+    """Plays a sequence of actions from the beginning of an episode; after the last one its actions are zero.
 
     Args:
         actions: (T, 2, R, R), in [-1, 1].

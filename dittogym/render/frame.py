@@ -23,7 +23,7 @@ def frame(
     """Draw one moment, (size, size, 3) uint8 RGB.
 
     Args:
-        scene: What does not move.
+        scene: The static parts of the scene.
         shot: The moment.
         size: Pixels per side.
         zoom: The picture shows 1 / zoom metres; ``None``: a little more than the robot observes.

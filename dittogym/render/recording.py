@@ -39,7 +39,7 @@ class Recording:
     """One episode of one simulation, as :meth:`dittogym.TorchEnv.film` returns it. A notebook shows its replay.
 
     Attributes:
-        scene: What does not move.
+        scene: The static parts of the scene.
         shots: The start, then one moment after each step.
         rewards: Of the steps.
         observation: (3, 64, 64) uint8, the last one.

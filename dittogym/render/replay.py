@@ -34,7 +34,7 @@ def replay_page(
     """The page of a replay.
 
     Args:
-        scene: What does not move.
+        scene: The static parts of the scene.
         shots: The start, then one moment after each step.
         rewards: Of the steps.
         success: Whether the last step counts as success, if the task defines it.

@@ -61,7 +61,7 @@ class Solid(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """What does not move.
+    """The static parts of a scene.
 
     Attributes:
         task: Name of the task.

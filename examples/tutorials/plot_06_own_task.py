@@ -62,9 +62,9 @@ for name, value in sums.items():
 #
 # The table above is the first thing to look at: the terms of an episode with random actions, already weighted.
 #
-# - **No term should drown the others.** Where the action cost exceeds what a good motion earns,
+# - **Keep the terms at similar scales.** Where the action cost exceeds what a good motion earns,
 #   the best policy does not move at all.
-# - **Reward progress, not only the goal.** A term that is the same for all reachable states teaches nothing. Height
+# - **Reward progress, not only the goal.** A term that is the same for all reachable states gives no gradient. Height
 #   pays as soon as the robot rises a little; a bonus for 3 cm alone would not.
 # - **Measure from the start** (``moment.start``), so that the return does not depend on where a robot was placed.
 # - **Bound what can be exploited**: a robot can throw single particles away, so use means over the robot, clip speeds,
