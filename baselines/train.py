@@ -8,7 +8,7 @@ from cfp.experiment import training
 
 PROGRAM = training.Program(
     "baselines",
-    f"Train an algorithm (--algo {'|'.join(ALGORITHMS)}) on a DittoGym task; name it to see its options here.",
+    f"Train an algorithm on a DittoGym task: {', '.join(ALGORITHMS)}. With --algo, this shows its options.",
     ("--algo shac --task run", "--algo gnn-16 --task kick --seed 1 --out runs/gnn", "--algo mpc --task run --dry-run"),
     configure,
     algorithm_of,

@@ -40,6 +40,7 @@ extensions = [
 ]
 exclude_patterns = [
     "_build",
+    "generated/ablation.md",
     "generated/leaderboard.md",
     "generated/planning.md",
     "generated/returns*.md",
@@ -92,7 +93,7 @@ class CommandHelp(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Run the command and show its output as a literal block."""
         self.env.note_reread()  # the program may have changed even if the page has not
-        environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
+        environment = os.environ | {"COLUMNS": "88", "NO_COLOR": "1", "TERM": "dumb"}
         command = [sys.executable, "-m", *self.arguments[0].split(), "--help"]
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
         if done.returncode != 0:

@@ -10,6 +10,7 @@ from pathlib import Path
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MultipleLocator
 from task_pages import PAGES, write
 
 import dittogym
@@ -253,16 +254,19 @@ def rewards_tasks_figure(path: Path) -> None:
     for axis, task in zip(drawing.subplots(2, 4).flat, dict.fromkeys(row["task"] for row in rows), strict=True):
         axis.axhline(float(shipped(task, "zero")["mean"]), color="0.65", zorder=0)
         axis.axhline(paper.CURVES[task][0][0], color="#b03a2e", linestyle="--", zorder=0)
-        for index, seed in enumerate(dict.fromkeys(row["seed"] for row in rows if row["task"] == task)):
+        for seed in dict.fromkeys(row["seed"] for row in rows if row["task"] == task):
             own = [row for row in rows if (row["task"], row["seed"]) == (task, seed)]
             steps = [int(row["steps"]) / 1000 for row in own if row["steps"]]
             means = [float(row["mean"]) for row in own]
-            axis.plot(steps, means[:-1], marker="o", ms=3, color=f"C{index}")
-            axis.plot(1.06 * steps[-1], means[-1], "D", ms=4, color=f"C{index}")
+            axis.plot(steps, means[:-1], marker="o", ms=3, color=f"C{seed}")
+            axis.plot(1.06 * steps[-1], means[-1], "D", ms=4, color=f"C{seed}")
         axis.set_xlim(left=0)
+        axis.xaxis.set_major_locator(MultipleLocator(10))
         axis.set_title(headline(task)[0], fontsize=9)
         axis.tick_params(labelsize=8)
         axis.spines[["top", "right"]].set_visible(False)
+    seeds = [Line2D([], [], marker="o", ms=3, color=f"C{seed}", label=f"seed {seed}") for seed in range(5)]
+    drawing.legend(handles=seeds, loc="outside lower center", ncols=5, fontsize=8, frameon=False)
     drawing.supxlabel("thousands of environment steps", fontsize=9)
     drawing.supylabel("return", fontsize=9)
     drawing.savefig(path, metadata={"Date": None})
@@ -290,7 +294,7 @@ def rewards_ablation_figure(path: Path) -> None:
 
 
 def rewards_stages_figure(path: Path) -> None:
-    """Draw evaluations of the learner ``sac`` with both stages or a single one, and of others, a line for each seed."""
+    """Draw evaluations of the learner ``sac`` with both stages or one, and of others: mean and range of the seeds."""
     rows = read("rewards-stages.csv")
     drawing = Figure(figsize=(7.2, 3.2), layout="constrained")
     FigureCanvasSVG(drawing)
@@ -298,11 +302,16 @@ def rewards_stages_figure(path: Path) -> None:
     for axis, task in zip(drawing.subplots(1, 2), ("shapematch", "run"), strict=True):
         for index, algorithm in enumerate(algorithms):
             own = [row for row in rows if (row["task"], row["algorithm"]) == (task, algorithm)]
-            for number, seed in enumerate(dict.fromkeys(row["seed"] for row in own)):
-                points = [row for row in own if row["seed"] == seed]
-                steps, means = ([float(row[column]) for row in points] for column in ("steps", "mean"))
-                label = None if number else algorithm
-                axis.plot(steps, means, marker="o", ms=3, lw=1, color=f"C{index}", label=label)
+            at: dict[float, list[float]] = {}
+            for row in own:
+                at.setdefault(float(row["steps"]), []).append(float(row["mean"]))
+            if own:
+                steps, means = list(at), list(at.values())
+                mean = [sum(values) / len(values) for values in means]
+                axis.plot(steps, mean, marker="o", ms=3, lw=1.5, color=f"C{index}", label=algorithm)
+                axis.fill_between(
+                    steps, list(map(min, means)), list(map(max, means)), color=f"C{index}", alpha=0.15, lw=0
+                )
         axis.set(xlabel="environment steps", ylabel=f"return in {headline(task)[0]}", xlim=(0, None))
         axis.spines[["top", "right"]].set_visible(False)
         axis.legend(fontsize=8, frameon=False)
@@ -328,7 +337,7 @@ def ablation_figure(path: Path) -> None:
         axis.set_title(part, fontsize=10)
         axis.set_ylim(0, 420)
         axis.spines[["top", "right"]].set_visible(False)
-        axis.legend(loc="lower right", fontsize=7, frameon=False)
+        axis.legend(loc="lower right", fontsize=7, framealpha=0.85, edgecolor="none")
     drawing.supxlabel("environment steps", fontsize=10)
     drawing.supylabel("return in SHAPE MATCH", fontsize=10)
     drawing.savefig(path, metadata={"Date": None})
