@@ -266,7 +266,7 @@ def rewards_tasks_figure(path: Path) -> None:
         axis.tick_params(labelsize=8)
         axis.spines[["top", "right"]].set_visible(False)
     seeds = [Line2D([], [], marker="o", ms=3, color=f"C{seed}", label=f"seed {seed}") for seed in range(5)]
-    drawing.legend(handles=seeds, loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+    drawing.legend(handles=seeds, loc="outside upper center", ncols=5, fontsize=8, frameon=False)
     drawing.supxlabel("thousands of environment steps", fontsize=9)
     drawing.supylabel("return", fontsize=9)
     drawing.savefig(path, metadata={"Date": None})
@@ -322,7 +322,7 @@ def ablation_figure(path: Path) -> None:
     """Draw learning curves of the learner ``analytic`` on SHAPE MATCH, one panel for each option that is changed."""
     rows = read("analytic-shapematch.csv")
     parts = list(dict.fromkeys(row["part"] for row in rows if row["part"] != "default"))
-    drawing = Figure(figsize=(7.2, 4.8), layout="constrained")
+    drawing = Figure(figsize=(7.2, 5.8), layout="constrained")
     FigureCanvasSVG(drawing)
     for axis, part in zip(drawing.subplots(2, 3, sharex=True, sharey=True).flat, parts, strict=True):
         for value in dict.fromkeys(row["value"] for row in rows if row["part"] in (part, "default")):
@@ -334,10 +334,10 @@ def ablation_figure(path: Path) -> None:
                 label = value if seed == "0" else None
                 (line,) = axis.plot(*points, style, marker="o", ms=3, lw=1.2, label=label, color=colour)
                 colour = line.get_color()
-        axis.set_title(part, fontsize=10)
         axis.set_ylim(0, 420)
         axis.spines[["top", "right"]].set_visible(False)
-        axis.legend(loc="lower right", fontsize=7, framealpha=0.85, edgecolor="none")
+        above = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": 2}
+        axis.legend(title=part, title_fontsize=9, fontsize=7, frameon=False, **above)
     drawing.supxlabel("environment steps", fontsize=10)
     drawing.supylabel("return in SHAPE MATCH", fontsize=10)
     drawing.savefig(path, metadata={"Date": None})
