@@ -110,7 +110,6 @@ def overview() -> str:
                 f"[{headline(task)[0]}](generated/{task}.md)",
                 *(number(shipped(task, name)["mean"]) for name in ("zero", "random")),
                 f"**{value}**" if exceeds(ours, theirs) else value,
-                spread(ours).strip(" ()"),
                 success(ours),
                 number(str(theirs)),
                 number(training["steps"]),
@@ -118,7 +117,7 @@ def overview() -> str:
                 training["minutes"],
             ]
         )
-    ours = ("This package", "Range", "Success")
+    ours = ("This package", "Success")
     return markdown(("Task", "Zero", "Random", *ours, "Paper's CFP", "Steps", "Paper's steps", "Minutes"), rows)
 
 
