@@ -149,7 +149,8 @@ def constrain(faces: Sequence[Face], velocity: Tensor) -> Tensor:
         hit = face.active & (normal > 0 if face.sign > 0 else normal < 0)
         if face.friction is not None:
             left = (tangent.abs() - face.friction * normal.abs()).clamp_min(0.0)
-            tangent = torch.where(hit & (face.friction > 0), torch.copysign(left, tangent), tangent)
+            slowed = torch.where(tangent < 0, -left, left)  # torch.copysign has no second derivative at 0
+            tangent = torch.where(hit & (face.friction > 0), slowed, tangent)
         if face.stick is not None:
             tangent = torch.where(hit & face.stick, 0.0, tangent)
         component[face.axis], component[1 - face.axis] = torch.where(hit, 0.0, normal), tangent

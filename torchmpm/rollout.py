@@ -188,7 +188,7 @@ def replayed(
             state = step(shared, state)
         return state
     for start in range(0, times, segment):
-        tensors, rebuild = tree.flatten((shared, state))
+        tensors, rebuild = tree.flatten(tree.without_inference((shared, state)))
         run = partial(_run, step, rebuild, min(segment, times - start))
         state = cast(tuple[Tensor, ...], _Replay.apply(run, *tensors))
     return state

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchmpm import transfer, tree
 from torchmpm.boundary import Face, constrain
 from torchmpm.grid import Grid
-from torchmpm.materials.base import broadcast_plane
+from torchmpm.materials.base import broadcast_plane, check_returned
 from torchmpm.materials.body import Body, slices
 from torchmpm.materials.linalg import Mat2, Sym2, matmul
 from torchmpm.materials.muscle import muscle_stress
@@ -96,7 +96,8 @@ def _deform(scene: Scene, nodes: Stencil, inside: Tensor, trial: Mat2, Jp: Tenso
     for body, part in slices(scene.bodies):
         a, b, c, d = trial
         before = Jp[:, part]
-        F, after = body.material.return_map((a[:, part], b[:, part], c[:, part], d[:, part]), before)
+        returned = body.material.return_map((a[:, part], b[:, part], c[:, part], d[:, part]), before)
+        F, after = check_returned(body.material, returned, before)
         tau = resolved_stress(body, F, before, scene.grid.h, scene.dt)
         if body.muscle and scene.actuation is not None:
             pulls = transfer.interpolate(nodes.part(part), scene.actuation)

@@ -219,3 +219,11 @@ def test_gradient_of_friction() -> None:
 def test_rules_that_make_no_sense(options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         VelocityRule(**{"direction": "-y"} | options)
+
+
+def test_friction_has_second_derivatives_at_rest() -> None:
+    velocity = everywhere(0.0, -1.0).clone().requires_grad_()
+    slid = apply((VelocityRule("-y", friction=0.3),), velocity)
+    (first,) = torch.autograd.grad(slid.square().sum(), velocity, create_graph=True)
+    (second,) = torch.autograd.grad(first.square().sum(), velocity)
+    assert second.isfinite().all()

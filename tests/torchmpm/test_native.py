@@ -170,3 +170,29 @@ def test_grains_pulled_apart_for_ever() -> None:
     assert eager.Jp.max() == 1e30 and (expected != 0).any() and (expected == 0).all(-1).all(-1).any()
     torch.testing.assert_close(native.Jp, eager.Jp, rtol=1e-13, atol=0)
     torch.testing.assert_close(slope, expected, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_soil_that_was_pulled_apart_is_as_soft_as_in_the_eager_backend(dtype: torch.dtype) -> None:
+    """The exponential of large negative numbers is 0, not infinite."""
+    solver = Solver(Grid(32), (Body(5, Snow(2000.0, 1000.0), mass=2.0),))
+    rest = ParticleState.at_rest(torch.full((1, 5, 2), 0.5, dtype=dtype))
+    Jp = torch.tensor([[1.0, 20.0, 3e4, 1e22, 1e29]], dtype=dtype)
+    native, eager = both(solver, replace(rest, F=0.99 * rest.F, Jp=Jp))
+    assert_close(native, eager, 1e-4 if dtype == torch.float32 else 1e-12)
+
+
+def test_soil_without_hardening_has_no_derivative_in_jp() -> None:
+    solver = Solver(Grid(32), (Body(1, Snow(2000.0, 1000.0, hardening_range=(1.0, 1.0)), mass=2.0),), backend="native")
+    rest = ParticleState.at_rest(torch.full((1, 1, 2), 0.5, dtype=torch.float64))
+    Jp = torch.ones(1, 1, dtype=torch.float64, requires_grad=True)
+    later = solver.step(replace(rest, F=0.99 * rest.F, Jp=Jp), substeps=2)
+    assert later.C.abs().max() > 0 and torch.autograd.grad(later.C.sum(), Jp)[0].item() == 0
+
+
+def test_a_particle_at_the_right_end_of_the_window_is_where_the_grid_says() -> None:
+    solver = Solver(Grid(5, 0.1), (Body(1, VonMises(500.0, 50.0, 62.0), mass=2.0),), gravity=(0.0, -9.0))
+    for x in (solver.grid.extent, math.nextafter(solver.grid.extent, 0.0)):
+        state = ParticleState.at_rest(torch.tensor([[[x, 0.25]]], dtype=torch.float64))
+        native, eager = both(solver, state, substeps=2)
+        assert bool(native.v.any()) == bool(eager.v.any()) == (x < solver.grid.extent)

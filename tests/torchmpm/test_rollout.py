@@ -341,3 +341,12 @@ def test_constants_that_a_step_makes_itself_are_made_again() -> None:
         gradients += torch.autograd.grad(final.F.square().sum(), log_mu)
         made.clear()
     torch.testing.assert_close(*gradients, rtol=1e-12, atol=0)
+
+
+def test_a_state_of_inference_mode_is_replayed() -> None:
+    solver = replace(robot(20), backend="eager")
+    with torch.inference_mode():
+        state = solver.step(lively(20), substeps=1)
+    field = torch.zeros(1, 2, 16, 16, dtype=torch.float64, requires_grad=True)
+    solver.step(state, field, substeps=25).x.sum().backward()
+    assert field.grad is not None and field.grad.any()

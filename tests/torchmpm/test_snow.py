@@ -139,3 +139,21 @@ def test_steep_hardening_has_derivatives() -> None:
         factor = min(max(math.exp(100.0 * (1.0 - Jp)), 0.1), 5.0)
         torch.testing.assert_close(xx, factor * plain)
         assert (slope == 0) == at_bound and slope.isfinite()
+
+
+@pytest.mark.parametrize("cutoff", [0.0, 1e-5])
+def test_return_map_between_the_bounds_is_the_identity_in_single_precision_too(cutoff: float) -> None:
+    """Where the principal stretches are nearly equal, a quotient of rounded differences would spoil the derivative."""
+    small = 5e-8 * torch.tensor([[[[1.0, 0.7], [0.4, -0.3]]]])
+    F = tuple(plane.requires_grad_() for plane in planes(torch.eye(2) + small))
+    returned, _ = snow_return(F, LOW, HIGH, cutoff)
+    if not cutoff:  # which makes this F symmetric
+        slopes = torch.autograd.grad(returned[0].sum(), F)
+        torch.testing.assert_close(torch.cat(slopes, 1), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(torch.cat(returned, 1), torch.cat(F, 1), atol=2e-7, rtol=0)
+
+
+def test_no_derivative_in_Jp_without_hardening() -> None:
+    Jp = torch.ones(1, 1, dtype=torch.float64, requires_grad=True)
+    xx, *_ = soil(hardening_range=(1.0, 1.0)).stress(planes(1.1 * torch.eye(2, dtype=torch.float64)[None, None]), Jp)
+    assert xx.item() != 0 and not xx.requires_grad

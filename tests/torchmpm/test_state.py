@@ -189,3 +189,11 @@ def test_annotations_hold_when_they_are_checked() -> None:
         [sys.executable, "-W", "error", "-c", textwrap.dedent(ANNOTATED)], capture_output=True, text=True, timeout=120
     )
     assert done.stdout.strip() == "all checked", done.stderr
+
+
+def test_a_pickle_holds_the_numbers_of_the_state_alone() -> None:
+    """Not five times the tensor that all fields are views of, nor the rest of its batch."""
+    state = robot(500).step(lively(500, batch=4), substeps=1)
+    size = 13 * 500 * state.x.element_size()
+    assert len(pickle.dumps(state)) < 4 * size + 4000
+    assert len(pickle.dumps(state[1])) < size + 4000

@@ -1,6 +1,6 @@
 """The interface of materials, and the shapes of their constants."""
 
-from typing import Protocol, TypeAlias, runtime_checkable
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -33,6 +33,38 @@ class Material(Protocol):
 
     def stiffness(self) -> Value:
         """Largest ratio of stress to strain (Frobenius norms) in undeformed material, Pa."""
+
+
+def check_returned(material: Material, returned: Any, Jp: Tensor) -> tuple[Mat2, Tensor]:
+    """What ``return_map`` returned, four planes and Jp of the shape of ``Jp`` (B, N), or else a TypeError."""
+    pair = isinstance(returned, tuple) and len(returned) == 2
+    if not (pair and _planes(returned[0], 4, Jp) and _planes(returned[1:], 1, Jp)):
+        wanted = f"(F, Jp), four tensors and one, all of shape {tuple(Jp.shape)}"
+        raise TypeError(f"return_map of {type(material).__name__} must return {wanted}, got {_found(returned)}")
+    return returned
+
+
+def check_stress(material: Material, stress: Any, Jp: Tensor) -> Sym2:
+    """What ``stress`` returned, three planes of the shape of ``Jp`` (B, N), or else a TypeError."""
+    if not _planes(stress, 3, Jp):
+        wanted = f"three tensors of shape {tuple(Jp.shape)}"
+        raise TypeError(f"stress of {type(material).__name__} must return {wanted}, got {_found(stress)}")
+    return stress
+
+
+def _planes(given: Any, count: int, like: Tensor) -> bool:
+    """Whether these are so many tensors of the shape of another."""
+    return (
+        isinstance(given, tuple)
+        and len(given) == count
+        and all(isinstance(plane, Tensor) and plane.shape == like.shape for plane in given)
+    )
+
+
+def _found(given: Any) -> str:
+    if isinstance(given, tuple):
+        return f"({', '.join(map(_found, given))})"
+    return f"shape {tuple(given.shape)}" if isinstance(given, Tensor) else type(given).__name__
 
 
 def lame(young: Value, poisson: Value) -> tuple[Value, Value]:
@@ -77,8 +109,9 @@ def broadcast_plane(value: Value, like: Tensor, name: str = "value") -> Value:
         return value[:, None]
     if value.ndim == 0 or (value.ndim == 2 and value.shape[0] in (1, batch) and value.shape[1] in (1, count)):
         return value
-    shapes = f"(), ({batch},), ({batch}, 1), ({batch}, {count}) or (1, {count})"
-    raise ValueError(f"{name} must be a number or have shape {shapes}, got {tuple(value.shape)}")
+    *shapes, last = dict.fromkeys(((), (batch,), (batch, 1), (batch, count), (1, count)))
+    allowed = f"{', '.join(map(str, shapes))} or {last}"
+    raise ValueError(f"{name} must be a number or have shape {allowed}, got {tuple(value.shape)}")
 
 
 def detached_column(value: Value) -> Value:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchmpm.materials.base import broadcast_plane
+from torchmpm.materials.base import broadcast_plane, check_stress
 from torchmpm.materials.body import Body
 from torchmpm.materials.elastic import corotated_stress
 from torchmpm.materials.linalg import Mat2, Sym2, det
@@ -28,7 +28,8 @@ def resolved_stress(body: Body, F: Mat2, Jp: Tensor, h: float, dt: float) -> Sym
     Where the stiffness of hardened snow exceeds the largest one for which substeps of ``dt`` are stable,
     ``(h / dt)^2 m / V``, the derivative is that of the stable one. All other derivatives are exact.
     """
-    material, tau = body.material, body.material.stress(F, Jp)
+    material = body.material
+    tau = check_stress(material, material.stress(F, Jp), Jp)
     if not isinstance(material, Snow) or material.exact_gradients:
         return tau
     with torch.no_grad():

@@ -35,9 +35,10 @@ def snow_return(F: Mat2, low: Value, high: Value, shear_cutoff: float = 0.0) -> 
     difference = safe_sqrt(square)
     stretches = 0.5 * (total + difference), 0.5 * (total - difference)
     major, minor = (_clamp(stretch, low, high) for stretch in stretches)
-    # For equal stretches the ratio multiplies zeros; its value is the limit for a small difference.
-    inside = ((stretches[0] >= low) & (stretches[0] <= high)).to(total.dtype)
-    ratio = 0.5 * torch.where(isotropic, inside, (major - minor) / torch.where(isotropic, 1.0, difference))
+    # Where both stretches are kept, the ratio is 1. Its quotient, and even more the derivative, would lose all digits
+    # where they are nearly equal, as in soil at rest.
+    kept = (stretches[0] <= high) & (stretches[1] >= low)
+    ratio = 0.5 * torch.where(kept, 1.0, (major - minor) / torch.where(kept | isotropic, 1.0, difference))
     mean = 0.5 * (major + minor)
     returned = join(Parts(mean * cos, mean * sin, ratio * n1, ratio * n2, parts.proper))
     return returned, stretches[0] * stretches[1] / (major * minor)
@@ -130,5 +131,6 @@ class Snow(Elastic):
         exponent = broadcast_plane(self.hardening, Jp, "hardening") * (1.0 - Jp)
         if high > 0:  # beyond it the exponential could overflow, and its derivative would be NaN even where clamped
             exponent = exponent.clamp_max(math.log(high) + 0.01)
-        factor = exponent.exp().clamp(low, high)
+        # At equal bounds, where the factor is constant, clamp would pass a derivative on.
+        factor = exponent.exp().clamp(low, high) if low < high else torch.full_like(Jp, low)
         return factor * broadcast_plane(self.mu, Jp, "mu"), factor * broadcast_plane(self.lam, Jp, "lam")

@@ -62,7 +62,7 @@ class Tables(ctypes.Structure):
 
     _fields_ = [
         *_members(ctypes.c_int64, "resolution", "num_bodies", "num_rules"),
-        *_members(ctypes.c_double, "h", "dt", "margin", "damping", "mass_epsilon", "stretch_floor"),
+        *_members(ctypes.c_double, "h", "dt", "margin", "extent", "damping", "mass_epsilon", "stretch_floor"),
         ("bodies", ctypes.POINTER(BodyTable)),
         ("rules", ctypes.POINTER(RuleTable)),
     ]
@@ -106,7 +106,7 @@ def make_tables(grid: Grid, bodies: Sequence[Body], rules: Sequence[VelocityRule
     directions = list(dict.fromkeys(rule.direction for rule in rules))
     rule_tables = (RuleTable * len(rules))(*(_rule_table(rule, directions.index(rule.direction)) for rule in rules))
     body_tables = (BodyTable * len(bodies))(*_body_tables(bodies, dt))
-    numbers = (grid.h, dt, grid.margin, damping, MASS_EPSILON, STRETCH_FLOOR)
+    numbers = (grid.h, dt, grid.margin, grid.extent, damping, MASS_EPSILON, STRETCH_FLOOR)
     key = bytes(Tables(grid.resolution, len(bodies), len(rules), *numbers)) + bytes(body_tables) + bytes(rule_tables)
     with _lock:
         if key not in _handles:

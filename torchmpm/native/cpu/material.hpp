@@ -72,8 +72,8 @@ INLINE Direction snow_return(const Values& m, Bounds bounds, Mat2& F, Real& Jp) 
     const Real root = std::sqrt(isotropic ? Real(1) : square2), difference = isotropic ? Real(0) : root;
     const Real first = Real(0.5) * (R.total + difference), second = Real(0.5) * (R.total - difference);
     const Real major = clamp(first, low, high), minor = clamp(second, low, high);
-    const Real inside = (first >= low) & (first <= high) ? Real(1) : Real(0);
-    const Real ratio = Real(0.5) * (isotropic ? inside : (major - minor) / root), sum = Real(0.5) * (major + minor);
+    const bool kept = (first <= high) & (second >= low);
+    const Real ratio = Real(0.5) * (kept ? Real(1) : (major - minor) / root), sum = Real(0.5) * (major + minor);
     F = join({sum * R.cos, sum * R.sin, ratio * n1, ratio * n2, v.sign});
     const Real grown = Jp * (first * second / (major * minor));
     Jp = grown > LARGEST_JP ? LARGEST_JP : grown;

@@ -51,7 +51,8 @@ INLINE void stress_adjoint(const Values& m, Real hard, Real tangent, Mat2 F, Dir
 template <Kind kind> INLINE Real hardening_adjoint(const Values& m, Bounds bounds, Real Jp, MaterialBar& bar) {
     if (kind != Kind::snow) return 0;
     const Real power = exponential(m.hardening() * (1 - Jp));
-    const bool free = (power >= bounds.hardening_low) & (power <= bounds.hardening_high);
+    const bool free = (power >= bounds.hardening_low) & (power <= bounds.hardening_high) &
+                      (bounds.hardening_low < bounds.hardening_high);
     const Real exponent = free ? bar.hard * power : 0;
     bar.values.hardening() = exponent * (1 - Jp);
     return -exponent * m.hardening();
@@ -108,15 +109,15 @@ INLINE void snow_adjoint(const Values& m, Bounds bounds, Mat2 F, Real Jp, Materi
     const Real root = std::sqrt(isotropic ? Real(1) : square2), difference = isotropic ? Real(0) : root;
     const Real first = Real(0.5) * (R.total + difference), second = Real(0.5) * (R.total - difference);
     const Real major = clamp(first, low, high), minor = clamp(second, low, high);
-    const Real inside = (first >= low) & (first <= high) ? Real(1) : Real(0);
-    const Real ratio = Real(0.5) * (isotropic ? inside : (major - minor) / root), sum = Real(0.5) * (major + minor);
+    const bool kept = (first <= high) & (second >= low);
+    const Real ratio = Real(0.5) * (kept ? Real(1) : (major - minor) / root), sum = Real(0.5) * (major + minor);
     const Real reduction = first * second / (major * minor);
     Jp_bar = Jp * reduction > LARGEST_JP ? Real(0) : Jp_bar;
     const Real reduction_bar = Jp_bar * Jp;
 
     const Parts v_bar = split(F_bar, v.sign);
     const Real sum_bar = v_bar.m1 * R.cos + v_bar.m2 * R.sin;
-    const Real ratio_bar = isotropic ? 0 : v_bar.n1 * n1 + v_bar.n2 * n2;
+    const Real ratio_bar = kept | isotropic ? 0 : v_bar.n1 * n1 + v_bar.n2 * n2;
     const Real major_bar = Real(0.5) * (sum_bar + ratio_bar / root) - reduction_bar * reduction / major;
     const Real minor_bar = Real(0.5) * (sum_bar - ratio_bar / root) - reduction_bar * reduction / minor;
     const Real area = reduction_bar / (major * minor);

@@ -19,7 +19,7 @@ struct RuleTable {
 
 struct Tables {
     int64_t resolution, num_bodies, num_rules;
-    double h, dt, margin, damping, mass_epsilon, stretch_floor;
+    double h, dt, margin, extent, damping, mass_epsilon, stretch_floor;
     const BodyTable* bodies;
     const RuleTable* rules;
 };
@@ -76,7 +76,7 @@ struct Scene {
         const Tables& t = *call.tables;
         resolution = int(t.resolution), width = resolution + 2 * PAD;
         h = Real(t.h), inverse_h = Real(1 / t.h), dt = Real(t.dt), damping = Real(t.damping);
-        margin = Real(t.margin), extent = Real(double(t.resolution) * t.h - t.margin);
+        margin = Real(t.margin), extent = Real(t.extent);
         mass_epsilon = Real(t.mass_epsilon);
         for (const BodyTable* b = t.bodies; b != t.bodies + t.num_bodies; ++b) add(*b, Real(t.stretch_floor));
         for (const RuleTable* r = t.rules; r != t.rules + t.num_rules; ++r)

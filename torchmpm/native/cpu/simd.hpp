@@ -78,6 +78,7 @@ INLINE void transpose(Real8 (&v)[8]) {
 INLINE Real exponential(Real x) {
     constexpr bool single = sizeof(Real) == 4;
     constexpr Real limit = single ? 250 : 2040;
+    x = x < -limit ? -limit : x;  // far below, the polynomial would overflow
     Real n = std::nearbyint(x * Real(1.4426950408889634));
     n = n > -limit ? n : -limit;  // also takes a NaN, which stays in r
     n = n < limit ? n : limit;

@@ -66,9 +66,9 @@ def snow_parts(m1, m2, n1, n2, low, high, shear_cutoff):
     difference = tl.where(isotropic, 0.0, root)
     first, second = 0.5 * (total + difference), 0.5 * (total - difference)
     major, minor = clamp(first, low, high), clamp(second, low, high)
-    inside = tl.where((first >= low) & (first <= high), 1.0, 0.0)
-    ratio = 0.5 * tl.where(isotropic, inside, (major - minor) / root)
-    return n1, n2, along, drop, isotropic, root, first, second, major, minor, ratio
+    kept = (first <= high) & (second >= low)
+    ratio = 0.5 * tl.where(kept, 1.0, (major - minor) / root)
+    return n1, n2, along, drop, isotropic, kept, root, first, second, major, minor, ratio
 
 
 @triton.jit
@@ -76,7 +76,9 @@ def snow_return(a, b, c, d, Jp, low, high, constants, bounds):
     """Returned deformation gradient and Jp."""
     m1, m2, n1, n2, proper = split(a, b, c, d)
     _, _, cos, sin, _ = direction(m1, m2)
-    n1, n2, _, _, _, _, first, second, major, minor, ratio = snow_parts(m1, m2, n1, n2, low, high, tl.load(bounds + 2))
+    n1, n2, _, _, _, _, _, first, second, major, minor, ratio = snow_parts(
+        m1, m2, n1, n2, low, high, tl.load(bounds + 2)
+    )
     sum = 0.5 * (major + minor)
     e, f, g, h = join(sum * cos, sum * sin, ratio * n1, ratio * n2, proper)
     largest = tl.load(constants + LARGEST_JP)

@@ -97,7 +97,7 @@ def snow_adjoint(
     """From derivatives in the returned F, in R and Jp to those in the trial F (four), in Jp, and in low and high."""
     m1, m2, p1, p2, proper = split(a, b, c, d)
     _, inverse, cos, sin, empty = direction(m1, m2)
-    n1, n2, along, drop, isotropic, root, first, second, major, minor, ratio = snow_parts(
+    n1, n2, along, drop, isotropic, kept, root, first, second, major, minor, ratio = snow_parts(
         m1, m2, p1, p2, low, high, tl.load(bounds + 2)
     )
     sum = 0.5 * (major + minor)
@@ -107,7 +107,7 @@ def snow_adjoint(
 
     m1_bar, m2_bar, n1_bar, n2_bar = join_adjoint(a_bar, b_bar, c_bar, d_bar, proper)
     sum_bar = m1_bar * cos + m2_bar * sin
-    ratio_bar = tl.where(isotropic, 0.0, n1_bar * n1 + n2_bar * n2)
+    ratio_bar = tl.where(kept | isotropic, 0.0, n1_bar * n1 + n2_bar * n2)
     major_bar = 0.5 * (sum_bar + ratio_bar / root) - reduction_bar * reduction / major
     minor_bar = 0.5 * (sum_bar - ratio_bar / root) - reduction_bar * reduction / minor
     area = reduction_bar / (major * minor)
@@ -145,7 +145,8 @@ def elastic_adjoint(a, b, c, d, a_bar, b_bar, c_bar, d_bar, cos_bar, sin_bar):
 def hardening_adjoint(Jp, hardening, hard_bar, bounds):
     """Derivatives in Jp and in the exponent through the hardening factor of snow."""
     power = tl.exp(hardening * (1.0 - Jp))
-    free = (power >= tl.load(bounds)) & (power <= tl.load(bounds + 1))
+    low, high = tl.load(bounds), tl.load(bounds + 1)
+    free = (power >= low) & (power <= high) & (low < high)
     exponent = tl.where(free, hard_bar * power, 0.0)
     return -exponent * hardening, exponent * (1.0 - Jp)
 

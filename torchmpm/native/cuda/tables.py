@@ -32,8 +32,7 @@ def device_tables(handle: int, dtype: torch.dtype, device: torch.device) -> Devi
     """The tables of a handle on a device; kept, because a copy to a device waits for it."""
     tables, bodies = tables_of(handle), bodies_of(handle)
     rules = tables.rules[: tables.num_rules]
-    extent = tables.resolution * tables.h - tables.margin
-    constants = [tables.h, 1.0 / tables.h, tables.dt, tables.margin, extent, tables.damping, tables.mass_epsilon]
+    constants = [tables.h, 1.0 / tables.h, tables.dt, tables.margin, tables.extent, tables.damping, tables.mass_epsilon]
     constants += [tables.stretch_floor, LARGEST_JP]
     constants += [0.0] * 3  # parts of a table begin at whole fours, as Triton compiles a kernel anew for others
     for body in bodies:
