@@ -1,6 +1,7 @@
 """From an action image to an actuation field on the nodes of the window."""
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -24,6 +25,16 @@ def to_grid_indexing(action: Tensor, indexing: ActionIndexing) -> Tensor:
 def from_grid_indexing(action: Tensor, indexing: ActionIndexing) -> Tensor:
     """Undo :func:`to_grid_indexing`, for an action (..., R, R) indexed (x rightwards, y upwards)."""
     return action.transpose(-1, -2).flip(-2) if indexing == "image" else action
+
+
+def trained_indexing(policy: Any) -> ActionIndexing | None:
+    """How a trained policy, such as :func:`cfp.load` returns it, indexes its actions; ``None`` if it does not say."""
+    description = getattr(policy, "description", None)
+    trained_in = description.get("environment") if isinstance(description, Mapping) else None
+    if trained_in is None:
+        return None
+    own: ActionIndexing = "grid" if trained_in.get("parity") == "reference" else "image"
+    return trained_in.get("action_layout") or own
 
 
 def patch_field(action: Tensor, patch: int, max_actuation: float | Tensor) -> Tensor:

@@ -113,7 +113,7 @@ def check_memory(task: str, memory: object, stale: tuple[str, ...], batch: int) 
     """Refuse what a task must not return as its initial memory."""
     who = f"initial_memory of task {task!r}"
     if not isinstance(memory, Mapping):
-        raise TypeError(f"{who} must return tensors by name, got {_kind(memory)}")
+        raise TypeError(f"{who} must return tensors by name, got {kind_of(memory)}")
     _check_leading(who, "memory", memory, batch)
     if missing := [name for name in stale if name not in memory]:
         raise ValueError(f"{who} must return what stale_memory names, got {sorted(memory)} without {missing}")
@@ -127,7 +127,7 @@ def check_outcome(task: str, outcome: object, memory: Memory, weights: Mapping[s
     parts = {"terms": outcome.terms, "info": outcome.info, "memory": outcome.memory}
     for what, values in parts.items():
         if not isinstance(values, Mapping) and (values is not None or what == "terms"):
-            raise TypeError(f"{who} must return {what} by name, got {_kind(values)}")
+            raise TypeError(f"{who} must return {what} by name, got {kind_of(values)}")
     flags = {"terminated": outcome.terminated, "success": outcome.success}
     info = outcome.info or {}
     for part, taken in (("terms", RESERVED_TERMS & outcome.terms.keys()), ("info", RESERVED_INFO & info.keys())):
@@ -137,17 +137,19 @@ def check_outcome(task: str, outcome: object, memory: Memory, weights: Mapping[s
         raise ValueError(f"weights of task {task!r} must hold every term of reward_fn, got none for {missing}")
     for name, value in outcome.terms.items():
         if not isinstance(value, Tensor) or value.shape != (batch,) or value.is_complex():
-            raise ValueError(f"{who} must return terms of shape (B,) in real numbers, got {_kind(value)} for {name!r}")
+            raise ValueError(
+                f"{who} must return terms of shape (B,) in real numbers, got {kind_of(value)} for {name!r}"
+            )
     weighted = {*outcome.terms, *RESERVED_TERMS} - {"failure"}  # the penalty of a failure has its own amount
     if unknown := sorted(weights.keys() - weighted):
         allowed = sorted(weighted)
         raise ValueError(f"weights of task {task!r} must be of the terms {allowed}, got {unknown}")
     for name, flag in flags.items():
         if flag is not None and not (isinstance(flag, Tensor) and (flag.dtype, *flag.shape) == (torch.bool, batch)):
-            raise ValueError(f"{who} must return {name} as bool of shape (B,), got {_kind(flag)}")
+            raise ValueError(f"{who} must return {name} as bool of shape (B,), got {kind_of(flag)}")
     _check_leading(who, "info", info, batch)
     if outcome.memory is not None:
-        before, after = ({name: _kind(value) for name, value in m.items()} for m in (memory, outcome.memory))
+        before, after = ({name: kind_of(value) for name, value in m.items()} for m in (memory, outcome.memory))
         if before != after:
             raise ValueError(f"{who} must return memory like that of initial_memory, {before}, got {after}")
 
@@ -155,8 +157,9 @@ def check_outcome(task: str, outcome: object, memory: Memory, weights: Mapping[s
 def _check_leading(who: str, what: str, values: Mapping[str, object], batch: int) -> None:
     for name, value in values.items():
         if not isinstance(value, Tensor) or value.shape[:1] != (batch,):
-            raise ValueError(f"{who} must return {what} of shape (B, ...), got {_kind(value)} for {name!r}")
+            raise ValueError(f"{who} must return {what} of shape (B, ...), got {kind_of(value)} for {name!r}")
 
 
-def _kind(value: object) -> str:
+def kind_of(value: object) -> str:
+    """Type and shape of a tensor, type of anything else, for messages."""
     return f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__

@@ -6,15 +6,16 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from dittogym.action import patch_field, place
-from dittogym.contract import Measurement, Moment, Outcome, check_memory, check_outcome, measure
+from dittogym.contract import Measurement, Moment, Outcome, check_memory, check_outcome, kind_of, measure
 from dittogym.model import EnvState, Model
-from dittogym.physics import Physics
+from dittogym.physics import NAMES, Physics
 from dittogym.reward_ops import EXACT, SMOOTH, RewardOps, action_cost
 from dittogym.window import centre_in_window, contains
 from torchmpm import ParticleState, diagnostics, tree
@@ -58,11 +59,20 @@ def reset(model: Model, positions: Tensor, physics: Physics | None = None) -> tu
     Args:
         model: The task.
         positions: (B, N, 2) in the world, m, robot first.
-        physics: Constants that differ from the task's, see :func:`dittogym.physics.physics_values`.
+        physics: Constants that differ from the task's, as :func:`dittogym.physics.physics_values` returns them. Whether
+            they are stable is not checked.
 
     Returns:
         State and observation (B, 3, 64, 64) uint8.
+
+    Raises:
+        ValueError: ``positions`` are of another shape or type, or ``physics`` holds an unknown name.
     """
+    shape = model.solver.num_particles, 2
+    if not isinstance(positions, Tensor) or positions.ndim != 3 or positions.shape[1:] != shape:
+        raise ValueError(f"positions must be a tensor of shape (B, {shape[0]}, 2), got {kind_of(positions)}")
+    if unknown := [name for name in physics or () if name not in NAMES]:
+        raise ValueError(f"physics may hold {', '.join(NAMES)}, got {', '.join(unknown)}")
     spec, particles = model.spec, ParticleState.at_rest(positions)
     start = measure(particles, model.num_robot_particles)
     steps = torch.zeros(len(positions), dtype=torch.int64, device=positions.device)
@@ -70,7 +80,8 @@ def reset(model: Model, positions: Tensor, physics: Physics | None = None) -> tu
     observation = observe(model, state)
     memory = spec.initial_memory(_moment(model, state, start, observation, EXACT), spec)
     check_memory(spec.name, memory, spec.stale_memory, len(positions))
-    return replace(state, memory=dict(memory)), observation  # of any kind of mapping
+    # Of any kind of mapping, and a copy: it may hold what the state does.
+    return replace(state, memory=tree.map(Tensor.clone, dict(memory))), observation
 
 
 def step(model: Model, state: EnvState, action: Tensor, *, soft: bool = False) -> StepResult:
@@ -79,8 +90,12 @@ def step(model: Model, state: EnvState, action: Tensor, *, soft: bool = False) -
     Args:
         model: The task.
         state: The present state.
-        action: (B, 2, R, R) in grid indexing, see :func:`dittogym.action.to_grid_indexing`.
+        action: (B, 2, R, R) in grid indexing, see :func:`dittogym.action.to_grid_indexing`, from -1 to 1. Elements with
+            numbers that are not finite end with :data:`FAILURE_REWARD`.
         soft: Whether the reward is the smooth one, for gradients; all else is as without.
+
+    Raises:
+        ValueError: ``action`` is of another shape or type, or the task returns what it must not.
     """
     return evaluate(model, *transition(model, state, action), soft=soft)
 
@@ -97,7 +112,11 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
 
     Returns:
         The next state, and the actuation on the patch (B, 2, P, P) in Pa.
+
+    Raises:
+        ValueError: ``action`` is of another shape or type.
     """
+    _check_action(model.spec.patch, action, state.particles.x)
     finite: list[Tensor] = []  # where gradients may go back, known after the step
 
     def guard(value: Tensor) -> Tensor:
@@ -128,6 +147,14 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
     com = torch.where(torch.isfinite(com).all(-1, keepdim=True), com, state.centre)  # the last that was finite
     origin = spec.window.origin(com) if spec.window.moves else state.origin
     return replace(state, particles=particles, origin=origin, centre=com, steps=state.steps + 1), actuation
+
+
+def _check_action(patch: int, action: Tensor, x: Tensor) -> None:
+    shape = action.shape if isinstance(action, Tensor) else ()
+    square = len(shape) == 4 and shape[2] == shape[3] <= patch
+    if not square or shape[:2] != (len(x), 2) or action.dtype != x.dtype:
+        wanted = f"{x.dtype} of shape ({len(x)}, 2, R, R) with R at most {patch}"
+        raise ValueError(f"action must be {wanted}, got {kind_of(action)}")
 
 
 def observe(model: Model, state: EnvState) -> Tensor:
@@ -184,7 +211,8 @@ def is_valid(model: Model, state: EnvState) -> Tensor:
 
 
 def _moment(model: Model, state: EnvState, now: Measurement, observation: Tensor, ops: RewardOps) -> Moment:
-    return Moment(state.particles, model.num_robot_particles, now, state.start, observation, state.memory, ops)
+    memory = MappingProxyType(state.memory)  # so that a task cannot exchange its entries
+    return Moment(state.particles, model.num_robot_particles, now, state.start, observation, memory, ops)
 
 
 def _weighted_reward(
@@ -192,7 +220,13 @@ def _weighted_reward(
 ) -> tuple[Outcome, dict[str, Tensor], Tensor]:
     """Outcome, weighted terms and their sum; of simulations that are not valid (B,) only ``failure`` counts."""
     spec, now = model.spec, moment.now
+    before = _versions(moment)
     outcome = spec.reward_fn(moment, spec)
+    if changed := dict.fromkeys(name for name, tensor, version in before if tensor._version != version):
+        who = f"reward_fn of task {spec.name!r}"
+        raise ValueError(
+            f"{who} must not change a moment in place, but return copies, got another {', '.join(changed)}"
+        )
     check_outcome(spec.name, outcome, moment.memory, spec.weights, len(now.split))
     terms, weights = dict(outcome.terms), spec.weights
     if spec.split_limit is not None:
@@ -204,11 +238,28 @@ def _weighted_reward(
     factors, failed = _columns(tuple(weights.get(name, 0.0) for name in terms), now.split.dtype, now.split.device)
     values = torch.stack(tuple(terms.values())) * factors
     counted = torch.where(valid, values, failed)
-    reward = counted.sum(0)
+    first, *others = counted.unbind()
+    reward = sum(others, first)  # in an order that does not depend on the size of the batch, as that of Tensor.sum does
     # Seldom, so that the names are not looked for in every step. Nothing can depend on numbers under torch.func.vmap.
     if not transforming() and not math.isfinite(reward.detach().sum()):
         _check_finite(spec.name, list(terms), values, valid)
     return outcome, dict(zip(terms, counted.unbind(), strict=True)), reward
+
+
+def _versions(moment: Moment) -> list[tuple[str, Tensor, int]]:
+    """The tensors of a moment, with its field and how often each was changed in place, where torch counts that."""
+    if transforming() or torch.compiler.is_compiling():
+        return []
+    state = moment.particles
+    parts = {
+        "particles": (state.x, state.v, state.C, state.F, state.Jp),
+        "now": moment.now,
+        "start": moment.start,
+        "observation": (moment.observation,),
+        "memory": moment.memory.values(),
+    }
+    tensors = [(name, tensor) for name, part in parts.items() for tensor in part if tensor is not None]
+    return [(name, tensor, tensor._version) for name, tensor in tensors if not tensor.is_inference()]
 
 
 @cached_tensors

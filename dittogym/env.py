@@ -202,7 +202,7 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         Returns:
             The recording, from which further films can be saved. A notebook shows it.
         """
-        act = as_function(policy)
+        act = as_function(policy, self.torch_env.action_layout)
         return film(
             self.torch_env, lambda images: as_tensor(act(images[0]), self.torch_env, True), path, seed, 0, options
         )

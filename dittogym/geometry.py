@@ -73,6 +73,10 @@ class Obstacle:
                 "Obstacle.with_friction changes that of all its faces"
             )
         checks.instances("rules", self.velocity_rules, VelocityRule)
+        if not (self.boxes or self.rules or self.observed):
+            raise ValueError(
+                f"boxes must hold a box if there are no rules and observed boxes, got none for {self.name!r}"
+            )
 
     @property
     def velocity_rules(self) -> tuple[VelocityRule, ...]:
@@ -113,8 +117,11 @@ def _faces(box: Box, friction: float) -> Iterator[VelocityRule]:
         yield VelocityRule("-y", i, (top - 1, top), friction=friction)
 
 
-def floor(friction: float = inf) -> Obstacle:
-    """Ground up to node 19; sticky by default, as published (the reference's Coulomb branch never acts)."""
+def floor(*, friction: float = inf) -> Obstacle:
+    """Ground up to node 19; sticky by default, as published (the reference's Coulomb branch never acts).
+
+    For ground of another height use :func:`solid`.
+    """
     rule = VelocityRule("-y", j=(None, FLOOR_NODE), friction=friction)
     return Obstacle("floor", (nodes(top=FLOOR_NODE + 1),), rules=(rule,), observed=())
 
@@ -126,7 +133,7 @@ def ceiling(node: int) -> Obstacle:
 
 
 def side_walls(top: int | None) -> Obstacle:
-    """Invisible walls at both ends of a fixed window that reaches from -0.5 m to 0.5 m, up to this node."""
+    """Invisible walls at x = -0.25 m and x = 0.25 m, as GROW, DIG and CATCH have them, up to this node."""
     height = inf if top is None else top
     boxes = (nodes(32, 34, top=height), nodes(-34, -32, top=height))
     rules = (VelocityRule("+x", (32, 34), (None, top)), VelocityRule("-x", (-34, -32), (None, top)))

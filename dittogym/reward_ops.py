@@ -110,13 +110,24 @@ def signed_quadratic(z: Tensor, k: float) -> Tensor:
 
 
 def distance(x: Tensor, point: Tensor) -> Tensor:
-    """Distances (B, N) of ``x`` (B, N, 2) from ``point`` (B, 2), m, whose derivative is 0 where they coincide."""
+    """Distances from a point, m, whose derivative is 0 where they coincide.
+
+    Args:
+        x: (B, N, 2), or (B, 2) for one position in each simulation, m.
+        point: (B, 2), or (2,) for the same point in all simulations, m.
+
+    Returns:
+        (B, N) or (B,).
+    """
     return safe_sqrt(_squared_distance(x, point))
 
 
 def _squared_distance(x: Tensor, point: Tensor) -> Tensor:
     # By component: a state keeps components apart, and Tensor.norm over its last axis takes a hundred times as long.
-    return (x[..., 0] - point[:, :1]).square() + (x[..., 1] - point[:, 1:]).square()
+    px, py = point[..., 0], point[..., 1]
+    if x.ndim == 3 and point.ndim == 2:
+        px, py = px[:, None], py[:, None]
+    return (x[..., 0] - px).square() + (x[..., 1] - py).square()
 
 
 def nearest(x: Tensor, point: Tensor, fraction: float) -> Tensor:
@@ -146,4 +157,4 @@ def pick(x: Tensor, index: Tensor) -> Tensor:
 
 def action_cost(actuation: Tensor) -> Tensor:
     """Sum over both muscle directions of the Frobenius norm of the actuation on the patch (B, 2, P, P); (B,)."""
-    return actuation.flatten(2).norm(dim=2).sum(1)
+    return safe_sqrt(actuation.flatten(2).square().sum(2)).sum(1)  # Tensor.norm has no second derivative at 0

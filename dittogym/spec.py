@@ -47,6 +47,7 @@ class BodySpec:
         checks.number("mass", self.mass, above=0.0)
         if self.lite is not None:
             object.__setattr__(self, "lite", checks.whole("lite", self.lite, 1))
+        checks.flag("hidden_velocity", self.hidden_velocity)
 
 
 def no_memory(moment: Moment, spec: TaskSpec) -> Memory:
@@ -142,6 +143,8 @@ class TaskSpec:
         object.__setattr__(self, "patch", checks.whole("patch", self.patch, 4, NODES))
         for name, most in (("horizon", None), ("coarse", self.patch), ("fine", self.patch)):
             object.__setattr__(self, name, checks.whole(name, getattr(self, name), 1, most))
+        if self.coarse > self.fine:
+            raise ValueError(f"coarse must be at most fine, {self.fine}, got {self.coarse}")
         checks.pair("gravity", self.gravity)
         if self.goal is not None:
             checks.pair("goal", self.goal)

@@ -72,8 +72,10 @@ class _VectorObservation(VectorWrapper):
 
 
 def _box(env: AnyEnv, name: str) -> gymnasium.spaces.Box:
-    space = getattr(env, "single_" + name if isinstance(env, VectorEnv) else name)
-    assert isinstance(space, gymnasium.spaces.Box)
+    space = getattr(env, "single_" + name if isinstance(env, VectorEnv) else name, None)
+    if not isinstance(space, gymnasium.spaces.Box):
+        kind = type(env).__name__
+        raise TypeError(f"env must be a Gymnasium environment of images (TorchEnv has resolution=...), got {kind}")
     return space
 
 

@@ -140,8 +140,10 @@ class Figure:
     def __post_init__(self) -> None:
         checks.pair("corner", self.corner)
         checks.number("pixel", self.pixel, above=0.0)
-        if not isinstance(self.mask, np.ndarray) or self.mask.ndim != 2 or not self.mask.any():
-            raise ValueError(f"mask must be an array (rows, columns) with a pixel set, got {np.shape(self.mask)}")
+        mask = self.mask
+        if not isinstance(mask, np.ndarray) or mask.ndim != 2 or mask.dtype != bool or not mask.any():
+            found = f"{getattr(mask, 'dtype', type(mask).__name__)} of shape {np.shape(mask)}"
+            raise ValueError(f"mask must be an array (rows, columns) of bool with a pixel set, got {found}")
 
     @property
     def size(self) -> tuple[float, float]:

@@ -78,7 +78,7 @@ def draw_boxes(boxes: Sequence[Box], origin: Tensor, row: Tensor, column: Tensor
     across = torch.stack([_between(x, box.left, box.right, box.closed) for box in boxes], dim=1)
     along = torch.stack([_between(y, box.bottom, box.top, box.closed) for box in boxes], dim=2)
     mask = along.float() @ across.float() > 0
-    fraction = mask.view(-1, SIZE, BLOCK, SIZE, BLOCK).to(origin.dtype).mean((2, 4))
+    fraction = mask.view(len(mask), SIZE, BLOCK, SIZE, BLOCK).to(origin.dtype).mean((2, 4))
     return Background(mask, fraction)
 
 
@@ -151,7 +151,7 @@ def splat_means(shown: RasterInput) -> Tensor:
     batch, width = len(weight), SIZE + 2 * FRAME
     sums = torch.zeros(len(rows), batch, width**2, dtype=weight.dtype, device=weight.device)
     sums = sums.scatter_add(2, ids.expand(len(rows), -1, -1), torch.stack(rows).flatten(2))
-    sums = sums.view(-1, batch, width, width)[..., FRAME:-FRAME, FRAME:-FRAME]
+    sums = sums.view(len(rows), batch, width, width)[..., FRAME:-FRAME, FRAME:-FRAME]
     expected, expected_moving = sums[0], sums[0 if hidden is None else 3]
     free = 1.0 if background is None else 1.0 - background.fraction
     hit = -torch.expm1(-expected_moving / SATURATION)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dittogym.action import from_grid_indexing, patch_corner, to_grid_indexing
+from dittogym.action import from_grid_indexing, patch_corner, to_grid_indexing, trained_indexing
 from dittogym.geometry import NODES
 from dittogym.model import check_stability
 from dittogym.physics import check_effect, physics_values
@@ -203,9 +203,7 @@ class Session:
 
     def _as_image(self, array: np.ndarray) -> np.ndarray:
         """What a policy returns (B, 2, R, R), in the orientation of the environment's actions."""
-        trained_in = self.policy.description.get("environment", {})
-        own = "grid" if trained_in.get("parity") == "reference" else "image"
-        layout: Any = trained_in.get("action_layout") or own
+        layout = trained_indexing(self.policy) or "image"
         turned = from_grid_indexing(to_grid_indexing(torch.as_tensor(array), layout), self.env.action_layout)
         return turned.numpy()
 

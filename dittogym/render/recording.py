@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from dittogym.action import ActionIndexing, trained_indexing
 from dittogym.render.files import replacing
 from dittogym.render.film import UNITS, possible_rate, write_film
 from dittogym.render.frame import frame, pace
@@ -273,16 +274,20 @@ def play(env: Any, act: Act, seed: Any, index: int = 0) -> Iterator[tuple[np.nda
         yield images, action.cpu().numpy(), end
 
 
-def as_function(policy: Any) -> Act:
+def as_function(policy: Any, layout: ActionIndexing) -> Act:
     """A policy as a function of observations.
 
     Args:
         policy: A function, or an object with ``predict(observation, state)`` as stable-baselines3's, which returns
             actions and the next state.
+        layout: ``action_layout`` of the environment.
 
     Raises:
         TypeError: It is neither.
+        ValueError: It was trained with another ``action_layout``.
     """
+    if (trained := trained_indexing(policy)) not in (None, layout):
+        raise ValueError(f"policy must be one for action_layout {layout!r} of the environment, got one for {trained!r}")
     if not hasattr(policy, "predict"):
         if not callable(policy):
             raise TypeError(f"policy must be a function or have a method predict, got {type(policy).__name__}")

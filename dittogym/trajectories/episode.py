@@ -58,12 +58,12 @@ def record(env: Any, policy: Any, *, seed: int = 0, fields: Sequence[str] = ("x"
         ValueError: The environment has more than one simulation, or there is no such field.
     """
     inner: Any = env.unwrapped if isinstance(env, gymnasium.Env) else env
-    act = as_function(policy)
+    torch_env = inner.torch_env if isinstance(inner, Env) else inner
+    checks.instance("env", torch_env, TorchEnv)
+    act = as_function(policy, torch_env.action_layout)
     if isinstance(inner, Env):
-        torch_env = inner.torch_env
         return record_batch(torch_env, lambda images: as_tensor(act(images[0]), torch_env, single=True), seed, fields)
-    checks.instance("env", inner, TorchEnv)
-    return record_batch(inner, act, seed, fields)
+    return record_batch(torch_env, act, seed, fields)
 
 
 def record_batch(env: TorchEnv, act: Act, seed: int, fields: Sequence[str]) -> Episode:

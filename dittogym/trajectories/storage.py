@@ -70,6 +70,9 @@ def load_episodes(path: str | os.PathLike[str]) -> list[Episode]:
 
 
 def _read(file: BinaryIO) -> list[Episode]:
+    if file.read(2) != b"PK":  # for other files NumPy recommends to unpickle them
+        raise ValueError("it is no npz archive")
+    file.seek(0)
     with np.load(file, allow_pickle=False) as archive:
         about = json.loads(str(archive["about"]))
         if (about["format"], about["version"]) != (FORMAT, VERSION):

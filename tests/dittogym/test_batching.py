@@ -175,3 +175,24 @@ def test_global_generators_are_left_alone(task: str) -> None:
         env.render(muscles=True, size=64)
     tiny(task).reset()  # entropy of the system
     assert states() == before
+
+
+@pytest.mark.parametrize("task", ["kick", "grow", "catch"])
+@torch.no_grad()
+def test_rewards_of_a_batch_are_those_of_its_single_environments_to_the_last_bit(task: str) -> None:
+    """The order in which the terms are added does not depend on the size of the batch."""
+    batch, singles = tiny(task, 4, dtype="float32"), [tiny(task, dtype="float32") for _ in range(4)]
+    batch.reset(seed=7)
+    for i, env in enumerate(singles):
+        env.reset(seed=7 + i)
+    for action in actions(batch, 12):
+        together = batch.step(action)[1]
+        assert together.tolist() == [env.step(action[i : i + 1])[1].item() for i, env in enumerate(singles)]
+
+
+@pytest.mark.parametrize("backend", ["auto", "eager"])
+def test_a_reset_of_no_element_changes_nothing(backend: str) -> None:
+    env = tiny("catch", 2, backend=backend)
+    before, _ = env.reset(seed=0)
+    seen, _ = env.reset(options={"reset_mask": [False, False]})
+    assert torch.equal(seen, before)

@@ -132,3 +132,21 @@ def test_render_modes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "dittogym.render.screen", raising=False)
     with pytest.raises(ImportError, match=r"needs pygame: pip install 'torchmpm\[human\]'"):
         dittogym.Env("run", render_mode="human")
+
+
+@pytest.mark.parametrize("task", ["kick", "catch"])
+def test_next_step_autoreset_with_reference_parity_looks_back_to_the_last_step(task: str) -> None:
+    """Not to one more step, which elements that have ended take with the others."""
+    options = {"max_episode_steps": 5, "parity": "reference"}
+    vector, single = make_vec(task, 1, **options), gymnasium.make(f"dittogym/{task}-coarse-v0", **SMALL, **options)
+    vector.reset(seed=0)
+    single.reset(seed=0)
+    action = np.full((1, *single.action_space.shape), 0.5, np.float32)
+    for _ in range(5):
+        seen = vector.step(action)[0]
+        one = single.step(action[0])[0]
+    assert np.array_equal(seen[0], one)
+    seen, one = vector.step(action)[0], single.reset()[0]
+    assert np.array_equal(seen[0], one)
+    for _ in range(3):
+        assert np.array_equal(vector.step(action)[0][0], single.step(action[0])[0])

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import zlib
 from dataclasses import replace
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import cv2
@@ -135,11 +136,11 @@ def test_policies_are_functions_or_predict() -> None:
         def predict(self, observation, state=None):
             return wave(observation), (state or 0) + 1
 
-    act = as_function(Counting())
+    act = as_function(Counting(), "image")
     for _ in range(2):
         assert act(np.zeros((1, 3, 64, 64), np.uint8)).shape == (1, 2, 8, 8)
     with pytest.raises(TypeError, match="policy must be a function or have a method predict, got int"):
-        as_function(3)
+        as_function(3, "image")
 
 
 @pytest.mark.parametrize(
@@ -228,3 +229,10 @@ def test_a_replay_plays_in_a_browser(recording: Recording, tmp_path) -> None:
     page = subprocess.run([BROWSER, *options, path.as_uri()], capture_output=True, text=True, timeout=120).stdout
     numbers = 21 * 2 * len(recording.shots[0].x)
     assert f"<title>3,{numbers},0.1,20 steps of 10 ms, return {sum(recording.rewards):.1f}." in page
+
+
+def test_a_policy_for_another_layout_of_actions_is_refused() -> None:
+    policy = SimpleNamespace(predict=wave, description={"environment": {"parity": "reference"}})
+    with pytest.raises(ValueError, match=r"policy must be one for action_layout 'image' .* got one for 'grid'"):
+        as_function(policy, "image")
+    as_function(policy, "grid")

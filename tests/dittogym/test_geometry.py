@@ -19,7 +19,9 @@ def test_bad_geometry() -> None:
     with pytest.raises(ValueError, match="at least 4 nodes"):
         solid("thin", (3, 5), (0, 9))
     with pytest.raises(ValueError, match="friction must not be negative"):
-        floor(-1.0)
+        floor(friction=-1.0)
+    with pytest.raises(ValueError, match=r"boxes must hold a box .* got none for 'nothing'"):
+        Obstacle("nothing")
     assert floor().velocity_rules[0].friction == math.inf
     for friction in (0.0, 0.3):  # it would have no effect
         with pytest.raises(ValueError, match=f"friction must not be given with rules.* got {friction} for 'floor'"):

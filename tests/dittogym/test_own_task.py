@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import MappingProxyType
 
@@ -453,6 +453,7 @@ def test_a_function_that_is_written_anew_takes_the_place_of_the_old_one() -> Non
         ({"target": np.zeros((3, 3), bool)}, ValueError, r"target must have shape \(64, 64\), got \(3, 3\)"),
         ({"weights": 1.0}, TypeError, "weights must be a Mapping, got 1.0"),
         ({"obstacles": (VelocityRule("-y"),)}, TypeError, r"obstacles\[0\] must be a Obstacle, got VelocityRule"),
+        ({"coarse": 16}, ValueError, "coarse must be at most fine, 8, got 16"),
         ({"obstacles": floor()}, TypeError, "obstacles must be a sequence of Obstacle, got Obstacle"),
     ],
 )
@@ -597,3 +598,32 @@ def test_its_title_is_its_name() -> None:
     dittogym.register("hop", hop)
     assert headline("hop") == headline("module:hop") == ("hop", "")
     assert headline("shapematch") == ("SHAPE MATCH", "Take the shape of a picture, without gravity.")
+
+
+def nudged(part: str) -> Callable[[Moment, TaskSpec], Outcome]:
+    """A reward function that changes a part of its moment in place."""
+
+    def reward(moment: Moment, spec: TaskSpec) -> Outcome:
+        changed = {"particles": moment.robot_x, "start": moment.start.com, "memory": moment.memory["count"]}[part]
+        changed += 1.0
+        return height(moment, spec)
+
+    return reward
+
+
+@pytest.mark.parametrize("part", ["particles", "start", "memory"])
+def test_a_reward_function_that_changes_its_moment_is_refused(part: str) -> None:
+    spec = dataclasses.replace(
+        hop(), reward_fn=nudged(part), initial_memory=lambda moment, spec: {"count": moment.start.com[:, 1]}
+    )
+    env = tiny(spec)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=f"reward_fn of task 'hop' must not change .* in place.* {part}$"):
+        env.step(torch.zeros(1, *env.action_shape, dtype=env.dtype))
+
+
+def test_the_initial_memory_is_a_copy() -> None:
+    env = tiny(dataclasses.replace(hop(), initial_memory=lambda moment, spec: {"start": moment.start.com}))
+    env.reset(seed=0)
+    env.env_state.memory["start"].zero_()
+    assert env.env_state.start.com.any()

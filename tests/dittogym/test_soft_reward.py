@@ -12,7 +12,7 @@ from torch import Tensor
 from dittogym import Outcome, TorchEnv, make_spec
 from dittogym.core import evaluate
 from dittogym.model import EnvState
-from dittogym.reward_ops import EXACT, SELECTION_WIDTH, SMOOTH, nearest
+from dittogym.reward_ops import EXACT, SELECTION_WIDTH, SMOOTH, distance, nearest
 from dittogym.tasks.grow import GOAL
 from dittogym.tasks.slot import FALLEN, FAR_SIDE
 from torchmpm import ParticleState
@@ -204,3 +204,11 @@ def test_soft_choice_of_the_nearest() -> None:
     assert (soft - hard).abs().max() < SELECTION_WIDTH
     alone = SMOOTH.mean_over_nearest(x[:, :1], x[:, :1], x[:, 0], 0.2)
     assert torch.allclose(alone, x[:, 0])
+
+
+def test_distances_of_particles_and_of_averages() -> None:
+    x, point = normal(3, 5, 2), normal(3, 2, seed=2)
+    expected = (x - point[:, None]).norm(dim=-1)
+    torch.testing.assert_close(distance(x, point), expected)
+    torch.testing.assert_close(distance(x[:, 1], point), expected[:, 1])
+    torch.testing.assert_close(distance(x, point[0])[0], expected[0])

@@ -98,7 +98,7 @@ def test_minari_gives_the_same_back(env, episodes, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("content", "reason"), [(b"", "No data"), (b"PK\x03\x04 no", "zip"), (b"\x80\x04K\x05.", "pickle"), (None, "about")]
+    ("content", "reason"), [(b"", "no npz"), (b"PK\x03\x04 no", "zip"), (b"\x80\x04K\x05.", "no npz"), (None, "about")]
 )
 def test_other_files_are_refused(content, reason, tmp_path):
     path = tmp_path / "other.npz"

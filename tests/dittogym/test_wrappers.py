@@ -12,6 +12,7 @@ from gymnasium import wrappers
 from tiny import SMALL, make_vec
 from torch.nn.functional import interpolate
 
+import dittogym
 from dittogym.wrappers import action_resolution, observation_resolution
 
 NAME = "dittogym/run-coarse-v0"
@@ -192,3 +193,8 @@ def test_actions_of_another_size_are_refused() -> None:
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"action must end in the shape \(4, 4\), got \(2, 5, 5\)"):
         env.step(np.zeros((2, 5, 5), np.float32))
+
+
+def test_a_torch_env_is_no_gymnasium_environment() -> None:
+    with pytest.raises(TypeError, match=r"env must be a Gymnasium environment .* got TorchEnv"):
+        action_resolution(dittogym.TorchEnv("run", **SMALL), 4)
