@@ -17,7 +17,7 @@ def rows(name: str) -> list[dict[str, str]]:
 
 
 def table() -> dict[str, list[float]]:
-    """Numbers of the README's table by task: zero actions, ours, success in percent, paper, minutes, steps here and there."""
+    """Numbers of the README's table by task: zero actions, ours, success (%), paper, minutes, steps here and there."""
     lines = re.findall(r"^\| ([A-Z ]+) \| (.*\d.*) \|$", (ROOT / "README.md").read_text(), re.MULTILINE)
     numbers = {name.lower().replace(" ", ""): re.findall(r"-?\d[\d,]*", cells) for name, cells in lines}
     return {task: [float(number.replace(",", "")) for number in found] for task, found in numbers.items()}

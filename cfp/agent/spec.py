@@ -59,7 +59,10 @@ class ActorSpec:
         """Check that the fields match each other."""
         increasing = list(self.resolutions) == sorted(set(self.resolutions))
         if not self.resolutions or not increasing or not set(self.resolutions) <= set(RESOLUTIONS):
-            raise ConfigError(f"resolutions must be increasing values of {RESOLUTIONS}, got {self.resolutions}")
+            default = "by default they are the task's coarse and fine"
+            raise ConfigError(
+                f"resolutions must be increasing values of {RESOLUTIONS}, got {self.resolutions}; {default}"
+            )
         finest, found, count = self.resolutions[-1], len(self.gate_bias), len(self.resolutions) - 1
         if found != count:
             raise ConfigError(f"gate_bias must have {count} values for resolutions {self.resolutions}, got {found}")

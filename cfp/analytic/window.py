@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -75,6 +76,7 @@ class WindowCollector(Stateful):
             NonFiniteError: Actions are not finite.
         """
         env, true_reward = self.env, 0.0
+        self.dropped_before = self.episodes.counts["dropped"]
         steps: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
         observation, neighbours = self.observe(), Neighbours.find(self._robot_positions())
         for _ in range(self.steps):
@@ -97,7 +99,13 @@ class WindowCollector(Stateful):
         return Window(observations, rewards, next_values, done, true_reward / self.steps)
 
     def scalars(self, window: Window) -> dict[str, float | None]:
-        """What to log of a window, see `WINDOW_METRICS`."""
+        """What to log of a window, see `WINDOW_METRICS`; warns if most of its gradients were left out."""
+        dropped, total = self.episodes.counts["dropped"] - self.dropped_before, window.rewards.numel()
+        if dropped > total / 2:
+            reason = "the reward or the simulation has no finite derivative there"
+            warnings.warn(
+                f"{dropped} of {total} gradients of a window are not finite and left out: {reason}", stacklevel=2
+            )
         return self.episodes.scalars() | {
             "train/reward": float(window.rewards.detach().mean()) / self.reward.scale,
             "train/true_reward": window.true_reward,
