@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
@@ -78,7 +77,10 @@ def reset(model: Model, positions: Tensor, physics: Physics | None = None) -> tu
     steps = torch.zeros(len(positions), dtype=torch.int64, device=positions.device)
     state = EnvState(particles, spec.window.origin(start.com), start.com, start, {}, physics or {}, steps)
     observation = observe(model, state)
-    memory = spec.initial_memory(_moment(model, state, start, observation, EXACT), spec)
+    moment = _moment(model, state, start, observation, EXACT)
+    before = _versions(moment)
+    memory = spec.initial_memory(moment, spec)
+    _check_versions(f"initial_memory of task {spec.name!r}", before)
     check_memory(spec.name, memory, spec.stale_memory, len(positions))
     # Of any kind of mapping, and a copy: it may hold what the state does.
     return replace(state, memory=tree.map(Tensor.clone, dict(memory))), observation
@@ -211,7 +213,7 @@ def is_valid(model: Model, state: EnvState) -> Tensor:
 
 
 def _moment(model: Model, state: EnvState, now: Measurement, observation: Tensor, ops: RewardOps) -> Moment:
-    memory = MappingProxyType(state.memory)  # so that a task cannot exchange its entries
+    memory = dict(state.memory)  # so that a task cannot exchange the entries of the state
     return Moment(state.particles, model.num_robot_particles, now, state.start, observation, memory, ops)
 
 
@@ -222,11 +224,7 @@ def _weighted_reward(
     spec, now = model.spec, moment.now
     before = _versions(moment)
     outcome = spec.reward_fn(moment, spec)
-    if changed := dict.fromkeys(name for name, tensor, version in before if tensor._version != version):
-        who = f"reward_fn of task {spec.name!r}"
-        raise ValueError(
-            f"{who} must not change a moment in place, but return copies, got another {', '.join(changed)}"
-        )
+    _check_versions(f"reward_fn of task {spec.name!r}", before)
     check_outcome(spec.name, outcome, moment.memory, spec.weights, len(now.split))
     terms, weights = dict(outcome.terms), spec.weights
     if spec.split_limit is not None:
@@ -260,6 +258,12 @@ def _versions(moment: Moment) -> list[tuple[str, Tensor, int]]:
     }
     tensors = [(name, tensor) for name, part in parts.items() for tensor in part if tensor is not None]
     return [(name, tensor, tensor._version) for name, tensor in tensors if not tensor.is_inference()]
+
+
+def _check_versions(who: str, before: list[tuple[str, Tensor, int]]) -> None:
+    """Refuse changes in place since :func:`_versions`."""
+    if changed := dict.fromkeys(name for name, tensor, version in before if tensor._version != version):
+        raise ValueError(f"{who} must not change its moment in place, got another {', '.join(changed)}")
 
 
 @cached_tensors

@@ -81,9 +81,10 @@ def success(row: Row) -> str:
 
 
 def exceeds(row: Row, value: float) -> bool:
-    """Whether a mean lies above a value by more than the half of its 95 % interval."""
-    half = 1.96 * float(row["std"]) / int(row["episodes"]) ** 0.5 if row["std"] else 0.0
-    return float(row["mean"]) - half > value
+    """Whether the lower end of the 95 % interval of a mean, or else the lowest episode, is above a value."""
+    if not row["std"]:
+        return float(row["lowest"]) > value
+    return float(row["mean"]) - 1.96 * float(row["std"]) / int(row["episodes"]) ** 0.5 > value
 
 
 def markdown(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

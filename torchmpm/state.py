@@ -128,9 +128,9 @@ class ParticleState:
     def __reduce__(self) -> tuple[type[ParticleState], tuple[Tensor, ...]]:
         """Pickle the fields, unless they are part of an autograd graph."""
         tree.refuse_graph("a ParticleState", self)
-        return ParticleState, tuple(
-            getattr(self, f.name).clone() for f in fields(self)
-        )  # not all that they are views of
+        # Copies, as views would bring along all that they are views of; leaves, as the fields are.
+        own = [getattr(self, f.name) for f in fields(self)]
+        return ParticleState, tuple(t.detach().clone().requires_grad_(t.requires_grad) for t in own)
 
     def __getitem__(self, index: Any) -> ParticleState:
         """Select batch elements by a number, slice, list or tensor; a number keeps a batch dimension of one.

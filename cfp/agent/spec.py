@@ -59,7 +59,7 @@ class ActorSpec:
         """Check that the fields match each other."""
         increasing = list(self.resolutions) == sorted(set(self.resolutions))
         if not self.resolutions or not increasing or not set(self.resolutions) <= set(RESOLUTIONS):
-            default = "by default they are the task's coarse and fine"
+            default = "by default they follow from the task's coarse and fine"
             raise ConfigError(
                 f"resolutions must be increasing values of {RESOLUTIONS}, got {self.resolutions}; {default}"
             )

@@ -100,12 +100,10 @@ class WindowCollector(Stateful):
 
     def scalars(self, window: Window) -> dict[str, float | None]:
         """What to log of a window, see `WINDOW_METRICS`; warns if most of its gradients were left out."""
-        dropped, total = self.episodes.counts["dropped"] - self.dropped_before, window.rewards.numel()
-        if dropped > total / 2:
+        dropped = self.episodes.counts["dropped"] - self.dropped_before
+        if dropped > window.rewards.numel() / 2:
             reason = "the reward or the simulation has no finite derivative there"
-            warnings.warn(
-                f"{dropped} of {total} gradients of a window are not finite and left out: {reason}", stacklevel=2
-            )
+            warnings.warn(f"most gradients of a window are not finite and were left out: {reason}", stacklevel=2)
         return self.episodes.scalars() | {
             "train/reward": float(window.rewards.detach().mean()) / self.reward.scale,
             "train/true_reward": window.true_reward,
@@ -144,7 +142,7 @@ def reward_warnings(config: WindowConfig) -> list[str]:
         differentiable.extend(term.requires_grad for term in outcome.terms.values())
         return outcome
 
-    action = torch.zeros(1, *env.action_shape, device=env.device, requires_grad=True)
+    action = torch.zeros(1, *env.action_shape, dtype=env.dtype, device=env.device, requires_grad=True)
     model = replace(env.model, spec=replace(env.spec, reward_fn=reward_fn))
     core.step(model, env.env_state, action, soft=True)
     if any(differentiable):

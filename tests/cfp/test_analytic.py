@@ -47,6 +47,7 @@ def test_a_reward_without_gradient_is_noticed(monkeypatch):
     monkeypatch.setitem(dittogym.TASKS, "count", lambda: spec)
     config = make(reward=RewardConfig("task"))
     assert reward_warnings(config) == []
+    assert reward_warnings(replace(config, environment=replace(config.environment, dtype="float64"))) == []
     assert "the reward of count has no gradient in the actions" in reward_warnings(replace(config, task="count"))[0]
 
 
@@ -238,3 +239,19 @@ def test_an_episode_that_ends_in_success_has_the_value_of_the_option(success, ex
     collector = WindowCollector(env, lambda: torch.zeros(2, 1), config)
     window = collector.collect(lambda _: torch.zeros(2, *env.action_shape), lambda seen: seen[:, 0] + 7.0)
     assert window.next_values.tolist() == [[pytest.approx(expected)] * 2]
+
+
+def test_gradients_that_are_not_finite_are_left_out_with_a_warning():
+    def rooted(moment, spec):
+        risen = moment.now.com[:, 1] - moment.start.com[:, 1]
+        return Outcome(terms={"risen": (risen * (risen > 0)).sqrt()})
+
+    spec = replace(dittogym.make_spec("run"), reward_fn=rooted, weights={"risen": 1.0})
+    env = dittogym.TorchEnv(spec, 2, particles=300, substeps=4)
+    collector = WindowCollector(env, lambda: torch.zeros(2, 1), WindowConfig(task="run", window=2))
+    action = torch.zeros(2, *env.action_shape, requires_grad=True)
+    window = collector.collect(lambda _: action, lambda seen: seen[:, 0])
+    window.rewards.sum().backward()
+    with pytest.warns(UserWarning, match="most gradients of a window are not finite and were left out"):
+        assert collector.scalars(window)["train/dropped"] == 4
+    assert not action.grad.any()

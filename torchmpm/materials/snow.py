@@ -132,5 +132,5 @@ class Snow(Elastic):
         if high > 0:  # beyond it the exponential could overflow, and its derivative would be NaN even where clamped
             exponent = exponent.clamp_max(math.log(high) + 0.01)
         # At equal bounds, where the factor is constant, clamp would pass a derivative on.
-        factor = exponent.exp().clamp(low, high) if low < high else torch.full_like(Jp, low)
+        factor = exponent.exp().clamp(low, high) if low < high else low + 0.0 * exponent
         return factor * broadcast_plane(self.mu, Jp, "mu"), factor * broadcast_plane(self.lam, Jp, "lam")

@@ -146,8 +146,8 @@ def hardening_adjoint(Jp, hardening, hard_bar, bounds):
     """Derivatives in Jp and in the exponent through the hardening factor of snow."""
     power = tl.exp(hardening * (1.0 - Jp))
     low, high = tl.load(bounds), tl.load(bounds + 1)
-    free = (power >= low) & (power <= high) & (low < high)
-    exponent = tl.where(free, hard_bar * power, 0.0)
+    free = (power >= low) & (power <= high)
+    exponent = tl.where(low < high, tl.where(free, hard_bar * power, 0.0), 0.0)
     return -exponent * hardening, exponent * (1.0 - Jp)
 
 
