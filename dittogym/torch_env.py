@@ -223,8 +223,7 @@ class TorchEnv:
             options: ``"positions"``: (N, 2) or (B, N, 2) in the world, m, robot first, used until the next seed, with
                 ``resample`` until the next reset; ``"physics"``: constants of the matter, see
                 :func:`dittogym.physics.physics_values`, used until given again, ``{}`` goes back to the task's own;
-                ``"reset_mask"``: (B,) bool, reset only these elements. Gradients in positions and constants reach back
-                to the reset that they are given to, not to later ones that use the same numbers.
+                ``"reset_mask"``: (B,) bool, reset only these elements. Gradients end at the reset with these tensors.
 
         Returns:
             The observation (B, 3, 64, 64) uint8 of all elements, and ``info``.
@@ -341,8 +340,7 @@ class TorchEnv:
             The recording, from which further films can be saved. A notebook shows it.
 
         Raises:
-            ValueError: An option is out of range, the kind of file does not take it, or the policy was trained with
-                another ``action_layout``.
+            ValueError: An option is out of range, the file does not take it, or the policy has another layout.
             TypeError: The policy is neither a function nor has a method ``predict``.
         """
         return film(self, as_function(policy, self.action_layout), path, seed, index, options)

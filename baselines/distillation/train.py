@@ -25,6 +25,7 @@ from cfp.analytic.episodes import Episodes
 from cfp.analytic.stateful import Stateful
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device, make_torch_env
+from cfp.envs.seeding import seeded
 from cfp.errors import NonFiniteError
 from cfp.experiment.algorithm import Position, Scalars
 from cfp.experiment.folder import policy_path
@@ -33,7 +34,6 @@ from cfp.experiment.schedules import linear_decay
 from cfp.experiment.stages import CoarseToFineStages, copy_coarse_weights
 from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
-from cfp.seeding import seeded
 from cfp.weights import load
 from dittogym import make_spec
 

@@ -173,7 +173,7 @@ OTHERS = [
         "dropout must be above 0 and below 1, got 1.5",
         main=ROBUSTNESS,
     ),
-    evaluating("under noise of NaN", "{folder} --noise nan", "noise must be positive", main=ROBUSTNESS),
+    evaluating("under noise of NaN", "{folder} --action-noise nan", "action_noise must be positive", main=ROBUSTNESS),
     evaluating("on ice that pushes", "{folder} --friction -1", "friction must be at least 0", main=ROBUSTNESS),
     evaluating("disturbed, nowhere", "--policy run", "out must be given with a single policy", main=ROBUSTNESS),
     Case("compare into an unset variable", command(compare.main, "--out ''"), ("must name a folder, got ''",), Refused),

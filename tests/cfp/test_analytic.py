@@ -62,7 +62,8 @@ def test_gradients_that_are_never_finite_end_the_training(monkeypatch):
     config = replace(make(reward=RewardConfig("task")), task="nan")
     learner = AnalyticLearner(config, 1, build_actor(config.actor_spec(1)))
     for _ in range(9):
-        learner.update()
+        with pytest.warns(UserWarning, match="most gradients of a window are not finite"):
+            learner.update()
     with pytest.raises(NonFiniteError, match="all gradients of 10 windows in a row are NaN, infinite or 0; a term of"):
         learner.update()
 
