@@ -223,7 +223,7 @@ class TorchEnv:
             options: ``"positions"``: (N, 2) or (B, N, 2) in the world, m, robot first, used until the next seed, with
                 ``resample`` until the next reset; ``"physics"``: constants of the matter, see
                 :func:`dittogym.physics.physics_values`, used until given again, ``{}`` goes back to the task's own;
-                ``"reset_mask"``: (B,) bool, reset only these elements. Gradients end at the reset with these tensors.
+                ``"reset_mask"``: (B,) bool, reset only these elements. Later resets reuse values without gradients.
 
         Returns:
             The observation (B, 3, 64, 64) uint8 of all elements, and ``info``.
