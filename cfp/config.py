@@ -147,7 +147,7 @@ class StagedConfig(RunConfig):
     """A run that trains several stages with action grids of increasing resolution, listed coarsest first."""
 
     steps: int
-    """Environment steps of all stages together."""
+    """Environment steps of all stages together, also of those that start_from takes the place of."""
     handover: tuple[int, ...]
     """Environment steps after which each stage hands over to the next (one less than stages)."""
     resolutions: tuple[int, ...]
