@@ -137,9 +137,8 @@ def check_outcome(task: str, outcome: object, memory: Memory, weights: Mapping[s
         raise ValueError(f"weights of task {task!r} must hold every term of reward_fn, got none for {missing}")
     for name, value in outcome.terms.items():
         if not isinstance(value, Tensor) or value.shape != (batch,) or value.is_complex():
-            raise ValueError(
-                f"{who} must return terms of shape (B,) in real numbers, got {kind_of(value)} for {name!r}"
-            )
+            found = f"{kind_of(value)} for {name!r}"
+            raise ValueError(f"{who} must return terms of shape (B,) in real numbers, got {found}")
     weighted = {*outcome.terms, *RESERVED_TERMS} - {"failure"}  # the penalty of a failure has its own amount
     if unknown := sorted(weights.keys() - weighted):
         allowed = sorted(weighted)

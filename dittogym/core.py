@@ -155,8 +155,8 @@ def _check_action(patch: int, action: Tensor, x: Tensor) -> None:
     shape = action.shape if isinstance(action, Tensor) else ()
     square = len(shape) == 4 and shape[2] == shape[3] <= patch
     if not square or shape[:2] != (len(x), 2) or action.dtype != x.dtype:
-        wanted = f"{x.dtype} of shape ({len(x)}, 2, R, R) with R at most {patch}"
-        raise ValueError(f"action must be {wanted}, got {kind_of(action)}")
+        allowed = f"{x.dtype} of shape ({len(x)}, 2, R, R) with R at most {patch}"
+        raise ValueError(f"action must be {allowed}, got {kind_of(action)}")
 
 
 def observe(model: Model, state: EnvState) -> Tensor:

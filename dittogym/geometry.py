@@ -74,9 +74,7 @@ class Obstacle:
             )
         checks.instances("rules", self.velocity_rules, VelocityRule)
         if not (self.boxes or self.rules or self.observed):
-            raise ValueError(
-                f"boxes must hold a box if there are no rules and observed boxes, got none for {self.name!r}"
-            )
+            raise ValueError(f"boxes must not be empty without rules and observed, got none for {self.name!r}")
 
     @property
     def velocity_rules(self) -> tuple[VelocityRule, ...]:

@@ -59,10 +59,8 @@ class ActorSpec:
         """Check that the fields match each other."""
         increasing = list(self.resolutions) == sorted(set(self.resolutions))
         if not self.resolutions or not increasing or not set(self.resolutions) <= set(RESOLUTIONS):
-            default = "by default they follow from the task's coarse and fine"
-            raise ConfigError(
-                f"resolutions must be increasing values of {RESOLUTIONS}, got {self.resolutions}; {default}"
-            )
+            given = f"{self.resolutions}; by default they follow from the task's coarse and fine"
+            raise ConfigError(f"resolutions must be increasing values of {RESOLUTIONS}, got {given}")
         finest, found, count = self.resolutions[-1], len(self.gate_bias), len(self.resolutions) - 1
         if found != count:
             raise ConfigError(f"gate_bias must have {count} values for resolutions {self.resolutions}, got {found}")

@@ -20,7 +20,7 @@ def test_bad_geometry() -> None:
         solid("thin", (3, 5), (0, 9))
     with pytest.raises(ValueError, match="friction must not be negative"):
         floor(friction=-1.0)
-    with pytest.raises(ValueError, match=r"boxes must hold a box .* got none for 'nothing'"):
+    with pytest.raises(ValueError, match="boxes must not be empty without rules and observed, got none for 'nothing'"):
         Obstacle("nothing")
     assert floor().velocity_rules[0].friction == math.inf
     for friction in (0.0, 0.3):  # it would have no effect

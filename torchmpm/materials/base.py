@@ -39,16 +39,16 @@ def check_returned(material: Material, returned: Any, Jp: Tensor) -> tuple[Mat2,
     """What ``return_map`` returned, four planes and Jp of the shape of ``Jp`` (B, N), or else a TypeError."""
     pair = isinstance(returned, tuple) and len(returned) == 2
     if not (pair and _planes(returned[0], 4, Jp) and _planes(returned[1:], 1, Jp)):
-        wanted = f"(F, Jp), four tensors and one, all of shape {tuple(Jp.shape)}"
-        raise TypeError(f"return_map of {type(material).__name__} must return {wanted}, got {_found(returned)}")
+        allowed = f"(F, Jp), four tensors and one, all of shape {tuple(Jp.shape)}"
+        raise TypeError(f"return_map of {type(material).__name__} must return {allowed}, got {_found(returned)}")
     return returned
 
 
 def check_stress(material: Material, stress: Any, Jp: Tensor) -> Sym2:
     """What ``stress`` returned, three planes of the shape of ``Jp`` (B, N), or else a TypeError."""
     if not _planes(stress, 3, Jp):
-        wanted = f"three tensors of shape {tuple(Jp.shape)}"
-        raise TypeError(f"stress of {type(material).__name__} must return {wanted}, got {_found(stress)}")
+        allowed = f"three tensors of shape {tuple(Jp.shape)}"
+        raise TypeError(f"stress of {type(material).__name__} must return {allowed}, got {_found(stress)}")
     return stress
 
 
