@@ -1,4 +1,4 @@
-"""Algorithms to compare the coarse-to-fine policy with, behind the same command lines, folders and policies."""
+"""Other algorithms, with the command lines, run folders and policy interface of the coarse-to-fine policy."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

@@ -15,7 +15,7 @@ STEPS = 30
 RANKED = {"shapematch": 30, "obstacle": 150, "catch": 150, "run": 150, "kick": 150}
 
 
-def sine(env: dittogym.TorchEnv, t: int) -> torch.Tensor:
+def wave(env: dittogym.TorchEnv, t: int) -> torch.Tensor:
     """The wave of the reference implementation's recorded episodes: along x in one muscle, along y in the other."""
     r, s = np.indices(env.action_shape[1:]) / env.action_resolution
     along, across = np.sin(2 * math.pi * (r + 0.15 * t)), np.cos(2 * math.pi * (s - 0.1 * t))
@@ -66,7 +66,7 @@ def main() -> None:
     print("| task | actions | return full | return lite | difference a step | centre of mass, at most (m) |")
     print("| --- " * 6 + "|")
     for task in dittogym.TASKS:
-        for policy in (zeros, sine):
+        for policy in (zeros, wave):
             (full, com), (lite, other) = (
                 rewards(task, tier, policy, STEPS, arguments.backend) for tier in ("full", "lite")
             )

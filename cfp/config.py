@@ -37,10 +37,10 @@ class RunConfig:
     task: str
     """Task; MODULE:NAME for a custom task that the module registers."""
     algo: str = "cfp"
-    """Algorithm."""
+    """Name of the algorithm."""
     preset: Preset = "quick"
-    """Source of the defaults: quick (minutes), paper (as published; not for learner analytic), or long (a night;
-    learner sac alone)."""
+    """Set of default options: quick (minutes), paper (the published values; not with learner analytic), or long (a
+    night; only cfp with learner sac)."""
     seed: int = 0
     """Seed of everything that is random."""
     device: str = "auto"
@@ -128,8 +128,8 @@ class OptimisationConfig(RunConfig):
     train_particles: Particles | None = None
     """Particles of the simulations in training, at most the environment's; None: as many."""
     train_dt: float | None = None
-    """Duration of a substep in training, s; None: 2e-4 in tasks where this changes little, unless substeps or
-    dt are given."""
+    """Duration of a substep in training, s; None: 2e-4 in RUN unless substeps or dt are given, else as in the
+    environment."""
 
     @property
     def training_environment(self) -> EnvironmentConfig:
@@ -147,13 +147,13 @@ class StagedConfig(RunConfig):
     """A run that trains several stages with action grids of increasing resolution, listed coarsest first."""
 
     steps: int
-    """Environment steps of all stages together, also of those that start_from takes the place of."""
+    """Environment steps of all stages together, including those that start_from replaces."""
     handover: tuple[int, ...]
-    """Environment steps after which each stage hands over to the next (one less than stages)."""
+    """Environment steps at which the next stage begins, one number for each stage but the last."""
     resolutions: tuple[int, ...]
     """Action grid R of each stage."""
     gate_bias: tuple[float, ...]
-    """Bias of the gate logit (one less than stages)."""
+    """Bias of the gate logit of each stage but the first."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
 
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
@@ -268,7 +268,7 @@ class Config(CoarseToFineConfig):
     alpha: tuple[float, ...]
     """Entropy temperature of each stage."""
     gate_penalty: tuple[float, ...]
-    """Weight of the gate penalty (one less than stages)."""
+    """Weight of the gate penalty, for each stage but the first."""
     critics_first: float = 0.0
     """Fraction of every stage but the first in which only the critics learn, if that is more than actor_start."""
     learning: LearningConfig = field(default_factory=LearningConfig)

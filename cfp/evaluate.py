@@ -43,17 +43,17 @@ class Selection:
     """Which policies, and where they are evaluated."""
 
     folder: tyro.conf.Positional[Path | None] = None
-    """A folder that a training wrote or is writing."""
+    """Run folder, of a finished training or of one in progress."""
     policy: str | None = None
     """In place of a folder: a policy file, the name of a policy that comes with the package, or hf://OWNER/NAME."""
     episodes: int = 5
     """Episodes of each row."""
     seed: int | None = None
-    """Seed of layouts and noise; the run's own if not given."""
+    """Seed of initial particle positions and noise; the run's own if not given."""
     particles: Particles | None = None
     """Particles: full (the paper's), lite, or counts; the run's own if not given."""
     dt: float | None = None
-    """Duration of a physics step, s; the run's own if not given."""
+    """Duration of a substep, s; the run's own if not given."""
     device: str = "auto"
     """cpu, cuda, or auto."""
 
@@ -92,15 +92,15 @@ class FilmOptions:
 
 @dataclass(frozen=True)
 class Command(Selection):
-    """Evaluate the policies of a run, or a single one, beside zero and random action, on the same particle layouts."""
+    """Evaluate the policies of a run, or a single policy, beside zero and random actions, in the same episodes."""
 
     noise: Noise = "default"
     """Action noise of the trained policies: with, without, both in rows of their own, or default, as trained."""
     json: bool = False
     """Print JSON instead of a table."""
     video: Path | None = None
-    """Also film one episode of the newest policy, with noise if --noise is both: a file .mp4, .gif or .webp, or .png
-    for a row of pictures."""
+    """Also film one episode of the last stage's policy, with noise if --noise is both: a file .mp4, .gif or .webp, or
+    .png for a row of pictures."""
     replay: Path | None = None
     """Also write one episode of it as a page (.html) that plays in any browser."""
     record: Path | None = None

@@ -113,9 +113,9 @@ def preset(task: str, name: Preset = "quick", learner: Learner | None = None) ->
     Args:
         task: One of `dittogym.TASKS`, or ``"MODULE:NAME"``. A custom task, for which nothing was published,
             has its own action grids, with the learner ``"sac"`` the numbers of RUN, and no preset ``"paper"``.
-        name: ``"paper"``: one robot at full size, the published numbers, the reference's interpolation and faults.
-            ``"quick"``: several robots with fewer particles, minutes instead of days. For the learner ``"sac"`` also
-            ``"long"``, the same as ``"quick"`` for a night of eight hours on two cores.
+        name: ``"paper"``: one robot with full particles, the published numbers, the reference's interpolation and
+            faults. ``"quick"``: several robots with fewer particles, minutes instead of days. For the learner ``"sac"``
+            also ``"long"``, the same as ``"quick"`` for a night of eight hours on two cores.
         learner: ``"analytic"`` or ``"sac"``; by default ``"analytic"`` for ``"quick"``, and ``"sac"`` for the other
             presets, which have no other.
 

@@ -44,7 +44,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Command(Selection):
-    """Evaluate the newest policy of a run, or a single one, under disturbances and changed constants.
+    """Evaluate the policy of a run's last stage, or a single policy, under disturbances and changed constants.
 
     The episodes of every case start on the same layouts.
 

@@ -32,9 +32,9 @@ class EnvironmentConfig:
     particles: Particles = "lite"
     """Particles: full (the paper's), lite (about 2,000), a count, or one count for robot and one for object."""
     substeps: int | None = None
-    """Physics steps in one environment step; None: as many as take 10 ms."""
+    """Substeps of a control step; None: as many as take 10 ms."""
     dt: float = DT
-    """Duration of a physics step, s."""
+    """Duration of a substep, s."""
     dtype: Literal["float32", "float64"] = "float32"
     """Precision of the physics."""
     backend: str = "auto"
@@ -135,7 +135,7 @@ class ReportConfig:
     eval_deterministic: bool = False
     """Evaluate without action noise."""
     patience: int = 0
-    """Consecutive evaluations without a new best after which a stage ends early; 0: only steps count."""
+    """End a stage early after this many evaluations in a row without a new best one; 0: never."""
     checkpoint_every: int = 1_000
     """Environment steps between checkpoints."""
     log_every: int = 500

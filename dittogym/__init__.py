@@ -1,4 +1,4 @@
-"""DittoGym's tasks: robots of soft, plastic matter that change their shape while they work.
+"""The eight tasks of DittoGym, as Gymnasium environments and as batched, differentiable torch environments.
 
 Importing this package registers the Gymnasium ids ``dittogym/{task}-{coarse|fine}-v0``; :func:`register` adds a custom
 task.

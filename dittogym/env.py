@@ -135,8 +135,8 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         """Start a new episode, with the arguments of :meth:`dittogym.TorchEnv.reset`.
 
         Args:
-            seed: Draws new positions.
-            options: As there.
+            seed: Seed from which new initial positions are drawn.
+            options: The options of :meth:`dittogym.TorchEnv.reset`.
 
         Returns:
             The observation (3, 64, 64) uint8, and ``info``.
@@ -168,11 +168,11 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         return first(as_numpy(observation)), float(reward[0]), bool(terminated[0]), limit, first(as_numpy(info))
 
     def save(self) -> Snapshot:
-        """The present moment, to return to with :meth:`load`; see :meth:`dittogym.TorchEnv.save`."""
+        """Return a snapshot, which :meth:`load` restores; see :meth:`dittogym.TorchEnv.save`."""
         return self.torch_env.save()
 
     def load(self, snapshot: Snapshot) -> np.ndarray:
-        """Continue from a saved moment, see :meth:`dittogym.TorchEnv.load`; returns its image (3, 64, 64) uint8.
+        """Restore a snapshot, see :meth:`dittogym.TorchEnv.load`; returns its observation (3, 64, 64) uint8.
 
         In mode ``"human"`` the return in the caption counts from here.
         """
@@ -196,7 +196,8 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
             policy: A function from an observation (3, 64, 64) to an action (2, R, R), or an object with such a method
                 ``predict``, as :func:`cfp.load` and stable-baselines3 return it.
             path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
-            seed: Of the reset.
+            seed: Seed of the reset.
+
             options: Such as ``size``, ``speed`` and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
 
         Returns:

@@ -44,8 +44,9 @@ def goal_box(point: tuple[float, float]) -> Box:
 class Obstacle:
     """Something that does not move.
 
-    Matter cannot enter its boxes, the robot sees them, and so does a person in :meth:`dittogym.TorchEnv.render`. Where
-    matter or the robot meet something else, ``rules`` and ``observed`` say so.
+    Particles cannot enter its boxes, and the boxes are drawn in the observation and in
+    :meth:`dittogym.TorchEnv.render`. ``rules`` replaces the effect on particles, and ``observed`` what the observation
+    shows.
 
     Attributes:
         name: For messages and docs.

@@ -27,7 +27,7 @@ Parity = Literal["clean", "reference"]
 @tree.register
 @dataclass(frozen=True, eq=False)
 class EnvState:
-    """Everything that an episode needs to go on, a pytree of tensors; leading dimension B throughout.
+    """The complete state of B episodes, a pytree of tensors with leading dimension B.
 
     Attributes:
         particles: The matter.
@@ -55,7 +55,7 @@ class EnvState:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A moment of an environment, see :meth:`dittogym.TorchEnv.save`.
+    """A saved state of an environment, see :meth:`dittogym.TorchEnv.save`.
 
     Attributes:
         kind: See :attr:`Model.kind`.
@@ -75,7 +75,7 @@ torch.serialization.add_safe_globals([Snapshot, EnvState, Measurement])  # tenso
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A task at a certain fidelity: what turns one :class:`EnvState` into the next.
+    """A task with given particle counts and substeps: solver, camera and rewards, without state.
 
     Attributes:
         spec: The task.
@@ -147,15 +147,15 @@ def make_model(
 ) -> Model:
     """Build the physics of a task.
 
-    Mass and volume of a body's particles are scaled by full-size over actual count, so that density and stiffness mean
-    the same at every tier.
+    Mass and volume of a body's particles are scaled by full over actual count, so that density and stiffness mean the
+    same for every particle count.
 
     Args:
         spec: The task.
         counts: Particles of each body.
         substeps: Substeps of a control step.
         backend: Of the solver.
-        parity: ``"reference"``: particles of unit volume and the pixel raster at every tier.
+        parity: ``"reference"``: particles of unit volume and the pixel raster for every particle count.
         segment: See :class:`Model`.
         dt: Duration of a substep, s.
     """

@@ -1,4 +1,4 @@
-"""Constants of the matter that may differ between the simulations of a batch (domain randomisation)."""
+"""Material parameters and gravity that may differ between the simulations of a batch (domain randomisation)."""
 
 from __future__ import annotations
 

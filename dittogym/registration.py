@@ -28,7 +28,7 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
         task: Its name; the ids are ``{namespace}/{task}-coarse-v{version}`` and ``{namespace}/{task}-fine-v{version}``.
         make: Returns the specification; its keyword arguments, which need defaults, become options of the environment.
             Where one of them lengthens the horizon, ``gymnasium.make`` needs ``max_episode_steps`` too.
-        namespace: Of the ids.
+        namespace: Namespace of the ids.
         version: Increase it with every change of behaviour. If a function is defined again, as in a notebook, the ids
             of the old one are removed.
 

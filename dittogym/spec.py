@@ -27,10 +27,11 @@ class BodySpec:
 
     Attributes:
         shape: Where they start.
-        count: Particles at full size.
-        mass: Mass of a particle at full size, kg.
-        material: ``None``: with the constants of the task, von Mises matter for the robot, elastic for an object.
-        lite: Particles in the lite tier; ``None``: 2,000 for the robot, in proportion to it for an object.
+        count: Number of particles with ``particles="full"``.
+        mass: Mass of a particle with ``particles="full"``, kg.
+        material: ``None``: with the constants of the task, a von Mises material for the robot, an elastic one for an
+            object.
+        lite: Number of particles with ``particles="lite"``; ``None``: 2,000 for the robot, in proportion for an object.
         hidden_velocity: Whether the velocity channels of the observation leave it out.
     """
 
@@ -75,11 +76,12 @@ class TaskSpec:
         gravity: (x, y), m/s^2.
         damping: Factor on node velocities in every 1e-4 s.
         window: Fixed or moving window.
-        view: Centre of the observed half-window.
-        reach: Centre of the patch of nodes on which actions act.
-        patch: Its width in nodes.
+        view: Centre (x, y) of the observed region, half a metre wide, in the window, m; ``None`` for a coordinate that
+            follows the robot.
+        reach: Centre (x, y) of the action patch, in the same form.
+        patch: Width of the action patch in nodes.
         obstacles: Static geometry, in order of precedence.
-        goal: Point in the world that the observation marks by a square of 19 fine pixels, m; ``None``: no goal.
+        goal: Point (x, y) in the world, m, drawn in the observation as a square 2 cm wide; ``None``: no goal.
         coarse, fine: Action resolutions.
         split_limit: Spread at which the episode ends, m; ``None``: it never does.
         initial_memory: What to remember from the start of an episode, tensors with a leading B.

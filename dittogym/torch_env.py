@@ -31,8 +31,9 @@ class TorchEnv:
     """``num_envs`` independent simulations of one task, advanced together.
 
     Rewards and states keep their autograd graph as long as gradients are enabled; :meth:`detach` cuts it. The
-    observation is an integer image and has no gradient. Elements are not reset automatically: one that has ended goes
-    on until :meth:`reset`. Element i of a batch reset with seed s is the single environment reset with seed s + i.
+    observation is an integer image without gradient, unless :meth:`step` is called with ``soft=True``. Elements are not
+    reset automatically: one that has ended goes on until :meth:`reset`. Element i of a batch reset with seed s is the
+    single environment reset with seed s + i.
 
     Args:
         task: A task name or a :class:`dittogym.spec.TaskSpec`.
@@ -175,12 +176,12 @@ class TorchEnv:
         return self._observation
 
     def detach(self, *, physics: bool = True) -> None:
-        """Cut the autograd graph; that of constants given to the last reset only with ``physics``."""
+        """Detach the state from the autograd graph, with ``physics=False`` except for the physics of the last reset."""
         state = tree.detach(self.env_state)
         self._env_state = state if physics else replace(state, physics=self.env_state.physics)
 
     def save(self) -> Snapshot:
-        """A copy of the present moment, to which :meth:`load` returns; keeps the autograd graph."""
+        """Return a snapshot of all simulations, which :meth:`load` restores; it keeps the autograd graph."""
         state, observation = tree.map(Tensor.clone, (self.env_state, self._present_observation()))
         return Snapshot(self.model.kind, state, observation, self.model.constants)
 
@@ -284,9 +285,10 @@ class TorchEnv:
             soft: Observation and reward are the smooth ones, for gradients; ``info["true_reward"]`` is the reward.
 
         Returns:
-            observation (B, 3, 64, 64) uint8; reward (B,); terminated (B,) bool; truncated (B,) bool, at the horizon;
-            and, all with a leading B, ``info``: ``reward_terms`` by name, ``com``, ``split``, ``finite`` (false outside
-            the simulation window, too), ``is_success`` where the task defines it, and the task's own quantities.
+            observation (B, 3, 64, 64) uint8, floating point and differentiable with ``soft``; reward (B,); terminated
+            (B,) bool; truncated (B,) bool, at the horizon; and, all with a leading B, ``info``: ``reward_terms`` by
+            name, ``com``, ``split``, ``finite`` (false outside the simulation window, too), ``is_success`` where the
+            task defines it, and the task's own quantities.
 
         Raises:
             ValueError: The action has the wrong shape or type or is not finite.
@@ -332,7 +334,8 @@ class TorchEnv:
             policy: A function from observations (B, 3, 64, 64) uint8, NumPy, to actions (B, 2, R, R), or an object with
                 such a method ``predict``, as :func:`cfp.load` returns it.
             path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
-            seed: Of the reset.
+            seed: Seed of the reset.
+
             index: Which element of the batch.
             options: Such as ``size``, ``speed`` and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
 

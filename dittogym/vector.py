@@ -117,8 +117,8 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Start new episodes, of all elements or of ``options["reset_mask"]``; see :meth:`dittogym.TorchEnv.reset`.
 
         Args:
-            seed: Draws new positions, of element i with ``seed + i`` or ``seed[i]``.
-            options: As there.
+            seed: Seed from which new initial positions are drawn, of element i ``seed + i`` or ``seed[i]``.
+            options: The options of :meth:`dittogym.TorchEnv.reset`.
 
         Returns:
             The observations (B, 3, 64, 64) uint8 of all elements, and ``info``.
@@ -174,11 +174,11 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return as_numpy(observation), rewards, ends, limits, _restarted(info, as_numpy(start), fresh)
 
     def save(self) -> Snapshot:
-        """The present moment of all simulations; see :meth:`dittogym.TorchEnv.save`."""
+        """Return a snapshot of all simulations; see :meth:`dittogym.TorchEnv.save`."""
         return self.torch_env.save()
 
     def load(self, snapshot: Snapshot, mask: np.ndarray | None = None) -> np.ndarray:
-        """Continue from a saved moment; an element that was to be reset continues instead.
+        """Restore a snapshot; an element that was to be reset continues instead.
 
         Args:
             snapshot: As in :meth:`dittogym.TorchEnv.load`.

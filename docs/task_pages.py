@@ -21,6 +21,22 @@ DOCS = Path(__file__).resolve().parent
 NOTES, PAGES = DOCS / "tasks", DOCS / "generated"
 SIZE = 384
 
+#: What the words of each task's page refer to.
+SCENES = {
+    "shapematch": "A disc of 17 cm lies in the middle of the window, without gravity.",
+    "run": "A disc of 18 cm stands on a floor on which nothing slips.",
+    "grow": "A block of 16 × 16 cm stands on the floor. One beam reaches in from the right, 15 cm above the floor, and "
+    "another from the left, 27 cm above it. The goal is above the left one.",
+    "kick": "A disc of 18 cm stands on the floor. An elastic cube of 5 cm lies to its right.",
+    "dig": "A disc of 14 cm starts above a bed of soil, 50 cm wide and 33 cm deep, between two walls. The goal is near "
+    "the bottom on the right.",
+    "obstacle": "A block of 16 × 16 cm stands in front of stairs that are highest, 5 cm, on the robot's side.",
+    "catch": "A disc of 18 cm lies on the right one of two blocks, between which a shaft of 9 cm leads down. An "
+    "elastic cube of 5 cm lies on the floor below the shaft. The goal is to the right of it, below the right block.",
+    "slot": "The way leads below a hanging block and a shelf. Behind the shelf stands a post, and the cap, an elastic "
+    "plate of 13 × 3 cm, lies on both and covers the opening between them.",
+}
+
 TEMPLATE = """# [[ title ]]
 
 [[ what ]]
@@ -31,6 +47,14 @@ TEMPLATE = """# [[ title ]]
 
 The pretrained policy with 2,000 particles; contraction is red, expansion blue.
 <a href="../replays/[[ spec.name ]].html">Replay of a whole episode</a>, to pause, scrub and recolour.
+
+## Scene
+
+[[ scene ]]
+
+```{image} [[ spec.name ]]-rest.png
+:alt: The whole simulation window in the initial state
+```
 
 | | |
 | --- | --- |
@@ -57,7 +81,7 @@ python -m cfp.train --task [[ spec.name ]] --out runs/[[ spec.name ]]
 
 ## Arguments
 
-The [arguments of all tasks](../tasks.md#arguments).
+This task has the [arguments of all tasks](../tasks.md#arguments).
 [[ notes ]]
 
 ## Results
@@ -65,15 +89,11 @@ The [arguments of all tasks](../tasks.md#arguments).
 ```{include} returns-[[ spec.name ]].md
 ```
 
-[](../results.md) says how the policies of the package and the planners were measured, and
-[](../experiments/algorithms.md) how the others were; rows of `cfp`, `coarse`, `fine`, `gnn-*` and `transformer-*` have
-earlier defaults of `--learner sac`.
+[](../results.md) explains how the pretrained policies and the planners were evaluated, and
+[](../experiments/algorithms.md) the other algorithms. `cfp`, `coarse`, `fine`, `gnn-*` and `transformer-*` were
+measured with earlier defaults of `--learner sac`.
 
 ## Geometry
-
-```{image} [[ spec.name ]]-rest.png
-:alt: The whole simulation window in the initial state
-```
 
 Ranges of nodes are inclusive, and nodes are counted from the origin of the world, 128 per metre. Where several rules
 for the same direction cover a node, the first one applies.
@@ -116,6 +136,7 @@ def write_pages() -> None:
             **context,
             title=title,
             what=what,
+            scene=SCENES[name],
             notes=notes,
             numbers=numbers(spec),
             geometry=[row(obstacle) for obstacle in spec.obstacles],

@@ -38,7 +38,7 @@ def sobol(count: int, seed: int) -> Points:
 
     Args:
         count: N, from 1 to 2**30.
-        seed: Of the scrambling, a whole number from 0 to 2**63 - 1.
+        seed: Seed of the scrambling, a whole number from 0 to 2**63 - 1.
 
     Raises:
         ValueError: ``count`` or ``seed`` is not a whole number in its range.

@@ -41,7 +41,7 @@ class Command:
     tasks: tuple[str, ...] = ("shapematch",)
     """Tasks."""
     algos: tuple[str, ...] = ("zero", "cfp")
-    """Algorithms, or variants that the plan names; zero is a resting robot, from which sample efficiency counts."""
+    """Algorithms, or variants that the plan names; include zero, relative to which sample efficiency is measured."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the runs; the reference policies zero, random and scripted have one run, with the first seed."""
     out: Folder = Path("runs/compare")
@@ -62,7 +62,7 @@ class Command:
     """Action noise of all policies in the final evaluation: with, without, or as in the paper, that is without in
     SHAPE MATCH and with it in all other tasks."""
     slot_episodes: int = 100
-    """Least number of episodes in SLOT, of all seeds of an algorithm together, for the success rate."""
+    """Minimum number of episodes in SLOT, summed over the seeds of an algorithm, for its success rate."""
     robustness: Robustness = "paper"
     """Disturbed cases that are evaluated."""
     executor: Literal["local", "ray"] = "local"
@@ -74,13 +74,13 @@ class Command:
     gpus_per_run: float = 0.0
     """Ray: GPUs of a run, also a fraction of one."""
     retries: int = 2
-    """How many more times a run is started whose process or node was lost, over all causes together."""
+    """Number of times that a run is restarted after its process or node was lost."""
     address: str | None = None
     """Ray: address of the cluster; if not given, RAY_ADDRESS, else one on this machine, new if there is none."""
     only: int | None = None
     """Carry out only the run of this number, as --dry-run lists them, and write no report (array jobs)."""
     report_only: bool = False
-    """Carry out nothing; write the report about what is there."""
+    """Only write the report from the existing results; train and evaluate nothing."""
     dry_run: bool = False
     """Only list the runs and their states."""
     protocol: Literal["v1"] | None = None

@@ -1,7 +1,7 @@
 """The numbers of the paper (DittoGym, ICLR 2024): Figures 5 to 8, Tables 4 and 5.
 
 Values of figures were measured from the drawn curves: mean and half the width of the band over the last tenth of
-the steps, three seeds, training returns. A resting robot was measured in the reference environment at full size.
+the steps, three seeds, training returns. A resting robot was measured in the reference environment with full particles.
 """
 
 from cfp.presets import TASKS

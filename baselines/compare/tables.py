@@ -224,7 +224,7 @@ def cost_table(groups: Sequence[Group]) -> Table:
         "Training without its evaluations and without that of a teacher that is trained first, which has columns of "
         "its own: mean over seeds. An episode is the task's whole length of steps; robots that train side by side "
         "share the time. Memory is the most that a run's process held, evaluations included. Right: the paper's Table "
-        "4, one robot at full size on an RTX 4090."
+        "4, one robot with full particles on an RTX 4090."
     )
     return Table("cost", "Cost", description, COST, [make_row(COST, group) for group in groups if group.costs])
 
@@ -322,7 +322,7 @@ def paper_table(groups: Sequence[Group]) -> Table:
         rows.append(row | {"expert": expert[0] if expert else None})
     description = (
         "Ours: interquartile mean of the final evaluation. Paper: mean of the last tenth of its training curves and "
-        "half the width of their band, three seeds, full size; expert: its best policy on this action grid; rest: a "
-        "robot that does not move, in the reference environment. The numbers of steps differ."
+        "half the width of their band, three seeds, full particles; expert: its best policy on this action grid; rest: "
+        "a robot that does not move, in the reference environment. The numbers of steps differ."
     )
     return Table("paper", "Beside the paper", description, PAPER, rows)

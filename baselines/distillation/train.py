@@ -168,8 +168,8 @@ class Distill(Stateful, CoarseToFineStages):
     def preset(task: str, name: str) -> DistillConfig:
         """Defaults of a task, with the networks of the same preset of the coarse-to-fine policy.
 
-        Both presets teach at the lite tier; ``quick`` is evaluated there, ``paper`` in the paper's environment. SHAPE
-        MATCH, whose episodes are alike and whose actions are fine, gets fewer labels and more, smaller updates.
+        Both presets teach with lite particles; ``quick`` is evaluated there, ``paper`` in the paper's environment.
+        SHAPE MATCH, whose episodes are alike and whose actions are fine, gets fewer labels and more, smaller updates.
         """
         base, shape_match = sac_preset(task, name), task == "shapematch"
         steps = 24_000 if shape_match else 48_000

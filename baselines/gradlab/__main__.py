@@ -30,9 +30,10 @@ DIRECTIONS = 4
 
 @dataclass(frozen=True)
 class GradLabConfig:
-    """Measure the gradient of a task's smooth return in the actions, by horizon, and write a table and a figure.
+    """Measure the gradient of a task's smooth return with respect to the actions at several horizons.
 
-    Compares it with finite differences, float32 with float64, and first- with zeroth-order estimates.
+    Writes a table and a figure. Compares the gradient with finite differences, float32 with float64, and first- with
+    zeroth-order estimates.
     """
 
     task: str = "run"
@@ -50,9 +51,9 @@ class GradLabConfig:
     resolution: Literal["coarse", "fine"] | int = "coarse"
     """Action grid."""
     substeps: int | None = None
-    """Physics steps in a control step; None: as many as take 10 ms."""
+    """Substeps of a control step; None: as many as take 10 ms."""
     dt: float = DT
-    """Duration of a physics step, s."""
+    """Duration of a substep, s."""
     backend: str = "auto"
     """How the physics is computed: auto, eager, compile, ..."""
     horizons: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64)

@@ -30,8 +30,8 @@ EXAMPLES = ("docs/leaderboard/*.json runs/compare/submissions/*.json",)
 class Command:
     """Check submissions, which ``baselines.compare --protocol`` writes, and print a ranking of each task as Markdown.
 
-    Policies are ranked by their mean return, among those that observe the same. With exit code 2 some file is no valid
-    submission; every defect has a line, and nothing is ranked.
+    Policies are ranked by their mean return, among those that observe the same. If a file is not a valid submission,
+    the command prints a line for each defect, ranks nothing and exits with code 2.
     """
 
     files: tyro.conf.Positional[tuple[Path, ...]]

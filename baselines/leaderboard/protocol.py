@@ -44,7 +44,7 @@ class FixedProtocol:
 V1 = FixedProtocol(
     version="v1",
     tasks=("shapematch", "run", "grow", "kick", "dig", "obstacle", "catch", "slot"),
-    # The lite tier, because the paper's particle counts take a laptop about ten times as long. The rest is as in the
+    # Lite particles, because the paper's particle counts take a laptop about ten times as long. The rest is as in the
     # environments of these versions, written down because their defaults may change.
     environment=EnvironmentConfig(
         num_envs=1, particles="lite", substeps=100, dt=1e-4, dtype="float32", parity="clean", resample=False

@@ -37,7 +37,8 @@ class PlannerConfig:
     termination_steps: float = 32.0
     """A plan that ends the episode early is charged this many control steps at its own mean reward."""
     split_weight: float = 1000.0
-    """Cost of a robot's spread beyond 80 % of the limit at which it counts as torn, per squared fraction of it."""
+    """Weight of the cost of a large spread: the square of the amount by which the spread, divided by the task's limit,
+    exceeds 0.8."""
 
     def check(self) -> None:
         """Check what the types do not express.

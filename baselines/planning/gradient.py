@@ -20,7 +20,7 @@ class GradientPlannerConfig(PlannerConfig):
     learning_rate: float = 0.6
     """Adam's step size on actions, which lie in [-1, 1]."""
     clip: float = 3.0
-    """Largest gradient norm of one control step, in medians over the steps of the plan."""
+    """Clip the gradient of a control step to this multiple of the median norm over the steps of the plan."""
 
     def check(self) -> None:
         """Check what the types do not express."""

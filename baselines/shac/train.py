@@ -184,10 +184,10 @@ class Shac(Stateful, Algorithm):
 
     @staticmethod
     def preset(task: str, name: str) -> ShacConfig:
-        """Defaults of a task: ``quick`` takes minutes and is evaluated at the lite tier.
+        """Defaults of a task: ``quick`` takes minutes and is evaluated with lite particles.
 
-        ``paper`` trains four times as long in smaller steps and is evaluated in the paper's environment. Both train at
-        the lite tier. RUN and OBSTACLE are trained on speed, the others on their own smooth reward.
+        ``paper`` trains four times as long in smaller steps and is evaluated in the paper's environment. Both train
+        with lite particles. RUN and OBSTACLE are trained on speed, the others on their own smooth reward.
         """
         base = sac_preset(task, name)
         quick, on_speed = name == "quick", task in ON_SPEED

@@ -232,10 +232,10 @@ class Gradient(Stateful, OpenLoopAlgorithm):
 
     @staticmethod
     def preset(task: str, name: str) -> GradientConfig:
-        """Defaults of a task: ``quick`` optimises at the lite tier, ``paper`` in the paper's environment.
+        """Defaults of a task: ``quick`` optimises with lite particles, ``paper`` in the paper's environment.
 
-        Both are evaluated at full size. Tasks other than SHAPE MATCH get fewer iterations of gradients that reach back
-        16 steps, on the coarse grid.
+        Both are evaluated with full particles. Tasks other than SHAPE MATCH get fewer iterations of gradients that
+        reach back 16 steps, on the coarse grid.
         """
         environment = sac_preset(task, name).environment
         quick, horizon = name == "quick", make_spec(task).horizon

@@ -28,7 +28,7 @@ class WindowConfig(OptimisationConfig):
     critic_updates: int = 16
     """Updates of the critic after each window."""
     tau: float = 0.4
-    """Fraction of the critic that goes into its target after each window."""
+    """Rate at which the target critic follows the critic after each window: target = (1 - tau) target + tau critic."""
     max_grad_norm: float = 1.0
     """Largest norm of a gradient of the networks, of actor and critic each."""
     max_episode_steps: int = 400

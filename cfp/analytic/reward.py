@@ -29,17 +29,18 @@ class RewardConfig:
     form: Literal["task", "speed"] = "task"
     """task: the task's own reward, made smooth; speed: 60 per m/s to the right, less the task's cost of action."""
     split_weight: float = 1000.0
-    """Cost of the square by which the robot's spread, as a fraction of the task's limit, exceeds split_margin."""
+    """Weight of the cost of a large spread: the square of the amount by which the spread, divided by the task's limit,
+    exceeds split_margin."""
     split_margin: float = 0.85
-    """Fraction of the limit on the spread from which it costs; no effect in tasks without a limit."""
+    """Fraction of the limit beyond which the spread costs; no effect in tasks without a limit."""
     integrity_weight: float = 300.0
-    """Cost of particles that were close when the window, or the episode within it, began and drift apart; see
-    `Neighbours`."""
+    """Weight of the cost of particles that were neighbours at the start of the window, or of the episode within it, and
+    drift apart."""
     scale: float = 0.05
-    """Factor of the whole, so that values are not far from one."""
+    """Factor on the training reward that keeps the critic's values near one."""
     success_reward: float = 0.0
-    """Reward for every step that an episode would have gone on after it ended in success; 0 as in the task, where an
-    episode that ends early earns no more."""
+    """Reward per step, discounted, as if the episode went on forever after it ended in success; 0: none, as in the
+    task."""
 
     def check(self) -> None:
         """Check what the types do not express."""

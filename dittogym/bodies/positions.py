@@ -1,4 +1,4 @@
-"""Particle counts and initial positions: fidelity tiers, random and evenly spread draws."""
+"""Particle counts and initial positions, random or evenly spread."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Particles: TypeAlias = "str | int | tuple[int, ...]"
 #: Seed of the first element, from which the others count on, or one for each; ``None``, alone or for one: not seeded.
 Seed: TypeAlias = "int | Sequence[int | None] | np.ndarray | None"
 
-#: Robot particles of the lite tier.
+#: Robot particles with ``particles="lite"``.
 LITE = 2000
 #: Seeds of NumPy's legacy generator.
 MAX_SEED = 2**32 - 1

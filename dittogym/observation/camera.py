@@ -57,9 +57,9 @@ class Camera:
     def observe_smoothly(self, x: Tensor, v: Tensor, origin: Tensor, centre: Tensor) -> Tensor:
         """The image in the units of the uint8 one as a smooth function of its arguments.
 
-        Particles are splats at every tier, and crop and background move with the robot without steps. The derivative
-        jumps only where values or velocities (5 m/s) saturate, at the edge of the simulated window, and where edges of
-        boxes meet edges of pixels.
+        Particles are splats for every particle count, and crop and background move with the robot without steps. The
+        derivative jumps only where values or velocities (5 m/s) saturate, at the edge of the simulated window, and
+        where edges of boxes meet edges of pixels.
         """
         follows = (self.view[0] is None and not self.window.moves, self.view[1] is None)
         row, column = raster.smooth_crop_corner(centre_in_window(self.view, centre, origin), follows)

@@ -40,9 +40,9 @@ def silhouette(observation: Tensor) -> Tensor:
 
 
 def soft_silhouette(observation: Tensor) -> Tensor:
-    """Probability of each pixel to belong to the :func:`silhouette` at full size.
+    """Probability of each pixel to belong to the :func:`silhouette` with full particles.
 
-    ``sigmoid((n - 24.8) / 3.3)`` for n expected full-size particles, fitted to random positions, as a function of the
+    ``sigmoid((n - 24.8) / 3.3)`` for n expected full particles, fitted to random positions, as a function of the
     occupancy ``1 - exp(-n / SATURATION)``, which includes the background.
 
     Args:

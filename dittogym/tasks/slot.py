@@ -100,7 +100,7 @@ def slot(variant: Literal["registered", "published"] = "registered") -> TaskSpec
     """The task SLOT.
 
     Args:
-        variant: ``"registered"``, or ``"published"`` for the matter of the published training run.
+        variant: ``"registered"``, or ``"published"`` for the material of the published training run.
     """
     mu, yield_stress, max_actuation = choice("variant", variant, VARIANTS)
     return TaskSpec(

@@ -29,7 +29,7 @@ class Episode:
         terminations: (T,) bool, whether the task ended the episode.
         truncations: (T,) bool, whether the time limit ended it.
         particles: Of the states, by name: ``x`` (T + 1, N, 2) in m, ``v`` (T + 1, N, 2) in m/s, and others on request.
-        seed: Of the reset.
+        seed: Seed of the reset.
         task: Name of the task.
     """
 
@@ -50,7 +50,7 @@ def record(env: Any, policy: Any, *, seed: int = 0, fields: Sequence[str] = ("x"
         env: A :class:`dittogym.TorchEnv` of one simulation, or a Gymnasium environment of this package. Its wrappers
             have no part in it.
         policy: A function of observations or an object with a method ``predict``, see :meth:`dittogym.TorchEnv.film`.
-        seed: Of the reset.
+        seed: Seed of the reset.
         fields: Of the particles, which to keep after each step: any of ``x``, ``v``, ``C``, ``F`` and ``Jp``.
 
     Raises:

@@ -8,7 +8,7 @@ batch. This tutorial simulates 64 robots of RUN with different stiffness and gra
 
 # %%
 # `dittogym.TorchEnv` is an environment whose inputs and outputs are tensors. With `particles="lite"` each robot has
-# 2,000 particles instead of 22,000; the page on fidelity compares the two.
+# 2,000 particles instead of 22,000; :doc:`/concepts/fidelity` compares the two.
 
 import math
 import time
