@@ -71,8 +71,8 @@ class Selection:
         if self.dt is not None:
             config = replace(config, environment=config.environment.with_dt(self.dt))
         config.check()
-        if any(is_of_another_task(policy.description, config.task) for policy in policies.values()):
-            print(f"the file of task {config.task!r} has changed since the policy was trained", file=sys.stderr)
+        if any(is_of_another_task(policy.description, config) for policy in policies.values()):
+            print(f"a file of task {config.task!r} has changed since the policy was trained", file=sys.stderr)
         return config, policies
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +14,7 @@ from cfp.evaluation.video import record_policy
 from cfp.experiment.folder import parse_folder, policy_path, read_config
 from cfp.experiment.process import Stopped, keep_memory
 from cfp.experiment.training import Program, from_python, train
+from cfp.files import parse_json
 from cfp.hub import Shareable
 from cfp.policy_protocols import Policy
 from cfp.tables import read_table
@@ -70,12 +70,15 @@ class Run:
         """Rows of the final table, ``results.json``, beside zero and random action.
 
         Raises:
-            CheckpointError: The run is not finished.
+            CheckpointError: The run is not finished, or the file cannot be read.
         """
         path = self.folder / "results.json"
         if not path.exists():
             raise CheckpointError(f"{self.folder}: the run is not finished (no results.json)")
-        rows: list[dict[str, Any]] = json.loads(path.read_text())
+        try:
+            rows: list[dict[str, Any]] = parse_json(path.read_text())
+        except (OSError, ValueError) as error:
+            raise CheckpointError(f"{path}: cannot be read ({error})") from error
         return rows
 
     def film(self, path: str | os.PathLike[str] | None = None, **options: Any) -> Recording:

@@ -54,12 +54,14 @@ def read_table(path: Path, numbers: Sequence[str] = ("step",)) -> list[dict[str,
     if not path.exists():
         return []
     try:
-        with open(path, newline="") as file:
+        with open(path, newline="", encoding="utf-8-sig") as file:  # a spreadsheet may have saved it
             text = file.read()
-        complete = text[: text.rfind("\n") + 1]
-        rows = [row for row in csv.DictReader(io.StringIO(complete)) if row.get("step")]
+        reader = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1]))
+        rows = [row for row in reader if row.get("step")]
     except (UnicodeDecodeError, csv.Error) as error:
         raise CheckpointError(f"{path}: cannot be read ({error})") from error
+    if reader.fieldnames and "step" not in reader.fieldnames:
+        raise CheckpointError(f"{path}: the first line must name a column step, got {', '.join(reader.fieldnames)}")
     for row in rows:
         for name in numbers:
             try:

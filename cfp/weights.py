@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import math
 import os
 from collections.abc import Iterator, Mapping
@@ -42,8 +43,9 @@ _DESCRIBED: dict[str, type | range] = {
     "environment": dict,
     "layout": range(LARGEST_SEED + 1),
     "task_file": str,
+    "target_picture": str,
 }
-_OPTIONAL = ("layout", "task_file")
+_OPTIONAL = ("layout", "task_file", "target_picture")
 #: Characters shown of an error of torch, which lists every layer.
 MAX_REASON = 300
 #: Folder of the policies that come with the package.
@@ -63,13 +65,20 @@ def describe_run(config: RunConfig, kind: str, stage: int, steps: int) -> dict[s
         "seed": config.seed,
         "deterministic": config.report.eval_deterministic,
         "environment": dataclasses.asdict(config.environment),
-    } | ({} if (file := fingerprint(config.task)) is None else {"task_file": file})
+    } | _contents(config)
 
 
-def is_of_another_task(description: Mapping[str, Any], task: str) -> bool:
-    """Whether the file of a custom task has changed since a policy was trained."""
-    then, now = description.get("task_file"), fingerprint(task)
-    return then is not None and now is not None and then != now
+def _contents(config: RunConfig) -> dict[str, str]:
+    """SHA-256 of the files that the task's options name: that of a custom task, and a chosen target picture."""
+    target = Path(config.environment.target or "")
+    picture = hashlib.sha256(target.read_bytes()).hexdigest() if target.is_file() else None
+    files = {"task_file": fingerprint(config.task), "target_picture": picture}
+    return {name: value for name, value in files.items() if value is not None}
+
+
+def is_of_another_task(description: Mapping[str, Any], config: RunConfig) -> bool:
+    """Whether the file of a custom task, or a target picture, has changed since a policy was trained."""
+    return any(description.get(name, value) != value for name, value in _contents(config).items())
 
 
 def shipped() -> list[str]:
@@ -84,7 +93,12 @@ def policy_file(path: str | Path) -> Path:
     if is_address(path):
         return download(str(path))
     file = Path(path)
-    file = file / "policy.safetensors" if file.is_dir() else file.with_suffix(".safetensors")
+    if file.is_dir():
+        file /= "policy.safetensors"
+    elif file.suffix == ".json":
+        file = file.with_suffix(".safetensors")
+    elif file.suffix != ".safetensors":
+        file = Path(f"{file}.safetensors")
     if not file.exists() and str(path) in shipped():
         file = SHIPPED / f"{path}.safetensors"
     if not file.exists():

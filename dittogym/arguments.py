@@ -96,8 +96,17 @@ def refuse_transforms(name: str) -> None:
         )
 
 
-def check_action(action: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """The action, if it is a finite floating point tensor of this shape."""
+def refuse_backward(name: str) -> None:
+    """Refuse to advance a state in a backward pass, where a checkpoint repeats a call from the state after it."""
+    if torch._C._current_graph_task_id() != -1:
+        raise RuntimeError(
+            f"{name} must not be called in a backward pass, as torch.utils.checkpoint does to repeat a step: use "
+            "dittogym.core.step with its model, which keeps nothing"
+        )
+
+
+def check_action(action: Tensor, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The action as a tensor of this type and device, if it is a finite floating point tensor of this shape."""
     if not isinstance(action, Tensor) or not action.is_floating_point():
         kind = action.dtype if isinstance(action, Tensor) else type(action).__name__
         raise ValueError(f"action must be a floating point tensor, got {kind}")
@@ -106,6 +115,7 @@ def check_action(action: Tensor, shape: tuple[int, ...]) -> Tensor:
         raise ValueError("action must hold numbers, got a tensor on the device meta")
     if tuple(action.shape) != shape:
         raise ValueError(f"action must have shape {shape}, got {tuple(action.shape)}")
+    action = action.to(device, dtype)
     # A sum that is finite spares the test of every entry; one of finite entries may overflow.
     if not math.isfinite(float(action.detach().sum())) and (wrong := int((~torch.isfinite(action)).sum())):
         raise ValueError(f"action must be finite, got {wrong} entries that are NaN or infinite")

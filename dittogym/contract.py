@@ -14,8 +14,9 @@ from torchmpm.materials.linalg import safe_sqrt
 
 #: Terms that the environment adds to those of a task.
 RESERVED_TERMS = frozenset({"split", "action", "alive", "failure"})
-#: What the environment puts into ``info``.
+#: What the environment puts into ``info``, and what Gymnasium does.
 RESERVED_INFO = frozenset({"com", "split", "finite", "object_com", "reward_terms", "is_success", "true_reward"})
+RESERVED_INFO |= {"episode", "final_obs", "final_info"}
 
 
 class Measurement(NamedTuple):
@@ -133,6 +134,9 @@ def check_outcome(task: str, outcome: object, memory: Memory, weights: Mapping[s
     for part, taken in (("terms", RESERVED_TERMS & outcome.terms.keys()), ("info", RESERVED_INFO & info.keys())):
         if taken:
             raise ValueError(f"{who} must not return the environment's own {part}, got {sorted(taken)}")
+    for name in (*outcome.terms, *info):  # Gymnasium puts a mask _name beside every entry of a batch's info
+        if not isinstance(name, str) or name.startswith(("_", "reward_terms/")):
+            raise ValueError(f"{who} must return names that do not begin with _ or reward_terms/, got {name!r}")
     if missing := [name for name in outcome.terms if name not in weights]:
         raise ValueError(f"weights of task {task!r} must hold every term of reward_fn, got none for {missing}")
     for name, value in outcome.terms.items():

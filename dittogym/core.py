@@ -125,7 +125,7 @@ def transition(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState,
         """Stop gradients of what is not finite; NaN would spread through parameters that the batch shares."""
         if value.requires_grad:
             value = value.view_as(value)
-            value.register_hook(lambda gradient: tree.where(finite[0], gradient, torch.zeros_like(gradient)))
+            value.register_hook(lambda g: None if g is None else tree.where(finite[0], g, torch.zeros_like(g)))
         return value
 
     guarded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tree.leaves((state, action)))

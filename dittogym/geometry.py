@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import inf, isinf
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any
 
 from dittogym.observation.image import RASTER
@@ -27,6 +27,14 @@ class Box:
     bottom: float = -inf
     top: float = inf
     closed: bool = False
+
+    def __post_init__(self) -> None:
+        for low, high in (("left", "right"), ("bottom", "top")):
+            ends = getattr(self, low), getattr(self, high)
+            if not all(isinstance(end, Real) for end in ends) or not ends[0] <= ends[1]:
+                raise ValueError(
+                    f"{low} and {high} must be numbers with {low} <= {high}, got {ends[0]!r} and {ends[1]!r}"
+                )
 
 
 def nodes(left: float = -inf, right: float = inf, bottom: float = -inf, top: float = inf, closed: bool = False) -> Box:
@@ -161,6 +169,7 @@ def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True, fric
         first, last = given
         if first is not None and last is not None and first > last:
             raise ValueError(f"{axis} must be a range (low, high) with low <= high, got {given}")
+    checks.flag("visible", visible)
     low, high = j
     box = nodes(*i, -inf if low is None else low, inf if high is None else high)
     return Obstacle(name, (box,), friction, observed=None if visible else ())

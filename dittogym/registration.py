@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import sys
 from collections.abc import Callable
 
 import gymnasium
@@ -47,7 +48,7 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
     """
     if not isinstance(task, str) or re.fullmatch(r"\w+", task) is None:
         raise ValueError(f"task must be a name of letters, digits and underscores, got {task!r}")
-    if not isinstance(namespace, str) or re.fullmatch(r"[\w:-]+", namespace) is None:
+    if not isinstance(namespace, str) or re.fullmatch(r"[\w-]+", namespace) is None:
         raise ValueError(f"namespace must be a name of letters, digits, underscores and dashes, got {namespace!r}")
     version = checks.whole("version", version, 0)
     if not callable(make):
@@ -66,7 +67,7 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
         raise ValueError(f"task must be the name in the specification, got {task!r} for a TaskSpec {spec.name!r}")
     if TASKS.get(task, make) is not make:
         for known in list(gymnasium.registry.values()):
-            if known.entry_point == ENTRY_POINT and known.kwargs["task"] == task:
+            if known.entry_point == ENTRY_POINT and known.kwargs["task"].rpartition(":")[2] == task:
                 del gymnasium.registry[known.id]
     for resolution in ("coarse", "fine"):
         name = f"{namespace}/{task}-{resolution}-v{version}"
@@ -76,9 +77,17 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
             entry_point=ENTRY_POINT,
             vector_entry_point="dittogym.vector:BatchEnv",
             max_episode_steps=spec.horizon,
-            kwargs={"task": task, "resolution": resolution},
+            kwargs={"task": _address(task, make), "resolution": resolution},
         )
     TASKS[task] = make
+
+
+def _address(task: str, make: Callable[..., TaskSpec]) -> str:
+    """``MODULE:NAME`` where another process finds the task by importing a module, else the name alone."""
+    module = sys.modules.get(getattr(make, "__module__", ""))
+    name = getattr(module, "__name__", "")
+    importable = name.isidentifier() and name != "__main__" and getattr(module, "__file__", None) is not None
+    return f"{name}:{task}" if importable else task
 
 
 def _source(make: Callable[..., TaskSpec]) -> object:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -45,8 +46,10 @@ class RewardOps:
             width: w, in units of ``z``; ``None``: a twentieth of the limit's size, for a limit of 0 of the other's.
 
         Raises:
-            ValueError: ``width`` is not positive, or is not given and all limits are 0.
+            ValueError: ``width`` is not positive, or is not given and all limits are 0, or ``low`` is above ``high``.
         """
+        if low is not None and high is not None and low > high:
+            raise ValueError(f"low must be at most high, {high}, got {low}")
         limits = [(limit, sign) for limit, sign in ((high, 1.0), (low, -1.0)) if limit is not None]
         if width is not None:
             checks.number("width", width, above=0.0)
@@ -61,7 +64,8 @@ class RewardOps:
         return z
 
     def heaviside(self, z: Tensor, width: float) -> Tensor:
-        """1 where ``z`` is positive, else 0; smooth, the sigmoid of ``z / width``."""
+        """1 where ``z`` is positive, else 0; smooth, the sigmoid of ``z / width``, with a positive ``width``."""
+        checks.number("width", width, above=0.0)
         return torch.sigmoid(z / width) if self.smooth else (z > 0).to(z.dtype)
 
     def split_penalty(self, split: Tensor, limit: float) -> Tensor:
@@ -83,11 +87,14 @@ class RewardOps:
             values: (B, N, K).
             x: (B, N, 2) positions of the particles, m.
             point: (B, 2), m.
-            fraction: How many to choose, as a fraction of all.
+            fraction: How many to choose, as a fraction of all, above 0 and at most 1.
 
         Returns:
             (B, K).
         """
+        checks.number("fraction", fraction, above=0.0)
+        if fraction > 1:
+            raise ValueError(f"fraction must be at most 1, got {fraction}")
         if not self.smooth:
             return pick(values, nearest(x.detach(), point.detach(), fraction)).mean(1)
         squared = _squared_distance(x, point)
@@ -109,17 +116,17 @@ def signed_quadratic(z: Tensor, k: float) -> Tensor:
     return 4.0 * z * z.abs() + k * z
 
 
-def distance(x: Tensor, point: Tensor) -> Tensor:
+def distance(x: Tensor, point: Tensor | Sequence[float]) -> Tensor:
     """Distances from a point, m, whose derivative is 0 where they coincide.
 
     Args:
         x: (B, N, 2), or (B, 2) for one position in each simulation, m.
-        point: (B, 2), or (2,) for the same point in all simulations, m.
+        point: (B, 2), or two numbers for the same point in all simulations, m.
 
     Returns:
         (B, N) or (B,).
     """
-    return safe_sqrt(_squared_distance(x, point))
+    return safe_sqrt(_squared_distance(x, point if isinstance(point, Tensor) else x.new_tensor(point)))
 
 
 def _squared_distance(x: Tensor, point: Tensor) -> Tensor:

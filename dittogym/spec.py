@@ -127,8 +127,11 @@ class TaskSpec:
         object.__setattr__(self, "weights", dict(self.weights))  # later changes of the caller's do not reach it
         if len(self.objects) > 1:
             raise ValueError(f"objects must be at most one body, got {len(self.objects)}")
-        if self.target is not None and np.shape(self.target) != (SIZE, SIZE):
-            raise ValueError(f"target must have shape {(SIZE, SIZE)}, got {np.shape(self.target)}")
+        if self.target is not None:
+            checks.instance("target", self.target, np.ndarray)
+            if self.target.dtype != bool or self.target.shape != (SIZE, SIZE):
+                found = f"{self.target.dtype} of shape {self.target.shape}"
+                raise ValueError(f"target must be bool of shape {(SIZE, SIZE)}, got {found}")
         for name in ("reward_fn", "initial_memory"):
             if not callable(given := getattr(self, name)):
                 raise TypeError(f"{name} must be a function of a Moment and a TaskSpec, got {given!r}")
@@ -147,9 +150,10 @@ class TaskSpec:
             object.__setattr__(self, name, checks.whole(name, getattr(self, name), 1, most))
         if self.coarse > self.fine:
             raise ValueError(f"coarse must be at most fine, {self.fine}, got {self.coarse}")
-        checks.pair("gravity", self.gravity)
-        if self.goal is not None:
-            checks.pair("goal", self.goal)
+        for name in ("gravity", "goal"):
+            if (given := getattr(self, name)) is not None or name == "gravity":
+                checks.pair(name, given)
+                object.__setattr__(self, name, tuple(map(float, given)))
         for name in ("view", "reach"):
             centre: Centre = getattr(self, name)
             if not isinstance(centre, tuple | list):

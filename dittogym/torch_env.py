@@ -149,6 +149,8 @@ class TorchEnv:
         own = self.num_envs, self.num_particles, self.dtype, self.device
         if kind != own:
             raise ValueError(f"env_state must be of {own} (simulations, particles, dtype, device), got {kind}")
+        if self._env_state is not None and (names := value.memory.keys()) != (mine := self._env_state.memory.keys()):
+            raise ValueError(f"env_state must have the memory of this task, {sorted(mine)}, got {sorted(names)}")
         self._env_state, self._actuation, self._observation = value, None, None
 
     @property
@@ -211,9 +213,16 @@ class TorchEnv:
             physics = merged(self.spec, mine.physics, state.physics, chosen, self._like)
             state, mine = (replace(each, physics=physics) for each in (state, mine))
             state, observation = tree.where(chosen, (state, observation), (mine, self._present_observation()))
+        actuation = self._actuation_of_others(chosen)
         self.env_state = state
-        self._observation = observation.clone()
+        self._actuation, self._observation = actuation, observation.clone()
         return observation
+
+    def _actuation_of_others(self, mask: Tensor) -> Tensor | None:
+        """The actuation of the last step, which pictures show, zero where the mask (B,) holds."""
+        if self._actuation is None or bool(mask.all()):
+            return None
+        return self._actuation.masked_fill(mask[:, None, None, None], 0.0)
 
     def reset(self, *, seed: Seed = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Start new episodes. A reset that raises an error changes nothing.
@@ -242,7 +251,9 @@ class TorchEnv:
         drawn = self._initial_positions.draw(seed, mask.cpu().numpy(), options.get("positions"), self._like)
         assert drawn.positions is not None
         index = mask.nonzero()[:, 0]
-        fresh, observation = core.reset(self.model, drawn.positions[index], tree.map(lambda t: t[index], physics))
+        # Indexing saves the index for the backward pass, which `detach(physics=False)` would make impossible to repeat.
+        own = tree.map(lambda t: t[index], physics) if len(index) < self.num_envs else physics
+        fresh, observation = core.reset(self.model, drawn.positions[index], own)
         info = core.measured_info(self.model, fresh, fresh.start)
         if self._env_state is not None:
             if self._as_reference:  # its reset leaves the last episode's centre, memory and observation
@@ -255,7 +266,7 @@ class TorchEnv:
         # Gradients in positions and constants reach back to this reset only, not to the next that uses them.
         self._initial_positions = replace(drawn, positions=drawn.positions.detach().clone())
         self._physics = tree.map(lambda t: t.detach().clone(), physics)
-        self._env_state, self._actuation, self._observation = fresh, None, observation
+        self._env_state, self._actuation, self._observation = fresh, self._actuation_of_others(mask), observation
         return observation.clone(), tree.map(lambda t: t.detach().clone(), info)
 
     def _next_physics(self, given: Any, mask: Tensor) -> Physics:
@@ -292,9 +303,12 @@ class TorchEnv:
 
         Raises:
             ValueError: The action has the wrong shape or type or is not finite.
+            RuntimeError: It is called under a transform of ``torch.func`` or in a backward pass.
         """
         arguments.refuse_transforms("TorchEnv.step")
-        action = arguments.check_action(action, (self.num_envs, *self.action_shape)).to(self.device, self.dtype)
+        arguments.refuse_backward("TorchEnv.step")
+        checks.flag("soft", soft)
+        action = arguments.check_action(action, (self.num_envs, *self.action_shape), self.dtype, self.device)
         action = to_grid_indexing(action, self.action_layout)
         result = core.step(self.model, self.env_state, action, soft=soft)
         info: dict[str, Any] = {"reward_terms": dict(result.terms), **result.info}

@@ -25,11 +25,7 @@ def action_resolution(env: AnyEnv, size: int) -> Any:
     box = _box(env, "action_space")
     size = checks.whole("size", size, 1, box.shape[-1])
 
-    def enlarge(action: np.ndarray) -> np.ndarray:
-        if np.shape(action)[-2:] != (size, size):
-            raise ValueError(f"action must end in the shape {(size, size)}, got {np.shape(action)}")
-        return _resized(np.asarray(action, np.float32), box.shape[-1], cv2.INTER_CUBIC).clip(-1.0, 1.0)
-
+    enlarge = functools.partial(_enlarged, size=size, largest=box.shape[-1])
     small = gymnasium.spaces.Box(-1.0, 1.0, (2, size, size), np.float32)
     if isinstance(env, VectorEnv):
         batch = batch_space(small, env.num_envs)
@@ -77,6 +73,13 @@ def _box(env: AnyEnv, name: str) -> gymnasium.spaces.Box:
         kind = type(env).__name__
         raise TypeError(f"env must be a Gymnasium environment of images (TorchEnv has resolution=...), got {kind}")
     return space
+
+
+def _enlarged(action: np.ndarray, size: int, largest: int) -> np.ndarray:
+    """Actions (..., size, size) at the resolution of the environment."""
+    if np.shape(action)[-2:] != (size, size):
+        raise ValueError(f"action must end in the shape {(size, size)}, got {np.shape(action)}")
+    return _resized(np.asarray(action, np.float32), largest, cv2.INTER_CUBIC).clip(-1.0, 1.0)
 
 
 def _resized(images: np.ndarray, size: int, interpolation: int) -> np.ndarray:

@@ -107,7 +107,7 @@ def instances(name: str, given: Any, kind: type) -> None:
 
 def flag(name: str, given: Any) -> None:
     """Raise a ValueError unless this is True or False; any text, "no" too, would count as true."""
-    if not isinstance(given, bool):
+    if not isinstance(given, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, got {given!r}")
 
 

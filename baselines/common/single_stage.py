@@ -35,7 +35,7 @@ class Coarse(CoarseToFine):
 
     @classmethod
     def preset(cls, task: str, name: str) -> SingleStageConfig:
-        """The first stage of `cfp.preset`, for all its steps, on the task's coarse or fine action grid."""
+        """The first stage of `cfp.preset`, for all its steps, on the first or last action grid of the same preset."""
         base = sac_preset(task, name)
         single = replace(
             base,

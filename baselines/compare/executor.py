@@ -89,11 +89,16 @@ class InProcessExecutor(Executor):
         return future
 
 
+def available_cpus() -> int:
+    """Number of cores that this process may use, which a cluster's scheduler may have limited."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class LocalExecutor(Executor):
     """Carries out runs in processes of this machine."""
 
     def __init__(self, workers: int, resources: Resources) -> None:
-        self.threads = resources.cpus or max(1, (os.cpu_count() or 1) // workers)
+        self.threads = resources.cpus or max(1, available_cpus() // workers)
         self.resources = resources
         self._pool = ThreadPoolExecutor(workers)
         self._stop, self._kill = threading.Event(), threading.Event()

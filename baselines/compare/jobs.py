@@ -13,6 +13,7 @@ from baselines.registry import ALGORITHMS, ALIASES, configure, sees
 from cfp.config import EVALUATION_SEED, RunConfig, to_json
 from cfp.errors import ConfigError
 from cfp.experiment.folder import holds_run, policy_path, read_config
+from cfp.experiment.training import decisive
 from cfp.files import read_json
 from cfp.from_dict import differences, flatten, leaf_names
 from cfp.sections import TASK_OPTIONS
@@ -186,8 +187,7 @@ def resolve(plan: Plan, label: str, task: str, preset: str, seed: int, steps: in
     algo = values.pop("algo", label)
     if label in {*ALGORITHMS, *REFERENCE_POLICIES}:
         algo = own.get("algo", label)
-    start: dict[str, Any] = {"algo": algo, "task": task, "preset": preset}
-    start |= {name: values[name] for name in ("learner", "start_from", "refine") if name in values}
+    start = decisive(values) | {"algo": algo, "task": task, "preset": preset}
     try:
         base = configure(start)
         if steps is not None and hasattr(base, "steps"):
@@ -236,10 +236,10 @@ def check_folder(job: Job) -> None:
                 f"{name} must be {old!r} as in the run in {job.folder}, got {new!r}; or name another --out"
             )
     path = policy_path(job.folder)
-    if path.exists() and is_of_another_task(read_policy(path)[1], job.config.task):
+    if path.exists() and is_of_another_task(read_policy(path)[1], job.config):
         raise ConfigError(
-            f"task: the file that defines {job.config.task!r} has changed since the run in {job.folder} was trained; "
-            "name another --out"
+            f"task: the module or the target picture of {job.config.task!r} has changed since the run in {job.folder} "
+            "was trained; name another --out"
         )
 
 

@@ -35,7 +35,9 @@ class Dataset:
         return sum(len(labels.observations) for labels in self.rounds)
 
     def add(self, labels: Labels) -> None:
-        """Add a round; the newest is kept whole even if it alone exceeds the capacity."""
+        """Add a round, if it has labels; the newest is kept whole even if it alone exceeds the capacity."""
+        if not len(labels.observations):
+            return
         self.rounds.append(labels)
         self._compressed.append(None)
         while len(self.rounds) > 1 and len(self) > self.capacity:

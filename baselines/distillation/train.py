@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from baselines.common.grid import grid_size
 from baselines.distillation import teachers
@@ -21,6 +21,7 @@ from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teach
 from baselines.planning.gradient import GradientPlannerConfig
 from cfp.agent.actor import Actor, build_actor
 from cfp.agent.actor_policy import ActorPolicy
+from cfp.analytic.critic import descend
 from cfp.analytic.episodes import Episodes
 from cfp.analytic.stateful import Stateful
 from cfp.config import RunConfig
@@ -155,8 +156,7 @@ class Distill(Stateful, CoarseToFineStages):
             raise NonFiniteError(f"the loss became {value} after {self.num_timesteps} environment steps of the stage")
         self.adam.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_(self.adam.param_groups[0]["params"], self.config.max_grad_norm)
-        self.adam.step()
+        descend(self.adam, self.config.max_grad_norm, "student's loss")
         return value
 
     @property

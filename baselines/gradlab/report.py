@@ -45,7 +45,7 @@ def conclude(task: str, results: Sequence[Result]) -> tuple[int, str]:
     if not useful:
         return 0, f"{task}: the gradient helps at no horizon measured. {limit}"
     last = useful[-1]
-    ratio = last["zeroth_variance"] / last["first_variance"]
+    ratio = last["zeroth_variance"] / last["first_variance"] if last["first_variance"] else math.inf
     return last["horizon"], (
         f"{task}: the gradient helps up to {last['horizon']} control steps. There its relative error is "
         f"{last['difference_error']:.1g}, its variance is {ratio:.2g} times smaller than that of a zeroth-order "

@@ -64,12 +64,13 @@ def falling_rate(rate: float, final: float, remaining: float) -> float:
     return rate * (final + (1 - final) * max(remaining, 0.0))
 
 
-def clip_each(parameters: Iterable[nn.Parameter], max_norm: float) -> None:
-    """Scale the gradient of each parameter tensor separately to a norm of at most ``max_norm``."""
+def clip_each(parameters: Iterable[nn.Parameter], max_norm: float) -> Tensor:
+    """Scale the gradient of each parameter tensor separately to a norm of at most ``max_norm``; returns the norms."""
     # The public torch.nn.utils.clip_grad_norm_, called for each tensor, takes ten times as long.
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     norms = torch.stack(torch._foreach_norm(gradients))
     torch._foreach_mul_(gradients, list((max_norm / (norms + 1e-6)).clamp(max=1.0).unbind()))
+    return norms
 
 
 class CFP(SAC):
@@ -211,14 +212,14 @@ class CFP(SAC):
         return scalars | {"actor_loss": loss.detach()}
 
     def _descend(self, loss: Tensor, optimizer: torch.optim.Optimizer, name: str) -> None:
-        if not torch.isfinite(loss):
-            raise NonFiniteError(
-                f"the {name} loss became {loss.item()} at update {self._n_updates + 1} "
-                f"({self.num_timesteps} environment steps into the stage)"
-            )
         optimizer.zero_grad()
         loss.backward()
-        clip_each(optimizer.param_groups[0]["params"], self.hyperparameters.max_grad_norm)
+        norms = clip_each(optimizer.param_groups[0]["params"], self.hyperparameters.max_grad_norm)
+        if not (torch.isfinite(loss) and torch.isfinite(norms).all()):
+            raise NonFiniteError(
+                f"the {name} loss {loss.item()} or its gradient is not finite at update {self._n_updates + 1} "
+                f"({self.num_timesteps} environment steps into the stage)"
+            )
         optimizer.step()
 
     def _sample_action(

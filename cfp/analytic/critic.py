@@ -11,6 +11,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from cfp.analytic.config import WindowConfig
 from cfp.analytic.stateful import Stateful
 from cfp.analytic.window import Window, td_lambda_targets
+from cfp.errors import NonFiniteError
 
 #: Width of the hidden layers.
 WIDTH = 128
@@ -28,6 +29,14 @@ def mlp(inputs: int, outputs: int) -> nn.Sequential:
         last.weight.mul_(0.1)
         last.bias.zero_()
     return nn.Sequential(*layers, last)
+
+
+def descend(adam: torch.optim.Adam, max_norm: float, name: str) -> None:
+    """Take a step along the gradient of ``name``, clipped to a norm; a `NonFiniteError` if it is not finite."""
+    norm = nn.utils.clip_grad_norm_(adam.param_groups[0]["params"], max_norm)
+    if not torch.isfinite(norm):
+        raise NonFiniteError(f"the gradient of the {name} is not finite")
+    adam.step()
 
 
 class Critic(Stateful):
@@ -62,7 +71,6 @@ class Critic(Stateful):
             self.adam.zero_grad()
             loss = (self._value(self.network, observations) - targets).square().mean()
             loss.backward()
-            nn.utils.clip_grad_norm_(self.network.parameters(), self.options.max_grad_norm)
-            self.adam.step()
+            descend(self.adam, self.options.max_grad_norm, "critic")
         get_ema_multi_avg_fn(1 - self.options.tau)(list(self.target.parameters()), list(self.network.parameters()), 1)
         return float(loss.detach())

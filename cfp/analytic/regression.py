@@ -8,11 +8,12 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from cfp.agent.actor import Actor
+from cfp.analytic.critic import descend
 from cfp.analytic.stateful import Stateful, compress, decompress
 
 #: Of Adam.
@@ -78,7 +79,6 @@ class Regression(Stateful):
         self.adam.zero_grad()
         loss = F.mse_loss(self.actor.outputs(images, deterministic=True).location, locations)
         loss.backward()
-        nn.utils.clip_grad_norm_(self.actor.trainable_parameters(), self.max_grad_norm)
-        self.adam.step()
+        descend(self.adam, self.max_grad_norm, "actor's regression")
         self.average.update_parameters(self.actor)
         return loss.detach()

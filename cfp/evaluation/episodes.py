@@ -118,16 +118,19 @@ class Trial:
         return episodes
 
 
-class _Stopped(Exception):
+class EpisodesStopped(Exception):
     """Another episode failed, or the program is being stopped."""
 
 
-def play(trials: Sequence[Trial], steps: int | None = None) -> list[list[Episode]]:
+def play(
+    trials: Sequence[Trial], steps: int | None = None, should_stop: Callable[[], bool] = lambda: False
+) -> list[list[Episode]]:
     """Play the episodes of all trials, those of each in the order of their layouts.
 
     Args:
         trials: What to play.
         steps: Steps of an episode at most, to show a progress bar on a terminal; None shows none.
+        should_stop: Asked before each step; once it is true, the episodes end in `EpisodesStopped`.
     """
     known = {(trial, *span): trial.known(*span) for trial in trials for span in trial.spans()}
     missing = [key for key, episodes in known.items() if episodes is None]
@@ -141,8 +144,8 @@ def play(trials: Sequence[Trial], steps: int | None = None) -> list[list[Episode
 
         def before_step() -> None:
             nonlocal taken
-            if stop.is_set():
-                raise _Stopped
+            if stop.is_set() or should_stop():
+                raise EpisodesStopped
             taken += count
             bar.update(count)
 

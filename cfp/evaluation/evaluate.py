@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -12,7 +12,7 @@ from scipy import stats
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from cfp.config import EVALUATION_SEED, RunConfig
-from cfp.envs.make import batch_size, make_env
+from cfp.envs.make import batch_size, make_env, on_cpu
 from cfp.evaluation.cache import EpisodeCache
 from cfp.evaluation.episodes import Trial, play
 from cfp.evaluation.untrained import UntrainedPolicy
@@ -60,7 +60,7 @@ def make_trial(
 ) -> Trial:
     """Episodes of a policy with actions (2, size, size) in the environment of a run."""
     batch, cache = batch_size(config, episodes), None
-    if isinstance(policy, UntrainedPolicy) and batch == 1:  # random actions of several at once depend on all of them
+    if isinstance(policy, UntrainedPolicy) and on_cpu(config):  # on a GPU episodes do not repeat
         cache = EpisodeCache.of(config, policy.kind, size)
     return Trial(
         name=name,
@@ -75,7 +75,9 @@ def make_trial(
     )
 
 
-def evaluate(trials: Sequence[Trial], steps: int | None = None) -> list[Result]:
+def evaluate(
+    trials: Sequence[Trial], steps: int | None = None, should_stop: Callable[[], bool] = lambda: False
+) -> list[Result]:
     """Evaluate policies without learning; torch's generator is left as it was.
 
     A trial gives the same result whatever the number of threads and whatever is evaluated beside it.
@@ -83,9 +85,10 @@ def evaluate(trials: Sequence[Trial], steps: int | None = None) -> list[Result]:
     Args:
         trials: Episodes, all played side by side.
         steps: Steps of an episode at most, to show a progress bar on a terminal; None shows none.
+        should_stop: Asked before each step; once it is true, the evaluation ends in `EpisodesStopped`.
     """
     results = []
-    for trial, episodes in zip(trials, play(trials, steps), strict=True):
+    for trial, episodes in zip(trials, play(trials, steps, should_stop), strict=True):
         successes = [episode.success for episode in episodes if episode.success is not None]
         success = float(np.mean(successes)) if successes else None
         results.append(Result(trial.name, trial.resolution, tuple(episode.total for episode in episodes), success))

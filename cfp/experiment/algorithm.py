@@ -109,7 +109,7 @@ class Algorithm(ABC):
 
     @property
     def steps_without_change(self) -> int:
-        """Environment steps at the beginning of the stage in which its policy does not learn yet."""
+        """Environment steps at the beginning of the stage in which its policy is not trained yet."""
         return 0
 
     @property

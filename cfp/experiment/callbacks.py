@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from tqdm import tqdm
 
 from cfp.config import RunConfig
+from cfp.evaluation.episodes import EpisodesStopped
 from cfp.evaluation.evaluate import evaluate, make_trial
 from cfp.evaluation.video import record_episode
 from cfp.experiment.algorithm import Algorithm, Position
@@ -52,6 +53,7 @@ class Stage:
     folder: Path
     position: Position
     algorithm: Algorithm
+    evaluation_due: bool = False  # the signal that stopped the last session came during an evaluation
 
     @property
     def number(self) -> int:
@@ -165,9 +167,11 @@ class EvaluationCallback(StageCallback):
     A trained one is evaluated before its first step, and then not again until it learns.
     """
 
-    def __init__(self, stage: Stage, table: CSVTable, tracker: Tracker, bar: ProgressBarCallback) -> None:
+    def __init__(
+        self, stage: Stage, table: CSVTable, tracker: Tracker, bar: ProgressBarCallback, signals: StopSignals
+    ) -> None:
         super().__init__(stage, stage.config.report.eval_every)
-        self.table, self.tracker, self.bar = table, tracker, bar
+        self.table, self.tracker, self.bar, self.signals = table, tracker, bar, signals
         rows = [row for row in table.rows if int(row["stage"]) == stage.number]
         self.means = [float(row["mean"]) for row in rows]  # earlier sessions included
         self.evaluated = int(rows[-1]["step"]) if rows else 0  # step of the last evaluation
@@ -194,7 +198,14 @@ class EvaluationCallback(StageCallback):
         seed, episodes = config.evaluation(stage.number)
         size, deterministic = config.action_size(stage.number), config.report.eval_deterministic
         trial = make_trial(config, "", stage.algorithm.policy, size, episodes, deterministic=deterministic, seed=seed)
-        result = evaluate([trial])[0]
+        try:
+            result = evaluate([trial], should_stop=lambda: self.signals.number != 0)[0]
+        except EpisodesStopped:
+            if not self.signals.number:
+                raise
+            stage.evaluation_due = True
+            return
+        stage.evaluation_due = False
         if result.mean > max(self.means, default=-float("inf")):
             stage.save_policy()  # before the row: a crash between the two repeats the evaluation
         self.means.append(result.mean)
@@ -208,7 +219,8 @@ class EvaluationCallback(StageCallback):
         self.bar.show(evaluated=result.mean)
 
     def _on_training_start(self) -> None:
-        if self.stage.algorithm.starts_trained and self.every and not self.means:
+        starts_trained = self.stage.algorithm.starts_trained and self.every and not self.means
+        if starts_trained or self.stage.evaluation_due:
             self._act()
 
     def _on_training_end(self) -> None:
@@ -243,7 +255,8 @@ class CheckpointCallback(StageCallback):
     def _act(self) -> None:
         if not self.evaluation.every or not self.evaluation.means:  # without evaluations the newest is the best
             self.stage.save_policy()
-        self.checkpoint.save(self.stage.algorithm, self.stage.config, self.stage.position)
+        stage = self.stage
+        self.checkpoint.save(stage.algorithm, stage.config, stage.position, stage.evaluation_due)
         self._saved = self.stage.step
 
     def _on_rollout_start(self) -> None:

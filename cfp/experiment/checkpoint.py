@@ -39,8 +39,8 @@ class Checkpoint:
         """Wall time since this object was made, and of the sessions that led to the checkpoint that was read."""
         return self._before + time.perf_counter() - self._start
 
-    def save(self, algorithm: Algorithm, config: RunConfig, position: Position) -> None:
-        """Replace the checkpoint."""
+    def save(self, algorithm: Algorithm, config: RunConfig, position: Position, evaluation_due: bool = False) -> None:
+        """Replace the checkpoint; the next session begins with an evaluation if one is due."""
         state = {
             "version": VERSION,
             "config": json.dumps(to_json(config)),
@@ -48,6 +48,7 @@ class Checkpoint:
             "offset": position.offset,
             "num_timesteps": algorithm.num_timesteps,
             "seconds": self.seconds,
+            "evaluation_due": evaluation_due,
             "algorithm": algorithm.state_dict(),
         }
         if (buffer := algorithm.replay_buffer) is not None:

@@ -54,7 +54,7 @@ class SACAlgorithm(Algorithm):
 
     @property
     def steps_without_change(self) -> int:
-        """Environment steps at the beginning of the stage before the actor's updates."""
+        """Environment steps at the beginning of the stage before actor updates (a lean encoder learns earlier)."""
         return max(self.model.hyperparameters.actor_start, self.model.hyperparameters.update_start)
 
     @classmethod

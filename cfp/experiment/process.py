@@ -18,8 +18,10 @@ def keep_memory() -> None:
         return
     library = ctypes.CDLL(None)
     if hasattr(library, "mallopt"):
-        library.mallopt(_M_MMAP_THRESHOLD, 1 << 30)
-        library.mallopt(_M_TRIM_THRESHOLD, (1 << 31) - 1)
+        # Before glibc 2.35 the threshold is at most 32 MiB. A threshold that was refused must not be followed by the
+        # other setting, which would fix it at its small initial value.
+        if any(library.mallopt(_M_MMAP_THRESHOLD, size) for size in (1 << 30, 1 << 25)):
+            library.mallopt(_M_TRIM_THRESHOLD, (1 << 31) - 1)
 
 
 def peak_memory() -> int | None:

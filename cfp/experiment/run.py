@@ -123,8 +123,8 @@ class TrainingRun:
         self.step = self.position.offset + self.state["num_timesteps"]
         print(f"resuming {folder} at step {self.step} of {config.ends()[-1]} (stage {self.position.stage})")
         newest = policy_path(folder)
-        if newest.exists() and is_of_another_task(read_policy(newest)[1], config.task):
-            print(f"the file of task {config.task!r} has changed: evaluations from before it are of another task")
+        if newest.exists() and is_of_another_task(read_policy(newest)[1], config):
+            print(f"a file of task {config.task!r} has changed: evaluations from before it are of another task")
 
     def train(self) -> None:
         """Train the stages that are left."""
@@ -138,8 +138,9 @@ class TrainingRun:
                 self.preparation_seconds = time.perf_counter() - start
             for number in range(self.position.stage, self.stages + 1):
                 self.position = Position(number, self.position.offset)
+                due = self.state is not None and self.state.get("evaluation_due", False)
                 algorithm = self._create()
-                self._train_stage(Stage(self.config, self.folder, self.position, algorithm))
+                self._train_stage(Stage(self.config, self.folder, self.position, algorithm, due))
                 newest = policy_path(self.folder)  # of the next stage already, if this repeats the end after a crash
                 if number < self.stages and read_policy(newest)[1]["stage"] == number:
                     copy_policy(newest, policy_path(self.folder, number))
@@ -168,7 +169,7 @@ class TrainingRun:
     def _train_stage(self, stage: Stage) -> None:
         """Train a stage to its end, unless that was done in an earlier session."""
         bar = ProgressBarCallback(stage)
-        evaluation = EvaluationCallback(stage, self.evaluations, self.tracker, bar)
+        evaluation = EvaluationCallback(stage, self.evaluations, self.tracker, bar, self.signals)
         # A process killed after the last step but before the last evaluation still has to evaluate.
         done = evaluation.has_plateaued if stage.steps_left else not evaluation.is_missing
         if done:
@@ -179,14 +180,15 @@ class TrainingRun:
                 bar,
                 LogCallback(stage, bar),
                 evaluation,
-                FilmCallback(stage, self.tracker),
                 CheckpointCallback(stage, self.checkpoint, evaluation, self.signals),
                 StopCallback(stage, evaluation, self.signals),
+                FilmCallback(stage, self.tracker),  # which a stop need not wait for
             ]
         )
         try:
             stage.algorithm.learn(stage.steps_left, callbacks)
         except StageFinished:
+            callbacks.on_training_end()  # which `learn` has not reached
             patience = self.config.report.patience
             tqdm.write(f"stage {stage.number} ends early: {patience} evaluations without a new best")
         finally:
@@ -200,6 +202,10 @@ class TrainingRun:
         policies = {name: self.algorithm.load(path, device) for name, path in files.items()}
         results = compare(self.config, policies, self.config.report.eval_episodes)
         write_json(self.folder / "results.json", to_rows(results))
+        print(format_table(self.config, results))
+        best = max((result for result in results if result.name in files), key=lambda result: result.mean).name
+        if best != list(files)[-1]:
+            print(f"{best} has the highest mean return; its policy is {files[best]}")
         untrained = {result.name: result.mean for result in results[:2]}
         print(f"learning curve: {plot_curve(self.folder, self.config, untrained)}")
         recording = None
@@ -209,11 +215,7 @@ class TrainingRun:
         config = self.config
         preset = self.algorithm.preset(config.task, config.preset)
         if isinstance(config, CoarseToFineConfig) and config.start_from is not None:
-            with suppress(CheckpointError):  # it may be gone by now
+            with suppress(CheckpointError, ConfigError):  # it may be gone by now, or the hub's client be missing
                 preset = like_start(preset, {"start_from": config.start_from, "refine": config.refine})
         page = write_page(self.folder, self.config, preset, results, recording, self.seconds)
         print(f"all of it on one page: {page}")
-        print(format_table(self.config, results))
-        best = max((result for result in results if result.name in files), key=lambda result: result.mean).name
-        if best != list(files)[-1]:
-            print(f"{best} has the highest mean return; its policy is {files[best]}")

@@ -116,7 +116,7 @@ def complete(
         read: Changes these options further.
         named: Options that it changes.
     """
-    preset = program.configure(_decisive(values))
+    preset = program.configure(decisive(values))
     if "algo" in values:
         values = {**values, "algo": preset.algo}  # may be given in another spelling
     if resume:
@@ -146,7 +146,7 @@ def from_python(program: Program, options: Mapping[str, Any], out: Path | None, 
         ConfigError: There is no such option, or a value is wrong.
     """
     plain = {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in options.items()}
-    places = {name.split(".")[-1]: name.split(".") for name in flatten(to_json(program.configure(_decisive(plain))))}
+    places = {name.split(".")[-1]: name.split(".") for name in flatten(to_json(program.configure(decisive(plain))))}
     values: dict[str, Any] = {}
     for name, value in plain.items():
         if name not in places:
@@ -161,7 +161,7 @@ def from_python(program: Program, options: Mapping[str, Any], out: Path | None, 
     return complete(program, values, out, resume, lambda config: Command(config, out, resume), plain.keys())
 
 
-def _decisive(values: Mapping[str, Any]) -> dict[str, Any]:
+def decisive(values: Mapping[str, Any]) -> dict[str, Any]:
     """Of some options those that choose the defaults."""
     return {name: values[name] for name in _Choice.decisive if name in values}
 
@@ -174,7 +174,7 @@ def _values(choice: _Choice) -> dict[str, Any]:
             values = read_json(choice.config)
         except (OSError, ValueError) as error:
             raise ConfigError(f"config: {choice.config} cannot be read as JSON ({error})") from error
-    given = {name: value for name, value in _decisive(vars(choice)).items() if value is not None and value is not False}
+    given = {name: value for name, value in decisive(vars(choice)).items() if value is not None and value is not False}
     return values | given
 
 

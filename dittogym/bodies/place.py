@@ -47,7 +47,7 @@ def _checked_place(spec: TaskSpec, name: str, body: BodySpec, points: np.ndarray
     if not bool(contains(corners, origin).all()):
         raise ValueError(f"{name} must lie inside the window ({window_range(origin)}), got {place}")
     for obstacle in spec.obstacles:
-        for box in obstacle.boxes:
+        for box in () if obstacle.rules == () else obstacle.boxes:
             if _any_inside(points, (box.left, box.bottom), (box.right, box.top)):
                 solid = f"{box.left:.4g} < x < {box.right:.4g}, {box.bottom:.4g} < y < {box.top:.4g}"
                 raise ValueError(f"{name} must start outside the obstacle {obstacle.name!r} ({solid}), got {place}")

@@ -27,6 +27,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from dittogym.play import protocol
 from dittogym.play.session import Answers, Session
+from torchmpm import checks
 
 PAGE = Path(__file__).parent / "page"
 HOSTS = ["127.0.0.1", "localhost"]
@@ -57,6 +58,7 @@ class Server:
 
     Raises:
         OSError: The port is taken.
+        ValueError: There is no such port.
     """
 
     def __init__(self, new_session: Callable[[], Session], token: str, port: int) -> None:
@@ -70,7 +72,7 @@ class Server:
             ],
             middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS)],  # not other names of this machine
         )
-        self._socket = socket.create_server((HOSTS[0], port))
+        self._socket = socket.create_server((HOSTS[0], checks.whole("port", port, 0, 65535)))
         self.port: int = self._socket.getsockname()[1]
         options: dict[str, Any] = {"log_level": "warning", "ws_max_size": protocol.LARGEST_MESSAGE, "lifespan": "off"}
         self._server = uvicorn.Server(uvicorn.Config(app, timeout_graceful_shutdown=1, **options))

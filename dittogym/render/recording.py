@@ -105,6 +105,7 @@ class Recording:
         """The pictures of a film with task, time, return and playback speed; for the arguments see :meth:`save`."""
         speed = self.default_speed if speed is None else speed
         checks.number("speed", speed, above=0.0)
+        checks.number("rate", rate, above=0.0)
         returns = np.cumsum([0.0, *self.rewards])
         for number in range(round(self.duration / speed * rate) + 1):
             time = min(number * speed / rate, self.duration)

@@ -172,5 +172,5 @@ def check_view(size: int, zoom: float | None) -> float:
     """Check the size and the zoom of a picture, and return the width that it shows, m."""
     checks.whole("size", size, 16, LARGEST)
     if zoom is not None:
-        checks.number("zoom", zoom, above=0.0)
+        checks.number("zoom", zoom, least=0.05)  # lines and numbers are drawn for every 0.1 m
     return VIEW_WIDTH if zoom is None else 1.0 / zoom

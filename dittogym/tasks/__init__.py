@@ -121,7 +121,7 @@ def make_spec(
         if unknown := [name for name in options if name not in known and not takes_all]:
             # The words are Python's own, which programs that try out options look for.
             names = f"it takes the arguments of TorchEnv, and {', '.join(('body', 'obstacles', *known))}"
-            raise TypeError(f"task {task!r} got an unexpected keyword argument {unknown[0]!r}; {names}")
+            raise TypeError(f"task {task_name(task)!r} got an unexpected keyword argument {unknown[0]!r}; {names}")
         spec = make(**options)
     if obstacles is not None:
         obstacles = [from_values(each) for each in obstacles] if isinstance(obstacles, list | tuple) else obstacles

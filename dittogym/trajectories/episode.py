@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from dittogym.bodies.positions import MAX_SEED
 from dittogym.env import Env, as_tensor
 from dittogym.render.recording import Act, as_function, play
 from dittogym.torch_env import TorchEnv
@@ -57,6 +58,7 @@ def record(env: Any, policy: Any, *, seed: int = 0, fields: Sequence[str] = ("x"
         TypeError: The environment or the policy is of another kind.
         ValueError: The environment has more than one simulation, or there is no such field.
     """
+    seed = checks.whole("seed", seed, 0, MAX_SEED)  # a file stores it as a number
     inner: Any = env.unwrapped if isinstance(env, gymnasium.Env) else env
     torch_env = inner.torch_env if isinstance(inner, Env) else inner
     checks.instance("env", torch_env, TorchEnv)

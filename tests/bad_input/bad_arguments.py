@@ -11,7 +11,8 @@ from bad_cases import Case
 import dittogym
 from dittogym import Outcome, TorchEnv, make_spec
 from dittogym.bodies.shapes import Disc, Figure, Rectangle
-from dittogym.geometry import solid
+from dittogym.geometry import Box, solid
+from dittogym.reward_ops import EXACT
 from dittogym.spec import BodySpec as RobotBody
 from dittogym.window import Window
 from torchmpm import (
@@ -51,6 +52,12 @@ def begun(**changes):
     made = env(num_envs=2, **changes)
     made.reset(seed=0)
     return made
+
+
+def catching():
+    made = TorchEnv("catch", 2, particles=(30, 30), substeps=1, backend="eager")
+    made.reset(seed=0)
+    return made.env_state
 
 
 def spec(**changes):
@@ -260,6 +267,39 @@ ENVIRONMENT = table(
         ("masked action", lambda: step(single(), np.ma.masked_all((2, 8, 8))), "masked array with 128 masked entries"),
         ("muscles by name", lambda: single(render_muscles="x"), "render_muscles must be True or False, got 'x'"),
         ("muscles of a batch", lambda: batch(render_muscles=1), "render_muscles must be True or False, got 1"),
+        ("picture from afar", lambda: begun().render(zoom=1e-9), "zoom must be at least 0.05, got 1e-09"),
+        (
+            "soft by name",
+            lambda: begun().step(torch.zeros(2, 2, 8, 8), soft="no"),
+            "soft must be True or False, got 'no'",
+        ),
+        (
+            "action beyond float32",
+            lambda: begun().step(torch.full((2, 2, 8, 8), 1e300, dtype=torch.float64)),
+            "action must be finite, got 256 entries",
+        ),
+        (
+            "state of another task",
+            lambda: setattr(begun(), "env_state", catching()),
+            "env_state must have the memory of this task, [], got ['object_com']",
+        ),
+        (
+            "target of numbers",
+            lambda: spec(target=np.zeros((64, 64))),
+            "target must be bool of shape (64, 64), got float64",
+        ),
+        (
+            "box of no order",
+            lambda: Box(0.5, 0.1),
+            "left and right must be numbers with left <= right, got 0.5 and 0.1",
+        ),
+        ("step of no width", lambda: EXACT.heaviside(torch.zeros(1), 0.0), "width must be positive, got 0.0"),
+        ("clamp of no order", lambda: EXACT.clamp(torch.zeros(1), 1.0, 0.5), "low must be at most high, 0.5, got 1.0"),
+        (
+            "nearest of all twice",
+            lambda: EXACT.mean_over_nearest(*[torch.zeros(1, 3, 2)] * 2, torch.zeros(1, 2), 2.0),
+            "fraction must be at most 1, got 2.0",
+        ),
         ("picture too large", lambda: begun().render(size=10**6), "size must be at most 8192, got 1000000"),
         ("actions of words", lambda: step(single(), "left"), ("action must be numbers of shape (2, 8, 8), got <U4",)),
         (
@@ -297,6 +337,12 @@ ENVIRONMENT = table(
         ("box at a name", lambda: solid("box", ("a", "b"), (0, 9)), "i must be a range (low, high) of node indices"),
         ("box at a truth", lambda: solid("box", (True, 9), (0, 9)), "i must be a range (low, high) of node indices"),
         ("box from 9 to 0", lambda: solid("box", (9, 0), (0, 9)), "i must be a range (low, high) with low <= high"),
+        (
+            "box seen by name",
+            lambda: solid("box", (0, 9), (0, 9), visible="no"),
+            "visible must be True or False, got 'no'",
+        ),
+        ("namespace of a module", lambda: dittogym.register("x", spec, namespace="a:b"), ("namespace must", "'a:b'")),
         ("namespace of two words", lambda: dittogym.register("x", spec, namespace="a b"), ("namespace must", "'a b'")),
         ("target of a number", lambda: make_spec("shapematch", target=3), ("target must be 'star'", "got int")),
     ]

@@ -218,6 +218,7 @@ def test_labels_are_dropped_oldest_first_and_survive_a_checkpoint():
     for index in range(4):
         images = torch.full((4, 3, 64, 64), index, dtype=torch.uint8)
         dataset.add(Labels(images, torch.full((4, 2, 8, 8), float(index))))
+        dataset.add(Labels(images[:0], torch.zeros(0, 2, 8, 8)))
     assert len(dataset) == 8
     copy = Dataset(10)
     copy.load_state_dict(dataset.state_dict())

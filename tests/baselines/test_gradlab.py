@@ -95,6 +95,7 @@ def test_conclusion_stops_at_the_first_objection(change: dict) -> None:
     assert reach == 8 and f"At 16, {objection}." in sentence
     assert conclude("run", [bad])[0] == 0
     assert conclude("run", [GOOD])[0] == 8
+    assert "inf times smaller" in conclude("run", [GOOD | {"first_variance": 0.0}])[1]  # a linear return
 
 
 def test_report_without_a_finite_sample_is_valid_json(tmp_path) -> None:

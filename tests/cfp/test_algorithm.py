@@ -259,8 +259,18 @@ def test_loss_that_is_not_finite_changes_no_weight():
     _, critic, _ = model.networks()
     before = {name: value.clone() for name, value in critic.state_dict().items()}
     batch = make_batch(8)
-    with pytest.raises(NonFiniteError, match="critic loss became nan"):
+    with pytest.raises(NonFiniteError, match="critic loss nan or its gradient is not finite"):
         model.update(batch._replace(rewards=batch.rewards * float("nan")))
+    assert all(torch.equal(value, before[name]) for name, value in critic.state_dict().items())
+
+
+def test_gradient_that_is_not_finite_changes_no_weight():
+    model = make_model(ActorSpec((8,)))
+    _, critic, _ = model.networks()
+    before = {name: value.clone() for name, value in critic.state_dict().items()}
+    next(critic.parameters()).register_hook(lambda gradient: gradient * float("inf"))
+    with pytest.raises(NonFiniteError, match=r"critic loss \d.* or its gradient is not finite"):
+        model.update(make_batch(8))
     assert all(torch.equal(value, before[name]) for name, value in critic.state_dict().items())
 
 

@@ -65,14 +65,22 @@ def test_line_cut_short_by_a_crash_is_left_out(tmp_path):
     assert [row["a"] for row in read_table(path)] == ["1", "2"]
 
 
-@pytest.mark.parametrize("content", [b"step,a\nabc,1\n", b"step,a\n\xff\xfe,1\n"])
+@pytest.mark.parametrize("content", [b"step,a\nabc,1\n", b"step,a\n\xff\xfe,1\n", b"step;a\n1;2\n"])
 def test_damaged_table_is_named(tmp_path, content):
     path = tmp_path / "evaluations.csv"
     path.write_bytes(content)
     with pytest.raises(
-        CheckpointError, match=r"evaluations\.csv: (column step must hold numbers, got 'abc'|cannot be read)"
+        CheckpointError,
+        match=r"evaluations\.csv: (column step must hold numbers, got 'abc'|cannot be read|.*column step, got step;a)",
     ):
         CSVTable(path, last_step=30)
+    assert path.read_bytes() == content
+
+
+def test_table_that_a_spreadsheet_has_saved_is_read(tmp_path):
+    path = tmp_path / "evaluations.csv"
+    path.write_bytes("\ufeffstep,a\r\n10,1\r\n".encode())
+    assert CSVTable(path, last_step=30).rows == [{"step": "10", "a": "1"}]
 
 
 def test_links_in_a_folder_of_a_stranger_are_not_written_through(tmp_path):

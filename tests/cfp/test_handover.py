@@ -25,7 +25,7 @@ def scripted(monkeypatch):
     """Evaluations that play nothing and return given means."""
     left = list(MEANS)
 
-    def pretend(trials):
+    def pretend(trials, should_stop):
         return [Result(trial.name, trial.resolution, (left.pop(0),) * 2) for trial in trials]
 
     monkeypatch.setattr("cfp.experiment.callbacks.evaluate", pretend)
@@ -33,11 +33,13 @@ def scripted(monkeypatch):
 
 def test_plateau_hands_over_and_ends_the_run(scripted, tmp_path, capsys):
     folder = tmp_path / "run"
-    options = "--eval-every 10 --patience 2 --critics-first 0".split()
+    options = "--eval-every 10 --patience 2 --critics-first 0 --log-every 15".split()
     assert run(folder, *options) == 0
     rows = [(int(row["step"]), int(row["stage"])) for row in read_table(folder / "evaluations.csv")]
     # The second of four evaluations is stage 1's best; stage 2 begins with one at 40, which stays its best.
     assert rows == [(10, 1), (20, 1), (30, 1), (40, 1), (40, 2), (50, 2), (60, 2)]
+    logged = [(int(row["step"]), int(row["stage"])) for row in read_table(folder / "progress.csv")]
+    assert logged == [(16, 1), (30, 1), (40, 1), (46, 2), (60, 2)]
     assert capsys.readouterr().out.count("ends early: 2 evaluations without a new best") == 2
     stages = [json.loads((folder / name).read_text()) for name in ("stage1.json", "policy.json")]
     assert [(stage["stage"], stage["steps"]) for stage in stages] == [(1, 20), (2, 40)]

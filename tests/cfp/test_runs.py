@@ -81,6 +81,9 @@ def test_unfinished_run_has_no_results(finished, tmp_path):
     assert run.policy.resolution == 64 and run.evaluations == []
     with pytest.raises(cfp.CheckpointError, match="not finished"):
         run.results  # noqa: B018
+    (tmp_path / "results.json").write_text('[{"policy": ')
+    with pytest.raises(cfp.CheckpointError, match=r"results\.json: cannot be read"):
+        run.results  # noqa: B018
 
 
 @pytest.mark.parametrize(

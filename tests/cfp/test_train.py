@@ -27,6 +27,7 @@ from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.spec import ActorSpec
 from cfp.config import to_json
 from cfp.evaluation.evaluate import compare
+from cfp.experiment import callbacks
 from cfp.experiment.cli import program_name
 from cfp.experiment.training import parse
 from cfp.presets import sac_preset
@@ -91,6 +92,21 @@ def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, caps
     assert f"resuming {folder} at step 44" in capsys.readouterr().out
     assert train.main(["--out", str(folder), "--resume"]) == 0
     assert f"resuming {folder} at step 70" in capsys.readouterr().out
+    assert_same_run(folder, finished, (*TABLES, "policy.safetensors"))
+
+
+def test_run_stopped_in_an_evaluation_repeats_it(finished, tmp_path):
+    folder, real = tmp_path / "stopped", callbacks.make_trial
+
+    def stop(*arguments, **options):
+        signal.raise_signal(signal.SIGTERM)
+        return real(*arguments, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(callbacks, "make_trial", stop)
+        assert run(folder) == 128 + signal.SIGTERM
+    assert read_table(folder / "evaluations.csv") == []
+    assert train.main(["--out", str(folder), "--resume"]) == 0
     assert_same_run(folder, finished, (*TABLES, "policy.safetensors"))
 
 
@@ -291,7 +307,7 @@ def test_task_of_a_module_is_trained_and_evaluated_by_name(tmp_path, monkeypatch
     with (tmp_path / "bouncing.py").open("a") as file:
         file.write("\n# another task now")
     assert evaluate.main([str(folder), "--episodes", "1"]) == 0
-    assert "the file of task 'bouncing:bounce' has changed since the policy was trained" in capsys.readouterr().err
+    assert "a file of task 'bouncing:bounce' has changed since the policy was trained" in capsys.readouterr().err
     forget()
     (tmp_path / "bouncing.py").unlink()
     sys.path_importer_cache.clear()

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image, ImageDraw
 from policy_files import save_actor
 
 import cfp
@@ -15,10 +16,10 @@ from cfp.agent.actor_policy import image_policy
 from cfp.agent.networks import normalise_image
 from cfp.agent.policies import CFPPolicy
 from cfp.agent.spec import ActorSpec
-from cfp.errors import ConfigError
+from cfp.errors import CheckpointError, ConfigError
 from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
-from cfp.weights import check_trained_for
+from cfp.weights import check_trained_for, describe_run, is_of_another_task, policy_file
 
 
 @pytest.fixture
@@ -144,6 +145,32 @@ def test_a_folder_without_a_policy_hides_no_shipped_one(tmp_path, monkeypatch):
     (tmp_path / "run").mkdir()
     monkeypatch.chdir(tmp_path)
     assert cfp.load("run").description["task"] == "run"
+
+
+@pytest.mark.parametrize(("name", "expected"), [("p", "p"), ("p.json", "p"), ("p-1.2", "p-1.2")])
+def test_file_of_a_policy_may_be_named_without_its_suffix(tmp_path, name, expected):
+    for stem in ("p", "p-1", "p-1.2"):
+        (tmp_path / f"{stem}.safetensors").touch()
+    assert policy_file(tmp_path / name) == tmp_path / f"{expected}.safetensors"
+    with pytest.raises(CheckpointError, match=r"p\.backup\.safetensors: there is no policy"):
+        policy_file(tmp_path / "p.backup")
+
+
+def test_a_changed_target_picture_is_another_task(tmp_path):
+    picture = tmp_path / "target.png"
+
+    def draw(shape):
+        image = Image.new("L", (64, 64), 255)
+        getattr(ImageDraw.Draw(image), shape)((20, 20, 44, 44), fill=0)
+        image.save(picture)
+
+    draw("ellipse")
+    config = sac_preset("shapematch", "quick")
+    config = replace(config, environment=replace(config.environment, target=str(picture)))
+    description = describe_run(config, "cfp", 1, 10)
+    assert not is_of_another_task(description, config)
+    draw("rectangle")
+    assert is_of_another_task(description, config)
 
 
 def test_the_policy_of_an_actor_is_an_independent_copy_made_without_random_numbers():

@@ -3,6 +3,8 @@
 import dataclasses
 import hashlib
 import math
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import MappingProxyType
@@ -151,6 +153,24 @@ def test_namespace_and_versions() -> None:
     dittogym.register("hop", hop, namespace="mine", version=3)
     assert {"mine/hop-coarse-v3", "mine/hop-fine-v3"} <= set(gymnasium.registry)
     assert gymnasium.make("mine/hop-fine-v3", **SMALL).action_space.shape == (2, 8, 8)
+
+
+def test_another_process_makes_the_task_from_its_specification(tmp_path: Path) -> None:
+    (tmp_path / "jumping.py").write_text(
+        "from dataclasses import replace\nimport dittogym\n"
+        "def jump():\n    return replace(dittogym.make_spec('run'), name='jump')\n"
+        "dittogym.register('jump', jump)\n"
+    )
+    first = "import gymnasium, jumping; print(gymnasium.spec('dittogym/jump-coarse-v0').to_json())"
+    second = (
+        "import sys, gymnasium; from gymnasium.envs.registration import EnvSpec; "
+        "print(gymnasium.make(EnvSpec.from_json(sys.stdin.read()), particles=30, substeps=1).unwrapped.torch_env)"
+    )
+    text = None
+    for program in (first, second):
+        command = [sys.executable, "-W", "ignore", "-c", program]
+        text = subprocess.run(command, cwd=tmp_path, input=text, capture_output=True, text=True, check=True).stdout
+    assert text == "TorchEnv('jump', 1, 8, device='cpu')\n"
 
 
 def test_a_taken_name_is_refused() -> None:
@@ -386,6 +406,8 @@ def test_a_longer_limit_than_the_horizon() -> None:
         ),
         ({"terms": {"alive": torch.zeros(2)}}, r"must not return the environment's own terms, got \['alive'\]"),
         ({"info": {"com": torch.zeros(2)}}, r"must not return the environment's own info, got \['com'\]"),
+        ({"info": {"episode": torch.zeros(2)}}, r"must not return the environment's own info, got \['episode'\]"),
+        ({"info": {"_risen": torch.zeros(2)}}, r"names that do not begin with _ or reward_terms/, got '_risen'"),
         ({"info": {"risen": 1.0}}, r"must return info of shape \(B, ...\), got float for 'risen'"),
         ({"memory": {"best": torch.zeros(2)}}, r"like that of initial_memory, {'first': .*got {'best': 'torch"),
         ({"memory": {"first": torch.zeros(2)}}, r"{'first': 'torch.float64 of shape \(2, 2\)'}, got {'first': 'torch"),
@@ -450,7 +472,11 @@ def test_a_function_that_is_written_anew_takes_the_place_of_the_old_one() -> Non
         ({"reach": (None, "up")}, ValueError, "reach y must be a number, got 'up'"),
         ({"reach": (None, 5.0)}, ValueError, r"reach must be 0 to 1 m from the lower left corner .* got \(None, 5.0\)"),
         ({"view": (-0.1, 0.5)}, ValueError, r"view must be 0 to 1 m from the lower left corner .* got \(-0.1, 0.5\)"),
-        ({"target": np.zeros((3, 3), bool)}, ValueError, r"target must have shape \(64, 64\), got \(3, 3\)"),
+        (
+            {"target": np.zeros((3, 3), bool)},
+            ValueError,
+            r"target must be bool of shape \(64, 64\), got bool of shape \(3, 3\)",
+        ),
         ({"weights": 1.0}, TypeError, "weights must be a Mapping, got 1.0"),
         ({"obstacles": (VelocityRule("-y"),)}, TypeError, r"obstacles\[0\] must be a Obstacle, got VelocityRule"),
         ({"coarse": 16}, ValueError, "coarse must be at most fine, 8, got 16"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from tiny import actions, forget, tiny
+from torch.utils.checkpoint import checkpoint
 
 import dittogym
 from dittogym import TorchEnv
@@ -212,12 +213,35 @@ def test_a_constant_is_learned_from_one_stretch_after_the_other() -> None:
     env, mu = small(), torch.tensor(500.0, dtype=torch.float64, requires_grad=True)
     drive = torch.full((1, 2, 8, 8), 0.5, dtype=torch.float64)
     env.reset(seed=0, options={"physics": {"mu": mu}})
-    env.step(drive)
-    env.detach(physics=False)
-    (slope,) = torch.autograd.grad(env.step(drive)[1].sum(), mu)
-    assert slope != 0
+    for _ in range(3):
+        (slope,) = torch.autograd.grad(env.step(drive)[1].sum(), mu)
+        assert slope != 0
+        env.detach(physics=False)
     env.detach()
     assert not env.step(drive)[1].requires_grad
+
+
+@pytest.mark.parametrize("use_reentrant", [True, False])
+def test_a_step_is_not_repeated_by_a_checkpoint(use_reentrant: bool) -> None:
+    """It would begin in the state after the step, and the gradients would be wrong."""
+    env = small()
+    env.reset(seed=0)
+    action = torch.zeros(1, 2, 8, 8, dtype=torch.float64, requires_grad=True)
+    reward = checkpoint(lambda action: env.step(action)[1], action, use_reentrant=use_reentrant)
+    with pytest.raises(RuntimeError, match=r"TorchEnv\.step must not be called in a backward pass"):
+        reward.sum().backward()
+
+
+def test_pictures_of_the_other_simulations_keep_their_muscles() -> None:
+    env = small(num_envs=2)
+    env.reset(seed=0)
+    start = env.save()
+    env.step(torch.full((2, 2, 8, 8), 0.5, dtype=torch.float64))
+    moving, mask = env.render(1), torch.tensor([True, False])
+    env.reset(options={"reset_mask": mask})
+    assert np.array_equal(env.render(1), moving)
+    env.load(start, mask)
+    assert np.array_equal(env.render(1), moving)
 
 
 def test_the_centre_of_a_broken_simulation_is_the_last_that_was_finite() -> None:
