@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tiers import sine
+from tiers import wave
 from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
@@ -115,7 +115,7 @@ def play_wave(task: str, dt: float) -> list[Episode]:
     """Episodes with the moving wave of the reference implementation's recorded episodes."""
 
     def episodes(env: dittogym.TorchEnv) -> list[Episode]:
-        return play(env, lambda _, step: sine(env, step).expand(env.num_envs, -1, -1, -1), WAVE_STEPS)
+        return play(env, lambda _, step: wave(env, step).expand(env.num_envs, -1, -1, -1), WAVE_STEPS)
 
     return [each for env in make_envs(task, dt, LAYOUTS, action_layout="grid") for each in episodes(env)]
 

@@ -6,7 +6,7 @@ Run `python benchmarks/soft.py`; `--tasks run,kick` for some tasks only.
 import argparse
 
 import torch
-from tiers import sine, zeros
+from tiers import wave, zeros
 
 import dittogym
 from dittogym.observation.image import silhouette, soft_silhouette
@@ -50,7 +50,7 @@ def main() -> None:
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for task in tasks:
         for tier in ("full", "lite"):
-            for policy in (zeros, sine):
+            for policy in (zeros, wave):
                 wrong, layout, occupancy, velocity, mean, most = gaps(task, tier, policy)
                 pixels = f"{wrong:.0f} | {layout:.0f} | {occupancy:.2f} | {velocity:.2f}"
                 print(f"| {task} | {tier} | {policy.__name__} | {pixels} | {mean:+.3f} | {most:.3f} |", flush=True)

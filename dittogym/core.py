@@ -206,6 +206,12 @@ def measured_info(model: Model, state: EnvState, now: Measurement) -> dict[str, 
     return {name: value for name, value in info.items() if value is not None}
 
 
+def seen(model: Model, state: EnvState, observation: Tensor) -> tuple[EnvState, Tensor, dict[str, Tensor]]:
+    """A state without its physics, its observation, and its ``info``: what a reset replaces in some elements."""
+    now = measure(state.particles, model.num_robot_particles)
+    return replace(state, physics={}), observation, measured_info(model, state, now)
+
+
 def is_valid(model: Model, state: EnvState) -> Tensor:
     """Which simulations can go on, (B,) bool: all numbers are finite and some of the robot is in the window."""
     robot = state.particles.x[:, : model.num_robot_particles].detach()

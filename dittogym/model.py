@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dittogym.contract import Measurement
 from dittogym.observation.camera import Camera
-from dittogym.physics import Physics, part_of
+from dittogym.physics import Physics, check_effect, merged, part_of, physics_values
 from dittogym.spec import DT, TaskSpec
 from dittogym.window import GRID
 from torchmpm import Body, Elastic, ParticleState, Solver, VonMises, tree
@@ -187,6 +187,18 @@ def check_stability(model: Model, physics: Physics) -> None:
     if solver.dt > limit:
         matter = "the mu, lam, max_actuation and mass that are given"
         raise ValueError(f"dt must be at most {limit} s to be stable with {matter}, got {solver.dt}")
+
+
+def next_physics(model: Model, present: Physics, given: object, mask: Tensor, like: Tensor) -> Physics:
+    """The constants of the next episodes: ``given`` for the elements in ``mask`` (B,), ``present`` for the others.
+
+    ``like`` (B,) has the dtype and device of the simulations.
+    """
+    values = physics_values(given, len(like), model.solver.num_particles, like)
+    check_effect(model.spec, values)
+    physics = merged(model.spec, present, values, mask, like)
+    check_stability(model, physics)
+    return physics
 
 
 def check_snapshot(model: Model, snapshot: Snapshot, like: Tensor) -> None:

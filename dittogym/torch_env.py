@@ -14,10 +14,9 @@ from torch import Tensor
 from dittogym import arguments, core
 from dittogym.action import ActionIndexing, to_grid_indexing
 from dittogym.bodies.positions import InitialPositions, Particles, Seed, get_state, particle_counts, set_state
-from dittogym.contract import measure
-from dittogym.model import EnvState, Parity, Snapshot, check_snapshot, check_stability, make_model
+from dittogym.model import EnvState, Parity, Snapshot, check_snapshot, make_model, next_physics
 from dittogym.observation.image import SHAPE
-from dittogym.physics import Physics, check_effect, merged, physics_values
+from dittogym.physics import Physics, merged
 from dittogym.render.frame import frame, png
 from dittogym.render.recording import Recording, as_function, film
 from dittogym.render.scene import QUANTITIES, Shot, describe, take
@@ -149,8 +148,8 @@ class TorchEnv:
         own = self.num_envs, self.num_particles, self.dtype, self.device
         if kind != own:
             raise ValueError(f"env_state must be of {own} (simulations, particles, dtype, device), got {kind}")
-        if self._env_state is not None and (names := value.memory.keys()) != (mine := self._env_state.memory.keys()):
-            raise ValueError(f"env_state must have the memory of this task, {sorted(mine)}, got {sorted(names)}")
+        if self._env_state is not None and (missing := self._env_state.memory.keys() - value.memory.keys()):
+            raise ValueError(f"env_state must have the memory of this task, got none of {sorted(missing)}")
         self._env_state, self._actuation, self._observation = value, None, None
 
     @property
@@ -220,9 +219,8 @@ class TorchEnv:
 
     def _actuation_of_others(self, mask: Tensor) -> Tensor | None:
         """The actuation of the last step, which pictures show, zero where the mask (B,) holds."""
-        if self._actuation is None or bool(mask.all()):
-            return None
-        return self._actuation.masked_fill(mask[:, None, None, None], 0.0)
+        kept = None if bool(mask.all()) else self._actuation
+        return None if kept is None else kept.masked_fill(mask[:, None, None, None], 0.0)
 
     def reset(self, *, seed: Seed = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Start new episodes. A reset that raises an error changes nothing.
@@ -247,7 +245,8 @@ class TorchEnv:
         mask = arguments.find_mask("reset_mask", options.get("reset_mask"), self.num_envs, self.device)
         if self._env_state is None and not bool(mask.all()):
             raise ValueError("reset_mask must reset all elements the first time")
-        physics = self._next_physics(options.get("physics"), mask)
+        given, present = options.get("physics"), self._physics
+        physics = present if given is None else next_physics(self.model, present, given, mask, self._like)
         drawn = self._initial_positions.draw(seed, mask.cpu().numpy(), options.get("positions"), self._like)
         assert drawn.positions is not None
         index = mask.nonzero()[:, 0]
@@ -261,31 +260,15 @@ class TorchEnv:
                 memory = {name: old.memory[name][index].detach() for name in self.spec.stale_memory}
                 fresh = replace(fresh, centre=old.centre[index].detach(), memory={**fresh.memory, **memory})
             if len(index) < self.num_envs:
-                fresh, observation, info = self._insert(index, fresh, observation, info)
+                kept = core.seen(self.model, self.env_state, self._present_observation())
+                others = replace(fresh, physics={}), observation, info
+                fresh, observation, info = tree.map(lambda whole, part: whole.index_copy(0, index, part), kept, others)
                 fresh = replace(fresh, physics=merged(self.spec, self.env_state.physics, physics, mask, self._like))
         # Gradients in positions and constants reach back to this reset only, not to the next that uses them.
         self._initial_positions = replace(drawn, positions=drawn.positions.detach().clone())
         self._physics = tree.map(lambda t: t.detach().clone(), physics)
         self._env_state, self._actuation, self._observation = fresh, self._actuation_of_others(mask), observation
         return observation.clone(), tree.map(lambda t: t.detach().clone(), info)
-
-    def _next_physics(self, given: Any, mask: Tensor) -> Physics:
-        """The constants of the next episodes, where elements outside ``mask`` keep those that wait for them."""
-        if given is None:
-            return self._physics
-        values = physics_values(given, self.num_envs, self.num_particles, self._like)
-        check_effect(self.spec, values)
-        physics = merged(self.spec, self._physics, values, mask, self._like)
-        check_stability(self.model, physics)
-        return physics
-
-    def _insert(self, index: Tensor, state: EnvState, *seen: Any) -> tuple[Any, ...]:
-        """The present state, observation and info of all elements, with others in place of the elements ``index``."""
-        old = replace(self.env_state, physics={})
-        info = core.measured_info(self.model, old, measure(old.particles, self.model.num_robot_particles))
-        present, others = (old, self._present_observation(), info), (replace(state, physics={}), *seen)
-        inserted: tuple[Any, ...] = tree.map(lambda whole, part: whole.index_copy(0, index, part), present, others)
-        return inserted
 
     def step(self, action: Tensor, *, soft: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Advance every simulation by one control step.

@@ -58,7 +58,7 @@ def test_descent_improves_the_true_return():
     assert algorithm.policy.actions.abs().max() < 1
 
 
-def test_rewards_with_steps_are_replaced_by_smooth_ones():
+def test_rewards_with_steps_are_replaced_by_smooth_ones(request):
     def ahead(moment, spec):
         x = moment.robot_x[..., 0].mean(1)
         return Outcome(terms={"ahead": moment.ops.heaviside(x - x.detach() - 1e-3, 1e-3)})
@@ -67,6 +67,7 @@ def test_rewards_with_steps_are_replaced_by_smooth_ones():
         return replace(dittogym.make_spec("run"), name="stepping", reward_fn=ahead, weights={"ahead": 1.0})
 
     dittogym.register("stepping", stepping)
+    request.addfinalizer(lambda: dittogym.TASKS.pop("stepping"))
     episode = shorten(Gradient(make("stepping", substeps=20)), 4).play(0.0)
     assert episode.gradient.abs().max() > 0 and episode.total == 0.0
 

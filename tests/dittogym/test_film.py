@@ -150,7 +150,7 @@ def test_policies_are_functions_or_predict() -> None:
         ({"path": "film.mp4", "size": 3}, "size must be at least 16, got 3"),
         ({"path": "film.mp4", "rate": 0}, "rate must be positive, got 0"),
         ({"path": "film.mp4", "speed": -1}, "speed must be positive, got -1"),
-        ({"path": "film.mp4", "zoom": 0}, "zoom must be positive, got 0"),
+        ({"path": "film.mp4", "zoom": 0}, "zoom must be at least 0.05, got 0"),
         ({"path": "film.png", "pictures": 0}, "pictures must be at least 1, got 0"),
         ({"path": "film.html", "size": 64}, "size must not be given with a path that ends in .html, which takes speed"),
         ({"path": "film.png", "speed": 1}, ".png, which takes size, zoom, muscles, pictures"),
