@@ -11,6 +11,7 @@ settings.register_profile("torchmpm", deadline=None)  # the first call of an ope
 settings.load_profile("torchmpm")
 
 
+os.environ["NO_PROXY"] = os.environ["no_proxy"] = "127.0.0.1,localhost"  # servers of the tests
 os.environ["TORCHMPM_EPISODES"] = ""  # tests keep no episodes in the user's folders; programs that they start neither
 
 

@@ -22,12 +22,6 @@ from cfp.sections import EnvironmentConfig
 from cfp.weights import describe_run
 from dittogym.contract import Outcome
 
-TINY = (
-    "--task shapematch --learner analytic --particles 300 --train-particles 300 --substeps 4 --num-envs 2 "
-    "--resolutions 4 8 --window 4 --steps 96 --handover 48 --minibatches 4 --minibatch-size 8 --windows-kept 3 "
-    "--num-layouts 4 --eval-every 48 --eval-episodes 1 --checkpoint-every 16 --log-every 8 --no-video --device cpu"
-).split()
-
 
 def make(task="run", stages=1, **changes):
     environment = EnvironmentConfig(changes.pop("num_envs", 2), 300, changes.pop("substeps", 4))
@@ -170,11 +164,25 @@ def test_regression_reaches_locations_and_leaves_coarse_actor_and_deviation(grid
     frozen = {name: value.clone() for name, value in actor.named_parameters() if not value.requires_grad}
     assert any(name.startswith("coarse") for name in frozen) == (len(grids) > 1)
     regression = Regression(actor, 3e-3, 0.9, 1.0)
-    losses = [regression.update(images, targets, 3e-3).item() for _ in range(150)]
+    losses, average = [], parameters(actor)
+    for update in range(150):
+        losses.append(regression.update(images, targets, 3e-3).item())
+        average = parameters(actor) if update == 0 else 0.9 * average + 0.1 * parameters(actor)
     assert losses[-1] < 0.3 * losses[0]
+    torch.testing.assert_close(parameters(regression.average.module), average, rtol=0, atol=1e-5)
+    assert not torch.equal(average, parameters(actor))
     assert all(torch.equal(value, dict(actor.named_parameters())[name]) for name, value in frozen.items())
     std = actor.act(actor.outputs(images)).log_prob
     assert std.isfinite().all()
+
+
+def test_rates_fall_along_a_line(tmp_path):
+    learner = AnalyticLearner.create(make(), 1, tmp_path)
+    config = learner.config
+    learner.num_timesteps = config.steps // 2
+    scalars = learner.update()
+    assert scalars["train/learning_rate"] == pytest.approx(0.55 * config.learning_rate)
+    assert scalars["train/action_step"] == pytest.approx(0.7 * config.action_step[0])
 
 
 def test_second_stage_learns_residual_and_gate_on_the_frozen_policy(tmp_path):

@@ -5,6 +5,7 @@ import stat
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -93,6 +94,21 @@ def test_damaged_file_is_replaced(quick_compiler: None, monkeypatch: pytest.Monk
     library.load(torch.float32)
     assert runs(tmp_path) == 2
     assert damaged.read_bytes() == file.read_bytes()
+
+
+def test_threads_compile_once(quick_compiler: None, tmp_path: Path) -> None:
+    with ThreadPoolExecutor(4) as pool:
+        libraries = list(pool.map(library.load, [torch.float32] * 4))
+    assert runs(tmp_path) == 1 and len(set(map(id, libraries))) == 1
+
+
+def test_another_checkout_finds_the_file(quick_compiler: None, tmp_path: Path) -> None:
+    for folder in (tmp_path / "one", tmp_path / "two"):
+        folder.mkdir()
+        (folder / "a.cpp").write_text("// the same")
+        forget()
+        library.build(folder / "a.cpp", "-DA")
+    assert runs(tmp_path) == 1
 
 
 def test_another_source_or_header_is_another_file(quick_compiler: None, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 from pathlib import Path
 
 import torch
@@ -25,6 +26,7 @@ NO_COMPILER = (
 #: Classes of x86 processors that a wheel has kernels for, by the names that torch gives to their vector instructions.
 _FAMILIES = {"AVX2": "x86-64-v3", "AVX512": "x86-64-v4"}
 _logger = logging.getLogger(__name__)
+_lock = threading.Lock()
 #: Members of ``struct Pool`` in ``team.hpp``.
 POOL = ("pool_parallel", "pool_rank", "pool_team_size")
 
@@ -42,8 +44,10 @@ def thread_pool() -> dict[str, int]:
 
 def _after_fork() -> None:
     """Reach no threads in a forked process: those of its parent are not there, and waiting for them would never end."""
+    global _lock
     thread_pool().clear()
     torch.set_num_threads(1)
+    _lock = threading.Lock()  # another thread may have held it
 
 
 if hasattr(os, "register_at_fork"):  # not on Windows
@@ -101,7 +105,8 @@ def build(source: Path, *options: str) -> ctypes.CDLL:
             return ctypes.CDLL(str(ready))
         except OSError as error:  # for instance where the system's C library is too old
             _logger.info("the kernels of the package do not load (%s)", error)
-    found = _load(source, options, cache_folder(), os.environ.get("CXX"), os.environ.get("PATH"))
+    with _lock:  # or the threads of an evaluation would all compile it
+        found = _load(source, options, cache_folder(), os.environ.get("CXX"), os.environ.get("PATH"))
     if isinstance(found, str):
         raise ValueError(f"backend 'native' {found}")
     return found
@@ -113,8 +118,10 @@ def _load(source: Path, options: tuple[str, ...], folder: str, *_: str | None) -
     program = compiler.find_compiler()
     if program is None:
         return NO_COMPILER
-    command = [*program, *compiler.arguments(source, options, "native"), "-o"]
-    path = Path(folder) / f"{source.stem}-{_key(command, source)}.so"
+    flags = compiler.arguments(source, options, "native")
+    command = [*program, *flags, "-o"]
+    independent = [each for each in flags if each != str(source) and not each.startswith("-I")]  # of where it is
+    path = Path(folder) / f"{source.stem}-{_key([*program, *independent], source)}.so"
     try:
         return ctypes.CDLL(str(path))
     except OSError:
