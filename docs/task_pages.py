@@ -56,6 +56,8 @@ The pretrained policy with 2,000 particles; contraction is red, expansion blue.
 :alt: The whole simulation window in the initial state
 ```
 
+## Use
+
 | | |
 | --- | --- |
 | Environments | `dittogym/[[ spec.name ]]-coarse-v0`, `dittogym/[[ spec.name ]]-fine-v0` |
