@@ -80,10 +80,10 @@ def test_unfinished_run_has_no_results(finished, tmp_path):
     run = cfp.Run(tmp_path)
     assert run.policy.resolution == 64 and run.evaluations == []
     with pytest.raises(cfp.CheckpointError, match="not finished"):
-        run.results  # noqa: B018
+        _ = run.results
     (tmp_path / "results.json").write_text('[{"policy": ')
     with pytest.raises(cfp.CheckpointError, match=r"results\.json: cannot be read"):
-        run.results  # noqa: B018
+        _ = run.results
 
 
 @pytest.mark.parametrize(
