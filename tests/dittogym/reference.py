@@ -1,4 +1,8 @@
-"""Replays recorded episodes of the reference implementation and lists how far ours is from them."""
+"""Replays recorded episodes of the reference implementation and lists how far ours is from them.
+
+``reference.npz`` beside this file holds an extract of the recordings, so that every clone can compare with them.
+``python tests/dittogym/reference.py`` writes it from the complete recordings.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 
 import dittogym
@@ -20,6 +23,7 @@ from torchmpm.substep import grid_velocity, particles_to_grid
 from torchmpm.transfer import interpolate
 
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "reference"
+EXTRACT = Path(__file__).with_name("reference.npz")
 
 #: Bounds by quantity of the float64 files. The physics starts from the recorded actuation field, because the reference
 #: computes that field in float32: `grid_actuation`, its distance from ours, is one unit in the last place of float32 at
@@ -61,11 +65,40 @@ EPISODE = {
 
 
 def load(name: str) -> dict[str, np.ndarray]:
-    """One file, or skip where the folder is not there."""
-    if not FOLDER.is_dir():
-        pytest.skip(f"needs the recorded figures in {FOLDER}")
-    with np.load(FOLDER / f"{name}.npz", allow_pickle=False) as data:
-        return dict(data)
+    """One recording: complete where the folder is there, otherwise the extract."""
+    if FOLDER.is_dir():
+        with np.load(FOLDER / f"{name}.npz", allow_pickle=False) as data:
+            return dict(data)
+    return load_extract(name)
+
+
+def load_extract(name: str) -> dict[str, np.ndarray]:
+    with np.load(EXTRACT, allow_pickle=False) as data:
+        return {key.removeprefix(f"{name}/"): data[key] for key in data if key.startswith(f"{name}/")}
+
+
+def extract(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What is kept of a recording: every ``particle_stride``-th particle and every ``image_stride``-th image.
+
+    Initial positions are left out where seed 0 draws the same ones.
+    """
+    particle_stride, image_stride = len(data["x0"]) // 50, max(len(data["actions"]) // 3, 1)
+    kept = {"particle_stride": np.array(particle_stride), "image_stride": np.array(image_stride)}
+    for key in ("config", "actions", "mass", *EPISODE, *SMALL):
+        if key not in data:
+            continue
+        value = data[key]
+        if key == "obs":
+            value = value[::image_stride]
+        elif key == "sub1_grid_actuation":
+            value = value.astype(np.float32)  # the reference computes it in this precision
+        elif key.startswith("sub") and "grid" not in key:
+            value = value[::particle_stride]
+        kept[key] = value
+    env = make(kept)
+    if env.state.x[0].shape != data["x0"].shape or worst(env.state.x[0], data["x0"]) > 1e-15:
+        kept["x0"] = data["x0"]
+    return kept
 
 
 def make(data: dict[str, np.ndarray], **options: Any) -> dittogym.TorchEnv:
@@ -82,8 +115,9 @@ def make(data: dict[str, np.ndarray], **options: Any) -> dittogym.TorchEnv:
         **options,
     )
     env.reset(seed=0)
-    # Not through the option "positions": one file parks particles that it does not need outside the window.
-    env.env_state, _ = core.reset(env.model, torch.as_tensor(data["x0"])[None].to(env.dtype))
+    if "x0" in data:
+        # Not through the option "positions": one file parks particles that it does not need outside the window.
+        env.env_state, _ = core.reset(env.model, torch.as_tensor(data["x0"])[None].to(env.dtype))
     return env
 
 
@@ -99,13 +133,15 @@ def substep_errors(data: dict[str, np.ndarray]) -> dict[str, float]:
     """Largest difference of every recorded quantity after 1, 10 and 100 substeps of the first action."""
     env = make(data)
     start, solver = env.env_state, env.model.solver
-    recorded = torch.as_tensor(data["sub1_grid_actuation"]).permute(2, 0, 1)[None]
+    recorded = torch.as_tensor(data["sub1_grid_actuation"]).permute(2, 0, 1)[None].to(env.dtype)
     errors, state, done = _first_grid(data, env, recorded), start.particles, 0
     for count in (1, 10, 100):
         state = solver.step(state, recorded, substeps=count - done, origin=start.origin)
         done = count
         for field in ("x", "v", "C", "F", "Jp"):
-            errors[f"sub{count}_{field}"] = worst(getattr(state, field)[0], data[f"sub{count}_{field}"])
+            key = f"sub{count}_{field}"
+            if key in SMALL:
+                errors[key] = worst(getattr(state, field)[0, :: data.get("particle_stride", 1)], data[key])
     return errors
 
 
@@ -126,7 +162,9 @@ def _first_grid(data: dict[str, np.ndarray], env: dittogym.TorchEnv, recorded: t
     heavy = data["sub1_grid_m"][..., None] > 1e-9
     return {
         "sub1_grid_actuation": worst(ours, recorded.numpy()),
-        "sub1_particle_actuation": worst(along, data["sub1_particle_actuation"]),
+        "sub1_particle_actuation": worst(
+            along[:: data.get("particle_stride", 1)], data["sub1_particle_actuation"]
+        ),
         # On nodes with next to no mass, velocity is a quotient of two rounding errors.
         "sub1_grid_v": worst(velocity.numpy() * heavy, data["sub1_grid_v"] * heavy),
         "sub1_grid_m": worst(on_nodes(grid.momentum[0, 0]), data["sub1_grid_m"]),
@@ -154,6 +192,7 @@ def episode_errors(data: dict[str, np.ndarray]) -> dict[str, float]:
         rows["det_F_mean"].append(torch.linalg.det(F).mean())
         rows["obs"].append(observation[0])
     ours = {name: torch.stack(values).numpy() for name, values in rows.items() if values}
+    ours["obs"] = ours["obs"][:: data.get("image_stride", 1)]
     errors = {name: worst(values, data[name]) for name, values in ours.items()}
     if env.spec.name in SHARES and robot != env.spec.robot.count:
         del errors["reward"]
@@ -163,3 +202,9 @@ def episode_errors(data: dict[str, np.ndarray]) -> dict[str, float]:
     errors["action_norm"] /= float(data["action_norm"].max()) or 1.0
     errors["obs"] = float((np.abs(ours["obs"].astype(int) - data["obs"].astype(int)) > 8).mean())
     return errors
+
+
+if __name__ == "__main__":
+    names = sorted(path.stem for path in FOLDER.glob("*.npz"))
+    found = {f"{name}/{key}": value for name in names for key, value in extract(load(name)).items()}
+    np.savez_compressed(EXTRACT, **found)

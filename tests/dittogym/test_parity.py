@@ -36,6 +36,25 @@ def test_episode(name: str) -> None:
 
 
 @torch.no_grad()
+def test_the_extract_without_the_complete_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reference, "FOLDER", reference.EXTRACT)  # no folder
+    name = "grow-coarse-small-f64"
+    data = reference.load(name)
+    assert len(data["sub1_x"]) < 100, "not the extract"
+    check(name, reference.substep_errors(data), reference.SMALL)
+    check(name, reference.episode_errors(data), reference.EPISODE)
+
+
+@pytest.mark.skipif(not reference.FOLDER.is_dir(), reason=f"needs the complete recordings in {reference.FOLDER}")
+@pytest.mark.parametrize("name", [f"{task}-coarse-small-f64" for task in TASKS] + list(RECORDED))
+def test_the_extract_is_of_the_complete_recordings(name: str) -> None:
+    found, expected = reference.load_extract(name), reference.extract(reference.load(name))
+    assert found.keys() == expected.keys()
+    for key, value in expected.items():
+        np.testing.assert_array_equal(found[key], value, err_msg=key)
+
+
+@torch.no_grad()
 def test_the_comparison_can_fail() -> None:
     """Actions one percent stronger exceed the bounds."""
     data = reference.load("run-coarse-small-f64")
