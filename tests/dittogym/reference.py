@@ -162,9 +162,7 @@ def _first_grid(data: dict[str, np.ndarray], env: dittogym.TorchEnv, recorded: t
     heavy = data["sub1_grid_m"][..., None] > 1e-9
     return {
         "sub1_grid_actuation": worst(ours, recorded.numpy()),
-        "sub1_particle_actuation": worst(
-            along[:: data.get("particle_stride", 1)], data["sub1_particle_actuation"]
-        ),
+        "sub1_particle_actuation": worst(along[:: data.get("particle_stride", 1)], data["sub1_particle_actuation"]),
         # On nodes with next to no mass, velocity is a quotient of two rounding errors.
         "sub1_grid_v": worst(velocity.numpy() * heavy, data["sub1_grid_v"] * heavy),
         "sub1_grid_m": worst(on_nodes(grid.momentum[0, 0]), data["sub1_grid_m"]),
