@@ -16,7 +16,7 @@ from dittogym.bodies.positions import MAX_SEED
 from dittogym.model import Snapshot
 from dittogym.render.frame import frame, pace
 from dittogym.render.recording import Recording, as_function, film
-from dittogym.render.scene import describe
+from dittogym.render.scene import check_size, describe
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
 from dittogym.torch_env import TorchEnv
@@ -95,6 +95,7 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         render_mode: ``None``, ``"rgb_array"`` or ``"human"``: a window, which needs pygame. Space pauses, the
             right arrow takes a single step, q or Escape closes the window; the simulation then goes on without it.
         render_muscles: Colour the robot by its muscles in pictures.
+        render_size: Pixels per side of pictures, and of the window.
         options: All arguments of :class:`dittogym.TorchEnv` but ``num_envs``.
 
     Raises:
@@ -106,18 +107,25 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": RENDER_FPS}
 
     def __init__(
-        self, task: str | TaskSpec, *, render_mode: str | None = None, render_muscles: bool = True, **options: Any
+        self,
+        task: str | TaskSpec,
+        *,
+        render_mode: str | None = None,
+        render_muscles: bool = True,
+        render_size: int = 512,
+        **options: Any,
     ) -> None:
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be None or one of {RENDER_MODES}, got {render_mode!r}")
         checks.flag("render_muscles", render_muscles)
+        check_size("render_size", render_size)
         if "num_envs" in options:
             batch = "gymnasium.make_vec(..., vectorization_mode='vector_entry_point') or dittogym.TorchEnv"
             raise TypeError(f"num_envs must not be given, got {options['num_envs']!r}; for a batch use {batch}")
         self.torch_env = TorchEnv(task, 1, **options)
         self._own_limit = self.torch_env.spec.horizon != make_spec(task).horizon
         self.observation_space, self.action_space = spaces(self.torch_env)
-        self.render_mode, self.render_muscles = render_mode, render_muscles
+        self.render_mode, self.render_muscles, self.render_size = render_mode, render_muscles, render_size
         self._screen, self._return = None, 0.0
         if render_mode == "human":
             from dittogym.render.screen import Screen  # pygame is an extra
@@ -182,11 +190,19 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         return first(as_numpy(observation))
 
     def render(self) -> np.ndarray | None:
-        """The picture (512, 512, 3) uint8 in mode ``"rgb_array"``, else nothing."""
-        return self.torch_env.render(muscles=self.render_muscles) if self.render_mode == "rgb_array" else None
+        """The picture (render_size, render_size, 3) uint8 in mode ``"rgb_array"``, else nothing."""
+        if self.render_mode != "rgb_array":
+            return None
+        return self.torch_env.render(size=self.render_size, muscles=self.render_muscles)
 
     def film(
-        self, policy: Any, path: str | os.PathLike[str] | None = None, *, seed: int = 0, **options: Any
+        self,
+        policy: Any,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        seed: int = 0,
+        max_steps: int | None = None,
+        **options: Any,
     ) -> Recording:
         """Reset, play an episode and record it; see :meth:`dittogym.TorchEnv.film`.
 
@@ -197,16 +213,18 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
                 ``predict``, as :func:`cfp.load` and stable-baselines3 return it.
             path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
             seed: Seed of the reset.
-
+            max_steps: Stop after this many steps if the episode is longer.
             options: Such as ``size``, ``speed`` and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
 
         Returns:
             The recording, from which further films can be saved. A notebook shows it.
         """
         act = as_function(policy, self.torch_env.action_layout)
-        return film(
-            self.torch_env, lambda images: as_tensor(act(images[0]), self.torch_env, True), path, seed, 0, options
-        )
+
+        def act_on_batch(images: np.ndarray) -> torch.Tensor:
+            return as_tensor(act(images[0]), self.torch_env, single=True)
+
+        return film(self.torch_env, act_on_batch, path, seed, 0, max_steps, options)
 
     def _repr_png_(self) -> bytes | None:
         return self.torch_env._repr_png_()
@@ -231,5 +249,6 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
             f"{scene.task}   {shown.step * scene.dt:.2f} s   return {self._return:.1f}",
             pace(RENDER_FPS * scene.dt),
         )
-        if not self._screen.show(frame(scene, shown, muscles=self.render_muscles, caption=caption)):
+        picture = frame(scene, shown, self.render_size, muscles=self.render_muscles, caption=caption)
+        if not self._screen.show(picture):
             self.close()

@@ -15,6 +15,7 @@ from torch import Tensor
 from dittogym.bodies.positions import Seed
 from dittogym.env import RENDER_FPS, RENDER_MODES, JsonSpec, as_numpy, as_tensor, spaces
 from dittogym.model import Snapshot
+from dittogym.render.scene import check_size
 from dittogym.spec import TaskSpec
 from dittogym.tasks import make_spec
 from dittogym.torch_env import TorchEnv
@@ -57,6 +58,7 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             ``info["final_info"]`` are the last ones), or ``DISABLED``.
         render_mode: ``None`` or ``"rgb_array"``.
         render_muscles: Colour the robots by their muscles in pictures.
+        render_size: Pixels per side of pictures.
         max_episode_steps: Horizon instead of the task's; -1: unlimited.
         options: All other arguments of :class:`dittogym.TorchEnv`.
 
@@ -82,12 +84,14 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         render_muscles: bool = True,
+        render_size: int = 512,
         max_episode_steps: int | None = None,
         **options: Any,
     ) -> None:
         if render_mode not in (None, RENDER_MODES[0]):
             raise ValueError(f"render_mode must be None or {RENDER_MODES[0]!r} for a batch, got {render_mode!r}")
         checks.flag("render_muscles", render_muscles)
+        check_size("render_size", render_size)
         if max_episode_steps not in (None, -1):
             checks.whole("max_episode_steps", max_episode_steps, 1)
         try:
@@ -97,7 +101,8 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise ValueError(f"autoreset_mode must be one of {modes}, got {autoreset_mode!r}") from error
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.torch_env = TorchEnv(task, num_envs, **options)
-        self.num_envs, self.render_mode, self.render_muscles = num_envs, render_mode, render_muscles
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self.render_muscles, self.render_size = render_muscles, render_size
         own, usual = self.torch_env.spec.horizon, make_spec(task).horizon
         # Gymnasium passes the limit of the id, whatever the task's options say.
         limit = own if max_episode_steps in (None, usual) else max_episode_steps
@@ -192,10 +197,11 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return as_numpy(observation)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """A picture for each simulation, (512, 512, 3) uint8, in mode ``"rgb_array"``, else nothing."""
+        """A picture for each simulation, (render_size, render_size, 3) uint8, in mode ``"rgb_array"``, else nothing."""
         if self.render_mode is None:
             return None
-        return tuple(self.torch_env.render(i, muscles=self.render_muscles) for i in range(self.num_envs))
+        options: dict[str, Any] = {"size": self.render_size, "muscles": self.render_muscles}
+        return tuple(self.torch_env.render(i, **options) for i in range(self.num_envs))
 
 
 def _array(values: Any) -> np.ndarray:

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from html import escape
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -219,16 +220,18 @@ def check_film_options(path: Any, options: dict[str, Any]) -> None:
         raise TypeError(f"path must be given with {', '.join(options)}, got None")
 
 
-def film(env: Any, act: Act, path: Any, seed: Any, index: int, options: dict[str, Any]) -> Recording:
+def film(
+    env: Any, act: Act, path: Any, seed: Any, index: int, max_steps: int | None, options: dict[str, Any]
+) -> Recording:
     """Record an episode, see :func:`record`, and save it if a ``path`` is given, see :meth:`Recording.save`."""
     check_film_options(path, options)  # before the episode
-    recording = record(env, act, seed, index)
+    recording = record(env, act, seed, index, max_steps)
     if path is not None:
         recording.save(path, **options)
     return recording
 
 
-def record(env: Any, act: Act, seed: Any = 0, index: int = 0) -> Recording:
+def record(env: Any, act: Act, seed: Any = 0, index: int = 0, max_steps: int | None = None) -> Recording:
     """Play an episode.
 
     Args:
@@ -236,9 +239,12 @@ def record(env: Any, act: Act, seed: Any = 0, index: int = 0) -> Recording:
         act: Chooses the actions.
         seed: Of the reset.
         index: Which element of the batch is recorded, until its episode ends.
+        max_steps: Stop after this many steps if the episode is longer.
     """
+    if max_steps is not None:
+        checks.whole("max_steps", max_steps, 1)
     recording = Recording(describe(env.model))
-    for observation, _, end in play(env, act, seed, index):
+    for observation, _, end in islice(play(env, act, seed, index), None if max_steps is None else max_steps + 1):
         recording.shots.append(env.shot(index, SHOWN))
         recording.observation = observation[index]
         if end is not None:

@@ -168,9 +168,14 @@ def take(
     return Shot(x, values, next(places), next(places), next(places), int(state.steps[index]))
 
 
+def check_size(name: str, size: int) -> None:
+    """Check the pixels per side of a picture, an argument that the caller calls ``name``."""
+    checks.whole(name, size, 16, LARGEST)
+
+
 def check_view(size: int, zoom: float | None) -> float:
     """Check the size and the zoom of a picture, and return the width that it shows, m."""
-    checks.whole("size", size, 16, LARGEST)
+    check_size("size", size)
     if zoom is not None:
         checks.number("zoom", zoom, least=0.05)  # lines and numbers are drawn for every 0.1 m
     return VIEW_WIDTH if zoom is None else 1.0 / zoom

@@ -266,6 +266,8 @@ ENVIRONMENT = table(
         ),
         ("masked action", lambda: step(single(), np.ma.masked_all((2, 8, 8))), "masked array with 128 masked entries"),
         ("muscles by name", lambda: single(render_muscles="x"), "render_muscles must be True or False, got 'x'"),
+        ("picture without pixels", lambda: single(render_size=0), "render_size must be at least 16, got 0"),
+        ("pictures without pixels", lambda: batch(render_size=0), "render_size must be at least 16, got 0"),
         ("muscles of a batch", lambda: batch(render_muscles=1), "render_muscles must be True or False, got 1"),
         ("picture from afar", lambda: begun().render(zoom=1e-9), "zoom must be at least 0.05, got 1e-09"),
         (

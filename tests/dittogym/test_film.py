@@ -55,6 +55,17 @@ def test_a_recording_is_the_episode(recording: Recording) -> None:
     assert recording.default_speed == 0.05  # 4 s
 
 
+@pytest.mark.parametrize("limit", [3, 50])
+@pytest.mark.parametrize("single", [True, False])
+def test_a_recording_stops_after_some_steps(limit: int, single: bool) -> None:
+    spec = replace(dittogym.make_spec("kick"), horizon=5)
+    env = dittogym.Env(spec, **SMALL) if single else dittogym.TorchEnv(spec, 2, **SMALL)
+    film = env.film(wave, max_steps=limit)
+    assert len(film.rewards) == len(film.shots) - 1 == min(limit, 5)
+    with pytest.raises(ValueError, match="max_steps must be at least 1, got 0"):
+        env.film(wave, max_steps=0)
+
+
 @pytest.mark.parametrize("suffix", ["gif", "webp", "mp4"])
 def test_films(recording: Recording, tmp_path, suffix: str) -> None:
     if suffix == "mp4":

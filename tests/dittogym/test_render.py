@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 
-from dittogym import Env, TorchEnv, make_spec
+from dittogym import BatchEnv, Env, TorchEnv, make_spec
 from dittogym.render.canvas import GROUND, SOLID, TARGET, Canvas
 from dittogym.render.colours import CONTRACT, EXPAND, RELAX, ROBOT, SCALES, shear_strain, speed
 from dittogym.render.scene import describe
@@ -100,6 +101,14 @@ def test_holes_of_a_target_stay_empty() -> None:
     canvas.target(describe(TorchEnv(spec, particles=100).model).target, np.array((0.5, 0.5)))
     for distance, colour in ((0, TARGET), (24, GROUND), (44, TARGET), (62, GROUND)):  # pixels of the picture
         assert tuple(canvas.image[128, 128 + distance]) == colour == tuple(canvas.image[128 - distance, 128])
+
+
+def test_the_size_of_pictures() -> None:
+    options = {"render_mode": "rgb_array", "render_size": 96, "particles": 100, "substeps": 1}
+    env, batch = gymnasium.make("dittogym/run-coarse-v0", **options), BatchEnv("run", 2, **options)
+    env.reset(seed=0), batch.reset(seed=0)
+    assert env.render().shape == batch.render()[1].shape == (96, 96, 3)
+    env.close()
 
 
 @pytest.mark.parametrize("muscles", [True, False])
