@@ -1,4 +1,4 @@
-# Every target installs what it needs into .venv first. `make PYTHON=python3.12 install` chooses the interpreter,
+# Targets install what they need into .venv first. `make PYTHON=python3.12 install` chooses the interpreter,
 # PIP_FLAGS passes options on to pip, for instance an index with CPU or CUDA builds of PyTorch.
 PYTHON ?= python3
 PIP_FLAGS ?=
@@ -9,7 +9,7 @@ STAMP := .venv/.stamp-install
 TRITON_STAMP := .venv/.stamp-triton
 DOCS_STAMP := .venv/.stamp-docs
 DEMO := runs/demo
-# Each takes up to 1 GB of memory. A process that has done its own tests takes some of another.
+# Each takes up to 1 GB of memory. Idle processes take tests from busy ones.
 TEST_PROCESSES ?= 2
 PYTEST := -m pytest -n $(TEST_PROCESSES) --dist worksteal
 
@@ -57,7 +57,7 @@ $(TRITON_STAMP): $(STAMP)
 	@touch $@
 
 test-gpu-kernels: $(TRITON_STAMP)  ## tests of the CUDA kernels: on a GPU, else in an interpreter and a compiler
-	$(BIN)/python -m pytest -m "" $(addprefix tests/torchmpm/test_cuda_,kernels.py graphs.py compilation.py)
+	$(BIN)/python -m pytest -m "" tests/torchmpm/test_cuda_*.py
 
 # In an environment of its own: .venv holds the newest versions. Old versions use what new ones of others deprecate.
 test-oldest:  ## fast tests with the oldest versions of all dependencies but torch

@@ -12,7 +12,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(autouse=True)
 def fresh_compiler() -> None:
-    """A process compiles a limited number of combinations before it runs eagerly: each benchmark starts at zero."""
+    """Each benchmark may compile anew: after too many compilations in a process, torch.compile runs eagerly."""
     torch.compiler.reset()
 
 

@@ -1,8 +1,9 @@
-"""Time and memory of a gradient through one step of RUN: the table in docs/concepts/gradients.md.
+"""Time and memory of a gradient through one step of RUN, as a table.
 
 Run `python benchmarks/gradients.py`; each size runs in a process of its own, whose peak memory is measured (Linux).
 """
 
+import argparse
 import gc
 import subprocess
 import sys
@@ -55,13 +56,16 @@ def measure(count: int) -> None:
 
 def main() -> None:
     """Print the table."""
-    if len(sys.argv) > 1:
-        measure(int(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--particles", type=int, help="print the row of this size, measured in this process")
+    particles = parser.parse_args().particles
+    if particles:
+        measure(particles)
         return
     print("| particles | forward, ms a substep | with backward | ratio | MiB predicted | MiB measured |")
     print("| --- | --- | --- | --- | --- | --- |", flush=True)
     for count in SIZES:
-        subprocess.run([sys.executable, __file__, str(count)], check=True)
+        subprocess.run([sys.executable, __file__, "--particles", str(count)], check=True)
 
 
 if __name__ == "__main__":

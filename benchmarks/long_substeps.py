@@ -2,8 +2,8 @@
 
 Run `OMP_NUM_THREADS=1 python benchmarks/long_substeps.py --out docs` for `substeps-returns.csv` and
 `substeps-gradients.csv`. The same episodes are played with both, from the same layouts of particles: a moving wave, the
-pretrained policy of the task if there is one, and a planned episode, where only the planner's substeps differ. A task
-that refuses the longer substep is left out.
+pretrained policy of the task, and a planned episode, where only the planner's substeps differ. A task that refuses the
+longer substep is left out.
 """
 
 import argparse
@@ -25,7 +25,8 @@ import dittogym
 from baselines import GradientPlanner
 from baselines.common.rollout import rollout
 from baselines.planning.mpc import MPC
-from cfp.weights import shipped
+from cfp.files import write_text
+from cfp.tables import csv_text
 from dittogym.core import observe
 from dittogym.spec import DT
 
@@ -93,10 +94,8 @@ def millimetres(distance: float) -> str:
 def row(task: str, kind: str, short: list[Episode], long: list[Episode]) -> dict[str, object]:
     """How much the longer substep changes, and how much two initial positions differ; root mean squares."""
     last = [min(len(one.centres), len(other.centres)) - 1 for one, other in zip(short, long, strict=True)]
-    totals, centres = (
-        [np.array([each(episode, k) for episode, k in zip(episodes, last, strict=True)]) for episodes in (short, long)]
-        for each in (lambda episode, _: episode.total, lambda episode, k: episode.centres[k])
-    )
+    totals = [np.array([episode.total for episode in episodes]) for episodes in (short, long)]
+    centres = [np.array([e.centres[k] for e, k in zip(episodes, last, strict=True)]) for episodes in (short, long)]
     first, second = np.triu_indices(len(last), 1)
     return {
         "task": task,
@@ -178,14 +177,10 @@ def write(path: Path, rows: Sequence[dict[str, object]]) -> None:
     if path.exists():
         with path.open(newline="") as file:
             old = [*csv.DictReader(file)]
-    written = {row["task"] for row in rows}
-    rows = sorted(
-        [*(row for row in old if row["task"] not in written), *rows], key=lambda row: TASKS.index(row["task"])
-    )
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    written = {new["task"] for new in rows}
+    kept = [each for each in old if each["task"] not in written]
+    table = sorted([*kept, *rows], key=lambda each: TASKS.index(each["task"]))
+    write_text(path, csv_text(table, list(table[0])))
 
 
 def main() -> None:
@@ -200,8 +195,7 @@ def main() -> None:
         except ValueError as error:
             print(f"{task}: {error}", flush=True)
             continue
-        kinds = {"wave": play_wave} | ({"policy": play_policy} if task in shipped() else {}) | {"plan": play_plan}
-        for kind, function in kinds.items():
+        for kind, function in (("wave", play_wave), ("policy", play_policy), ("plan", play_plan)):
             returns.append(row(task, kind, function(task, DT), function(task, LONG)))
             print(*returns[-1].values(), flush=True)
         slopes.append(gradients(task))

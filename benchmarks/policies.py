@@ -3,8 +3,8 @@
 Run ``python benchmarks/policies.py --out docs/policies.csv POLICY...``; a policy is a name that comes with the package,
 a policy file, or a run folder, all of whose stages are evaluated. Each one plays ``--episodes`` episodes with ``full``
 and with ``lite`` particles, on layouts that nothing was trained or chosen on, beside zero and random action on fewer
-layouts; then ``--success`` more with ``lite`` particles, where the task defines success. Rows of the same task,
-particles and policy are replaced in the table; everything else in it stays.
+layouts; then ``--success`` episodes with ``lite`` particles, for a narrower interval of the share of successes. Rows
+with the same task, particles, policy and number of episodes are replaced in the table; everything else in it stays.
 """
 
 import argparse
@@ -18,7 +18,9 @@ from cfp.config import RunConfig
 from cfp.evaluate import open_policy, open_run
 from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed, make_trial
 from cfp.evaluation.untrained import UntrainedPolicy
+from cfp.files import write_text
 from cfp.policy_protocols import Policy
+from cfp.tables import csv_text
 from cfp.train import PROGRAM
 
 COLUMNS = ("task", "particles", "policy", "action", "episodes", "mean", "lowest", "highest", "std", "success")
@@ -45,8 +47,7 @@ def results(
                     trial = make_trial(there, name, policy, policy.resolution, count, deterministic=quiet, seed=seed)
                     trials.append(replace(trial, resolution=policy.description["resolution"]))
         for result in evaluate(trials, there.make_spec().horizon):
-            if result.success is not None or len(result.returns) != success:
-                yield particles, result
+            yield particles, result
 
 
 def to_row(task: str, particles: str, result: Result) -> dict[str, Any]:
@@ -72,10 +73,7 @@ def merge(path: Path, rows: list[dict[str, Any]]) -> None:
         with path.open(newline="") as file:
             table = {tuple(row[name] for name in KEY): row for row in csv.DictReader(file)}
     table |= {tuple(str(row[name]) for name in KEY): row for row in rows}
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(table.values())
+    write_text(path, csv_text(table.values(), COLUMNS))
 
 
 def main() -> None:
@@ -84,7 +82,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="the table")
     parser.add_argument("--episodes", type=int, default=10, help="episodes of each policy and tier")
     parser.add_argument("--untrained", type=int, default=3, help="episodes of zero and random action")
-    parser.add_argument("--success", type=int, default=100, help="lite episodes for the share of successes")
+    parser.add_argument("--success", type=int, default=100, help="lite episodes for the share of successes; 0: none")
     arguments = parser.parse_args()
     for given in arguments.policies:
         if (Path(given) / "config.json").exists():

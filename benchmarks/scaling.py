@@ -17,6 +17,8 @@ import tyro
 from matplotlib import pyplot
 from test_solver import scene
 
+from cfp.files import write_text
+from cfp.tables import csv_text
 from torchmpm.memory import estimate_memory
 
 SUBSTEPS = 100
@@ -35,7 +37,9 @@ class Options:
     out: Path
     """Table (CSV)."""
     picture: Path | None = None
-    """Picture of the table; the table is not measured again if it is there."""
+    """Picture of the table."""
+    draw_only: bool = False
+    """Draw the table that --out names, and measure nothing."""
     backend: str = "auto"
     """Backend of the solver."""
     rounds: int = 8
@@ -106,13 +110,10 @@ def draw(rows: list[Row], path: Path) -> None:
 
 
 def main(options: Options) -> None:
-    """Write the table and the picture."""
-    if options.picture is None or not options.out.exists():
+    """Measure the table, and draw the picture."""
+    if not options.draw_only:
         rows = measure(options)
-        with options.out.open("w", newline="") as file:
-            writer = csv.DictWriter(file, rows[0])
-            writer.writeheader()
-            writer.writerows(rows)
+        write_text(options.out, csv_text(rows, list(rows[0])))
     if options.picture is not None:
         with options.out.open(newline="") as file:
             draw([{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)], options.picture)

@@ -57,16 +57,20 @@ def measure(target: str, out: Path, polish: int) -> dict:
     """Train for one target, unless that is done, and evaluate the result."""
     name, kept = Path(target).stem, out / f"{Path(target).stem}.json"
     if kept.exists():
-        return json.loads(kept.read_text())
+        result = json.loads(kept.read_text())
+        if result["polish"] != polish:
+            raise SystemExit(f"{kept}: was measured with --polish {result['polish']}, got {polish}; use another --out")
+        return result
     if len(target) == 1 and target not in "IMT":
-        picture_of_letter = letter(target)
-        cv2.imwrite(target := str(out / f"{target}.png"), picture_of_letter)
+        drawn = letter(target)
+        target = str(out / f"{target}.png")
+        cv2.imwrite(target, drawn)
     start = time.process_time()
     options = ["--algo", "gradient", "--task", "shapematch", "--target", target, "--polish", str(polish), "--no-video"]
     if train([*options, "--out", str(out / name), "--resume"]) != 0:
         raise SystemExit(f"{target}: training failed")
     minutes = (time.process_time() - start) / 60
-    result = {"target": target, "minutes": minutes, **play(baselines.load(out / name), target)}
+    result = {"target": target, "polish": polish, "minutes": minutes, **play(baselines.load(out / name), target)}
     kept.write_text(json.dumps(result))
     return result
 
@@ -94,7 +98,7 @@ def picture(results: list[dict]) -> np.ndarray:
     return np.kron(np.hstack(columns), np.ones((SCALE, SCALE, 1), np.uint8))
 
 
-if __name__ == "__main__":
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "--out", type=Path, default=Path("runs/shapes"), help="folder of the runs, table.md and picture.png"
@@ -109,3 +113,7 @@ if __name__ == "__main__":
     (arguments.out / "table.md").write_text("\n".join(lines) + "\n")
     cv2.imwrite(str(arguments.out / "picture.png"), picture(found))
     print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

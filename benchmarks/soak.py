@@ -9,6 +9,7 @@ hardly affect.
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import time
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ import numpy as np
 import tyro
 
 import dittogym  # noqa: F401  registers the environments
+from cfp.sections import Particles
 from cfp.tables import CSVTable
 from torchmpm import diagnostics
 
@@ -33,8 +35,8 @@ class Options:
     """Task, at its coarse resolution."""
     robots: int = 16
     """Simulations in the batch."""
-    particles: str = "lite"
-    """"lite", "full", or the number of the robot's particles."""
+    particles: Particles = "lite"
+    """lite, full, or the number of the robot's particles."""
     substeps: int = 100
     """Physics steps of 0.1 ms in an environment step."""
     steps: int = 100_000
@@ -58,15 +60,15 @@ def main(options: Options) -> None:
         num_envs=options.robots,
         vectorization_mode="vector_entry_point",
         autoreset_mode="Disabled" if options.endless else "SameStep",
-        particles=int(options.particles) if options.particles.isdecimal() else options.particles,
+        particles=options.particles,
         substeps=options.substeps,
     )
     env.reset(seed=0)
     env.step(np.zeros(env.action_space.shape, np.float32))  # compiles the kernels
     env.reset(seed=0)
     draw, table = np.random.default_rng(0), CSVTable(options.out)
-    calls = -(-options.steps // options.robots)
-    ends = np.linspace(0, calls, options.rows + 1).astype(int)
+    calls = math.ceil(options.steps / options.robots)
+    ends = np.linspace(0, calls, min(options.rows, calls) + 1).astype(int)
     for first, last in itertools.pairwise(ends):
         episodes = failed = broken = 0
         start = time.process_time()

@@ -1,6 +1,6 @@
-"""Error of the soft observation and the soft rewards: the tables of docs/concepts/gradients.md.
+"""Error of the soft observation and the soft rewards, the figures of docs/concepts/gradients.md.
 
-Run `python benchmarks/soft.py`; `--tasks run,kick` for some tasks only.
+Run `python benchmarks/soft.py`; `--tasks run kick` for some tasks only.
 """
 
 import argparse
@@ -43,9 +43,9 @@ def gaps(task: str, tier: str, policy) -> list[float]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tasks", default=",".join(dittogym.TASKS))
-    tasks = parser.parse_args().tasks.split(",")
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--tasks", nargs="+", default=list(dittogym.TASKS), choices=dittogym.TASKS)
+    tasks = parser.parse_args().tasks
     print("| task | tier | actions | pixels wrong | (another layout) | occupancy | velocity | reward, mean | at most |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for task in tasks:

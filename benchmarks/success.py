@@ -26,7 +26,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=45, help="control steps after which an episode is truncated")
     parser.add_argument("--noise", type=float, default=0.1, help="standard deviation on every action entry")
     parser.add_argument("--episodes", type=int, default=100)
-    parser.add_argument("--particles", default="full")
+    parser.add_argument("--particles", choices=("full", "lite"), default="full")
     arguments = parser.parse_args()
     config, policies = open_policy(PROGRAM, arguments.policy, "cpu", None)
     policy, own = policies.popitem()[1], config.environment

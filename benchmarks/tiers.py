@@ -8,11 +8,13 @@ import math
 
 import numpy as np
 import torch
+from scipy.stats import spearmanr
 
 import dittogym
 
 STEPS = 30
-RANKED = {"shapematch": 30, "obstacle": 150, "catch": 150, "run": 150, "kick": 150}
+#: Steps of the episodes in which random policies are ranked.
+RANKED = {"shapematch": 30, "obstacle": 150, "catch": 150, "run": 150, "kick": 100}
 
 
 def wave(env: dittogym.TorchEnv, t: int) -> torch.Tensor:
@@ -82,8 +84,7 @@ def main() -> None:
                 for seed in range(arguments.policies)
             ]
         )
-        ranks = returns.argsort(0).argsort(0)
-        spearman = np.corrcoef(ranks.T)[0, 1]
+        spearman = spearmanr(*returns.T).statistic
         spread = returns[:, 0].min(), returns[:, 0].max()
         print(
             f"{task}: rank correlation {spearman:.3f} over {arguments.policies} policies, {steps} steps, "

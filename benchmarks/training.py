@@ -127,8 +127,10 @@ def timed(owner: object, name: str, clock: dict[str, float]) -> Iterator[None]:
             clock[name] = clock.get(name, 0.0) + time.perf_counter() - start
 
     setattr(owner, name, run)
-    yield
-    delattr(owner, name)
+    try:
+        yield
+    finally:
+        delattr(owner, name)
 
 
 def former_quick(task: str) -> Config:
@@ -148,7 +150,8 @@ def training(task: str, steps: int) -> None:
     for name, config in (("former quick", former_quick(task)), ("quick", sac_preset(task, "quick"))):
         num_envs = config.environment.num_envs
         for stage in (1, 2):
-            model, clock = make_model(config, stage, num_envs), dict[str, float]()
+            model = make_model(config, stage, num_envs)
+            clock: dict[str, float] = {}
             model.learn(config.learning.batch_size + 2 * num_envs)
             with timed(model.env, "step", clock), timed(model, "train", clock):
                 start = time.perf_counter()
@@ -173,8 +176,8 @@ def environments(steps: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rounds", type=int, default=12, help="repeats of an update and of a step")
-    parser.add_argument("--steps", type=int, default=12, help="batched training steps")
+    parser.add_argument("--rounds", type=int, default=12, help="repeats of an update")
+    parser.add_argument("--steps", type=int, default=12, help="batched training steps, and environment steps")
     parser.add_argument("--skip", nargs="*", default=[], choices=("updates", "training", "environments"))
     arguments = parser.parse_args()
     keep_memory()

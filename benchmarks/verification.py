@@ -1,11 +1,10 @@
 """The solver against closed forms, and orders of convergence: `python benchmarks/verification.py --out table.csv`.
 
-Every function here is one problem with its own scene; `docs/concepts/verification.md` tells what each is.
+Each problem is a function with its own scene; `docs/concepts/verification.md` explains them.
 """
 
 from __future__ import annotations
 
-import csv
 import itertools
 import math
 from collections.abc import Iterator, Sequence
@@ -17,10 +16,12 @@ import torch
 import tyro
 from torch import Tensor
 
+from cfp.files import write_text
+from cfp.tables import csv_text
 from torchmpm import Body, Elastic, Grid, Material, ParticleState, Solver, VelocityRule, VonMises, diagnostics, fixed
 from torchmpm.sampling import lattice
 
-#: So heavy and stiff that the 1e-10 kg that each node gets do not show.
+#: Large values, so that the 1e-10 kg that are added to every node are negligible.
 MU, LAM, DENSITY = 5e6, 2e6, 2e4
 #: Resistance to stretching in one direction alone, Pa.
 MODULUS = LAM + 2 * MU
@@ -114,7 +115,7 @@ def pulse(cells: int, courant: float = 0.25, backend: str = "auto") -> Pulse:
 
 
 def traction(stretch: float, backend: str = "auto") -> Result:
-    """Stress in a bar that is stretched evenly and held at its left end, from what it gains by being held."""
+    """Stress in a bar that is stretched evenly and held at its left end, from the impulse on the nodes that hold it."""
     grid = Grid(32)
     height, corner = 4 * grid.h, (8 * grid.h, 8 * grid.h)
     body, state = block((24, 8), corner, (12 * grid.h, height))
@@ -129,9 +130,9 @@ def traction(stretch: float, backend: str = "auto") -> Result:
 
 
 def plastic_flow(stretch: float, backend: str = "auto") -> Result:
-    """Elastic over whole change of area of soft matter that has been drawn out to this ratio of its sides.
+    """Elastic divided by total change of area of a plastic block that has been stretched to this ratio of its sides.
 
-    The whole deformation is added up from the velocity gradients on the side.
+    The total deformation is integrated from the velocity gradients.
     """
     grid, rate = Grid(32), 25.0
     body, state = block((32, 32), (0.375, 0.375), (0.25, 0.25), VonMises(MU, LAM, yield_stress=1e4))
@@ -245,10 +246,7 @@ def main(options: Options) -> None:
     for row in table(options.backend):
         rows.append(row)
         print(" | ".join(str(cell) for cell in row.values()), flush=True)
-    with open(options.out, "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_text(options.out, csv_text(rows, list(rows[0])))
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ tree first, and have a compiler.
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 import time
@@ -44,8 +45,11 @@ def measure(kind: str) -> tuple[float, float]:
 
 def main() -> int:
     """Print the table; returns the exit code."""
-    if len(sys.argv) > 1:
-        print(*measure(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kind", choices=KINDS, help="measure these kernels alone, in this process")
+    kind = parser.parse_args().kind
+    if kind:
+        print(*measure(kind))
         return 0
     came_from = library.provenance()
     print(f"{library.family()}: {came_from}")
@@ -54,7 +58,7 @@ def main() -> int:
     best = dict.fromkeys(KINDS, (0.0, 0.0))
     for _ in range(ROUNDS):
         for kind in KINDS:
-            command = [sys.executable, __file__, kind]
+            command = [sys.executable, __file__, "--kind", kind]
             forward, gradient = subprocess.check_output(command, text=True).split()
             best[kind] = (max(best[kind][0], float(forward)), max(best[kind][1], float(gradient)))
     for name, wheel, compiled in zip(("forward", "gradient"), best["wheel"], best["compiled"], strict=True):

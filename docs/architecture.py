@@ -69,16 +69,12 @@ def read_folder(folder: Path) -> Folder:
 
 def read_package(name: str) -> Package:
     """Read a package."""
-    folders = tuple(read_folder(file.parent) for file in sorted((ROOT / name).rglob("__init__.py"), key=sort_key))
+    inits = sorted((ROOT / name).rglob("__init__.py"), key=lambda init: init.parent.parts)
+    folders = tuple(read_folder(init.parent) for init in inits)
     names = {found for file in (ROOT / name).rglob("*.py") for found in imported(file)} - {name}
     internal = tuple(other for other in PACKAGES if other in names)
     external = tuple(sorted(names - set(PACKAGES) - sys.stdlib_module_names))
     return Package(folders, internal, external)
-
-
-def sort_key(init: Path) -> tuple[str, ...]:
-    """Sort folders before their subfolders."""
-    return init.parent.parts
 
 
 def diagram() -> str:

@@ -20,7 +20,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 import architecture  # noqa: E402
 from drawings import write_drawings  # noqa: E402
 from media import write_replays  # noqa: E402
-from result_tables import write_results  # noqa: E402
+from result_figures import write_figures  # noqa: E402
+from result_tables import write_tables  # noqa: E402
 from task_pages import write_pages  # noqa: E402
 
 project = "torchmpm"
@@ -180,7 +181,8 @@ def drop_links_back(app: Sphinx, page: str, template: str, context: dict[str, ob
 def write_generated(app: Sphinx) -> None:
     """Write the pages of the tasks, the tables of results and drawings, and replays."""
     write_pages()
-    write_results()
+    write_tables()
+    write_figures()
     write_drawings()
     write_replays(Path(app.outdir) / "replays")
 

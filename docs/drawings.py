@@ -16,8 +16,9 @@ from task_pages import PAGES, write
 from dittogym.render.canvas import GROUND, TARGET
 from dittogym.tasks.targets import load_target
 
-#: Pixels of a shown picture, and of the fish in units of its half length.
+#: Pixels per side of a shown picture.
 SHOWN = 96
+#: Corners of the tail and centre of the eye, in half lengths of the fish.
 TAIL, EYE = ((-0.55, 0.0), (-1.0, -0.5), (-1.0, 0.5)), (0.4, -0.1)
 
 
@@ -120,12 +121,12 @@ def write_drawings() -> None:
     """Write `targets.md` and its pictures into the folder of the generated pages."""
     folder = PAGES / "targets"
     folder.mkdir(parents=True, exist_ok=True)
-    rows = []
+    rows, clean = [], load_target(fish())
     with tempfile.TemporaryDirectory() as temporary:
         for number, (name, (suffix, mask, draw)) in enumerate(DRAWINGS.items()):
             path, picture = Path(temporary, f"fish{suffix}"), draw(mask).astype(np.uint8)
             cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, 30] if suffix == ".jpg" else [])
-            (target, remarks), clean = become(path), load_target(fish())
+            target, remarks = become(path)
             cv2.imwrite(str(folder / f"{number}.png"), pair(picture, target))
             overlap = (target & clean).sum() / (target | clean).sum()
             result = f"warning: {' '.join(remarks)}" if remarks else f"{target.sum()} pixels, overlap {overlap:.2f}"
@@ -137,7 +138,3 @@ def write_drawings() -> None:
         except ValueError as error:
             rows.append(["a vector drawing (SVG)", "", f"error: {str(error).replace(str(path), path.name)}"])
     write(PAGES / "targets.md", markdown(("Drawing", "File, and target", "Result"), rows))
-
-
-if __name__ == "__main__":
-    write_drawings()

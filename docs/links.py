@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 import sys
-from dataclasses import dataclass, field
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -13,15 +13,14 @@ ROOT = Path(__file__).resolve().parents[1]
 STANDALONE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "benchmarks/README.md")
 
 
-@dataclass
 class Page(HTMLParser):
     """Link targets and anchors of an HTML page."""
 
-    targets: list[str] = field(default_factory=list)
-    anchors: set[str] = field(default_factory=set)
-
-    def __post_init__(self) -> None:
+    def __init__(self, file: Path) -> None:
         super().__init__()
+        self.targets: list[str] = []
+        self.anchors: set[str] = set()
+        self.feed(file.read_text())
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         """Collect links, images, scripts and anchors."""
@@ -32,22 +31,14 @@ class Page(HTMLParser):
                 self.anchors.add(value)
 
 
-def read(file: Path) -> Page:
-    """Read a page."""
-    page = Page()
-    page.feed(file.read_text())
-    return page
-
-
 def is_relative(target: str) -> bool:
     """Whether a link is relative."""
     parts = urlsplit(target)
     return not (parts.scheme or parts.netloc)
 
 
-def broken_in_site(site: Path) -> list[str]:
+def broken_in_site(site: Path, pages: dict[Path, Page]) -> list[str]:
     """Broken links of a built site."""
-    pages = {file.resolve(): read(file) for file in site.rglob("*.html")}
     broken = []
     for file, page in pages.items():
         for target in filter(is_relative, page.targets):
@@ -56,7 +47,7 @@ def broken_in_site(site: Path) -> list[str]:
             place = place / "index.html" if place.is_dir() else place
             missing = parts.fragment and place in pages and unquote(parts.fragment) not in pages[place].anchors
             if not place.exists() or missing:
-                broken.append(f"{file.relative_to(site.resolve())}: {target}")
+                broken.append(f"{file.relative_to(site)}: {target}")
     return broken
 
 
@@ -71,9 +62,17 @@ def broken_in_repository() -> list[str]:
     return broken
 
 
+def main() -> int:
+    """Print the broken links of the site in the folder that the command names; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("site", type=Path, help="folder of the built site")
+    site = parser.parse_args().site.resolve()
+    pages = {file: Page(file) for file in site.rglob("*.html")}
+    broken = broken_in_site(site, pages) + broken_in_repository()
+    count = sum(len(page.targets) for page in pages.values())
+    print("\n".join(broken) or f"{count} links on {len(pages)} pages, none broken")
+    return int(bool(broken))
+
+
 if __name__ == "__main__":
-    site = Path(sys.argv[1])
-    broken = broken_in_site(site) + broken_in_repository()
-    count = sum(len(read(file).targets) for file in site.rglob("*.html"))
-    print("\n".join(broken) or f"{count} links on {len(list(site.rglob('*.html')))} pages, none broken")
-    sys.exit(bool(broken))
+    sys.exit(main())

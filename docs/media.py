@@ -4,9 +4,9 @@ Each policy gets `images/films/POLICY.webp`, and those of all tasks together `im
 behind each film is kept in `images/films/sources.json`; a test compares them with those of the package.
 """
 
+import argparse
 import hashlib
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -66,8 +66,13 @@ def grid_frames(recordings: dict[str, Recording]) -> list[np.ndarray]:
     return frames
 
 
-def main(names: list[str]) -> None:
+def main() -> None:
     """Make the films of some policies, or of all, and the grid."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("policies", nargs="*", metavar="POLICY", help="all by default")
+    names = parser.parse_args().policies
+    if unknown := [name for name in names if name not in shipped()]:
+        parser.error(f"policy must be one of {', '.join(shipped())}, got {unknown[0]}")
     sources = json.loads(SOURCES.read_text()) if SOURCES.exists() else {}
     recordings = {name: record_policy(name) for name in shipped()}
     for name in names or recordings:
@@ -79,4 +84,4 @@ def main(names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -1,4 +1,4 @@
-"""Writes a page for each task from its `TaskSpec`, so that no number is written by hand."""
+"""Writes a page for each task from its `TaskSpec`; only the descriptions of the scenes are written by hand."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DOCS = Path(__file__).resolve().parent
 NOTES, PAGES = DOCS / "tasks", DOCS / "generated"
 SIZE = 384
 
-#: What the words of each task's page refer to.
+#: Description of each task's scene.
 SCENES = {
     "shapematch": "A disc of 17 cm lies in the middle of the window, without gravity.",
     "run": "A disc of 18 cm stands on a floor on which nothing slips.",
@@ -117,6 +117,16 @@ for the same direction cover a node, the first one applies.
 """
 
 
+#: Square brackets, because the pages hold curly ones.
+ENVIRONMENT = jinja2.Environment(
+    undefined=jinja2.StrictUndefined,
+    variable_start_string="[[",
+    variable_end_string="]]",
+    block_start_string="[%",
+    block_end_string="%]",
+)
+
+
 def write_pages() -> None:
     """Write `generated/{task}.md` and a picture for every task."""
     PAGES.mkdir(exist_ok=True)
@@ -124,17 +134,10 @@ def write_pages() -> None:
     for name in dittogym.TASKS:
         spec, module = dittogym.make_spec(name), importlib.import_module(f"dittogym.tasks.{name}")
         picture(name)
-        environment = jinja2.Environment(
-            undefined=jinja2.StrictUndefined,
-            variable_start_string="[[",
-            variable_end_string="]]",
-            block_start_string="[%",
-            block_end_string="%]",
-        )
         title, what = headline(name)
         context: dict[str, Any] = {"spec": spec, "weights": spec.weights, "module": module}
-        notes = environment.from_string((NOTES / f"{name}.md").read_text()).render(context)
-        page = environment.from_string(TEMPLATE).render(
+        notes = ENVIRONMENT.from_string((NOTES / f"{name}.md").read_text()).render(context)
+        page = ENVIRONMENT.from_string(TEMPLATE).render(
             **context,
             title=title,
             what=what,
@@ -222,11 +225,11 @@ def centre(place: tuple[float | None, float | None]) -> str:
 
 def row(obstacle: Obstacle) -> tuple[str, str, str]:
     """Name, visibility and velocity rules of an obstacle."""
-    rules = "<br>".join(dict.fromkeys(map(rule, obstacle.velocity_rules)))
+    rules = "<br>".join(dict.fromkeys(map(describe, obstacle.velocity_rules)))
     return obstacle.name, "yes" if obstacle.observed_boxes else "no", rules
 
 
-def rule(rule: VelocityRule) -> str:
+def describe(rule: VelocityRule) -> str:
     """Describe a velocity rule."""
     ways = {"+x": "to the right", "-x": "to the left", "+y": "upwards", "-y": "downwards"}
     where = [
@@ -234,7 +237,9 @@ def rule(rule: VelocityRule) -> str:
         for axis, (low, high) in (("i", rule.i), ("j", rule.j))
         if (low, high) != (None, None)
     ]
-    hold = ", no slip" if math.isinf(rule.friction) else f", friction {rule.friction:g}" if rule.friction else ""
+    hold = f", friction {rule.friction:g}" if rule.friction else ""
+    if math.isinf(rule.friction):
+        hold = ", no slip"
     frame = " of the window" if rule.frame == "window" else ""
     return f"no motion {ways[rule.direction]}{hold}: {', '.join(where) or 'everywhere'}{frame}"
 

@@ -14,7 +14,7 @@ from test_solver import SIZES, scene  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning")
 SUBSTEPS = 100
-#: Particles as they are drawn, like in most programs; and ordered once, with the blocks that this pays off with.
+#: Particles in random order, and particles sorted by x with longer blocks for each thread.
 PEERS = ("taichi", "taichi-ordered")
 
 

@@ -26,7 +26,7 @@ physics = {"mu": stiffness, "gravity": torch.stack((torch.zeros(NUM), gravity), 
 batch.reset(seed=0, options={"physics": physics})
 
 # %%
-# The actions are a wave that travels to the left through the horizontal muscles.
+# The actions are a wave that travels to the left, the same for horizontal and vertical muscles.
 
 column = torch.arange(batch.action_resolution) / batch.action_resolution
 
@@ -60,7 +60,8 @@ figure.tight_layout()
 
 # %%
 # The simulations of a batch do not affect each other: element 13 moves as it does alone, bit for bit with the native
-# backend and to rounding with the others.
+# backend and to rounding with the others. Element i of a batch that is reset with seed s begins like a single
+# environment with seed s + i.
 
 alone = dittogym.TorchEnv("run", particles="lite", substeps=50)
 alone.reset(seed=13, options={"physics": {"mu": stiffness[13], "gravity": (0.0, gravity[13].item())}})

@@ -18,6 +18,7 @@ from torch.nn.functional import conv2d
 import dittogym
 from dittogym.observation.image import soft_silhouette
 
+# segment=None: no checkpoints, so the gradient is faster and needs more memory
 env = dittogym.TorchEnv("shapematch", resolution=16, particles="lite", target="star", segment=None)
 target = torch.as_tensor(env.spec.target, dtype=torch.float32)
 
@@ -42,11 +43,11 @@ def blurred(image: torch.Tensor, width: float) -> torch.Tensor:
 def episode(theta: torch.Tensor, width: float) -> tuple[torch.Tensor, float]:
     """Simulate an episode; return its loss, and its return."""
     env.reset(seed=0)
-    loss, total = torch.zeros(()), 0.0
+    loss, total, goal = torch.zeros(()), 0.0, blurred(target, width)
     for action in theta.tanh():
         _, reward, *_ = env.step(action[None])
         picture = soft_silhouette(env.soft_observation())[0]
-        loss = loss + (blurred(picture, width) - blurred(target, width)).abs().mean()
+        loss = loss + (blurred(picture, width) - goal).abs().mean()
         total += reward.item()
     return loss / len(theta), total
 

@@ -8,8 +8,8 @@ which a simulated robot, with different particles, produces the same recording.
 """
 
 # %%
-# The actions are a wave that stretches and shears the robot. They are zero in the last third, to observe how it
-# relaxes.
+# The actions are a wave that stretches and shears the robot. They are zero in the last four steps, to observe
+# how it relaxes.
 
 import math
 
@@ -27,9 +27,10 @@ GUESS = {"mu": 500.0, "yield_stress": 62.0}
 
 def muscles() -> Tensor:
     """Actions (STEPS, 1, 2, R, R)."""
-    row, column = torch.meshgrid(*[torch.arange(RESOLUTION) / RESOLUTION] * 2, indexing="ij")
+    places = torch.arange(RESOLUTION) / RESOLUTION
+    row, column = torch.meshgrid(places, places, indexing="ij")
     actions = torch.zeros(STEPS, 1, 2, RESOLUTION, RESOLUTION)
-    for step in range(2 * STEPS // 3):
+    for step in range(STEPS - 4):
         actions[step, 0, 0] = torch.sin(2 * math.pi * (column + 0.1 * step))
         actions[step, 0, 1] = -torch.cos(2 * math.pi * (row - 0.1 * step))
     return 0.8 * actions

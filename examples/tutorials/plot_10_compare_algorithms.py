@@ -11,6 +11,7 @@ optimised by gradient descent.
 # Options for single algorithms are given in a JSON file. This one limits the optimisation to 30 iterations with few
 # particles.
 
+import csv
 import json
 import subprocess
 import sys
@@ -42,7 +43,7 @@ print(run("--dry-run"))
 
 run()
 report = (out / "report.md").read_text()
-print(report[: report.index("##", report.index("## ") + 3)])
+print("\n## ".join(report.split("\n## ")[:2]))  # up to its first table
 
 # %%
 # The report is an HTML page, with tables as CSV files and plots in the same folder. Policies that observe nothing,
@@ -57,9 +58,8 @@ axis.axis("off")
 # %%
 # The tables can be read by any program:
 
-lines = (out / "returns.csv").read_text().splitlines()
-columns = lines[0].split(",")
-rows = [dict(zip(columns, line.split(","), strict=False)) for line in lines[1:]]
+with (out / "returns.csv").open(newline="") as file:
+    rows = list(csv.DictReader(file))
 for row in rows:
     print(f"{row['algo']:9s} {float(row['mean']):.0f}")
 means = {row["algo"]: float(row["mean"]) for row in rows}

@@ -2,10 +2,10 @@ r"""
 On a GPU, and on a cluster
 ==========================
 
-The same program runs on a CPU and, with ``device="cuda"``, on a GPU. They differ in the number of robots that is
-needed to use the whole device. This tutorial measures it on the machine on which the documentation was built. Nothing
-has been timed on a GPU yet; there, ``backend="native"`` selects the fused kernels, and the default is plain PyTorch
-operations.
+The same program runs on a CPU and, with ``device="cuda"``, on a GPU. A GPU needs many more robots in parallel than a
+CPU before all of it is busy. This tutorial measures the speed by the number of robots, on the machine on which the
+documentation was built. Nothing has been timed on a GPU yet; there, ``backend="native"`` selects the fused kernels, and
+the default is plain PyTorch operations.
 """
 
 # %%
@@ -66,6 +66,3 @@ figure.tight_layout()
 
 for size, alone, both in zip(sizes, forward, backward, strict=True):
     print(f"{size:3d} robots: {alone:7.0f} steps/s, with the gradient {both:6.0f}")
-
-assert max(forward) >= forward[0]
-assert all(a > b for a, b in zip(forward, backward, strict=True)), "gradients take time"

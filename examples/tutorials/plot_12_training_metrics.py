@@ -19,21 +19,12 @@ import matplotlib.pyplot as plt
 
 folder = tempfile.TemporaryDirectory()
 out = Path(folder.name) / "run"
-options = (
-    "--task shapematch --learner sac --seed 0 --num-envs 8 --particles 500 --batch-size 64 --update-start 64 --no-video"
-)
-budget = "--random-steps 120 40 --steps 1200 --handover 800 --gradient-steps 1 --log-every 40 --eval-every 400"
-command = [
-    sys.executable,
-    "-m",
-    "cfp.train",
-    "--out",
-    str(out),
-    "--eval-episodes",
-    "2",
-    *options.split(),
-    *budget.split(),
-]
+options = """
+    --task shapematch --learner sac --seed 0 --particles 500 --num-envs 8 --steps 1200 --handover 800
+    --batch-size 64 --gradient-steps 1 --update-start 64 --random-steps 120 40
+    --log-every 40 --eval-every 400 --eval-episodes 2 --no-video
+"""
+command = [sys.executable, "-m", "cfp.train", "--out", str(out), *options.split()]
 subprocess.run(command, check=True, capture_output=True)
 with (out / "progress.csv").open() as file:
     rows = list(csv.DictReader(file))

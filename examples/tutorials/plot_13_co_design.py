@@ -2,9 +2,9 @@ r"""
 Design body and controller together
 ===================================
 
-Gradients reach everything that goes into a simulation, also where the particles lie at the start and how stiff each of
-them is. This tutorial optimises a gait for RUN, first for the task's own round robot, and then together with the
-shape and the stiffness of the body.
+Gradients reach every input of a simulation, including the initial positions of the particles and the stiffness of
+each. This tutorial optimises a gait for RUN, first for the task's own round robot, and then together with the shape
+and the stiffness of the body.
 """
 
 # %%
@@ -13,7 +13,8 @@ shape and the stiffness of the body.
 #
 # The particles of the disc are moved to new places by a map that keeps areas, and with them masses: the body becomes
 # longer where it becomes lower. With $u$ from 0 at the rear end to 1 at the front, lengths are multiplied by $g(u)$,
-# heights above the floor by $1/g(u)$. Stiffness is multiplied by an exponential of a plane through $u$ and height.
+# heights above the floor by $1/g(u)$. Stiffness is multiplied by the exponential of a bounded linear function of
+# $u$ and height.
 
 import dataclasses
 import math
