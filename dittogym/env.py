@@ -190,19 +190,13 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         return first(as_numpy(observation))
 
     def render(self) -> np.ndarray | None:
-        """The picture (render_size, render_size, 3) uint8 in mode ``"rgb_array"``, else nothing."""
+        """The picture (S, S, 3) uint8 of ``render_size`` S in mode ``"rgb_array"``, else nothing."""
         if self.render_mode != "rgb_array":
             return None
         return self.torch_env.render(size=self.render_size, muscles=self.render_muscles)
 
     def film(
-        self,
-        policy: Any,
-        path: str | os.PathLike[str] | None = None,
-        *,
-        seed: int = 0,
-        max_steps: int | None = None,
-        **options: Any,
+        self, policy: Any, path: str | os.PathLike[str] | None = None, *, seed: int = 0, **options: Any
     ) -> Recording:
         """Reset, play an episode and record it; see :meth:`dittogym.TorchEnv.film`.
 
@@ -213,8 +207,8 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
                 ``predict``, as :func:`cfp.load` and stable-baselines3 return it.
             path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
             seed: Seed of the reset.
-            max_steps: Stop after this many steps if the episode is longer.
-            options: Such as ``size``, ``speed`` and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
+            options: ``max_steps``, after which the recording ends, and options of the file, such as ``size``, ``speed``
+                and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
 
         Returns:
             The recording, from which further films can be saved. A notebook shows it.
@@ -224,7 +218,7 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         def act_on_batch(images: np.ndarray) -> torch.Tensor:
             return as_tensor(act(images[0]), self.torch_env, single=True)
 
-        return film(self.torch_env, act_on_batch, path, seed, 0, max_steps, options)
+        return film(self.torch_env, act_on_batch, path, seed, **options)
 
     def _repr_png_(self) -> bytes | None:
         return self.torch_env._repr_png_()

@@ -323,14 +323,7 @@ class TorchEnv:
         return frame(describe(self.model), self.shot(index, ("muscle",)), size, zoom, muscles)
 
     def film(
-        self,
-        policy: Any,
-        path: str | os.PathLike[str] | None = None,
-        *,
-        seed: Seed = 0,
-        index: int = 0,
-        max_steps: int | None = None,
-        **options: Any,
+        self, policy: Any, path: str | os.PathLike[str] | None = None, *, seed: Seed = 0, index: int = 0, **options: Any
     ) -> Recording:
         """Reset, play an episode, and record one of the simulations until its episode ends.
 
@@ -340,8 +333,8 @@ class TorchEnv:
             path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
             seed: Seed of the reset.
             index: Which element of the batch.
-            max_steps: Stop after this many steps if the episode is longer.
-            options: Such as ``size``, ``speed`` and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
+            options: ``max_steps``, after which the recording ends, and options of the file, such as ``size``, ``speed``
+                and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
 
         Returns:
             The recording, from which further films can be saved. A notebook shows it.
@@ -350,7 +343,7 @@ class TorchEnv:
             ValueError: An option is out of range, the file does not take it, or the policy has another layout.
             TypeError: The policy is neither a function nor has a method ``predict``.
         """
-        return film(self, as_function(policy, self.action_layout), path, seed, index, max_steps, options)
+        return film(self, as_function(policy, self.action_layout), path, seed, index, **options)
 
     def _repr_png_(self) -> bytes | None:
         """What a notebook shows: the first simulation, once there is a state."""

@@ -197,7 +197,7 @@ class BatchEnv(JsonSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return as_numpy(observation)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """A picture for each simulation, (render_size, render_size, 3) uint8, in mode ``"rgb_array"``, else nothing."""
+        """A picture (S, S, 3) uint8 of ``render_size`` S of each simulation in mode ``"rgb_array"``, else nothing."""
         if self.render_mode is None:
             return None
         options: dict[str, Any] = {"size": self.render_size, "muscles": self.render_muscles}

@@ -221,7 +221,7 @@ def check_film_options(path: Any, options: dict[str, Any]) -> None:
 
 
 def film(
-    env: Any, act: Act, path: Any, seed: Any, index: int, max_steps: int | None, options: dict[str, Any]
+    env: Any, act: Act, path: Any, seed: Any, index: int = 0, *, max_steps: int | None = None, **options: Any
 ) -> Recording:
     """Record an episode, see :func:`record`, and save it if a ``path`` is given, see :meth:`Recording.save`."""
     check_film_options(path, options)  # before the episode
