@@ -78,8 +78,8 @@ def impulses(
 
     Returns:
         ``"gravity"``, ``"damping"`` and ``"boundary"``, each (B, 2), kg m/s. Their sum is the change of
-        :func:`momentum` over the substep while all particles are more than a cell from the ends of the window.
-        Internal forces and muscles cancel.
+        :func:`momentum` over the substep while all particles are more than a cell from the ends of the window, but for
+        the 1e-10 kg that are added to the mass of a node. Internal forces and muscles cancel.
     """
     _check(solver, state)
     scene = solver.scene(state, actuation, origin)

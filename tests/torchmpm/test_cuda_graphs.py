@@ -12,7 +12,7 @@ from scenes import lively, normal, robot, robot_and_ball
 from test_native_adjoint import assert_gradients_close, gradients, state_leaves
 from torch import Tensor
 
-from torchmpm import tree
+from torchmpm import Body, VonMises, tree
 from torchmpm.backends import compiler_found
 from torchmpm.native import operator
 from torchmpm.native.tables import Inputs
@@ -210,3 +210,17 @@ def test_within_a_graph_of_the_caller() -> None:
         planes = operator.native_step(*arguments)
     graph.replay()
     torch.testing.assert_close(planes[0], expected.x[..., 0], rtol=0, atol=1e-12)
+
+
+@pytest.mark.cuda
+def test_a_step_within_a_graph_of_the_caller() -> None:
+    """With values and gravity some of which are numbers, which must not be copied to the device in every step."""
+    mu = torch.full((100,), 500.0, dtype=torch.float64, device="cuda")[None]
+    solver = robot(100, bodies=(Body(100, VonMises(mu, 50.0, 60.0), mass=2.0),), backend="native")
+    state = lively(100).to("cuda")
+    expected = solver.step(state, substeps=5)
+    graph = torch.cuda.CUDAGraph()
+    with torch.no_grad(), torch.cuda.graph(graph):
+        found = solver.step(state, substeps=5)
+    graph.replay()
+    torch.testing.assert_close(found.x, expected.x, rtol=0, atol=1e-12)

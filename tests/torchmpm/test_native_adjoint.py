@@ -9,7 +9,7 @@ from native_scenes import NAMES, RULES, moving, solvers, values
 from scenes import lively, normal, robot
 from torch import Tensor
 
-from torchmpm import Body, Elastic, ParticleState, Snow, Solver, VonMises, trajectory
+from torchmpm import Body, Elastic, Grid, ParticleState, Snow, Solver, VelocityRule, VonMises, trajectory
 from torchmpm.backends import compiler_found
 from torchmpm.native import operator
 from torchmpm.native.cpu import call
@@ -159,16 +159,29 @@ def test_corners_have_the_derivatives_of_the_plain_substep(material: Elastic) ->
     assert_gradients_close(found, expected, 1e-10)
 
 
+def test_friction_that_just_stops_a_node_has_the_derivative_of_sliding() -> None:
+    particle = ParticleState.at_rest(torch.tensor([[[0.5, 0.5]]], dtype=torch.float64))
+    found = []
+    for backend in ("native", "eager"):
+        v = torch.tensor([[[1.0, -1.0]]], dtype=torch.float64, requires_grad=True)
+        body, rule = Body(1, Elastic(0.0, 0.0)), VelocityRule("-y", friction=1.0)
+        final = Solver(Grid(8), (body,), rules=(rule,), backend=backend).step(replace(particle, v=v))
+        assert not final.v.any()
+        found.append(torch.autograd.grad(final.v[..., 0].sum(), v)[0])
+    torch.testing.assert_close(*found)
+    assert found[0].tolist() == [[[pytest.approx(1.0), pytest.approx(1.0)]]]
+
+
 def test_threads_and_batch_make_no_difference() -> None:
-    """Bit by bit, as forward."""
-    given = state_leaves(2700, 3)
-    wanted = ("x", "F", "actuation", "origin")
+    """Bit by bit, as forward; also in constants that particles or simulations share."""
+    given = state_leaves(2700, 3) | value_leaves(2700, 3)
+    wanted = ("x", "F", "actuation", "origin", *value_leaves(3, 1))
     before = torch.get_num_threads()
     try:
         results = []
         for threads in (1, 2, 2, 5):
             torch.set_num_threads(threads)
-            results.append(gradients(lambda _: solvers(2700, 3)["three bodies"], given, wanted, 8, "native"))
+            results.append(gradients(lambda leaves: varied(2700, leaves), given, wanted, 8, "native"))
     finally:
         torch.set_num_threads(before)
     for result in results[1:]:

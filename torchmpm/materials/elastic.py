@@ -22,7 +22,7 @@ def corotated_stress(F: Mat2, mu: Value, lam: Value, J: Tensor | None = None) ->
 
 
 def corotated_energy(F: Mat2, mu: Value, lam: Value, J: Tensor | None = None) -> Tensor:
-    """Energy mu |F - R|^2 + lam/2 (J - 1)^2, whose derivative is :func:`corotated_stress`, (B, N), J/m^2."""
+    """Energy mu |F - R|^2 + lam/2 (J - 1)^2, (B, N), J/m^2; :func:`corotated_stress` is its derivative times F^T."""
     distance = sum((f - r).square() for f, r in zip(F, orthogonal(F), strict=True))
     return mu * distance + 0.5 * lam * ((det(F) if J is None else J) - 1.0).square()
 

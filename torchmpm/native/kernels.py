@@ -22,7 +22,7 @@ from torchmpm.state import ParticleState
 
 #: A node remembers its rule in one byte.
 MAX_RULES = 254
-#: Addresses within one simulation have 32 bits; a node has at most eight numbers.
+#: Addresses within one simulation have 32 bits on CUDA, where a node has at most eight numbers.
 MAX_RESOLUTION, MAX_PARTICLES = 16_000, 2**30
 #: The tape on CUDA takes no more than this, bytes.
 CUDA_TAPE_BYTES = 2**31
@@ -97,7 +97,7 @@ class Kernels:
         """Advance a state (B, N) whose arguments were checked; see :meth:`torchmpm.Solver.step`."""
         origin = origin.contiguous()
         actuation = None if actuation is None else actuation.contiguous()
-        given = gravity if isinstance(gravity, Tensor) else upload(gravity, state.Jp)
+        given = gravity if isinstance(gravity, Tensor) else upload(tuple(gravity), state.dtype, state.device)
         gravity = given.to(state.Jp).expand(state.batch_size, 2).contiguous()
         values, shift = self.values(state.Jp), node_shift(self.grid, origin)
         planes = state.stack()

@@ -1,14 +1,15 @@
 """Inputs of the kernels: a solver as typed tables built once, a table of its constants, and the tensors of a call."""
 
 import ctypes
+import itertools
 import math
-import threading
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchmpm.backends import cached_tensors
 from torchmpm.boundary import VelocityRule, limits
 from torchmpm.grid import Grid
 from torchmpm.materials.base import Value, broadcast_plane
@@ -96,9 +97,9 @@ class Inputs(NamedTuple):
         )
 
 
-_lock = threading.Lock()
 _handles: dict[bytes, int] = {}
-_by_handle: list[Tables] = []
+_by_handle: dict[int, Tables] = {}
+_next_handle = itertools.count()
 
 
 def make_tables(grid: Grid, bodies: Sequence[Body], rules: Sequence[VelocityRule], dt: float, damping: float) -> int:
@@ -108,12 +109,11 @@ def make_tables(grid: Grid, bodies: Sequence[Body], rules: Sequence[VelocityRule
     body_tables = (BodyTable * len(bodies))(*_body_tables(bodies, dt))
     numbers = (grid.h, dt, grid.margin, grid.extent, damping, MASS_EPSILON, STRETCH_FLOOR)
     key = bytes(Tables(grid.resolution, len(bodies), len(rules), *numbers)) + bytes(body_tables) + bytes(rule_tables)
-    with _lock:
-        if key not in _handles:
-            sizes = (grid.resolution, len(bodies), len(rules))
-            _by_handle.append(Tables(*sizes, *numbers, body_tables, rule_tables))
-            _handles[key] = len(_by_handle) - 1
-        return _handles[key]
+    if key not in _handles:
+        handle = next(_next_handle)  # another thread may do the same at this moment, with a handle of its own
+        _by_handle[handle] = Tables(grid.resolution, len(bodies), len(rules), *numbers, body_tables, rule_tables)
+        _handles.setdefault(key, handle)
+    return _handles[key]
 
 
 def tables_of(handle: int) -> Tables:
@@ -151,10 +151,11 @@ def _rule_table(rule: VelocityRule, slot: int) -> RuleTable:
     return RuleTable(axis, rule.frame == "world", slot, sign, *limits(rule.i), *limits(rule.j), rule.friction)
 
 
-def upload(numbers: Sequence[float], like: Tensor) -> Tensor:
-    """Numbers as a tensor of the dtype and on the device of ``like``; does not wait for the device."""
-    host = torch.tensor(numbers, dtype=like.dtype, device="cpu")
-    return host.pin_memory().to(like.device, non_blocking=True) if like.is_cuda else host
+@cached_tensors
+def upload(numbers: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Numbers as a tensor; does not wait for the device."""
+    host = torch.tensor(numbers, dtype=dtype, device="cpu")
+    return host.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else host
 
 
 def make_values(bodies: Sequence[Body], dt: float, h: float, like: Tensor) -> Tensor:
@@ -166,9 +167,10 @@ def make_values(bodies: Sequence[Body], dt: float, h: float, like: Tensor) -> Te
     for body, part in slices(bodies):
         rows = _rows(body, -dt * (4.0 / h**2), like[:, part])
         if all(isinstance(row, (int, float)) for row in rows):
-            tables.append(upload([float(row) for row in rows], like).view(VALUES, 1, 1))
+            tables.append(upload(tuple(float(row) for row in rows), like.dtype, like.device).view(VALUES, 1, 1))
         else:
-            planes = [torch.as_tensor(row, dtype=like.dtype, device=like.device) for row in rows]
+            # On CUDA, new_full only launches a kernel, where a copy of a number would wait for the device.
+            planes = [row.to(like) if isinstance(row, Tensor) else like.new_full((1, 1), row) for row in rows]
             planes = [plane.reshape(1, 1) if plane.ndim == 0 else plane for plane in planes]
             tables.append(torch.stack(torch.broadcast_tensors(*planes)))
     batch = max(table.shape[1] for table in tables)

@@ -112,7 +112,7 @@ private:
         const bool actuated = body.muscle && scene.muscles;
         if (actuated) {
             field.read(scene, at, work.field);
-            sample(field, at, actuation);
+            actuation_from_nodes(field, at, actuation);
         } else if (scene.muscles) {
             actuation.none();
         }

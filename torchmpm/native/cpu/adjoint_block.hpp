@@ -16,7 +16,7 @@ struct alignas(64) Nodes {
 };
 
 // Muscle actuation from the nodes that were read.
-PASS void sample(const Nodes& field, const Stencil& at, Actuation& out) {
+PASS void actuation_from_nodes(const Nodes& field, const Stencil& at, Actuation& out) {
 #pragma omp simd
     for (int k = 0; k < LANES; ++k) {
         Real sum[2] = {0, 0};

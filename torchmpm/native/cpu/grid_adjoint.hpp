@@ -11,7 +11,7 @@ INLINE void constrain_adjoint(const Rule& rule, const Real (&v)[2], Real (&bar)[
     if (std::isinf(rule.friction)) {
         tangent_bar = 0;
     } else if (rule.friction != 0) {
-        const bool slides = std::abs(tangent) - rule.friction * std::abs(normal) > 0;
+        const bool slides = std::abs(tangent) - rule.friction * std::abs(normal) >= 0;
         const Real drag = (tangent > 0) == (normal > 0) ? -rule.friction * tangent_bar : rule.friction * tangent_bar;
         if (slides) normal_bar = drag;
         if (!slides) tangent_bar = 0;

@@ -90,8 +90,7 @@ INLINE void von_mises_adjoint(const Values& m, Bounds bounds, Mat2 F, MaterialBa
     bar.R.sin += yields ? grow_total * v_bar.m2 : 0;
     const Real n1 = yields ? grow_difference * v_bar.n1 + along * v.n1 : 0;
     const Real n2 = yields ? grow_difference * v_bar.n2 + along * v.n2 : 0;
-    const Mat2 through{yields ? 0 : F_bar.a, yields ? 0 : F_bar.b, yields ? 0 : F_bar.c, yields ? 0 : F_bar.d};
-    F_bar = through + join(adjoint(R, bar.R, n1, n2));
+    F_bar = select(yields, Mat2{}, F_bar) + join(adjoint(R, bar.R, n1, n2));
 }
 
 // Repeats the lines of snow_return: a struct of intermediate values would keep the compiler from vectorising the return

@@ -20,9 +20,10 @@ struct Box {
     }
 };
 
+// Weights and distances are zero for particles that do not take part.
 struct alignas(64) Stencil {
     Real wx[3][LANES], wy[3][LANES];  // weights
-    Real fx[LANES], fy[LANES];        // distance from the first node in cells; all zero for others
+    Real fx[LANES], fy[LANES];        // distance from the first node in cells
     Real on[LANES];                   // 1 for particles that take part, 0 for others
     int32_t node[LANES];              // first node
     Box box;                          // all nodes of particles that take part

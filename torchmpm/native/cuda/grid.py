@@ -73,7 +73,7 @@ def constrain_adjoint(rules, code, vx, vy, bar_x, bar_y, SLOT: tl.constexpr):
     on_y, friction, normal, tangent, hit = read_rule(rules, code, vx, vy, SLOT)
     normal_bar, tangent_bar = tl.where(on_y, bar_y, bar_x), tl.where(on_y, bar_x, bar_y)
     rubs = hit & (friction != 0)
-    slides = rubbed(tangent, normal, friction) > 0
+    slides = rubbed(tangent, normal, friction) >= 0
     drag = tl.where((tangent > 0) == (normal > 0), -friction, friction) * tangent_bar
     normal_bar = tl.where(hit, tl.where(rubs & slides, drag, 0.0), normal_bar)
     tangent_bar = tl.where(rubs & (slides == 0), 0.0, tangent_bar)

@@ -84,7 +84,7 @@ class Program:
             self.over_particles(particles_pass, *end, FINISH=True, BEGIN=False, **flags)
 
     def over_nodes(self, kernel: Any, *buffers: Tensor, bars: tuple[Tensor, ...] = ()) -> None:
-        """Launch a pass over the nodes: ``buffers`` are sums, node_bars, and the box of the substep."""
+        """Launch a pass over the nodes: ``buffers`` are sums, velocities or their derivatives, and a box."""
         tables, inputs = self.tables, self.inputs
         programs = max(1, min(-(-self.cells // BLOCK), NODE_PROGRAMS // self.batch))
         tensors = (*buffers, self.codes, self.device_tables.rules, inputs.gravity, *bars, self.device_tables.constants)
