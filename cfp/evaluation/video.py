@@ -19,7 +19,7 @@ from cfp.evaluation.evaluate import Noise, evaluation_seed, without_noise
 from cfp.policy_protocols import Policy
 from dittogym import TorchEnv
 from dittogym.render.film import VideoUnavailable
-from dittogym.render.recording import Act, Recording, check_film, record
+from dittogym.render.recording import Act, Recording, check_options, record
 
 Recorded = TypeVar("Recorded")
 
@@ -59,13 +59,13 @@ def check_files(paths: Mapping[str, Path | None], options: Mapping[str, Any]) ->
         ConfigError: A file has another suffix than what it is to hold, or an option is out of range.
     """
     for name, path in paths.items():
-        if path is not None and (name == "replay") != (path.suffix == ".html"):
-            allowed = "in .html" if name == "replay" else "in .mp4, .gif, .webp or .png"
-            raise ConfigError(f"{name} must end {allowed}, got {path}")
-        try:
-            check_film(path or "none.mp4", **options)
-        except ValueError as error:
-            raise ConfigError(str(error).replace("path", name, 1)) from error
+        allowed = (".html",) if name == "replay" else (".mp4", ".gif", ".webp", ".png")
+        if path is not None and path.suffix not in allowed:
+            raise ConfigError(f"{name} must end in {' or '.join(allowed)}, got {path}")
+    try:
+        check_options(**options)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
 
 
 def save_media(

@@ -35,8 +35,8 @@ def with_body(spec: TaskSpec, body: BodyLike) -> TaskSpec:
         spec: The task.
         body: The path of an image or an array (H, W), (H, W, 3), (H, W, 4), read by
             :func:`dittogym.bodies.images.read_mask`; corners (K, 2) of an outline with x to the right and y upwards, in
-            any unit; a shape of
-            :mod:`dittogym.bodies.shapes` in world coordinates; or a :class:`dittogym.spec.BodySpec`.
+            any unit; a shape of :mod:`dittogym.bodies.shapes` in world coordinates; or a
+            :class:`dittogym.spec.BodySpec`.
 
     Raises:
         ValueError: Not readable as one of these, or empty.

@@ -26,7 +26,11 @@ Direction: TypeAlias = Literal["left", "right", "up", "down"]
 
 @dataclass(frozen=True)
 class Grip:
-    """Particles that are pulled at: their indices (n,), weights (n, 1) from 0 to 1, and where they are held (2,), m."""
+    """Particles that are pulled at.
+
+    Their indices (n,), weights (n, 1) from 0 to 1, and the ``offset`` (2,), m, from their weighted centre to the place
+    at which they are held.
+    """
 
     indices: Tensor
     weights: Tensor

@@ -21,6 +21,8 @@ HIDDEN = 65535
 #: The head of a frame: whole numbers, then floating point ones; see :func:`pack_frame`.
 HEAD = struct.Struct("<9I8f")
 
+#: Bounded, so that squares of distances are finite.
+Metres: TypeAlias = Annotated[float, Meta(ge=-1e4, le=1e4)]
 Count: TypeAlias = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 Pixels: TypeAlias = Annotated[bytes, Meta(min_length=64, max_length=2**16)]
 
@@ -55,8 +57,8 @@ class Hand(Message, frozen=True):
     """What the pointer does at a point of the world, m; without a tool it lets go. Frames echo the last ``id``."""
 
     tool: Literal["pull", "contract", "expand", None]
-    x: float = 0.0
-    y: float = 0.0
+    x: Metres = 0.0
+    y: Metres = 0.0
     id: Count = 0
 
 

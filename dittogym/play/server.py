@@ -16,13 +16,14 @@ from typing import Any
 import torch
 import uvicorn
 from starlette.applications import Starlette
-from starlette.datastructures import Headers, QueryParams
+from starlette.datastructures import Headers, MutableHeaders, QueryParams
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from dittogym.play import protocol
@@ -70,7 +71,8 @@ class Server:
                 WebSocketRoute("/ws", self.play),
                 Mount("/page", StaticFiles(directory=PAGE)),
             ],
-            middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS)],  # not other names of this machine
+            # Not under other names of this machine.
+            middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS), Middleware(WithHeaders)],
         )
         self._socket = socket.create_server((HOSTS[0], checks.whole("port", port, 0, 65535)))
         self.port: int = self._socket.getsockname()[1]
@@ -95,7 +97,7 @@ class Server:
         """Serve the page."""
         if not has_token(request.query_params, self.token):
             return PlainTextResponse("Open the address that the program printed; it ends in a token.", 403)
-        return FileResponse(PAGE / "index.html", headers=HEADERS)
+        return FileResponse(PAGE / "index.html")
 
     async def play(self, websocket: WebSocket) -> None:
         """Play with a page until it is closed."""
@@ -114,6 +116,23 @@ class Server:
             await connection.run(self.new_session)
         finally:
             self.connections.discard(connection)
+
+
+class WithHeaders:
+    """Middleware that adds :data:`HEADERS` to all responses."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(HEADERS)
+            await send(message)
+
+        await self.app(scope, receive, send_with_headers)
 
 
 def has_token(query: QueryParams, token: str) -> bool:
@@ -189,9 +208,10 @@ class Connection:
             pace.count(taken)
             for answer in answers:
                 await self.websocket.send_json(answer)
-            if terms != (terms := list(session.terms)):
+            if terms != list(session.terms):
+                terms = list(session.terms)
                 await self.websocket.send_json({"type": "terms", "names": terms})
-            if taken or messages or fresh:
+            if taken or messages or answers or fresh:
                 fresh = False
                 await self.websocket.send_bytes(session.frame(pace.rate))
                 self.sent += 1

@@ -20,7 +20,7 @@ from dittogym.model import check_stability
 from dittogym.physics import check_effect, physics_values
 from dittogym.play import protocol
 from dittogym.play.hand import Direction, Grip, press, reach, wave
-from dittogym.play.moment import Moment, stacked
+from dittogym.play.saved import SavedEpisode, same_physics, stacked
 from dittogym.render.recording import Recording
 from dittogym.render.scene import Shot, describe
 from dittogym.tasks import TASKS, headline, task_name
@@ -83,7 +83,7 @@ class Session:
         self.policy_name: str | None = None
         self.hand = protocol.Hand(None)
         self.physics: dict[str, Any] = {}
-        self.moment: Moment | None = None
+        self.saved: SavedEpisode | None = None
         self.num_frames = self.num_steps = 0
         self._reset(seed)
         self._apply_policy(protocol.Policy(policy))
@@ -107,6 +107,7 @@ class Session:
             "speed": self.speed,
             "colour": self.colour,
             "terms": list(self.terms),
+            "saved": self.saved is not None,
         }
         return describe(self.env.model).as_json() | about
 
@@ -266,14 +267,15 @@ class Session:
         if message.name is not None and message.name not in self.policies:
             raise ValueError(f"name must be one of {', '.join(self.policies) or 'none'}, got {message.name!r}")
         policy: Any = None if message.name is None else self.policies[message.name]()
-        resolution = self.own_resolution if policy is None else policy.resolution
-        if resolution != self.env.action_resolution:
+        env, resolution = self.env, self.own_resolution if policy is None else policy.resolution
+        if resolution != env.action_resolution:
             env = TorchEnv(self.task, 1, **{**self.options, "resolution": resolution})
             env.reset(seed=self.seed, options={"physics": self.physics})
             env.env_state = self.env.env_state
-            self.env, self.painted = env, np.zeros(env.action_shape, np.float32)
-            self.action = self.painted
-        self.policy = policy.attached(self.env) if hasattr(policy, "attached") else policy
+        self.policy = policy.attached(env) if hasattr(policy, "attached") else policy
+        if env is not self.env:
+            self.env = env
+            self.action = self.painted = np.zeros(env.action_shape, np.float32)
         self.policy_name, self.memory, self.gate = message.name, None, np.zeros((2, 0, 0), np.float32)
         return [{"type": "policy", "name": message.name, "reach": reach(self.env.spec.patch / NODES, resolution)}]
 
@@ -299,10 +301,9 @@ class Session:
     def _apply_save(self, message: protocol.Save) -> Answers:
         file, name = io.BytesIO(), f"{self.env.spec.name}-{self.shot.step}"
         if message.what == "moment":
-            name, ends = f"{name}.pt", (self.terminated, self.truncated, self.success, self.invalid)
-            past = self.env.save(), self.total, *ends, self.seed, self.actions, self.recording, self.touched
-            self.moment = Moment(*past).copy()
-            torch.save(self.moment.snapshot, file)
+            past = {field: getattr(self, field) for field in SavedEpisode._fields[1:]}
+            name, self.saved = f"{name}.pt", SavedEpisode(self.env.save(), **past).copy()
+            torch.save(self.saved.snapshot, file)
         elif not self.actions:
             raise ValueError(f"{message.what} must be of at least one step, got none since the reset")
         elif message.what == "actions":
@@ -314,18 +315,19 @@ class Session:
             file.write(self.recording.page().encode())
         return [{"type": "file", "name": name, "content": base64.b64encode(file.getvalue()).decode()}]
 
-    def _apply_back(self, message: protocol.Back) -> None:
-        if self.moment is None:
+    def _apply_back(self, message: protocol.Back) -> Answers:
+        if self.saved is None:
             raise ValueError("there is no moment to go back to: save one first")
-        then = self.moment.copy()  # what came after it did not happen
-        self.total, self.terminated, self.truncated = then.total, then.terminated, then.truncated
-        self.success, self.invalid = then.success, then.invalid
-        self.seed, self.actions, self.recording = then.seed, then.actions, then.recording
+        then = self.saved.copy()  # what came after it did not happen
+        for name in SavedEpisode._fields[1:]:
+            setattr(self, name, getattr(then, name))
         self.observation, state = self.env.load(then.snapshot), self.env.env_state
         values = physics_values(self.physics, 1, self.env.num_particles, state.centre[:, 0])
         self.env.env_state = replace(state, physics=values)
         self.grip, self.memory, self.shot = None, None, self.env.shot()
-        self.touched = list(dict.fromkeys((*then.touched, *self.touched, "went back to a saved moment")))
+        if not same_physics(state.physics, values):
+            self._note(CHANGED_MATTER)
+        return [{"type": "reset"}]
 
     def _apply_draw(self, message: protocol.Draw) -> Answers:
         size = round(len(message.pixels) ** 0.5)
@@ -339,10 +341,10 @@ class Session:
             try:
                 self.env = TorchEnv(self.task, 1, **{**self.options, "resolution": self.env.action_resolution})
                 self._reset(self.seed)
-            except Exception:  # a task of the user's may raise anything
+                self._apply_policy(protocol.Policy(self.policy_name))
+            except Exception:  # a task or a policy of the user's may raise anything
                 self.env, self.options = old
                 raise
-        self.moment = None
-        self._apply_policy(protocol.Policy(self.policy_name))
+        self.saved = None
         notices = ({"type": "notice", "message": str(warning.message)} for warning in caught)
         return [{"type": "hello", **self.describe()}, {"type": "reset"}, *notices]

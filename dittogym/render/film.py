@@ -7,13 +7,14 @@ from collections.abc import Iterable, Iterator
 from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from PIL import Image
 
 from dittogym.render.files import replacing
 
+Frame = TypeVar("Frame")
 #: The unit in which a format counts the time of a picture, s; a film has the nearest rate that is possible.
 UNITS = {".gif": 0.01, ".webp": 0.001, ".mp4": None}
 
@@ -25,6 +26,12 @@ class VideoUnavailable(ImportError):
 def available() -> bool:
     """Whether the optional packages that write MP4 files are installed."""
     return bool(find_spec("imageio") and find_spec("imageio_ffmpeg"))
+
+
+def check_available() -> None:
+    """Raise `VideoUnavailable` unless MP4 files can be written."""
+    if not available():
+        raise VideoUnavailable("MP4 needs imageio with ffmpeg: pip install 'torchmpm[video]'")
 
 
 def possible_rate(suffix: str, rate: float) -> float:
@@ -48,13 +55,13 @@ def write_film(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
         if path.suffix == ".mp4":
             _write_mp4(aside, frames, rate)
         else:
-            pictures = (Image.fromarray(frame) for frame in _held(frames, round(rate)))
+            pictures = _held(map(Image.fromarray, frames), round(rate))
             quality: Any = {"quality": 75, "method": 3} if path.suffix == ".webp" else {}
             first, duration = next(pictures), round(1000 / rate)
             first.save(aside, save_all=True, append_images=pictures, duration=duration, loop=0, **quality)
 
 
-def _held(frames: Iterable[np.ndarray], times: int) -> Iterator[np.ndarray]:
+def _held(frames: Iterable[Frame], times: int) -> Iterator[Frame]:
     """The pictures, and the last one some more times."""
     for frame in frames:
         yield frame
@@ -62,8 +69,7 @@ def _held(frames: Iterable[np.ndarray], times: int) -> Iterator[np.ndarray]:
 
 
 def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
-    if not available():
-        raise VideoUnavailable("MP4 needs imageio with ffmpeg: pip install 'torchmpm[video]'")
+    check_available()
     import imageio.v2 as imageio
 
     options: dict[str, Any] = {"codec": "libx264", "pixelformat": "yuv420p", "macro_block_size": 2, "quality": 8}

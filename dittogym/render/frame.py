@@ -55,7 +55,8 @@ def pace(speed: float) -> str:
     """A playback speed in words; 1 is real time."""
     if speed == 1:
         return "real time"
-    return f"{1 / speed:.2g} times slower" if speed < 1 else f"{speed:.2g} times faster"
+    factor, word = (1 / speed, "slower") if speed < 1 else (speed, "faster")
+    return f"{factor:.0f} times {word}" if factor >= 9.95 else f"{factor:.2g} times {word}"
 
 
 def png(picture: np.ndarray) -> bytes:

@@ -16,7 +16,7 @@ from PIL import Image
 
 from dittogym.action import ActionIndexing, trained_indexing
 from dittogym.render.files import replacing
-from dittogym.render.film import UNITS, possible_rate, write_film
+from dittogym.render.film import UNITS, check_available, possible_rate, write_film
 from dittogym.render.frame import frame, pace
 from dittogym.render.replay import SHOWN, replay_page
 from dittogym.render.scene import Scene, Shot, check_view, describe
@@ -197,13 +197,25 @@ def check_film(
     path = Path(path)
     if path.suffix not in OPTIONS:
         raise ValueError(f"path must end in one of {', '.join(OPTIONS)}, got {str(path)!r}")
+    check_options(size, rate, speed, zoom, muscles, pictures)
+    return path
+
+
+def check_options(
+    size: int = 512,
+    rate: float = 30.0,
+    speed: float | None = None,
+    zoom: float | None = None,
+    muscles: bool = True,
+    pictures: int = 6,
+) -> None:
+    """Check the options of :meth:`Recording.save`."""
     check_view(size, zoom)
     checks.number("rate", rate, above=0.0)
     if speed is not None:
         checks.number("speed", speed, above=0.0)
     checks.flag("muscles", muscles)
     checks.whole("pictures", pictures, 1)
-    return path
 
 
 def check_film_options(path: Any, options: dict[str, Any]) -> None:
@@ -213,6 +225,8 @@ def check_film_options(path: Any, options: dict[str, Any]) -> None:
         raise TypeError(f"film got an unexpected keyword argument {unknown[0]!r}; it takes {', '.join(known)}")
     if path is not None:
         suffix = check_film(path, **options).suffix
+        if suffix == ".mp4":
+            check_available()
         if unused := [name for name in options if name not in OPTIONS[suffix]]:
             allowed = ", ".join(OPTIONS[suffix])
             raise ValueError(f"{unused[0]} must not be given with a path that ends in {suffix}, which takes {allowed}")

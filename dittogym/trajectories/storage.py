@@ -60,6 +60,7 @@ def load_episodes(path: str | os.PathLike[str]) -> list[Episode]:
 
     Raises:
         ValueError: It is damaged, or not such a file.
+        OSError: It cannot be opened.
     """
     with open(path, "rb") as file:
         try:

@@ -182,8 +182,8 @@ def test_video_and_replay_or_how_to_install(finished, tmp_path, monkeypatch, cap
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ("--video film.html", "video must end in .mp4, .gif, .webp or .png, got film.html"),
-        ("--video film.avi", "video must end in one of .gif, .webp, .mp4"),
+        ("--video film.html", "video must end in .mp4 or .gif or .webp or .png, got film.html"),
+        ("--video film.avi", "video must end in .mp4 or .gif or .webp or .png, got film.avi"),
         ("--replay film.mp4", "replay must end in .html, got film.mp4"),
         ("--video film.mp4 --size 3", "size must be at least 16, got 3"),
     ],

@@ -20,7 +20,7 @@ from tiny import SMALL
 
 import dittogym
 from dittogym.render import files
-from dittogym.render.film import write_film
+from dittogym.render.film import VideoUnavailable, write_film
 from dittogym.render.frame import pace
 from dittogym.render.recording import Recording, as_function
 
@@ -53,6 +53,12 @@ def test_a_recording_is_the_episode(recording: Recording) -> None:
     assert recording.rewards == pytest.approx(rewards, abs=1e-3) and recording.duration == pytest.approx(0.2)
     assert recording.success is False and np.array_equal(recording.observation, observation[0])
     assert recording.default_speed == 0.05  # 4 s
+
+
+def test_without_the_packages_for_mp4_no_episode_is_played(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
+    monkeypatch.setattr("dittogym.render.film.find_spec", lambda name: None)
+    with pytest.raises(VideoUnavailable, match="MP4 needs imageio"):
+        dittogym.TorchEnv("kick", **SMALL).film(lambda observation: pytest.fail("played"), tmp_path / "film.mp4")
 
 
 @pytest.mark.parametrize("limit", [3, 50])
@@ -123,8 +129,8 @@ def test_pictures_of_a_film(recording: Recording) -> None:
     moved = recording.shots[10]._replace(x=(first + second) / 2)
     middle = replace(recording, shots=[moved]).picture(0.0)
     assert (np.abs(near.astype(int) - middle).max(-1) > 60).mean() < 0.01
-    assert [pace(speed) for speed in (1, 0.05, 0.3, 2)] == [
-        "real time", "20 times slower", "3.3 times slower", "2 times faster",
+    assert [pace(speed) for speed in (1, 0.05, 0.003, 0.3, 2)] == [
+        "real time", "20 times slower", "333 times slower", "3.3 times slower", "2 times faster",
     ]  # fmt: skip
 
 

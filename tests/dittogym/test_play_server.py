@@ -90,7 +90,9 @@ def test_page_and_token(server: Server) -> None:
     code, page, headers = status(server, "/?token=secret")
     assert code == 200 and "default-src 'self'" in headers["content-security-policy"]
     assert "http" not in page  # nothing comes from elsewhere
-    assert status(server, "/page/main.js")[0] == 200 and status(server, "/page/../server.py")[0] == 404
+    code, _, headers = status(server, "/page/main.js")
+    assert code == 200 and headers["cache-control"] == "no-store"
+    assert status(server, "/page/../server.py")[0] == 404
     assert status(server, "/?token=secret", host="example.org")[0] == 400
 
 
@@ -122,6 +124,21 @@ def test_malformed_messages_are_answered_and_survived(server: Server) -> None:
             receive(page, "error")
     with open_page(server) as page:
         receive(page, "hello")
+
+
+def test_a_page_sees_that_time_has_stopped_after_an_error() -> None:
+    session = Session("run", **SMALL)
+    session.advance()  # compiles the kernels
+    session.policy = object()  # which cannot act
+    server = Server(lambda: session, "secret", port=0)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    with open_page(server) as page:
+        receive(page, "error")
+        number, *_, flags = HEAD.unpack_from(page.recv(timeout=60))[:4]
+        assert number and not flags & 1
+    server.stop()
+    thread.join(10)
 
 
 def test_time_stops_and_goes_on_in_single_steps(server: Server) -> None:

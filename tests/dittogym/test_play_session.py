@@ -239,6 +239,25 @@ def test_the_reach_of_the_hand_follows_the_resolution() -> None:
     assert fine == {"pull": REACH, "muscles": MUSCLE_REACH} and coarse["muscles"] == pytest.approx(0.6 * 0.5 / 8)
 
 
+def test_going_back_to_a_moment_of_other_matter_is_told() -> None:
+    played = session()
+    played.advance()
+    played.apply(Save("moment"))
+    played.apply(protocol.Matter(stiffness=2, yield_stress=1, gravity=9))
+    assert played.apply(protocol.Back()) == [{"type": "reset"}] and played.touched == ["other matter or gravity"]
+    assert played.describe()["saved"] and not session().describe()["saved"]
+
+
+def test_a_policy_that_cannot_act_changes_nothing() -> None:
+    broken = Constant(resolution=4)
+    broken.attached = lambda env: int("no")
+    played = session(policies={"broken": lambda: broken})
+    env = played.env
+    with pytest.raises(ValueError, match="invalid literal"):
+        played.apply(protocol.Policy("broken"))
+    assert played.env is env and played.policy is None and played.painted.shape == env.action_shape
+
+
 def test_files_after_going_back_are_of_what_led_there() -> None:
     """In the same episode, twice, and from a later one of another seed."""
     played = session(seed=3)
@@ -261,7 +280,7 @@ def test_files_after_going_back_are_of_what_led_there() -> None:
     (answer,) = played.apply(Save("actions"))
     saved = np.load(io.BytesIO(base64.b64decode(answer["content"])))
     assert np.array_equal(saved["actions"][:6], kept) and len(saved["actions"]) == 7 and saved["seed"] == 3
-    assert "went back to a saved moment" in saved["touched"]
+    assert not len(saved["touched"]), "the actions alone repeat the episode"
     env = TorchEnv("run", **SMALL)
     env.reset(seed=3)
     for action in saved["actions"]:
@@ -351,6 +370,7 @@ BAD = {
     '{"type": "hand", "tool": "bite"}': "Invalid enum value 'bite' - at `$.tool`",
     '{"type": "hand", "tool": "pull", "x": "0"}': "Expected `float`, got `str` - at `$.x`",
     '{"type": "hand", "tool": "pull", "x": 1e999}': "Number out of range - at `$.x`",
+    '{"type": "hand", "tool": "pull", "y": 1e39}': "Expected `float` <= 10000.0 - at `$.y`",
     '{"type": "hand", "tool": "pull", "id": -1}': "Expected `int` >= 0 - at `$.id`",
     '{"type": "reset", "seed": 1.5}': "Expected `int | null`, got `float` - at `$.seed`",
     '{"type": "paint", "muscles": "both", "value": 1, "cells": []}': "length >= 1 - at `$.cells`",

@@ -35,7 +35,7 @@ function decode(buffer, flags) {
   const [originX, originY, x, y, cornerX, cornerY, total, rate] = take(Float32Array, 8);
   const frame = { number, step, echo, resolution, origin: [originX, originY], centre: [x, y], corner: [cornerX, cornerY], total, rate };
   flags.forEach((name, bit) => { frame[name] = Boolean(bits >> bit & 1); });
-  frame.rewards = Array.from({ length: rows }, () => take(Float32Array, width));
+  frame.rewards = Array.from({ length: rows }, () => take(Float32Array, width).slice());  // not a view, which would keep the frame
   frame.positions = take(Uint16Array, 2 * count);
   frame.colours = take(Uint8Array, count);
   frame.observation = take(Uint8Array, 3 * 64 * 64);

@@ -10,7 +10,7 @@ const scene = new Scene($("scene")), plot = new Plot($("plot"), $("terms"));
 const observation = new Images($("observation"), ["occupancy", "velocity →", "velocity ↑"]);
 const actions = new Images($("action"), ["horizontal", "vertical"]);
 const gates = new Images($("action"), ["gate, hor.", "gate, vert."]);
-const ui = { tool: "pull", colour: "deformation", pointer: null, brush: false };
+const ui = { tool: "pull", colour: "deformation", pointer: null, brush: false, wave: null };
 let task = null, frame = null, fresh = false, ids = 0, shades = null, policy = null, chosen = false, toldSlow = false;
 const presses = new Map();
 // For tests and the console: frames drawn, and milliseconds from the pointer to the frame that it has changed.
@@ -31,6 +31,7 @@ const link = new Link({
     options($("colour"), Object.keys(task.scales).map((name) => [name, name]), ui.colour);
     policy = task.policy ?? policy;
     pad.setTask(task);
+    $("back").disabled = !task.saved;
     legend();
     if (!matterSet()) setMatter();
   },
@@ -205,6 +206,7 @@ actions.canvases.forEach((canvas, channel) => {
 // Buttons and keys.
 const wave = (direction) => {
   if (direction) showMuscles();
+  ui.wave = direction;
   link.send("wave", { direction });
   for (const button of $("waves").children) button.classList.toggle("on", button.dataset.wave === direction);
 };
@@ -245,7 +247,7 @@ addEventListener("keydown", (event) => {
   event.preventDefault();
   action();
 });
-addEventListener("keyup", (event) => { if (ARROWS[event.key]) wave(null); });
+addEventListener("keyup", (event) => { if (ui.wave && ARROWS[event.key] === ui.wave) wave(null); });
 addEventListener("blur", () => wave(null));
 
 // Matter: factors are powers of two.
@@ -253,14 +255,15 @@ const factor = (id) => 2 ** Number($(id).value);
 const matterSet = () => $("gravity").dataset.set;
 function setMatter() {
   $("stiffness").value = $("yield").value = 0;
-  $("gravity").value = task.matter.gravity;
+  const { gravity } = task.matter;
+  Object.assign($("gravity"), { min: Math.min(-10, gravity), max: Math.max(30, gravity), value: gravity });
   $("gravity").dataset.set = true;
   tellMatter();
 }
 function tellMatter() {
   $("stiffness-out").textContent = `μ = ${Math.round(factor("stiffness") * task.matter.mu)} Pa`;
   $("yield-out").textContent = `${Math.round(factor("yield") * task.matter.yield_stress)} Pa`;
-  $("gravity-out").textContent = `${Number($("gravity").value)} m/s²`;
+  $("gravity-out").textContent = `${Number(Number($("gravity").value).toFixed(2))} m/s²`;
 }
 function sendMatter() {
   tellMatter();

@@ -17,7 +17,7 @@ export class Pad {
     $("use").onclick = () => { use(this.drawing()); $("pad").close(); scrollTo(0, 0); };
     $("paper").addEventListener("pointerdown", (event) => { $("paper").setPointerCapture(event.pointerId); this.stroke(event); });
     $("paper").addEventListener("pointermove", (event) => { if (event.buttons) this.stroke(event); });
-    $("paper").addEventListener("pointerup", () => { this.last = null; });
+    for (const name of ["pointerup", "pointercancel"]) $("paper").addEventListener(name, () => { this.last = null; });
   }
 
   setTask(task) {

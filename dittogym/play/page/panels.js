@@ -5,10 +5,10 @@ const LONGEST = 6000;
 
 export class Plot {
   constructor(canvas, list) {
-    Object.assign(this, { canvas, list, returns: [], rows: [], terms: [] });
+    Object.assign(this, { canvas, list, rows: [], terms: [] });
   }
 
-  reset() { this.returns = []; this.rows = []; }
+  reset() { this.rows = []; }
 
   setTerms(terms) {
     this.terms = terms;
@@ -23,22 +23,19 @@ export class Plot {
   }
 
   add(rewards) {
-    for (const row of rewards) {
-      this.returns.push(row[0]);
-      this.rows.push(row);
-    }
-    if (this.rows.length > LONGEST) { this.rows.splice(0, 1000); this.returns.splice(0, 1000); }
+    this.rows.push(...rewards);
+    if (this.rows.length > LONGEST) this.rows.splice(0, 1000);
   }
 
   draw() {
-    const ratio = devicePixelRatio || 1, { canvas, rows, returns } = this, style = getComputedStyle(document.documentElement);
+    const ratio = devicePixelRatio || 1, { canvas, rows } = this, style = getComputedStyle(document.documentElement);
     canvas.width = canvas.clientWidth * ratio;
     canvas.height = canvas.clientHeight * ratio;
     const context = canvas.getContext("2d"), faint = style.getPropertyValue("--faint"), gap = 12 * ratio;
     const half = (canvas.height - gap) / 2;
     context.font = `${10 * ratio}px system-ui, sans-serif`;
     const last = rows.slice(-200);
-    this.curve(context, [returns], 0, half, [style.getPropertyValue("--text")], "return", faint, ratio);
+    this.curve(context, [rows.map((row) => row[0])], 0, half, [style.getPropertyValue("--text")], "return", faint, ratio);
     const series = this.terms.map((_, k) => last.map((row) => row[k + 1]));
     this.curve(context, series, half + gap, half, COLOURS, `terms, last ${last.length || 200} steps`, faint, ratio);
     const now = rows.at(-1);
