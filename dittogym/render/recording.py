@@ -144,16 +144,17 @@ class Recording:
             ValueError: The suffix is another, or a number is out of range.
             dittogym.render.film.VideoUnavailable: MP4 without the extra ``video``.
         """
-        path = check_film(path, size, rate, speed, zoom, muscles, pictures)
+        shown: dict[str, Any] = {"size": size, "zoom": zoom, "muscles": muscles}
+        path = check_film(path, rate=rate, speed=speed, pictures=pictures, **shown)
         if path.suffix == ".html":
             with replacing(path) as aside:
                 aside.write_text(self.page(speed), encoding="utf-8")
         elif path.suffix == ".png":
             with replacing(path) as aside:
-                Image.fromarray(self._strip(size, zoom, muscles, pictures)).save(aside)
+                Image.fromarray(self._strip(pictures, **shown)).save(aside)
         else:
             rate = possible_rate(path.suffix, rate)
-            write_film(path, self.frames(size=size, rate=rate, speed=speed, zoom=zoom, muscles=muscles), rate)
+            write_film(path, self.frames(rate=rate, speed=speed, **shown), rate)
         return path
 
     def page(self, speed: float | None = None) -> str:
@@ -171,33 +172,25 @@ class Recording:
         """Digits behind the point of times, so that steps can be told apart."""
         return max(2, int(np.ceil(-np.log10(self.scene.dt) - 1e-9)))
 
-    def _strip(self, size: int, zoom: float | None, muscles: bool, pictures: int) -> np.ndarray:
-        shown = []
+    def _strip(self, pictures: int, *, size: int, **shown: Any) -> np.ndarray:
+        strip = []
         for time in np.linspace(0, self.duration, pictures):
             caption = f"{time:.{self._digits}f} s", ""
-            shown += [self.picture(time, size=size, zoom=zoom, muscles=muscles, caption=caption)]
-            shown += [np.full((size, max(1, size // 64), 3), 255, np.uint8)]
-        return np.concatenate(shown[:-1], axis=1)
+            strip += [self.picture(time, size=size, caption=caption, **shown)]
+            strip += [np.full((size, max(1, size // 64), 3), 255, np.uint8)]
+        return np.concatenate(strip[:-1], axis=1)
 
     def _repr_html_(self) -> str:
         page = escape(self.page())
         return f'<iframe srcdoc="{page}" width="600" height="800" style="border:0; max-width:100%"></iframe>'
 
 
-def check_film(
-    path: str | os.PathLike[str],
-    size: int = 512,
-    rate: float = 30.0,
-    speed: float | None = None,
-    zoom: float | None = None,
-    muscles: bool = True,
-    pictures: int = 6,
-) -> Path:
+def check_film(path: str | os.PathLike[str], **options: Any) -> Path:
     """Check the arguments of :meth:`Recording.save`, and return the path."""
     path = Path(path)
     if path.suffix not in OPTIONS:
         raise ValueError(f"path must end in one of {', '.join(OPTIONS)}, got {str(path)!r}")
-    check_options(size, rate, speed, zoom, muscles, pictures)
+    check_options(**options)
     return path
 
 
