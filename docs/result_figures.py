@@ -151,12 +151,13 @@ def rewards_stages_figure(path: Path) -> None:
             if own:
                 steps, means = list(at), list(at.values())
                 mean = [sum(values) / len(values) for values in means]
-                axis.plot(steps, mean, marker="o", ms=3, lw=1.5, color=f"C{index}", label=algorithm)
+                axis.plot(steps, mean, marker="o", ms=3, lw=1.5, color=f"C{index}")
                 axis.fill_between(
                     steps, list(map(min, means)), list(map(max, means)), color=f"C{index}", alpha=0.15, lw=0
                 )
         axis.set(xlabel="environment steps", ylabel=f"return in {headline(task)[0]}", xlim=(0, None))
-        axis.legend(fontsize=8, frameon=False)
+    handles = [Line2D([], [], marker="o", ms=3, color=f"C{k}", label=name) for k, name in enumerate(algorithms)]
+    drawing.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=8, frameon=False)
     save(drawing, path)
 
 
