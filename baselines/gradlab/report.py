@@ -48,7 +48,7 @@ def conclude(task: str, results: Sequence[Result]) -> tuple[int, str]:
     ratio = last["zeroth_variance"] / last["first_variance"] if last["first_variance"] else math.inf
     return last["horizon"], (
         f"{task}: the gradient helps up to {last['horizon']} control steps. There its relative error is "
-        f"{last['difference_error']:.1g}, its variance is {ratio:.2g} times smaller than that of a zeroth-order "
+        f"{last['difference_error']:.1g}, its variance is {ratio:,.0f} times smaller than that of a zeroth-order "
         f"estimate from as many simulations, and a step along it gains {last['first_gain']:.3g} against "
         f"{last['zeroth_gain']:.3g}. {limit}"
     )
