@@ -334,7 +334,7 @@ class Session:
         if size**2 != len(message.pixels):
             raise ValueError(f"pixels must be those of a square, got {len(message.pixels)}")
         picture = np.frombuffer(message.pixels, np.uint8).reshape(size, size)
-        old = self.env, self.options
+        old = vars(self).copy()
         self.options = {**self.options, message.what: picture}
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -343,7 +343,7 @@ class Session:
                 self._reset(self.seed)
                 self._apply_policy(protocol.Policy(self.policy_name))
             except Exception:  # a task or a policy of the user's may raise anything
-                self.env, self.options = old
+                vars(self).update(old)
                 raise
         self.saved = None
         notices = ({"type": "notice", "message": str(warning.message)} for warning in caught)

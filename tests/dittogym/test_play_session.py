@@ -258,6 +258,25 @@ def test_a_policy_that_cannot_act_changes_nothing() -> None:
     assert played.env is env and played.policy is None and played.painted.shape == env.action_shape
 
 
+def test_a_drawing_with_which_the_policy_cannot_act_changes_nothing() -> None:
+    policy, loaded = Constant(resolution=4), []
+
+    def load() -> Constant:
+        loaded.append(policy)
+        if len(loaded) == 2:
+            raise OSError("the file is gone")
+        return policy
+
+    played = session(policies={"constant": load}, policy="constant")
+    played.advance()
+    before = vars(played).copy()
+    with pytest.raises(OSError, match="gone"):
+        played.apply(protocol.Draw("body", np.full((64, 64), 255, np.uint8).tobytes()))
+    assert vars(played) is not before and all(vars(played)[name] is value for name, value in before.items())
+    played.advance()
+    assert len(played.actions) == 2 and played.recording.rewards
+
+
 def test_files_after_going_back_are_of_what_led_there() -> None:
     """In the same episode, twice, and from a later one of another seed."""
     played = session(seed=3)

@@ -169,12 +169,18 @@ def make_values(bodies: Sequence[Body], dt: float, h: float, like: Tensor) -> Te
         if all(isinstance(row, (int, float)) for row in rows):
             tables.append(upload(tuple(float(row) for row in rows), like.dtype, like.device).view(VALUES, 1, 1))
         else:
-            # On CUDA, new_full only launches a kernel, where a copy of a number would wait for the device.
-            planes = [row.to(like) if isinstance(row, Tensor) else like.new_full((1, 1), row) for row in rows]
-            planes = [plane.reshape(1, 1) if plane.ndim == 0 else plane for plane in planes]
+            planes = [_plane(row, like) for row in rows]
             tables.append(torch.stack(torch.broadcast_tensors(*planes)))
     batch = max(table.shape[1] for table in tables)
     return torch.cat([table.expand(-1, batch, -1) for table in tables], dim=2).contiguous()
+
+
+def _plane(row: Value, like: Tensor) -> Tensor:
+    """A number, or a tensor, as a plane that broadcasts against ``like`` (B, N)."""
+    if isinstance(row, Tensor) and row.device == like.device:
+        row = row.to(like)
+        return row.reshape(1, 1) if row.ndim == 0 else row
+    return like.new_full((1, 1), float(row))  # launches a kernel, where a copy would wait for the device
 
 
 def _rows(body: Body, factor: float, like: Tensor) -> list[Value]:
