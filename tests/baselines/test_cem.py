@@ -63,6 +63,15 @@ def test_simulations_of_a_batch_are_planned_apart() -> None:
     assert not torch.allclose(together[:, 0], together[:, 1], atol=1e-3)
 
 
+def test_distribution_moves_to_the_elites_that_are_finite() -> None:
+    planner = CEMPlanner(small("run", substeps=1), quick(momentum=0.25))
+    elites = torch.tensor([-0.2, 0.6, 0.9]).view(1, 1, 3, 1, 1, 1).expand(3, 1, 3, 2, 4, 4)
+    mean, std = torch.full((3, 1, 2, 4, 4), 0.4), torch.full((3, 1, 2, 4, 4), 0.8)
+    mean, std = planner._refit(mean, std, elites, torch.tensor([[True, True, False]]))
+    torch.testing.assert_close(mean, torch.full_like(mean, 0.25 * 0.4 + 0.75 * 0.2))
+    torch.testing.assert_close(std, torch.full_like(std, 0.25 * 0.8 + 0.75 * 0.4))
+
+
 def test_plan_is_never_worse_than_what_is_kept() -> None:
     env = small("run", substeps=1)
     step = wanted(torch.full((1, 1, 1, 1), 0.25))

@@ -118,6 +118,21 @@ def test_ending_the_episode_forgoes_what_comes_after() -> None:
     assert chosen[0.0] == pytest.approx(0.5, abs=0.02) and chosen[5.0] == pytest.approx(0.25, abs=0.02)
 
 
+@pytest.mark.parametrize(("termination_steps", "charged"), [(5.0, 5), (1000.0, 28)])
+def test_early_end_is_charged_at_the_mean_reward_of_a_step(termination_steps: float, charged: int) -> None:
+    def ends(model, state, action):
+        result = soft_step(model, state, action)
+        reward = torch.full_like(result.reward, 1.5)
+        return result._replace(reward=reward, true_reward=reward, terminated=result.state.steps == 2)
+
+    env = small("shapematch", substeps=1)
+    config = GradientPlannerConfig(horizon=2, commit=1, termination_steps=termination_steps, split_weight=0.0)
+    planner = GradientPlanner(env, config, step=ends)
+    smooth, value = planner._returns(env.env_state, torch.zeros(2, 1, *env.action_shape))
+    assert env.spec.horizon == 30 and float(smooth) == 3.0
+    assert float(value) == pytest.approx(3.0 - 1.5 * charged)
+
+
 def test_plans_end_with_the_episode() -> None:
     env = small("shapematch", substeps=1)
     planner = GradientPlanner(env, GradientPlannerConfig(horizon=16, commit=8, iterations=1))

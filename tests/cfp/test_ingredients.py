@@ -207,6 +207,14 @@ def test_larger_actions_are_averaged_over_the_cells_of_the_grid():
     assert [values.shape for values in critics(observation, torch.randn(3, 2, 18, 18))] == [(3, 1)] * 2
 
 
+def test_layers_of_lean_critics_bound_the_values_of_inputs_never_seen():
+    critics, image, features = LeanCritics(8), torch.zeros(3, 3, 32, 32), torch.randn(3, 16, 4, 4)
+    actions = torch.randn(3, 2, 8, 8)
+    large, larger = (critics(Encoded(image, scale * features), scale * actions) for scale in (1e3, 1e4))
+    for one, other in zip(large, larger, strict=True):
+        torch.testing.assert_close(one, other, rtol=0.1, atol=0.01)
+
+
 def test_actor_starts_after_the_critics_and_rates_fall():
     options = {"update_start": 4, "batch_size": 4, "actor_start": 10, "final_rate": 0.1, "actor_rate": 1e-4}
     model = make_model(ActorSpec((8,)), **options)

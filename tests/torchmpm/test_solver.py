@@ -432,3 +432,13 @@ def test_gravity_of_another_shape(shape: tuple[int, ...]) -> None:
 def test_gravity_that_is_no_numbers(value: Tensor) -> None:
     with pytest.raises(ValueError, match=r"^gravity must be real and not empty, got"):
         robot(5, gravity=value)
+
+
+@pytest.mark.parametrize("as_tensor", [False, True])
+def test_gravity_moves_a_particle_at_rest_by_less_than_a_cell(as_tensor: bool) -> None:
+    largest = robot(5).grid.h / robot(5).dt ** 2
+    for value in (0.999 * largest, -0.999 * largest):
+        robot(5, gravity=torch.tensor([0.0, value]) if as_tensor else (0.0, value))
+    for value in (1.001 * largest, -1.001 * largest):
+        with pytest.raises(ValueError, match=r"^gravity must be (above -|below )"):
+            robot(5, gravity=torch.tensor([0.0, value]) if as_tensor else (0.0, value))
