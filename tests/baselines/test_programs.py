@@ -92,9 +92,15 @@ def test_every_algorithm_is_tried_here():
 
 #: The same programs as with 16 segments, and several times slower; and as coarse, with another grid.
 LARGE = {"gnn-64", "transformer-64", "fine"}
+#: The same programs as cfp, mpc and gnn-16, with a single stage, another planner and other networks.
+ALIKE = {"coarse", "cem", "transformer-16"}
 
 
-@pytest.fixture(scope="module", params=[pytest.param(a, marks=[pytest.mark.slow] * (a in LARGE)) for a in TINY])
+def algorithms(slow):
+    return [pytest.param(algo, marks=[pytest.mark.slow] * (algo in slow)) for algo in TINY]
+
+
+@pytest.fixture(scope="module", params=algorithms(slow=LARGE))
 def finished(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param) / "whole"
     assert run(request.param, folder) == 0
@@ -154,6 +160,7 @@ def test_folder_is_evaluated_whatever_trained_it(finished, capsys):
         assert "baselines.evaluate and baselines.robustness run other algorithms" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("finished", algorithms(slow=LARGE | ALIKE), indirect=True)
 def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monkeypatch, capsys, stop_at):
     algo, whole = finished
     folder = tmp_path / "stopped"
@@ -254,6 +261,7 @@ def test_algorithm_with_a_count_has_two_spellings(given, name):
     assert run.name == f"{name}-run-quick-0" and run == baselines.registry.configure({"algo": name, "task": "run"})
 
 
+@pytest.mark.parametrize("finished", algorithms(slow=set(TINY) - {"cfp", "gradient", "gnn-16"}), indirect=True)
 def test_robustness_is_reported_whatever_trained_it(finished):
     _, folder = finished
     assert robustness.main([str(folder), "--episodes", "1", "--device", "cpu"]) == 0

@@ -69,6 +69,7 @@ LEARNING = (
 ).split()
 
 
+@pytest.mark.slow
 def test_coarse_is_the_first_stage_and_goes_on(tmp_path):
     """With one seed the curves of coarse and CFP are the same up to the handover."""
     trained("coarse", tmp_path / "coarse", *LEARNING, "--resolutions", "4", "--steps", "60")

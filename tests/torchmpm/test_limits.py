@@ -179,11 +179,11 @@ def test_a_particle_at_no_place_harms_no_other(axis: int) -> None:
         torch.testing.assert_close(beside, alone, rtol=1e-10, atol=0)
 
 
-@pytest.mark.parametrize("velocity", [(-8.0, 0.0), (8.0, 0.0), (0.0, -8.0), (0.0, 8.0)])
-def test_matter_that_leaves_the_window_does_not_explode(velocity: tuple[float, float]) -> None:
-    """In the lower half cells, where weights are extrapolated, some of it gets faster."""
-    state = placed(0.45 + 0.1 * torch.rand(1, 100, 2, generator=generator(1), dtype=torch.float64))
-    final = free(100).step(replace(state, v=state.v + torch.tensor(velocity).double()), substeps=1500)
+def test_matter_that_leaves_the_window_does_not_explode() -> None:
+    """To the left, right, bottom and top; below, weights are extrapolated, and some of it gets faster."""
+    state = placed((0.45 + 0.1 * torch.rand(1, 100, 2, generator=generator(1), dtype=torch.float64)).repeat(4, 1, 1))
+    velocity = torch.tensor([(-8.0, 0.0), (8.0, 0.0), (0.0, -8.0), (0.0, 8.0)], dtype=torch.float64)
+    final = free(100).step(replace(state, v=state.v + velocity[:, None]), substeps=1500)
     assert final.x.isfinite().all() and final.x.abs().max() < 2.0
 
 
