@@ -14,6 +14,14 @@ CHECKED = """
 from jaxtyping import install_import_hook
 with install_import_hook("torchmpm", "beartype.beartype"):
     import torchmpm
+import torch
+try:
+    torchmpm.ParticleState.at_rest(torch.zeros(5, 3))
+except Exception as error:
+    assert type(error).__name__ == "TypeCheckError", error
+else:
+    raise AssertionError("annotations are not checked")
+del torch  # the samples import what they use
 """
 
 
