@@ -18,7 +18,7 @@ FORMAT = "cfp-policy"
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], Any], shared: bool = False) -> None:
-    """Write a file aside, flush it to disk, and move it into place; an `OSError` leaves the old file untouched.
+    """Write a file aside, flush it to disk, and move it into place; an error leaves the old file untouched.
 
     Args:
         path: The file.
@@ -34,8 +34,8 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], Any], shared: bool 
             write(file)
             file.flush()
             os.fsync(file.fileno())
-    except OSError:
-        aside.unlink(missing_ok=True)  # on a full disk every byte counts
+    except BaseException:  # a full disk, on which every byte counts; Ctrl-C
+        aside.unlink(missing_ok=True)
         raise
     os.replace(aside, path)
     _sync_folder(path.parent)

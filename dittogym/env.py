@@ -206,7 +206,7 @@ class Env(JsonSpec, gymnasium.Env[np.ndarray, np.ndarray]):
             policy: A function from an observation (3, 64, 64) to an action (2, R, R), or an object with such a method
                 ``predict``, as :func:`cfp.load` and stable-baselines3 return it.
             path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
-            seed: Seed of the reset.
+            seed: Seed of the reset and of the policy's noise.
             options: ``max_steps``, after which the recording ends, and options of the file, such as ``size``, ``speed``
                 and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.
 

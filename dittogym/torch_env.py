@@ -331,7 +331,7 @@ class TorchEnv:
             policy: A function from observations (B, 3, 64, 64) uint8, NumPy, to actions (B, 2, R, R), or an object with
                 such a method ``predict``, as :func:`cfp.load` returns it.
             path: A film (``.mp4``, ``.gif``, ``.webp``), a filmstrip (``.png``) or a replay (``.html``) to write.
-            seed: Seed of the reset.
+            seed: Seed of the reset and, if it is not ``None``, of the policy's noise.
             index: Which element of the batch.
             options: ``max_steps``, after which the recording ends, and options of the file, such as ``size``, ``speed``
                 and ``zoom``, see :meth:`dittogym.render.recording.Recording.save`.

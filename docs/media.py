@@ -10,7 +10,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import torch
 
 import cfp
 import dittogym
@@ -35,9 +34,7 @@ def record_policy(name: str) -> Recording:
     seed = SEEDS.get(name, 0)
     policy = cfp.load(name)
     env = dittogym.TorchEnv(policy.description["task"], particles="lite", resolution=policy.resolution)
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)  # policies act with noise
-        return env.film(policy, seed=seed)
+    return env.film(policy, seed=seed)
 
 
 def write_replays(folder: Path) -> None:

@@ -71,8 +71,11 @@ def execute(
             if signals.number and not stopping:
                 stopping = True
                 executor.stop()
-    finally:
-        executor.shutdown(kill=bool(pending))
+    except BaseException as error:
+        executor.stop()
+        executor.shutdown(kill=not isinstance(error, Exception))  # an error of one run costs the others nothing
+        raise
+    executor.shutdown(kill=False)
 
 
 class InProcessExecutor(Executor):

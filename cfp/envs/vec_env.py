@@ -139,10 +139,12 @@ class TorchVecEnv(VecEnv):
             return list(range(self.num_envs))
         return list(indices) if isinstance(indices, Iterable) else [indices]
 
+    def _owner(self, attr_name: str) -> Any:
+        return self if attr_name == "render_mode" else self.torch_env
+
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Attribute of the batch, repeated for each requested element."""
-        owner = self if attr_name == "render_mode" else self.torch_env
-        return [getattr(owner, attr_name) for _ in self._indices(indices)]
+        return [getattr(self._owner(attr_name), attr_name) for _ in self._indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of the whole batch.
@@ -152,7 +154,7 @@ class TorchVecEnv(VecEnv):
         """
         if self._indices(indices) != list(range(self.num_envs)):
             raise ValueError(f"indices must be None, got {indices}: the elements of a batch share their attributes")
-        setattr(self.torch_env, attr_name, value)
+        setattr(self._owner(attr_name), attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any

@@ -1,7 +1,8 @@
 """Episodes played side by side on all cores, each with the result, to the last bit, that it has when played alone.
 
 On a CPU every episode has an environment and a thread of its own: the simulation then takes the same path whatever
-else is played, an episode that has ended costs nothing, and no core waits for another one.
+else is played, and an episode that has ended costs nothing. Policies act one after the other, because torch's
+generator, from which they take their noise, belongs to the whole process.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from cfp.envs.disturbances import Disturbed
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.evaluation.cache import Episode, EpisodeCache
 from cfp.policy_protocols import DisturbablePolicy, SeesState
+from dittogym.seeding import noise_seed
 
 
 def attached(policy: PolicyPredictor, env: VecEnv) -> PolicyPredictor:
@@ -48,7 +50,7 @@ class SeededPolicy:
         before_step: Called before each step.
     """
 
-    _turn = Lock()  # torch's generator belongs to the whole process
+    _turn = Lock()
 
     def __init__(self, policy: PolicyPredictor, layout: int, before_step: Callable[[], None] = lambda: None) -> None:
         self.policy, self.layout, self.before_step = policy, layout, before_step
@@ -57,7 +59,7 @@ class SeededPolicy:
     def predict(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, Memory]:
         """Actions of the policy; reseeds torch's generator."""
         self.before_step()
-        seed = int(np.random.SeedSequence((self.layout, self.steps)).generate_state(1)[0])
+        seed = noise_seed(self.layout, self.steps)
         self.steps += 1
         threads = torch.get_num_threads()
         with self._turn:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, TextIO, TypeVar
 
 import numpy as np
-import torch
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from cfp.config import RunConfig
@@ -38,7 +37,7 @@ def record_episode(
     seed: int,
     recorder: Callable[[TorchEnv, Act, int], Recorded],
 ) -> Recorded:
-    """One episode of a policy with actions (2, size, size); torch's generator is left as it was."""
+    """One episode of a policy with actions (2, size, size)."""
     venv = TorchVecEnv(make_torch_env(config, size, 1))
     acting, memory, start = SeededPolicy(attached(policy, venv), seed), None, np.array([True])
 
@@ -48,8 +47,7 @@ def record_episode(
         start = np.array([False])
         return action
 
-    with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
-        return recorder(venv.torch_env, act, seed)
+    return recorder(venv.torch_env, act, seed)
 
 
 def check_files(paths: Mapping[str, Path | None], options: Mapping[str, Any]) -> None:

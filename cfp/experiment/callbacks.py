@@ -179,7 +179,7 @@ class EvaluationCallback(StageCallback):
 
     @property
     def is_missing(self) -> bool:
-        """Whether the policy of the present step, the last of the stage, has not been evaluated."""
+        """Whether the policy of the present step has not been evaluated."""
         return self.every > 0 and self.evaluated < self.stage.step
 
     @property
@@ -220,7 +220,7 @@ class EvaluationCallback(StageCallback):
 
     def _on_training_start(self) -> None:
         starts_trained = self.stage.algorithm.starts_trained and self.every and not self.means
-        if starts_trained or self.stage.evaluation_due:
+        if starts_trained or (self.stage.evaluation_due and self.is_missing):  # a crash may have come after its row
             self._act()
 
     def _on_training_end(self) -> None:

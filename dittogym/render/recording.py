@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from html import escape
 from itertools import islice
@@ -20,6 +21,7 @@ from dittogym.render.film import UNITS, check_available, possible_rate, write_fi
 from dittogym.render.frame import frame, pace
 from dittogym.render.replay import SHOWN, replay_page
 from dittogym.render.scene import Scene, Shot, check_view, describe
+from dittogym.seeding import noise_seed, seeded
 from torchmpm import checks
 
 #: Chooses actions (B, 2, R, R) from observations (B, 3, 64, 64).
@@ -268,17 +270,20 @@ def play(env: Any, act: Act, seed: Any, index: int = 0) -> Iterator[tuple[np.nda
     Args:
         env: A :class:`dittogym.TorchEnv`, which is reset.
         act: Chooses the actions.
-        seed: Of the reset.
+        seed: Of the reset, and of the noise that ``act`` takes from torch's generators, which are left as they were.
         index: Which element of the batch to play to the end of its episode.
 
     Raises:
         ValueError: ``act`` returns something else than actions.
     """
     observation, _ = env.reset(seed=seed)
-    images, ended = observation.cpu().numpy(), False
+    images, ended, step = observation.cpu().numpy(), False, 0
+    own = seed if seed is None or np.ndim(seed) == 0 else seed[index]
     yield images, None, None
     while not ended:
-        chosen = act(images)
+        with nullcontext() if own is None else seeded(noise_seed(int(own), step)):
+            chosen = act(images)
+        step += 1
         try:
             action = torch.as_tensor(chosen, device=env.device)
         except (RuntimeError, TypeError, ValueError) as error:
@@ -293,7 +298,8 @@ def as_function(policy: Any, layout: ActionIndexing) -> Act:
 
     Args:
         policy: A function, or an object with ``predict(observation, state)`` as stable-baselines3's, which returns
-            actions and the next state.
+            actions and the next state. If its ``deterministic_by_default`` is true, it is also given
+            ``deterministic=True``.
         layout: ``action_layout`` of the environment.
 
     Raises:
@@ -306,11 +312,12 @@ def as_function(policy: Any, layout: ActionIndexing) -> Act:
         if not callable(policy):
             raise TypeError(f"policy must be a function or have a method predict, got {type(policy).__name__}")
         return policy
+    options = {"deterministic": True} if getattr(policy, "deterministic_by_default", False) else {}
     memory: Any = None
 
     def act(observation: np.ndarray) -> Any:
         nonlocal memory
-        action, memory = policy.predict(observation, memory)
+        action, memory = policy.predict(observation, memory, **options)
         return action
 
     return act

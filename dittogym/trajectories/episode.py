@@ -51,7 +51,7 @@ def record(env: Any, policy: Any, *, seed: int = 0, fields: Sequence[str] = ("x"
         env: A :class:`dittogym.TorchEnv` of one simulation, or a Gymnasium environment of this package. Its wrappers
             have no part in it.
         policy: A function of observations or an object with a method ``predict``, see :meth:`dittogym.TorchEnv.film`.
-        seed: Seed of the reset.
+        seed: Seed of the reset and of the policy's noise.
         fields: Of the particles, which to keep after each step: any of ``x``, ``v``, ``C``, ``F`` and ``Jp``.
 
     Raises:

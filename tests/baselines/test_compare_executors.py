@@ -9,6 +9,7 @@ import sys
 import time
 import types
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -71,6 +72,9 @@ class FakeRay(types.ModuleType):
     def shutdown(self):
         self.running = False
         self.pool.shutdown()
+
+    def cancel(self, reference):
+        reference.future().cancel()
 
     def remote(self, function):
         def options(max_retries, retry_exceptions=(), **_):
@@ -181,6 +185,22 @@ def test_error_of_an_executor_is_not_lost(job, monkeypatch, use_program):
     monkeypatch.setattr("baselines.compare.executor.write_text", lambda *_: open("/dev/full/nothing", "w"))
     with pytest.raises(OSError):
         outcomes(RayExecutor(None, Resources(retries=0)), job)
+
+
+def test_error_of_a_run_stops_the_others_with_a_checkpoint(job, use_program):
+    use_program(PATIENT)
+
+    class Failing(LocalExecutor):
+        def _run(self, job):
+            if job.label != "broken":
+                return super()._run(job)
+            while not Path("ready").exists():
+                time.sleep(0.01)
+            raise OSError("no space left")
+
+    with pytest.raises(OSError, match="no space left"):
+        outcomes(Failing(2, Resources(cpus=1)), job, replace(job, label="broken"))
+    assert Path("ended").read_text() == "checkpoint"
 
 
 def test_cancelled_task_of_ray_is_stopped(job, monkeypatch):

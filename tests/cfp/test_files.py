@@ -94,6 +94,18 @@ def test_links_in_a_folder_of_a_stranger_are_not_written_through(tmp_path):
     assert json.loads((folder / "config.json").read_text()) == {"a": 1}
 
 
+def test_ctrl_c_leaves_no_file_aside(tmp_path):
+    def interrupted(file):
+        file.write(b"ne")
+        raise KeyboardInterrupt
+
+    path = tmp_path / "policy"
+    path.write_bytes(b"old")
+    with pytest.raises(KeyboardInterrupt):
+        write_atomically(path, interrupted, shared=True)
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
 def test_row_that_no_longer_fits_names_the_file(tmp_path, monkeypatch):
     table = CSVTable(tmp_path / "t.csv")
     table.add({"step": 1})

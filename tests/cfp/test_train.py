@@ -106,7 +106,16 @@ def test_run_stopped_in_an_evaluation_repeats_it(finished, tmp_path):
         patch.setattr(callbacks, "make_trial", stop)
         assert run(folder) == 128 + signal.SIGTERM
     assert read_table(folder / "evaluations.csv") == []
-    assert train.main(["--out", str(folder), "--resume"]) == 0
+    evaluate_first = callbacks.EvaluationCallback._on_training_start
+
+    def crash(callback):
+        evaluate_first(callback)
+        raise RuntimeError("killed")
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(RuntimeError, match="killed"):
+        patch.setattr(callbacks.EvaluationCallback, "_on_training_start", crash)
+        train.main(["--out", str(folder), "--resume"])
+    assert train.main(["--out", str(folder), "--resume"]) == 0  # finds the row, and does not add it again
     assert_same_run(folder, finished, (*TABLES, "policy.safetensors"))
 
 

@@ -143,6 +143,8 @@ def test_elements_share_attributes_and_pictures_come_one_by_one():
     assert env.get_attr("push", 1) == [0.1]
     env.set_attr("push", 7)
     assert env.get_attr("push") == [7, 7]
+    env.set_attr("render_mode", None)
+    assert env.get_attr("render_mode") == [None, None]
     assert env.env_method("render", 1)[0].max() == 1
     with pytest.raises(ValueError, match="indices"):
         env.set_attr("push", 7, indices=[0])

@@ -148,6 +148,20 @@ def test_environments_of_gymnasium_film_too(tmp_path) -> None:
     assert "<iframe" in recorded._repr_html_() and env._repr_png_().startswith(b"\x89PNG")
 
 
+def test_a_film_is_repeatable_and_leaves_torch_s_generator_alone() -> None:
+    env = dittogym.TorchEnv("shapematch", resolution=8, **SMALL)
+
+    def noisy(observation: np.ndarray) -> torch.Tensor:
+        return 2 * torch.rand(1, 2, 8, 8) - 1
+
+    state = torch.get_rng_state()
+    first = env.film(noisy, seed=3).rewards
+    assert torch.equal(torch.get_rng_state(), state)
+    assert env.film(noisy, seed=3).rewards == env.film(noisy, seed=[3]).rewards == first
+    assert env.film(noisy, seed=4).rewards != first
+    assert env.film(noisy, seed=None).rewards != env.film(noisy, seed=None).rewards
+
+
 def test_policies_are_functions_or_predict() -> None:
     class Counting:
         def predict(self, observation, state=None):
@@ -158,6 +172,17 @@ def test_policies_are_functions_or_predict() -> None:
         assert act(np.zeros((1, 3, 64, 64), np.uint8)).shape == (1, 2, 8, 8)
     with pytest.raises(TypeError, match="policy must be a function or have a method predict, got int"):
         as_function(3, "image")
+
+
+def test_policies_act_with_noise_or_without_as_they_were_evaluated_in_training() -> None:
+    class Telling:
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            return deterministic, state
+
+    policy = Telling()
+    assert as_function(policy, "image")(np.zeros(0)) is False
+    policy.deterministic_by_default = True
+    assert as_function(policy, "image")(np.zeros(0)) is True
 
 
 @pytest.mark.parametrize(
