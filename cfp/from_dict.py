@@ -73,7 +73,7 @@ def type_name(kind: Any) -> str:
         return " or ".join(map(repr, arguments))
     if origin is tuple:
         count = "a list" if arguments[-1] is Ellipsis else f"a list of {len(arguments)}"
-        return f"{count}, each {type_name(arguments[0])}"
+        return f"{count}, each element {type_name(arguments[0])}"
     if arguments:
         return " or ".join(map(type_name, arguments))
     return _TYPE_NAMES[kind]

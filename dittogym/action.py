@@ -13,6 +13,11 @@ from torchmpm.backends import cached_tensors, transforming
 ActionIndexing = Literal["image", "grid"]
 
 
+def default_indexing(parity: str) -> ActionIndexing:
+    """How actions are indexed unless ``action_layout`` says otherwise."""
+    return "grid" if parity == "reference" else "image"
+
+
 def to_grid_indexing(action: Tensor, indexing: ActionIndexing) -> Tensor:
     """Bring an action (B, 2, R, R) to the index order (component, x rightwards, y upwards).
 
@@ -33,8 +38,7 @@ def trained_indexing(policy: Any) -> ActionIndexing | None:
     trained_in = description.get("environment") if isinstance(description, Mapping) else None
     if trained_in is None:
         return None
-    own: ActionIndexing = "grid" if trained_in.get("parity") == "reference" else "image"
-    return trained_in.get("action_layout") or own
+    return trained_in.get("action_layout") or default_indexing(trained_in.get("parity", "clean"))
 
 
 def patch_field(action: Tensor, patch: int, max_actuation: float | Tensor) -> Tensor:

@@ -269,7 +269,7 @@ def _versions(moment: Moment) -> list[tuple[str, Tensor, int]]:
 def _check_versions(who: str, before: list[tuple[str, Tensor, int]]) -> None:
     """Refuse changes in place since :func:`_versions`."""
     if changed := dict.fromkeys(name for name, tensor, version in before if tensor._version != version):
-        raise ValueError(f"{who} must not change its moment in place, got another {', '.join(changed)}")
+        raise ValueError(f"{who} must not change its moment in place, but it changed {', '.join(changed)}")
 
 
 @cached_tensors

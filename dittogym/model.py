@@ -19,6 +19,7 @@ from dittogym.spec import DT, TaskSpec
 from dittogym.window import GRID
 from torchmpm import Body, Elastic, ParticleState, Solver, VonMises, tree
 from torchmpm.rollout import Segment
+from torchmpm.stability import stable_dt
 
 #: The option ``parity``: with ``"reference"`` the behaviours of the reference implementation are brought back.
 Parity = Literal["clean", "reference"]
@@ -182,10 +183,11 @@ def make_model(
 
 def check_stability(model: Model, physics: Physics) -> None:
     """Refuse matter that with its muscles needs shorter substeps."""
-    solver = model.solver_for(physics)
-    limit = solver.stable_dt(physics.get("max_actuation", model.spec.max_actuation))
+    solver, actuation = model.solver_for(physics), physics.get("max_actuation", model.spec.max_actuation)
+    limit = solver.stable_dt(actuation)
     if solver.dt > limit:
-        matter = "the mu, lam, max_actuation and mass that are given"
+        robot = stable_dt(solver.bodies[:1], GRID.h, actuation) == limit
+        matter = f"the material, muscles and mass of the {'robot' if robot else 'object'}"
         raise ValueError(f"dt must be at most {limit} s to be stable with {matter}, got {solver.dt}")
 
 

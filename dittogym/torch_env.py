@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dittogym import arguments, core
-from dittogym.action import ActionIndexing, to_grid_indexing
+from dittogym.action import ActionIndexing, default_indexing, to_grid_indexing
 from dittogym.bodies.positions import InitialPositions, Particles, Seed, get_state, particle_counts, set_state
 from dittogym.model import EnvState, Parity, Snapshot, check_snapshot, make_model, next_physics
 from dittogym.observation.image import SHAPE
@@ -106,8 +106,7 @@ class TorchEnv:
         self.action_resolution = arguments.find_resolution(self.spec, resolution)
         self.action_shape = (2, self.action_resolution, self.action_resolution)
         self._as_reference = arguments.choice("parity", parity, {"clean": False, "reference": True})
-        own: ActionIndexing = "grid" if self._as_reference else "image"
-        layouts: dict[str | None, ActionIndexing] = {"image": "image", "grid": "grid", None: own}
+        layouts = {"image": "image", "grid": "grid", None: default_indexing(parity)}
         self.action_layout = arguments.choice("action_layout", action_layout, layouts)
         counts = particle_counts(self.spec, particles)
         self.model = make_model(self.spec, counts, substeps, backend, parity, segment, float(dt))

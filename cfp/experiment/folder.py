@@ -74,6 +74,8 @@ def read_config(folder: Path, configure: Callable[[dict[str, Any]], RunConfig]) 
         return config
     except FileNotFoundError as error:
         raise CheckpointError(f"{folder}: there is no run (no config.json)") from error
+    except ConfigError as error:
+        raise CheckpointError(f"{path}: {error}") from error
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{path}: cannot be read ({error})") from error
 

@@ -116,12 +116,15 @@ class TrainingRun:
     def _read_checkpoint(self) -> None:
         """Set state, position and step from the checkpoint."""
         config, folder, self.state = self.config, self.folder, self.checkpoint.read()
-        check_same(json.loads(self.state["config"]), config)
+        past, total = json.loads(self.state["config"]), config.ends()[-1]
+        check_same(past, config)
         self.position = Position(self.state["stage"], self.state["offset"])
         if self.position.stage > self.stages:
             raise self.checkpoint.does_not_fit(ValueError(f"it is of stage {self.position.stage}"))
         self.step = self.position.offset + self.state["num_timesteps"]
-        print(f"resuming {folder} at step {self.step} of {config.ends()[-1]} (stage {self.position.stage})")
+        if total < min(self.step, past.get("steps", 0)):
+            raise ConfigError(f"steps must be at least {self.step}, those that the run has taken, got {total}")
+        print(f"resuming {folder} at step {self.step} of {total} (stage {self.position.stage})")
         newest = policy_path(folder)
         if newest.exists() and is_of_another_task(read_policy(newest)[1], config):
             print(f"a file of task {config.task!r} has changed: evaluations from before it are of another task")

@@ -77,8 +77,11 @@ def play(command: Command) -> None:
         from dittogym.play.session import Session
     except ModuleNotFoundError as error:
         raise OSError(f"the page needs a web server: pip install torchmpm[play] ({error})") from error
-    new_session = partial(Session, **options(command))
-    new_session()  # what is wrong with the options shows before a page is opened
+    try:
+        new_session = partial(Session, **options(command))
+        new_session()  # what is wrong with the options shows before a page is opened
+    except (TypeError, pkgutil.resolve_name("cfp:CFPError")) as error:
+        raise ValueError(str(error)) from error
     server = Server(new_session, secrets.token_urlsafe(16), command.port)
     print(f"Play at {server.address}\nCtrl-C stops the program.", flush=True)
     if command.browser:
@@ -97,7 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         play(command)
     except KeyboardInterrupt:
         return 0
-    except (ValueError, TypeError, OSError, pkgutil.resolve_name("cfp:CFPError")) as error:
+    except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ class SavedEpisode(NamedTuple):
     truncated: bool
     success: bool
     invalid: bool
+    memory: Any  # Of the policy
     seed: int  # Of the particles
     actions: list[np.ndarray]
     recording: Recording

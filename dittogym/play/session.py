@@ -205,8 +205,7 @@ class Session:
     def _as_image(self, array: np.ndarray) -> np.ndarray:
         """What a policy returns (B, 2, R, R), in the orientation of the environment's actions."""
         layout = trained_indexing(self.policy) or "image"
-        turned = from_grid_indexing(to_grid_indexing(torch.as_tensor(array), layout), self.env.action_layout)
-        return turned.numpy()
+        return from_grid_indexing(to_grid_indexing(torch.as_tensor(array), layout), self.env.action_layout).numpy()
 
     def _pull(self) -> None:
         """Let the hand pull at matter, which it takes hold of the first time."""
@@ -277,6 +276,7 @@ class Session:
             self.env = env
             self.action = self.painted = np.zeros(env.action_shape, np.float32)
         self.policy_name, self.memory, self.gate = message.name, None, np.zeros((2, 0, 0), np.float32)
+        self.saved = self.saved and self.saved._replace(memory=None)  # it belongs to the policy before
         return [{"type": "policy", "name": message.name, "reach": reach(self.env.spec.patch / NODES, resolution)}]
 
     def _apply_colour(self, message: protocol.Colour) -> None:
@@ -324,7 +324,7 @@ class Session:
         self.observation, state = self.env.load(then.snapshot), self.env.env_state
         values = physics_values(self.physics, 1, self.env.num_particles, state.centre[:, 0])
         self.env.env_state = replace(state, physics=values)
-        self.grip, self.memory, self.shot = None, None, self.env.shot()
+        self.grip, self.shot = None, self.env.shot()
         if not same_physics(state.physics, values):
             self._note(CHANGED_MATTER)
         return [{"type": "reset"}]

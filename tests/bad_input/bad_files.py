@@ -232,7 +232,7 @@ RUNS = [
     resumed("a chunk of objects", chunk_of_objects, "this part of the replay buffer is missing or damaged"),
     resumed("broken options", write("config.json", "{"), "config.json: cannot be read"),
     evaluated("no options", lambda folder: (folder / "config.json").unlink(), "there is no run (no config.json)"),
-    evaluated("unknown options", options(colour=1), "config.json: cannot be read (colour is not an option"),
+    evaluated("unknown options", options(colour=1), "config.json: colour is not an option"),
     evaluated("no policy", lambda folder: (folder / "policy.safetensors").unlink(), "no policy has been written yet"),
     evaluated("a policy cut short", cut("policy.safetensors"), "policy.safetensors: the policy is damaged"),
 ]
@@ -258,7 +258,7 @@ CONFIGS = [
     file_of_options("with a rate of 400 digits", f'{{"tau": 1{"0" * 400}}}', "tau must be a number"),
     file_of_options("with steps of 401 digits", f'{{"steps": 1{"0" * 400}}}', "steps must be between", "of 401 digits"),
     file_of_options("with floats of 16 bits", '{"environment": {"dtype": "float16"}}', "dtype must be 'float32' or"),
-    file_of_options("with half particles", '{"environment": {"particles": [1.5, 2]}}', "a list of 2, each an integer"),
+    file_of_options("with half particles", '{"environment": {"particles": [1.5, 2]}}', "of 2, each element an integer"),
     Case(
         "config file missing",
         command(cfp.train.main, "--config no.json --out run --dry-run"),

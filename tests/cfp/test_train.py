@@ -146,6 +146,11 @@ def test_finished_run_can_be_prolonged_and_its_results_do_not_outlive_it(tmp_pat
     assert not (folder / "results.json").exists()
     assert train.main(["--out", str(folder), "--resume"]) == 0
     assert read_table(folder / "progress.csv")[-1]["step"] == "60" and (folder / "results.json").exists()
+    before = {path: path.read_bytes() for path in folder.glob("*.json")}
+    capsys.readouterr()
+    assert train.main(["--out", str(folder), "--resume", "--steps", "44"]) == 2
+    assert "steps must be at least 60, those that the run has taken, got 44" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in folder.glob("*.json")} == before
 
 
 def test_resuming_nothing_is_an_error_unless_a_task_is_named(tmp_path, capsys):

@@ -10,6 +10,7 @@ import torch
 from tiny import SMALL, TASKS, actions, assert_same_bits, everything, make_vec, set_particles, stir, tiny
 
 import dittogym
+import torchmpm
 from dittogym import TorchEnv
 from dittogym.physics import NAMES
 from dittogym.render.colours import CONTRACT
@@ -368,7 +369,7 @@ def test_matter_too_stiff_for_the_substeps_is_refused() -> None:
     before = env.state
     limit = 1.0 / 128 / math.sqrt(2 * (9000.0 + 50.0 + 45.0) / 2.0)
     for physics in ({"mu": [9000.0, 650.0]}, {"mu": 650.0, "mass": 0.05}, {"max_actuation": 1e4}, {"lam": 1e4}):
-        message = r"dt must be at most (\S+) s .* mu, lam, max_actuation and mass that are given, got 0\.0001"
+        message = r"dt must be at most (\S+) s .* the material, muscles and mass of the robot, got 0\.0001"
         with pytest.raises(ValueError, match=message) as raised:
             env.reset(options={"physics": physics})
         if "mu" in physics and "mass" not in physics:
@@ -377,6 +378,10 @@ def test_matter_too_stiff_for_the_substeps_is_refused() -> None:
     env.reset(options={"physics": {"mu": 3000.0}})
     with pytest.raises(ValueError, match="dt must be at most"):
         tiny(replace(dittogym.make_spec("run"), mu=9000.0))
+    kick = dittogym.make_spec("kick")
+    hard = replace(kick.objects[0], material=torchmpm.Elastic(2e4, 100.0))
+    with pytest.raises(ValueError, match="mass of the object, got"):
+        tiny(replace(kick, objects=(hard,)))
 
 
 def test_a_negative_lame_parameter_is_that_of_the_task() -> None:

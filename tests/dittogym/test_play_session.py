@@ -234,6 +234,19 @@ def test_going_back_restores_success_and_failure() -> None:
     assert played.success and played.invalid and not played.playing
 
 
+def test_going_back_restores_the_memory_of_the_same_policy() -> None:
+    played = session(policies={"constant": Constant})
+    played.apply(protocol.Policy("constant"))
+    played.advance()
+    played.apply(Save("moment"))
+    played.advance()
+    played.apply(protocol.Back())
+    assert played.memory[0][0] == 1
+    played.apply(protocol.Policy("constant"))
+    played.apply(protocol.Back())
+    assert played.memory is None
+
+
 def test_the_reach_of_the_hand_follows_the_resolution() -> None:
     fine, coarse = (session(resolution=size).describe()["reach"] for size in (32, 8))
     assert fine == {"pull": REACH, "muscles": MUSCLE_REACH} and coarse["muscles"] == pytest.approx(0.6 * 0.5 / 8)
