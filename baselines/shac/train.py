@@ -19,6 +19,7 @@ from cfp.analytic.stateful import Stateful
 from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
+from cfp.envs.seeding import seeded
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.algorithm import Algorithm, Scalars, Sees
 from cfp.experiment.schedules import linear_decay
@@ -27,7 +28,6 @@ from cfp.presets import ON_SPEED, sac_preset
 from cfp.sections import ReportConfig
 from cfp.validation import check_at_least
 from cfp.weights import KIND, load, policy_for, read_policy
-from dittogym.seeding import seeded
 
 #: Updates in a row without a finite gradient after which training gives up.
 PATIENCE = 10

@@ -12,12 +12,10 @@ from gymnasium import spaces
 from torch import Tensor, nn
 
 from cfp.agent.actor import Actor, build_actor
-from cfp.agent.networks import IMAGE_SIZE
 from cfp.agent.spec import ActorSpec
 from cfp.files import write_policy
 from cfp.hub import Shareable
-
-IMAGE_SHAPE = (3, IMAGE_SIZE, IMAGE_SIZE)
+from dittogym.observation.image import SHAPE
 
 # Arguments of `predict` in stable-baselines3.
 Observation: TypeAlias = np.ndarray | dict[str, np.ndarray]
@@ -29,7 +27,7 @@ def check_images(observation: object) -> None:
     """Refuse anything but a uint8 image or a batch of them: networks take other numbers as normalised already."""
     if not isinstance(observation, np.ndarray):
         found = type(observation).__name__
-    elif observation.dtype == np.uint8 and observation.shape[-3:] == IMAGE_SHAPE and observation.ndim in (3, 4):
+    elif observation.dtype == np.uint8 and observation.shape[-3:] == SHAPE and observation.ndim in (3, 4):
         return
     else:
         found = f"{observation.dtype} array of shape {observation.shape}"
@@ -53,7 +51,7 @@ class ActorPolicy(nn.Module, Shareable):
         self.deterministic_by_default = deterministic_by_default
         self.description: dict[str, Any] = {}
         self.actor = (build_actor(spec) if actor is None else actor).requires_grad_(False)
-        self.observation_space = spaces.Box(0, 255, IMAGE_SHAPE, np.uint8)
+        self.observation_space = spaces.Box(0, 255, SHAPE, np.uint8)
         self.action_space = spaces.Box(-1.0, 1.0, (2, self.resolution, self.resolution), np.float32)
 
     @property
@@ -90,7 +88,7 @@ class ActorPolicy(nn.Module, Shareable):
         """
         check_images(observation)
         assert isinstance(observation, np.ndarray)
-        action, _ = self.predict_with_gate(observation.reshape(-1, *IMAGE_SHAPE), deterministic)
+        action, _ = self.predict_with_gate(observation.reshape(-1, *SHAPE), deterministic)
         return action if observation.ndim == 4 else action[0], state
 
     @torch.no_grad()

@@ -15,9 +15,10 @@ from torch.nn import functional as F
 from cfp.agent import fused
 from cfp.agent.spec import Interpolation
 from dittogym.action import bicubic
+from dittogym.observation.image import SIZE
 
 #: Rows and columns of the observation, and of actions as input of the paper's encoders.
-IMAGE_SIZE = 64
+IMAGE_SIZE = SIZE
 
 #: Number of entries of a latent image.
 LATENT = 32 * 4 * 4
@@ -66,7 +67,7 @@ class Encoder(nn.Module):
     """
 
     patches: Tensor
-    """Coordinate channels in the receptive fields of the first layer, unfolded to (225, 2 x 8 x 8)."""
+    """Coordinate channels in the receptive fields of the first layer, unfolded to (225, 2 kernel^2)."""
 
     def __init__(self, channels: int, width: int, size: int = IMAGE_SIZE) -> None:
         super().__init__()

@@ -22,6 +22,7 @@ from cfp.analytic.regression import ImageMemory, Regression
 from cfp.analytic.stateful import Stateful
 from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
 from cfp.envs.make import choose_device, make_torch_env
+from cfp.envs.seeding import seeded
 from cfp.errors import NonFiniteError
 from cfp.evaluation.pictures import policy_pictures
 from cfp.experiment.algorithm import Scalars
@@ -29,7 +30,6 @@ from cfp.experiment.schedules import linear_decay
 from cfp.experiment.stages import CoarseToFineStages, refines
 from cfp.presets import analytic_preset
 from dittogym import core
-from dittogym.seeding import seeded
 
 #: Every scalar that ``AnalyticLearner.update`` logs, and what it means.
 METRICS: dict[str, str] = {

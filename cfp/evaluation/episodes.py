@@ -26,7 +26,7 @@ from cfp.envs.disturbances import Disturbed
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.evaluation.cache import Episode, EpisodeCache
 from cfp.policy_protocols import DisturbablePolicy, SeesState
-from dittogym.seeding import noise_seed
+from dittogym.render.recording import noise_seed
 
 
 def attached(policy: PolicyPredictor, env: VecEnv) -> PolicyPredictor:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit  # scipy.stats takes a second to import
 from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from cfp.config import EVALUATION_SEED, RunConfig
@@ -47,7 +47,7 @@ class Result:
         count = len(self.returns)
         if count < 2:
             return None
-        return float(stats.t.ppf(0.975, count - 1) * np.std(self.returns, ddof=1) / math.sqrt(count))
+        return float(stdtrit(count - 1, 0.975) * np.std(self.returns, ddof=1) / math.sqrt(count))
 
 
 def evaluation_seed(config: RunConfig) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from html import escape
 from itertools import islice
@@ -21,7 +20,6 @@ from dittogym.render.film import UNITS, check_available, possible_rate, write_fi
 from dittogym.render.frame import frame, pace
 from dittogym.render.replay import SHOWN, replay_page
 from dittogym.render.scene import Scene, Shot, check_view, describe
-from dittogym.seeding import noise_seed, seeded
 from torchmpm import checks
 
 #: Chooses actions (B, 2, R, R) from observations (B, 3, 64, 64).
@@ -281,7 +279,9 @@ def play(env: Any, act: Act, seed: Any, index: int = 0) -> Iterator[tuple[np.nda
     own = seed if seed is None or np.ndim(seed) == 0 else seed[index]
     yield images, None, None
     while not ended:
-        with nullcontext() if own is None else seeded(noise_seed(int(own), step)):
+        with torch.random.fork_rng(devices=range(torch.cuda.device_count()), enabled=own is not None):
+            if own is not None:
+                torch.manual_seed(noise_seed(int(own), step))
             chosen = act(images)
         step += 1
         try:
@@ -291,6 +291,11 @@ def play(env: Any, act: Act, seed: Any, index: int = 0) -> Iterator[tuple[np.nda
         observation, *end = env.step(action)
         images, ended = observation.cpu().numpy(), bool(end[1][index] | end[2][index])
         yield images, action.cpu().numpy(), end
+
+
+def noise_seed(seed: int, step: int) -> int:
+    """Seed of a policy's noise in a step of the episode with this seed."""
+    return int(np.random.SeedSequence((seed, step)).generate_state(1)[0])
 
 
 def as_function(policy: Any, layout: ActionIndexing) -> Act:
