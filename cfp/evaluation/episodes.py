@@ -26,7 +26,7 @@ from cfp.envs.disturbances import Disturbed
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.evaluation.cache import Episode, EpisodeCache
 from cfp.policy_protocols import DisturbablePolicy, SeesState
-from dittogym.render.recording import noise_seed
+from dittogym.render.recording import seed_noise
 
 
 def attached(policy: PolicyPredictor, env: VecEnv) -> PolicyPredictor:
@@ -59,13 +59,12 @@ class SeededPolicy:
     def predict(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, Memory]:
         """Actions of the policy; reseeds torch's generator."""
         self.before_step()
-        seed = noise_seed(self.layout, self.steps)
-        self.steps += 1
         threads = torch.get_num_threads()
         with self._turn:
             torch.set_num_threads(1)
             try:
-                torch.manual_seed(seed)
+                seed_noise(self.layout, self.steps)
+                self.steps += 1
                 return self.policy.predict(*args, **kwargs)
             finally:
                 torch.set_num_threads(threads)

@@ -30,7 +30,9 @@ def run_command(command: Callable[[], int | None]) -> int:
     """
     keep_memory()
     try:
-        return command() or 0
+        code = command() or 0
+        sys.stdout.flush()  # while a reader that has gone is still noticed here
+        return code
     except Stopped as stopped:
         print(stopped)
         return 128 + stopped.number

@@ -143,12 +143,12 @@ def test_student_meets_faults_and_labels_do_not() -> None:
 
 
 def test_student_does_as_the_teacher_in_a_closed_loop():
-    config = make(num_envs=4, substeps=20, rollout_steps=16, updates=40, batch_size=32, steps=640, handover=(512,))
+    config = make(num_envs=4, substeps=20, rollout_steps=16, updates=20, batch_size=16, steps=384, handover=(256,))
     student, rows = Distill(config), []
     student.collector.teacher = Mirror()
-    student.learn(512, EachUpdate(rows.append))
+    student.learn(256, EachUpdate(rows.append))
     assert set(rows[0]) == set(METRICS)
-    assert rows[-1]["train/fresh_loss"] < 0.15 * rows[0]["train/fresh_loss"]
+    assert rows[-1]["train/fresh_loss"] < 0.05 * rows[0]["train/fresh_loss"]
     assert [row["train/beta"] for row in rows[:3]] == pytest.approx([1.0, 0.7, 0.49])
     fine = Distill(config, 2, student.policy)
     fine.collector.teacher = Mirror()
@@ -161,7 +161,7 @@ def test_student_does_as_the_teacher_in_a_closed_loop():
         for _ in range(20):
             action, _ = policy.predict(seen.numpy(), deterministic=True)
             wanted = project(Mirror().act(env, seen), policy.resolution, 64)
-            assert (torch.as_tensor(action) - wanted).square().mean().sqrt() < 0.1
+            assert (torch.as_tensor(action) - wanted).square().mean().sqrt() < 0.06
             seen = env.step(torch.as_tensor(action))[0]
 
 

@@ -107,15 +107,15 @@ def test_updates_reduce_the_critic_loss_of_a_fixed_batch(algo, tmp_path):
     model = model_of(algo, tmp_path / "run")
     model.hyperparameters = replace(model.hyperparameters, actor_start=0)
     env, generator = model.get_env(), torch.Generator().manual_seed(0)
-    now = torch.as_tensor(env.reset()).repeat(8, 1, 1)
+    now = torch.as_tensor(env.reset()).repeat(4, 1, 1)
     now[..., :FEATURES] += torch.randn(now[..., :FEATURES].shape, generator=generator)
     count = now.shape[1]
-    actions = 2 * torch.rand(16, 2 * count, generator=generator) - 1
+    actions = 2 * torch.rand(8, 2 * count, generator=generator) - 1
     rewards = actions.mean(1, keepdim=True)
-    batch = ReplayBufferSamples(now, actions, now, torch.ones(16, 1), rewards)
+    batch = ReplayBufferSamples(now, actions, now, torch.ones(8, 1), rewards)
     weights = copy.deepcopy(model.networks()[0].state_dict())
-    losses = [float(model.update(batch)["critic_loss"]) for _ in range(40)]
-    assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
+    losses = [float(model.update(batch)["critic_loss"]) for _ in range(20)]
+    assert np.mean(losses[-5:]) < 0.1 * np.mean(losses[:5])
     assert any(not torch.equal(weights[name], value) for name, value in model.networks()[0].state_dict().items())
 
 

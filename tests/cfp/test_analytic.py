@@ -100,7 +100,7 @@ def test_impossible_options_are_named(changes, message):
 
 def test_training_shapes_the_robot(tmp_path):
     config = make("shapematch", resolutions=(8,), window=16, steps=448, max_episode_steps=48, num_layouts=2)
-    config = replace(config, weight_average=0.9, minibatches=16, minibatch_size=32, windows_kept=4)
+    config = replace(config, weight_average=0.9, minibatches=16, minibatch_size=16, windows_kept=4)
     config = replace(config, environment=EnvironmentConfig(2, 300), train_particles=300)
     learner, rewards = AnalyticLearner.create(config, 1, tmp_path), []
     while learner.num_timesteps < config.steps:

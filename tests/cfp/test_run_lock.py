@@ -1,5 +1,6 @@
 import subprocess
 import sys
+from threading import Timer
 
 import pytest
 
@@ -23,27 +24,21 @@ def holder(folder):
     return process
 
 
-def test_folder_is_held_by_one_process(tmp_path):
+def test_folder_is_held_by_one_process_until_it_ends(tmp_path):
     folder = tmp_path / "run"
     process = holder(folder)
+    message = f"out: {folder} is in use by process {process.pid} on"
     try:
-        with pytest.raises(FolderInUse, match=f"out: {folder} is in use by process {process.pid} on"), run_lock(folder):
-            pass
+        for timeout in (0, 0.1):
+            with pytest.raises(FolderInUse, match=message), run_lock(folder, timeout):
+                pass
+        Timer(0.3, process.kill).start()
+        with run_lock(folder, 60):  # waits for it
+            assert (folder / ".lock").exists()
     finally:
         process.kill()
         process.communicate()
-    with run_lock(folder):  # what a killed process held is free
-        assert (folder / ".lock").exists()
     assert folder.exists() and not list(folder.iterdir())
-
-
-def test_patience_outlasts_another_process(tmp_path):
-    process = holder(tmp_path)
-    with pytest.raises(FolderInUse), run_lock(tmp_path, 0.1):
-        pass
-    process.communicate("go\n")
-    with run_lock(tmp_path, 60):
-        pass
 
 
 def test_new_folder_goes_again_if_nothing_was_written(tmp_path):
