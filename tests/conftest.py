@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 from hypothesis import settings
+from short_episodes import short_episodes
 
 settings.register_profile("torchmpm", deadline=None)  # the first call of an operator may compile or allocate
 settings.load_profile("torchmpm")
@@ -22,6 +23,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("cuda"):
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
+
+
+@pytest.fixture(scope="module")
+def short() -> Iterator[None]:
+    """For modules whose tiny runs need no whole episodes."""
+    with short_episodes():
+        yield
 
 
 @pytest.fixture(scope="module", autouse=True)

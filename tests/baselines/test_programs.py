@@ -20,6 +20,8 @@ from cfp.experiment.training import parse
 from cfp.policy_protocols import SeesState
 from cfp.tables import read_table
 
+pytestmark = pytest.mark.usefixtures("short")
+
 COMMON = "--particles 100 --substeps 1 --eval-episodes 2 --no-video --device cpu".split()
 MODULAR = (
     "--num-envs 2 --steps 60 --random-steps 10 --batch-size 4 --buffer-size 60 --update-start 8 --gradient-steps 1 "
@@ -44,23 +46,23 @@ TINY = {
     ),
     "gradient": (
         "--iterations 5 --grid 4 --train-particles 100 --polish 3 --polish-grid 8 "
-        "--eval-every 90 --checkpoint-every 30 --log-every 30",
-        180,
+        "--eval-every 24 --checkpoint-every 8 --log-every 8",
+        48,
         ["stage 1", "stage 2", "  own layout"],
     ),
     "mpc": (
-        "--grid 8 --horizon 3 --commit 2 --iterations 1 --eval-every 12 --checkpoint-every 5 --log-every 5",
-        17,
+        "--grid 8 --horizon 3 --commit 2 --iterations 1 --eval-every 3 --checkpoint-every 2 --log-every 2",
+        5,
         ["stage 1", "  own layout"],
     ),
     "cem": (
-        "--grid 8 --horizon 3 --commit 2 --iterations 2 --candidates 5 --elites 2 --eval-every 12 "
-        "--checkpoint-every 5 --log-every 5",
-        17,
+        "--grid 8 --horizon 3 --commit 2 --iterations 2 --candidates 5 --elites 2 --eval-every 3 "
+        "--checkpoint-every 2 --log-every 2",
+        5,
         ["stage 1", "  own layout"],
     ),
     "shac": (
-        "--train-particles 100 --num-envs 2 --steps 96 --window 6 --grid 8 --max-episode-steps 20 --critic-updates 2 "
+        "--train-particles 100 --num-envs 2 --steps 96 --window 6 --grid 8 --max-episode-steps 6 --critic-updates 2 "
         "--eval-every 48 --checkpoint-every 12 --log-every 24",
         60,
         ["stage 1"],
@@ -102,7 +104,7 @@ def algorithms(slow):
 
 
 @pytest.fixture(scope="module", params=algorithms(slow=LARGE))
-def finished(request, tmp_path_factory):
+def finished(request, tmp_path_factory, short):
     folder = tmp_path_factory.mktemp(request.param) / "whole"
     assert run(request.param, folder) == 0
     return request.param, folder
@@ -111,7 +113,7 @@ def finished(request, tmp_path_factory):
 def test_fit_is_the_command_line(tmp_path):
     assert run("cem", tmp_path / "command") == 0
     names = ("grid", "horizon", "commit", "iterations", "candidates", "elites", "eval_every", "checkpoint_every")
-    options = dict(zip((*names, "log_every"), (8, 3, 2, 2, 5, 2, 12, 5, 5), strict=True))
+    options = dict(zip((*names, "log_every"), (8, 3, 2, 2, 5, 2, 3, 2, 2), strict=True))
     options |= {"particles": 100, "substeps": 1, "eval_episodes": 2, "video": False, "device": "cpu"}
     fitted = baselines.fit("cem", "shapematch", out=tmp_path / "python", **options)
     assert fitted.policy.description["kind"] == "cem" and fitted.results[-1]["policy"] == "  own layout"
@@ -177,20 +179,20 @@ def test_stopped_run_goes_on_as_if_nothing_had_happened(finished, tmp_path, monk
 
 
 def test_stop_in_the_last_step_leaves_a_whole_stage(tmp_path, stop_at):
-    stop_at(30)
+    stop_at(8)
     assert run("mpc", tmp_path) == 128 + signal.SIGINT
-    assert [row["step"] for row in read_table(tmp_path / "evaluations.csv")] == ["12", "24"]
+    assert [row["step"] for row in read_table(tmp_path / "evaluations.csv")] == ["3", "6"]
     assert not (tmp_path / "results.json").exists()
     assert train.main(["--out", str(tmp_path), "--resume"]) == 0
     assert (tmp_path / "results.json").exists()
-    assert [row["step"] for row in read_table(tmp_path / "evaluations.csv")] == ["12", "24", "30"]
+    assert [row["step"] for row in read_table(tmp_path / "evaluations.csv")] == ["3", "6", "8"]
 
 
 def test_last_evaluation_that_a_crash_prevented_is_made_up_for(tmp_path, monkeypatch):
     act = EvaluationCallback._act
 
     def crash(callback):
-        if callback.stage.step == 30:
+        if callback.stage.step == 8:
             raise RuntimeError("killed")
         act(callback)
 
@@ -199,7 +201,7 @@ def test_last_evaluation_that_a_crash_prevented_is_made_up_for(tmp_path, monkeyp
         run("mpc", tmp_path)
     monkeypatch.undo()
     assert train.main(["--out", str(tmp_path), "--resume"]) == 0
-    assert [row["step"] for row in read_table(tmp_path / "evaluations.csv")] == ["12", "24", "30"]
+    assert [row["step"] for row in read_table(tmp_path / "evaluations.csv")] == ["3", "6", "8"]
     assert len(baselines.load(tmp_path).actions) == json.loads((tmp_path / "policy.json").read_text())["steps"]
 
 

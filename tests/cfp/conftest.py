@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from short_episodes import short_episodes
 from tiny_runs import run
 
 
@@ -10,6 +11,7 @@ def finished(tmp_path_factory):
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # as in the tests that repeat it
     folder = tmp_path_factory.mktemp("runs") / "whole"
-    assert run(folder) == 0
+    with short_episodes():
+        assert run(folder) == 0
     torch.set_num_threads(threads)
     return folder

@@ -15,6 +15,8 @@ from cfp.experiment.callbacks import StopCallback
 from cfp.files import write_policy
 from cfp.weights import read_policy
 
+pytestmark = pytest.mark.usefixtures("short")
+
 
 @contextmanager
 def small_files():

@@ -17,6 +17,8 @@ from cfp.presets import sac_preset
 from cfp.tables import read_table
 from cfp.train import PROGRAM
 
+pytestmark = pytest.mark.usefixtures("short")
+
 MEANS = [1.0, 3.0, 2.0, 2.5, 9.0, 1.0, 5.0, 4.0, 3.0, 2.0]
 
 

@@ -21,6 +21,8 @@ from cfp.evaluate import Selection
 from cfp.train import PROGRAM
 from cfp.weights import policy_file
 
+pytestmark = pytest.mark.usefixtures("short")
+
 huggingface_hub = pytest.importorskip("huggingface_hub")
 REPO = "someone/runner"
 

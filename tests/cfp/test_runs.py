@@ -5,12 +5,15 @@ import signal
 from pathlib import Path
 
 import pytest
+from short_episodes import HORIZON
 from tiny_runs import assert_same_run, at_step
 
 import cfp
 from cfp import evaluate
 from cfp.weights import read_policy
 from dittogym.trajectories import load_episodes
+
+pytestmark = pytest.mark.usefixtures("short")
 
 #: The options of `tiny_runs.TINY`.
 OPTIONS = {
@@ -51,7 +54,7 @@ def test_run_holds_policy_evaluations_results_and_film(finished, tmp_path):
     assert run.policy.description["steps"] == best["step"]
     assert [row["policy"] for row in run.results] == ["zero action", "random action", "stage 1", "stage 2"]
     recording = run.film(tmp_path / "film.html", speed=0.5)
-    assert len(recording.rewards) == 30 and (tmp_path / "film.html").stat().st_size > 10_000
+    assert len(recording.rewards) == HORIZON and (tmp_path / "film.html").stat().st_size > 10_000
     with pytest.raises(ValueError, match="path must end in"):
         run.film(tmp_path / "film.doc")
     with pytest.raises(cfp.CheckpointError, match="no run"):
@@ -69,7 +72,7 @@ def test_recorded_episodes_are_those_that_were_evaluated(finished, tmp_path, noi
         json.loads(told.out)[-1]["returns"], abs=2e-3
     )
     assert [list(episode.particles) for episode in episodes] == [["x"], ["x"]] and f"record: {file}" in told.err
-    assert episodes[0].seed + 1 == episodes[1].seed and episodes[0].actions.shape == (30, 2, 64, 64)
+    assert episodes[0].seed + 1 == episodes[1].seed and episodes[0].actions.shape == (HORIZON, 2, 64, 64)
     assert evaluate.main([str(finished), "--record", str(tmp_path / "episodes.h5")]) == 2
     assert "record must end in .npz, got" in capsys.readouterr().err
 

@@ -34,6 +34,8 @@ from cfp.weights import policy_file, read_policy, shipped
 from dittogym.render.frame import png
 from dittogym.tasks.targets import load_target
 
+pytestmark = pytest.mark.usefixtures("short")
+
 
 def test_run_trains_both_stages_and_leaves_its_files(finished):
     for name in ("config.json", "results.json", "curve.png", "policy.safetensors", "policy.json", "stage1.json"):
