@@ -94,9 +94,8 @@ def test_every_algorithm_is_tried_here():
 
 #: The same programs as with 16 segments, and several times slower; and as coarse, with another grid.
 LARGE = {"gnn-64", "transformer-64", "fine"}
-#: The same programs as cfp, mpc and gnn-16, with a single stage, another planner and other networks; `tests/cfp` stops
-#: cfp.
-ALIKE = {"cfp", "coarse", "cem", "transformer-16"}
+#: The same programs as cfp, mpc and gnn-16, with a single stage, another planner and other networks.
+ALIKE = {"coarse", "cem", "transformer-16"}
 
 
 def algorithms(slow):

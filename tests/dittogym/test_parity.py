@@ -29,15 +29,7 @@ def test_substeps_in_float64(task: str) -> None:
     check(name, reference.substep_errors(reference.load(name)), reference.SMALL)
 
 
-#: Robots at rest move little; `test_conformance` compares their rewards.
-AT_REST = {name for name in RECORDED if "zeros" in name and not name.startswith("shapematch")}
-
-
-@pytest.mark.parametrize(
-    "name",
-    [f"{task}-coarse-small-f64" for task in TASKS]
-    + [pytest.param(name, marks=[pytest.mark.slow] * (name in AT_REST)) for name in RECORDED],
-)
+@pytest.mark.parametrize("name", [f"{task}-coarse-small-f64" for task in TASKS] + list(RECORDED))
 @torch.no_grad()
 def test_episode(name: str) -> None:
     check(name, reference.episode_errors(reference.load(name)), reference.EPISODE)

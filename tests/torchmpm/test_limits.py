@@ -120,7 +120,7 @@ def test_an_empty_batch_stays_empty() -> None:
         robot(20).step(ParticleState.at_rest(torch.zeros(1, 0, 2)))
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, 1e30])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30, -1e30])
 @pytest.mark.parametrize("name", ["x", "v", "C", "F", "Jp", "actuation", "origin"])
 def test_a_broken_element_harms_no_other(name: str, value: float) -> None:
     """Not by a bit, wherever the number is; and it stays broken, it is not hidden."""
@@ -187,7 +187,7 @@ def test_matter_that_leaves_the_window_does_not_explode() -> None:
     assert final.x.isfinite().all() and final.x.abs().max() < 2.0
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("place", ["x", "y", "outside", "at the edge"])
 @pytest.mark.parametrize("name", ["elastic", "von Mises", "soil"])
 def test_particles_outside_the_window_have_no_gradient(name: str, place: str, value: float) -> None:

@@ -79,7 +79,7 @@ print(predicted - least, 1024 * (resident("VmHWM") - before))
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux")
 @pytest.mark.parametrize(
     ("backend", "count", "substeps"),
-    [pytest.param("eager", 4000, 20, marks=pytest.mark.slow), ("native", 22000, 60)],
+    [pytest.param("eager", 4000, 20, marks=pytest.mark.slow), ("native", 22000, 60), ("native", 3000, 150)],
 )
 def test_resident_memory_of_a_process(backend: str, count: int, substeps: int) -> None:
     """What further substeps add to the memory that the system gives to a process."""
