@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import inf, isinf
-from numbers import Integral, Real
-from typing import Any
+from numbers import Real
 
 from dittogym.observation.image import RASTER
 from torchmpm import VelocityRule, checks
-from torchmpm.boundary import Range
+from torchmpm.boundary import Range, limits
 
 #: Nodes per metre of every DittoGym window.
 NODES = 128
@@ -73,15 +72,16 @@ class Obstacle:
 
     def __post_init__(self) -> None:
         checks.instance("name", self.name, str)
-        checks.instances("boxes", self.boxes, Box)
-        if self.observed is not None:
-            checks.instances("observed", self.observed, Box)
+        for name, kind in (("boxes", Box), ("rules", VelocityRule), ("observed", Box)):
+            if (given := getattr(self, name)) is not None or name == "boxes":
+                checks.instances(name, given, kind)
+                object.__setattr__(self, name, tuple(given))  # later changes of the caller's do not reach it
         if self.rules is not None and self.friction is not None:
             raise ValueError(
                 f"friction must not be given with rules, which have their own, got {self.friction} for {self.name!r}; "
                 "Obstacle.with_friction changes that of all its faces"
             )
-        checks.instances("rules", self.velocity_rules, VelocityRule)
+        _ = self.velocity_rules  # checks edges and friction
         if not (self.boxes or self.rules or self.observed):
             raise ValueError(f"boxes must not be empty without rules and observed, got none for {self.name!r}")
 
@@ -147,13 +147,13 @@ def side_walls(top: int | None) -> Obstacle:
     return Obstacle("side walls", boxes, rules=rules, observed=())
 
 
-def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True, friction: float = 0.0) -> Obstacle:
+def solid(name: str, i: Range, j: Range, *, visible: bool = True, friction: float = 0.0) -> Obstacle:
     """A box of nodes that matter cannot enter.
 
     Args:
         name: For messages and docs.
-        i: Inclusive range of world node indices in x.
-        j: Inclusive range of world node indices in y; ``None`` leaves an end open.
+        i: Inclusive range of world node indices in x; ``None`` leaves an end open.
+        j: Inclusive range of world node indices in y.
         visible: Whether the robot sees it.
         friction: Coulomb coefficient of its faces; ``math.inf`` sticks, as the floor does.
 
@@ -161,15 +161,7 @@ def solid(name: str, i: tuple[int, int], j: Range, *, visible: bool = True, fric
         ValueError: A range is not two node indices in order, the friction is negative, or the box is narrower than
             four nodes.
     """
-    for axis, given in (("i", i), ("j", j)):
-        kind, open_ends = (Integral, "") if axis == "i" else (Integral | None, ", None for an open end")
-        ends: Any = given if isinstance(given, tuple | list) else ()
-        if len(ends) != 2 or not all(isinstance(end, kind) and not isinstance(end, bool) for end in ends):
-            raise ValueError(f"{axis} must be a range (low, high) of node indices{open_ends}, got {given!r}")
-        first, last = given
-        if first is not None and last is not None and first > last:
-            raise ValueError(f"{axis} must be a range (low, high) with low <= high, got {given}")
     checks.flag("visible", visible)
-    low, high = j
-    box = nodes(*i, -inf if low is None else low, inf if high is None else high)
+    inside = VelocityRule("+x", i, j)  # checks the ranges
+    box = nodes(*limits(inside.i), *limits(inside.j))
     return Obstacle(name, (box,), friction, observed=None if visible else ())

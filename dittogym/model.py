@@ -19,7 +19,7 @@ from dittogym.spec import DT, TaskSpec
 from dittogym.window import GRID
 from torchmpm import Body, Elastic, ParticleState, Solver, VonMises, tree
 from torchmpm.rollout import Segment
-from torchmpm.stability import stable_dt
+from torchmpm.stability import check_gravity, stable_dt
 
 #: The option ``parity``: with ``"reference"`` the behaviours of the reference implementation are brought back.
 Parity = Literal["clean", "reference"]
@@ -173,7 +173,7 @@ def make_model(
         allow_unstable=True,  # checked with the muscles, here and when a reset changes the matter
     )
     pixels = parity == "reference" or counts == full
-    native = backend in ("auto", "native") and solver.kernels.unsupported(torch.device("cpu")) is None
+    native = backend in ("auto", "native")  # of the camera, which draws any matter
     hidden = tuple(body.hidden_velocity for body in spec.bodies)
     camera = Camera(spec.view, spec.window, spec.observed_boxes, counts, weight, hidden, pixels, native)
     model = Model(spec, solver, substeps, camera, segment)
@@ -182,13 +182,14 @@ def make_model(
 
 
 def check_stability(model: Model, physics: Physics) -> None:
-    """Refuse matter that with its muscles needs shorter substeps."""
+    """Refuse matter that with its muscles needs shorter substeps, and gravity that does."""
     solver, actuation = model.solver_for(physics), physics.get("max_actuation", model.spec.max_actuation)
     limit = solver.stable_dt(actuation)
     if solver.dt > limit:
         robot = stable_dt(solver.bodies[:1], GRID.h, actuation) == limit
         matter = f"the material, muscles and mass of the {'robot' if robot else 'object'}"
         raise ValueError(f"dt must be at most {limit} s to be stable with {matter}, got {solver.dt}")
+    check_gravity(solver.gravity, GRID.h, solver.dt)
 
 
 def next_physics(model: Model, present: Physics, given: object, mask: Tensor, like: Tensor) -> Physics:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Mapping
 from typing import Any, TypeAlias
@@ -21,9 +20,8 @@ Physics: TypeAlias = Mapping[str, Tensor]
 #: muscle limit of the robot, Pa; gravity, m/s^2; and a factor on the mass of all particles.
 NAMES = ("mu", "lam", "yield_stress", "max_actuation", "gravity", "mass")
 _SIGNS = {"mu": "positive", "mass": "positive", "yield_stress": "not negative", "max_actuation": "not negative"}
-#: Largest amounts, far above any use. With more gravity a particle at rest crosses a cell of the grid within a substep;
-#: sums over much heavier particles overflow in float32.
-_LARGEST = {"gravity": 5e5, "mass": 1e6}
+#: Largest factor on the mass, far above any use: sums over much heavier particles overflow in float32.
+_LARGEST_MASS = 1e6
 #: Those that may differ between the particles of a body.
 PER_PARTICLE = ("mu", "lam", "yield_stress", "mass")
 
@@ -47,7 +45,7 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
 
     Raises:
         ValueError: Not a mapping, an unknown name, a wrong shape, or values that are not finite, have a wrong sign, or
-            are too large (gravity, mass).
+            are too large (mass).
     """
     if not isinstance(given, Mapping):
         raise ValueError(f"physics must be a mapping from {', '.join(NAMES)} to values, got {type(given).__name__}")
@@ -67,8 +65,8 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
             kind = f"finite, {sign}" if sign else "finite"
             raise ValueError(f"physics[{name!r}] must be {kind}, got {tensor.detach()[~allowed].flatten()[0].item()}")
         largest = float(tensor.detach().abs().max())
-        if largest > _LARGEST.get(name, math.inf):
-            raise ValueError(f"physics[{name!r}] must be at most {_LARGEST[name]:g} in amount, got {largest:g}")
+        if name == "mass" and largest > _LARGEST_MASS:
+            raise ValueError(f"physics['mass'] must be at most {_LARGEST_MASS:g}, got {largest:g}")
         values[name] = _expanded(tensor, name, batch)
     return values
 

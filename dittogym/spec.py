@@ -122,9 +122,10 @@ class TaskSpec:
         for name, kind in (("name", str), ("robot", BodySpec), ("window", Window), ("weights", Mapping)):
             checks.instance(name, getattr(self, name), kind)
         for name, each in (("objects", BodySpec), ("obstacles", Obstacle), ("stale_memory", str)):
-            checks.instances(name, getattr(self, name), each)
+            checks.instances(name, given := getattr(self, name), each)
+            object.__setattr__(self, name, tuple(given))  # later changes of the caller's do not reach it
         self._check_numbers()
-        object.__setattr__(self, "weights", dict(self.weights))  # later changes of the caller's do not reach it
+        object.__setattr__(self, "weights", dict(self.weights))
         if len(self.objects) > 1:
             raise ValueError(f"objects must be at most one body, got {len(self.objects)}")
         if self.target is not None:

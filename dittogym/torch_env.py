@@ -110,7 +110,7 @@ class TorchEnv:
         self.action_layout = arguments.choice("action_layout", action_layout, layouts)
         counts = particle_counts(self.spec, particles)
         self.model = make_model(self.spec, counts, substeps, backend, parity, segment, float(dt))
-        random = self._as_reference or counts == tuple(body.count for body in self.spec.bodies)
+        random = self.model.camera.pixels  # both as in the reference, with full counts or its parity
         self._initial_positions = InitialPositions(self.spec, counts, self.num_envs, random=random, resample=resample)
         self._like = torch.empty(self.num_envs, dtype=self.dtype, device=self.device)
         self.device = self._like.device  # with the number of what is the current device now

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -56,8 +56,9 @@ class VelocityRule:
         if self.friction != math.inf:
             checks.number("friction", self.friction, least=0.0)
         for name, given in (("i", self.i), ("j", self.j)):
-            ends = [end for end in given if end is not None] if isinstance(given, tuple) and len(given) == 2 else [None]
-            if not all(isinstance(end, Integral) for end in ends) or ends != sorted(ends):
+            pair = isinstance(given, tuple | list) and len(given) == 2
+            ends: list[Any] = [end for end in given if end is not None] if pair else [None]
+            if not all(isinstance(end, Integral) and not isinstance(end, bool) for end in ends) or ends != sorted(ends):
                 raise ValueError(
                     f"{name} must be an inclusive range (low, high) of node indices or None with low <= high, "
                     f"got {given!r}"

@@ -1,6 +1,5 @@
 """The solver: a frozen description of grid, bodies and boundary, and the step that advances a state."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from typing import Any
@@ -93,10 +92,8 @@ class Solver:
             if self.gravity.ndim not in (1, 2) or self.gravity.shape[-1] != 2:
                 raise ValueError(f"gravity must have shape (2,) or (B, 2), got {tuple(self.gravity.shape)}")
         else:
-            if not isinstance(self.gravity, Sequence) or len(self.gravity) != 2:
-                raise ValueError(f"gravity must be two numbers (x, y) or a tensor, got {self.gravity!r}")
-            for component, value in zip("xy", self.gravity, strict=True):
-                checks.number(f"gravity {component}", value)
+            checks.pair("gravity", self.gravity)
+            object.__setattr__(self, "gravity", tuple(map(float, self.gravity)))
         checks.number("damping", self.damping, least=0.0)
         if self.damping > 1:
             raise ValueError(f"damping must be at most 1, got {self.damping}")
@@ -112,9 +109,7 @@ class Solver:
                 checks.entries(name, tensor, above=0.0 if name.endswith(("].mass", "].volume")) else None)
         if not self.allow_unstable:
             self._check_stability()
-            largest = self.grid.h / self.dt**2  # with it, a particle at rest crosses a cell within a substep
-            for part in (self.gravity,) if isinstance(self.gravity, Tensor) else self.gravity:
-                checks.entries("gravity", part, above=-largest, below=largest)
+            stability.check_gravity(self.gravity, self.grid.h, self.dt)
 
     def _check_stability(self) -> None:
         try:
@@ -232,7 +227,7 @@ class Solver:
             planes = replayed(run, scene, planes, substeps, segment)
         else:
             planes = repeated(partial(run, scene), planes, substeps, segment=segment, reads=reads)
-        return ParticleState.from_planes(planes)
+        return ParticleState.from_stack(torch.stack(planes))
 
     def substep(self, scene: Scene, planes: Planes) -> Planes:
         """One substep of a scene, from 13 planes (B, N) to new ones; a subclass may compute it in another way."""

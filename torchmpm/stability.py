@@ -1,10 +1,12 @@
-"""The largest stable substep."""
+"""The largest stable substep, and the largest gravity."""
 
 import math
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
+from torchmpm import checks
 from torchmpm.materials.base import Value, detached_column
 from torchmpm.materials.body import Body
 
@@ -34,3 +36,10 @@ def stable_dt(bodies: Sequence[Body], h: float, actuation: Value = 0.0) -> float
         rates.append(float(rate.max()))
     fastest = math.sqrt(max(rates))
     return h / fastest if fastest > 0 else math.inf
+
+
+def check_gravity(gravity: tuple[float, float] | Tensor, h: float, dt: float) -> None:
+    """Raise a ValueError if a particle at rest would cross a cell of width ``h``, m, within a substep of ``dt``, s."""
+    largest = h / dt**2
+    for part in (gravity,) if isinstance(gravity, Tensor) else gravity:
+        checks.entries("gravity", part, above=-largest, below=largest)

@@ -165,13 +165,8 @@ class ParticleState:
         return (*(plane for field in fields for plane in field.unbind(-1)), self.Jp)
 
     @classmethod
-    def from_planes(cls, planes: tuple[Tensor, ...]) -> ParticleState:
-        """Inverse of :meth:`planes`; the planes stay contiguous behind the documented shapes."""
-        return cls.from_stack(torch.stack(planes))
-
-    @classmethod
     def from_stack(cls, stacked: Tensor) -> ParticleState:
-        """Inverse of :meth:`stack`; the fields are views of the tensor (13, B, N)."""
+        """Inverse of :meth:`stack`; the fields are views of the tensor (13, B, N), so that planes stay contiguous."""
         vector, matrix = (lambda p: p.movedim(0, -1)), (lambda p: p.movedim(0, -1).unflatten(-1, (2, 2)))
         x, v, C, F = vector(stacked[0:2]), vector(stacked[2:4]), matrix(stacked[4:8]), matrix(stacked[8:12])
         return cls(x, v, C, F, stacked[12])

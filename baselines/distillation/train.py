@@ -212,7 +212,7 @@ class Distill(Stateful, CoarseToFineStages):
         teachers.train_teacher(config, folder, signals)
 
     @classmethod
-    def create(cls, config: DistillConfig, stage: int, folder: Path, resumed: bool = False) -> Distill:
+    def create(cls, config: DistillConfig, stage: int, folder: Path) -> Distill:
         """The student at the beginning of a stage."""
         start = load(policy_path(folder, stage - 1), choose_device(config.device)) if stage > 1 else None
         teacher = None if config.teacher == "mpc" else teachers.teacher_path(folder)

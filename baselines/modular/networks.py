@@ -23,6 +23,7 @@ from cfp.agent.networks import initialise, perceptron
 from cfp.files import write_policy
 from cfp.weights import read_policy, report_mismatch
 from dittogym import TorchEnv
+from dittogym.action import from_grid_indexing, trained_indexing
 from dittogym.spec import TaskSpec
 
 Kind = Literal["gnn", "transformer"]
@@ -164,7 +165,8 @@ class SegmentPolicy(StateBasedPolicy):
         values = self.actor(self.nodes.observe(env, labels).to(device), deterministic)
         if self.change is not None:
             values = torch.from_numpy(self.change(values.cpu().numpy()))
-        return self.nodes.to_grid(env, labels, values.to(env.device)), (labels.cpu().numpy(),)
+        action = self.nodes.to_grid(env, labels, values.to(env.device))
+        return from_grid_indexing(action, trained_indexing(self) or env.action_layout), (labels.cpu().numpy(),)
 
     def save(self, path: Path) -> None:
         """Write ``path`` (``.safetensors``) and the ``.json`` beside it."""

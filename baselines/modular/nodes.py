@@ -8,7 +8,7 @@ from torch.nn.functional import pad
 
 from baselines.modular.kmeans import adjacency, segment_means, squared_distances
 from dittogym import TorchEnv
-from dittogym.action import from_grid_indexing, patch_corner
+from dittogym.action import patch_corner
 from dittogym.geometry import FLOOR_NODE, NODES
 from dittogym.spec import TaskSpec
 from dittogym.window import centre_in_window
@@ -89,9 +89,10 @@ class Nodes:
         return torch.cat([part.float() for part in parts], -1)
 
     def to_grid(self, env: TorchEnv, labels: Tensor, values: Tensor) -> Tensor:
-        """Actions (B, 2, P, P) in which every node of the patch has the value of the segment with the nearest centre.
+        """Muscles (B, 2, P, P) in which every node of the patch has the value of the segment with the nearest centre.
 
-        Labels are (B, N), values (B, K, 2) in [-1, 1]; the action grid of ``env`` must be its patch.
+        Labels are (B, N), values (B, K, 2) in [-1, 1], and nodes are indexed (x rightwards, y upwards). The action grid
+        of ``env`` must be its patch.
         """
         size, state = env.spec.patch, env.env_state
         grid = env.model.solver.grid.resolution
@@ -102,7 +103,7 @@ class Nodes:
         centres, _ = segment_means(visible_positions(env), labels, self.count)
         nearest = squared_distances(position.to(centres), centres).argmin(-1)
         field = values.to(centres).gather(1, nearest[..., None].expand(-1, -1, 2))
-        return from_grid_indexing(field.transpose(1, 2).unflatten(2, (size, size)), env.action_layout)
+        return field.transpose(1, 2).unflatten(2, (size, size))
 
 
 def visible_positions(env: TorchEnv) -> Tensor:

@@ -139,7 +139,7 @@ class Modular(SACAlgorithm):
         )
 
     @classmethod
-    def create(cls, config: ModularConfig, stage: int, folder: Path, resumed: bool = False) -> Modular:
+    def create(cls, config: ModularConfig, stage: int, folder: Path) -> Modular:
         """The algorithm at the beginning of its only stage."""
         env = SegmentedEnv(make_torch_env(config, config.resolution(stage)), config.nodes)
         networks = {"kind": config.kind, "features": config.nodes.num_features(env.env.spec)}

@@ -1,5 +1,7 @@
 """Short-horizon actor-critic: a policy trained by gradients through the simulation (Xu et al., ICLR 2022)."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,16 +20,16 @@ from cfp.analytic.reward import RewardConfig
 from cfp.analytic.stateful import Stateful
 from cfp.analytic.window import WINDOW_METRICS, Window, WindowCollector, reward_warnings, short_horizon_loss
 from cfp.config import RunConfig
-from cfp.envs.make import make_torch_env
+from cfp.envs.make import choose_device, make_torch_env
 from cfp.envs.seeding import seeded
 from cfp.errors import ConfigError, NonFiniteError
-from cfp.experiment.algorithm import Algorithm, Scalars, Sees
+from cfp.experiment.algorithm import Algorithm, Position, Scalars, Sees
+from cfp.experiment.folder import start_path
 from cfp.experiment.schedules import linear_decay
-from cfp.policy_protocols import Policy
 from cfp.presets import ON_SPEED, sac_preset
 from cfp.sections import ReportConfig
 from cfp.validation import check_at_least
-from cfp.weights import KIND, load, policy_for, read_policy
+from cfp.weights import KIND, copy_policy, load, policy_for, read_policy
 
 #: Updates in a row without a finite gradient after which training gives up.
 PATIENCE = 10
@@ -97,7 +99,7 @@ class Shac(Stateful, Algorithm):
     parts = ("actor", "actor_adam", "critic", "collector")
     values = ("generator", "skipped", "skipped_in_a_row")
 
-    def __init__(self, config: ShacConfig, stage: int = 1, start: Policy | None = None) -> None:
+    def __init__(self, config: ShacConfig, stage: int = 1, start: ActorPolicy | None = None) -> None:
         self.config = config
         training = replace(config, environment=config.training_environment)
         self.env = make_torch_env(training, config.resolution(stage))
@@ -105,7 +107,7 @@ class Shac(Stateful, Algorithm):
         with seeded(config.seed):
             self.actor, critic = self._make_networks()
         if start is not None:
-            assert isinstance(self.actor, ImageActor) and isinstance(start, ActorPolicy)
+            assert isinstance(self.actor, ImageActor)
             self.actor.actor.load_state_dict(start.actor.state_dict())
             self.actor.actor.fix_std()
         self.critic = Critic(critic, config)
@@ -213,16 +215,26 @@ class Shac(Stateful, Algorithm):
         return reward_warnings(config)
 
     @classmethod
-    def initial_policy(cls, config: ShacConfig) -> ActorPolicy | None:
-        """The policy from which the actor starts, if the options name one."""
+    def initialize(cls, config: ShacConfig, folder: Path) -> Position:
+        """Copy the policy from which the actor starts into the folder, if the options name one."""
         if config.start_from is None:
-            return None
+            return Position()
         policy, resolutions = policy_for(config, config.start_from), (config.resolution(1),)
         if policy.spec.resolutions != resolutions:
             raise ConfigError(f"start_from must have the resolutions {resolutions}, got {policy.spec.resolutions}")
         if policy.spec.encoder != "full":
             raise ConfigError(f"start_from must be a policy with encoder full, got {policy.spec.encoder}")
-        return policy
+        copy_policy(config.start_from, start_path(folder))
+        return Position()
+
+    @classmethod
+    def create(cls, config: ShacConfig, stage: int, folder: Path) -> Shac:
+        """Networks and environment, with the policy from which the actor starts."""
+        if config.start_from is None:
+            return cls(config)
+        algorithm = cls(config, start=load(start_path(folder), choose_device(config.device)))
+        algorithm.starts_trained = True
+        return algorithm
 
     def save_policy(self, path: Path, description: dict[str, Any]) -> None:
         """Write the policy; one of the image becomes a policy of CFP."""

@@ -83,7 +83,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         return replace(analytic_preset(task, name), algo="analytic")
 
     @classmethod
-    def create(cls, config: AnalyticConfig, stage: int, folder: Path, resumed: bool = False) -> AnalyticLearner:
+    def create(cls, config: AnalyticConfig, stage: int, folder: Path) -> AnalyticLearner:
         """Networks, memory and environment of a stage."""
         with seeded(config.seed):
             actor = build_actor(config.actor_spec(stage)).to(choose_device(config.device))

@@ -45,7 +45,7 @@ class Algorithm(ABC):
     Args:
         config: Options of the run. A subclass with other arguments than these overrides `create`.
         stage: Which stage, 1 is the first.
-        start: Policy of the stage before; in the first stage `initial_policy`.
+        start: Policy of the stage before, if there is one.
     """
 
     sees: ClassVar[Sees] = "image"  # what its policies look at; their training may use more
@@ -70,7 +70,6 @@ class Algorithm(ABC):
     @classmethod
     def initialize(cls, config: Any, folder: Path) -> Position:
         """Put what the first stage of a new run needs into its ``folder``, and return which stage that is."""
-        cls.initial_policy(config)
         return Position()
 
     @classmethod  # noqa: B027  (most algorithms need nothing)
@@ -78,20 +77,12 @@ class Algorithm(ABC):
         """Do what precedes the first stage, such as training a teacher; ``signals`` tell whether to stop."""
 
     @classmethod
-    def create(cls, config: Any, stage: int, folder: Path, resumed: bool = False) -> Algorithm:
-        """The algorithm at the beginning of a stage, also if it is ``resumed`` from a checkpoint loaded later."""
-        if stage > 1:
-            start: Policy | None = cls.load(policy_path(folder, stage - 1), choose_device(config.device))
-        else:
-            start = None if resumed else cls.initial_policy(config)
+    def create(cls, config: Any, stage: int, folder: Path) -> Algorithm:
+        """The algorithm at the beginning of a stage, also where a checkpoint is loaded into it later."""
+        start = cls.load(policy_path(folder, stage - 1), choose_device(config.device)) if stage > 1 else None
         algorithm = cls(config, stage, start)
-        algorithm.starts_trained = start is not None
+        algorithm.starts_trained = stage > 1
         return algorithm
-
-    @classmethod
-    def initial_policy(cls, config: Any) -> Policy | None:
-        """The trained policy that the first stage begins with, if the options name one."""
-        return None
 
     @classmethod
     def warnings(cls, config: Any, folder: Path, first_stage: int) -> list[str]:

@@ -20,8 +20,9 @@ from cfp.config import Config, Preset, RunConfig
 from cfp.envs.make import choose_device, make_env
 from cfp.evaluation.pictures import policy_pictures
 from cfp.experiment.algorithm import Algorithm, Scalars
+from cfp.experiment.folder import start_path
 from cfp.experiment.sac_state import load_model_state_dict, model_state_dict
-from cfp.experiment.stages import CoarseToFineStages, refines, start_path
+from cfp.experiment.stages import CoarseToFineStages, refines
 from cfp.presets import sac_preset
 from cfp.weights import load
 
@@ -140,7 +141,7 @@ class CoarseToFine(CoarseToFineStages, SACAlgorithm):
         return replace(own, random_steps=0) if refines(config, folder, stage) else own
 
     @classmethod
-    def create(cls, config: Config, stage: int, folder: Path, resumed: bool = False) -> CoarseToFine:
+    def create(cls, config: Config, stage: int, folder: Path) -> CoarseToFine:
         """Networks, replay memory and environment of a stage."""
         limit, spec = config.learning.max_episode_steps, config.actor_spec(stage)
         env = make_env(config, config.action_size(stage), max_episode_steps=limit)

@@ -85,6 +85,11 @@ def policy_path(folder: Path, stage: int | None = None) -> Path:
     return folder / ("policy.safetensors" if stage is None else f"stage{stage}.safetensors")
 
 
+def start_path(folder: Path) -> Path:
+    """The run's own copy of the policy that its first stage begins with, if the options name one."""
+    return folder / "start.safetensors"
+
+
 def policy_files(folder: Path, stages: int) -> dict[str, Path]:
     """Policies of a run so far by name: those of finished stages, then the one in training or trained last."""
     finished = {f"stage {stage}": policy_path(folder, stage) for stage in range(1, stages)}

@@ -156,9 +156,8 @@ class TrainingRun:
 
     def _create(self) -> Algorithm:
         """The algorithm of the present stage: at its beginning, or as the checkpoint holds it."""
-        resumed = self.state is not None
         try:
-            algorithm = self.algorithm.create(self.config, self.position.stage, self.folder, resumed)
+            algorithm = self.algorithm.create(self.config, self.position.stage, self.folder)
         except CFPError:
             if not self.checkpoint.path.exists():  # options that it refuses leave no run behind
                 (self.folder / "config.json").unlink()

@@ -13,7 +13,7 @@ from cfp.agent.lean import LeanEncoder
 from cfp.config import StagedConfig
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm, Position
-from cfp.experiment.folder import policy_path
+from cfp.experiment.folder import policy_path, start_path
 from cfp.files import write_policy
 from cfp.weights import KIND, copy_policy, load, policy_for, read_policy, report_mismatch
 
@@ -84,11 +84,6 @@ def copy_coarse_weights(actor: Actor, coarse: Actor) -> None:
     actor.get_submodule("coarse").load_state_dict(coarse.state_dict())
     if isinstance(actor.encoder, LeanEncoder):  # heads and critics start from trained features
         actor.encoder.load_state_dict(coarse.encoder.state_dict())
-
-
-def start_path(folder: Path) -> Path:
-    """The run's own copy of the policy that it refines."""
-    return folder / "start.safetensors"
 
 
 def refines(config: Any, folder: Path, stage: int) -> bool:

@@ -1,4 +1,4 @@
-"""Where the particles of a body start: discs, boxes, lattices, polygons and pictures."""
+"""Where the particles of a body start: discs, boxes, lattices and pictures."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class Session:
         policies: What loads the policies, by the names they have on the page.
         policy: Name of the one that acts at first.
         seed: Of the particles.
-        options: All arguments of :class:`dittogym.TorchEnv` but ``num_envs``.
+        options: Arguments of :class:`dittogym.TorchEnv` but ``num_envs`` and ``action_layout``.
 
     Raises:
         ValueError: An option is out of range.
@@ -73,8 +73,8 @@ class Session:
         seed: int = 0,
         **options: Any,
     ) -> None:
-        self.task, self.policies, self.seed, self.options = task, dict(policies or {}), seed, options
-        self.env = TorchEnv(task, 1, **options)
+        self.task, self.seed, self.options = task, seed, {**options, "action_layout": "image"}  # that of the page
+        self.policies, self.env = dict(policies or {}), TorchEnv(task, 1, **self.options)
         self.own_resolution = self.env.action_resolution
         self.control_step = self.env.model.substeps * self.env.model.solver.dt
         self.playing, self.speed = True, 0.1 if self.env.spec.horizon * self.control_step < SHORT else 1.0
@@ -203,9 +203,9 @@ class Session:
         return self._as_image(chosen)[0]
 
     def _as_image(self, array: np.ndarray) -> np.ndarray:
-        """What a policy returns (B, 2, R, R), in the orientation of the environment's actions."""
+        """What a policy returns (B, 2, R, R), oriented as the page shows it."""
         layout = trained_indexing(self.policy) or "image"
-        return from_grid_indexing(to_grid_indexing(torch.as_tensor(array), layout), self.env.action_layout).numpy()
+        return from_grid_indexing(to_grid_indexing(torch.as_tensor(array), layout), "image").numpy()
 
     def _pull(self) -> None:
         """Let the hand pull at matter, which it takes hold of the first time."""

@@ -257,12 +257,12 @@ ENVIRONMENT = table(
         (
             "gravity that crosses cells",
             lambda: env().reset(options={"physics": {"gravity": (0.0, -1e12)}}),
-            "physics['gravity'] must be at most 500000 in amount, got 1e+12",
+            ("gravity must be above -", "got -999999995904.0"),
         ),
         (
             "mass of a planet",
             lambda: env().reset(options={"physics": {"mass": 1e30}}),
-            "physics['mass'] must be at most 1e+06 in amount, got 1e+30",
+            "physics['mass'] must be at most 1e+06, got 1e+30",
         ),
         ("masked action", lambda: step(single(), np.ma.masked_all((2, 8, 8))), "masked array with 128 masked entries"),
         ("muscles by name", lambda: single(render_muscles="x"), "render_muscles must be True or False, got 'x'"),
@@ -336,9 +336,17 @@ ENVIRONMENT = table(
         ("figure of no pixels", lambda: Figure(np.zeros((3, 3), bool), (0.4, 0.2), 0.1), "mask must be an array"),
         ("robot of nothing", lambda: RobotBody(Disc((0.4, 0.2), 0.1), 0), "count must be at least 1, got 0"),
         ("robot of no area", lambda: env(body=[(0, 0), (1, 1), (2, 2)]), "body must have corners that enclose an area"),
-        ("box at a name", lambda: solid("box", ("a", "b"), (0, 9)), "i must be a range (low, high) of node indices"),
-        ("box at a truth", lambda: solid("box", (True, 9), (0, 9)), "i must be a range (low, high) of node indices"),
-        ("box from 9 to 0", lambda: solid("box", (9, 0), (0, 9)), "i must be a range (low, high) with low <= high"),
+        (
+            "box at a name",
+            lambda: solid("box", ("a", "b"), (0, 9)),
+            "i must be an inclusive range (low, high) of node indices",
+        ),
+        (
+            "box at a truth",
+            lambda: solid("box", (True, 9), (0, 9)),
+            "i must be an inclusive range (low, high) of node indices",
+        ),
+        ("box from 9 to 0", lambda: solid("box", (9, 0), (0, 9)), ("with low <= high", "got (9, 0)")),
         (
             "box seen by name",
             lambda: solid("box", (0, 9), (0, 9), visible="no"),

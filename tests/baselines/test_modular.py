@@ -9,6 +9,7 @@ import torch
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 import baselines
+from baselines.modular.env import SegmentedEnv
 from baselines.modular.kmeans import fit, update
 from baselines.modular.networks import ModularActor, ModularCritics, SegmentPolicy
 from baselines.modular.nodes import Nodes, pack, visible_positions
@@ -21,6 +22,7 @@ from cfp.robustness import report
 from cfp.sections import EnvironmentConfig, ReportConfig
 from cfp.weights import describe_run
 from dittogym import TorchEnv
+from dittogym.action import from_grid_indexing, to_grid_indexing
 
 KINDS = ("gnn", "transformer")
 FEATURES = 10
@@ -148,6 +150,27 @@ def test_policy_of_a_file_acts_like_the_one_in_training(tmp_path):
         seen = venv.step(model.predict(seen, deterministic=True)[0])[0]
     assert torch.allclose(env.state.x, venv.unwrapped.torch_env.env.state.x, atol=1e-6)
     assert np.array_equal(memory[0].shape, (2, 200)) and action.shape == (2, 2, 64, 64)
+
+
+@pytest.mark.parametrize("trained", ["image", "grid"])
+def test_policy_answers_in_the_orientation_that_it_was_trained_in(trained):
+    """Whatever the environment's, because teachers and pages turn its actions from the one that it says."""
+    about = {"resolution": 64, "environment": {"action_layout": trained}}
+    policy = SegmentPolicy(ModularActor("gnn", FEATURES), Nodes(16, True), about)
+    images, actions = np.zeros((1, 3, 64, 64), np.uint8), {}
+    for layout in ("image", "grid"):
+        env = TorchEnv("run", 1, 64, particles=200, substeps=20, action_layout=layout)
+        env.reset(seed=0)
+        actions[layout] = policy.attached(env).predict(images, deterministic=True)[0]
+        segments = SegmentedEnv(env, policy.nodes)
+        segments.reset(seed=0)
+        values = policy.actor(segments.env_state.observation, True).detach()
+        segments.step(values)
+        moved = env.state.x
+        env.reset(seed=0)
+        env.step(from_grid_indexing(to_grid_indexing(torch.from_numpy(actions[layout]), trained), layout))
+        assert torch.equal(env.state.x, moved)
+    assert np.array_equal(*actions.values())
 
 
 def test_robots_are_segmented_anew_where_their_episode_begins_and_nowhere_else():

@@ -10,7 +10,7 @@ from baselines.modular.kmeans import adjacency, connect, fit, segment_means, squ
 from baselines.modular.nodes import LENGTH_SCALE, SPEED_SCALE, Nodes, pack, unpack
 from cfp.errors import ConfigError
 from dittogym import TorchEnv
-from dittogym.action import place, to_grid_indexing
+from dittogym.action import place
 from dittogym.window import centre_in_window
 
 
@@ -126,15 +126,14 @@ def test_what_is_seen_depends_on_the_task(task, columns):
     assert Nodes(16, False).num_columns(dittogym.make_spec(task)) == columns
 
 
-@pytest.mark.parametrize("layout", ["image", "grid"])
 @pytest.mark.parametrize("task", ["run", "dig"])
-def test_nodes_of_the_grid_get_the_value_of_the_nearest_segment(task, layout):
-    env = segmented(task, 1, action_layout=layout)
+def test_nodes_of_the_grid_get_the_value_of_the_nearest_segment(task):
+    env = segmented(task, 1)
     values = torch.stack((torch.linspace(-1, 1, 16), torch.linspace(1, 0, 16)), -1)[None]
     action = env.nodes.to_grid(env.env, env.labels, values)
     state, spec = env.env.env_state, env.env.spec
     centre = centre_in_window(spec.reach, state.centre, state.origin)
-    field = place(to_grid_indexing(action, layout), centre, 128)
+    field = place(action, centre, 128)
     robot = state.particles.x[:, : env.env.model.num_robot_particles]
     centres, _ = segment_means(robot, env.labels, 16)
     for point in robot[0, ::50]:

@@ -286,7 +286,10 @@ def test_actor_on_the_image_begins_with_a_policy_of_any_algorithm(tmp_path):
     origins = replace(trained, environment=config.environment, resolutions=(config.resolution(1),))
     save_actor(path, actor, origins, 1, 5)
     warm = replace(config, start_from=str(path))
-    algorithm = Shac(warm, 1, Shac.initial_policy(warm))
+    Shac.initialize(warm, tmp_path)
+    path.unlink()  # the run has its own copy
+    algorithm = Shac.create(warm, 1, tmp_path)
+    assert algorithm.starts_trained and not Shac.create(config, 1, tmp_path).starts_trained
     for name, value in actor.state_dict().items():
         if not name.startswith("std."):
             assert torch.equal(algorithm.actor.actor.state_dict()[name], value), name
@@ -295,10 +298,9 @@ def test_actor_on_the_image_begins_with_a_policy_of_any_algorithm(tmp_path):
     spread = torch.stack([algorithm.policy(images).atanh() for _ in range(30)]).std(0).mean()
     assert spread == pytest.approx(0.105, rel=0.05)  # not that of the policy, which nothing would change any more
     with pytest.raises(ConfigError, match=r"start_from.*kick"):
-        Shac.initial_policy(replace(warm, task="kick"))
+        Shac.initialize(replace(warm, task="kick", start_from="run"), tmp_path)
     with pytest.raises(ConfigError, match=r"start_from.*sees"):
         replace(warm, sees="state").check()
-    assert Shac.initial_policy(config) is None
 
 
 def test_policy_of_the_state_says_what_it_needs(tmp_path):

@@ -100,9 +100,10 @@ def test_pulling_moves_matter_towards_the_pointer() -> None:
         assert played.grip is None
 
 
-def test_muscles_under_the_pointer() -> None:
-    """The action has its largest value in the cell that holds the pointer."""
-    played = session(resolution=16)
+@pytest.mark.parametrize("parity", ["clean", "reference"])
+def test_muscles_under_the_pointer(parity: str) -> None:
+    """The action has its largest value in the cell that holds the pointer, and acts there."""
+    played = session(resolution=16, parity=parity)
     corner, cell = played._corner(), 0.5 / 16
     for tool, sign in (("contract", 1), ("expand", -1)):
         played.apply(Hand(tool, corner[0] + 5.5 * cell, corner[1] + 0.5 - 7.5 * cell))
@@ -110,6 +111,8 @@ def test_muscles_under_the_pointer() -> None:
         action = sign * played.actions[-1]
         corner = played._corner()
         assert np.unravel_index(action[0].argmax(), (16, 16)) == (7, 5) and action.max() == pytest.approx(1, abs=0.1)
+        at = (played.shot.x[:, 0] - played.hand.x) ** 2 + (played.shot.x[:, 1] - played.hand.y) ** 2
+        assert np.abs(played.shot.values["muscle"][at < 0.01**2] - 127.5).min() > 100
     near = press(np.array((0.1, 0.2)), np.zeros(2), 0.5, 8)
     assert near.shape == (2, 8, 8) and near.max() <= 1
 

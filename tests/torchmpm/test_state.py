@@ -81,7 +81,7 @@ def test_planes_are_the_components_and_invert() -> None:
     expected.append(state.Jp)
     assert len(planes) == len(expected) == 13
     assert all(torch.equal(plane, component) for plane, component in zip(planes, expected, strict=True))
-    again = ParticleState.from_planes(planes)
+    again = ParticleState.from_stack(torch.stack(planes))
     assert_identical(again, state)
     assert all(plane.is_contiguous() for plane in again.planes())
 

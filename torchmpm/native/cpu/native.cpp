@@ -1,4 +1,4 @@
-// The C interface that torchmpm/native/cpu/library.py loads.
+// The C interface that torchmpm/native/cpu/call.py calls.
 #include <exception>
 #include <memory>
 
