@@ -8,7 +8,8 @@ from importlib import import_module
 #: Module of each program, with a function ``main``, and what it does.
 PROGRAMS = {
     "train": ("baselines.train", "train a policy on a task, by the coarse-to-fine method or another --algo"),
-    "evaluate": ("baselines.evaluate", "returns of a trained policy, with films, replays and recorded trajectories"),
+    "evaluate": ("baselines.evaluate", "returns of a trained policy, with films and recorded trajectories"),
+    "replay": ("baselines.replay", "an episode of a policy, to watch in a browser"),
     "robustness": ("baselines.robustness", "returns of a policy in disturbed simulations"),
     "play": ("dittogym.play.__main__", "play with a robot on a page in the browser"),
     "compare": ("baselines.compare.__main__", "train and evaluate several algorithms, and report about them"),

@@ -11,7 +11,7 @@ from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm, Sees
 from cfp.from_dict import update_from_dict
 from cfp.policy_protocols import Policy
-from cfp.presets import like_start
+from cfp.presets import DEFAULT_TASK, like_start
 from cfp.weights import policy_file, read_policy
 
 #: ``"module:Class"`` of each algorithm, a subclass of `cfp.experiment.algorithm.Algorithm`.
@@ -63,7 +63,7 @@ def sees(name: str) -> Sees:
 def configure(values: dict[str, Any]) -> RunConfig:
     """Options from JSON values, else from the preset they name; a `ConfigError` for a wrong name or type."""
     algo, task, preset = (
-        values.get(name, default) for name, default in (("algo", "cfp"), ("task", "shapematch"), ("preset", "quick"))
+        values.get(name, default) for name, default in (("algo", "cfp"), ("task", DEFAULT_TASK), ("preset", "quick"))
     )
     if isinstance(algo, str) and algo in ALIASES:
         algo = ALIASES[algo]

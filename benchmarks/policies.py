@@ -35,7 +35,7 @@ def results(
     for particles in ("full", "lite"):
         there = replace(config, environment=config.environment.for_evaluation(particles))
         trials = [
-            make_trial(there, kind, UntrainedPolicy(kind, size), size, untrained, deterministic=True, seed=seed)
+            make_trial(there, kind, UntrainedPolicy(kind, size), untrained, deterministic=True, seed=seed)
             for kind in ("zero", "random")
             if untrained
         ]
@@ -44,8 +44,7 @@ def results(
             for count in counts:
                 if count:
                     quiet = policy.deterministic_by_default
-                    trial = make_trial(there, name, policy, policy.resolution, count, deterministic=quiet, seed=seed)
-                    trials.append(replace(trial, resolution=policy.description["resolution"]))
+                    trials.append(make_trial(there, name, policy, count, deterministic=quiet, seed=seed))
         for result in evaluate(trials, there.make_spec().horizon):
             yield particles, result
 

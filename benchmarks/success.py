@@ -10,11 +10,11 @@ from dataclasses import replace
 from baselines.compare.stats import wilson_interval
 from baselines.train import PROGRAM
 from cfp.envs.disturbances import Case, Disturbed
+from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import monitored
 from cfp.evaluate import open_policy
 from cfp.evaluation.episodes import Trial
-from cfp.evaluation.evaluate import evaluate, evaluation_seed
-from dittogym import TorchEnv, make_spec
+from cfp.evaluation.evaluate import decision_grid, evaluate, evaluation_seed
 
 #: Episodes between two reports.
 BATCH = 20
@@ -29,22 +29,13 @@ def main() -> None:
     parser.add_argument("--particles", choices=("full", "lite"), default="full")
     arguments = parser.parse_args()
     config, policies = open_policy(PROGRAM, arguments.policy, "cpu", None)
-    policy, own = policies.popitem()[1], config.environment
-    spec = replace(make_spec(config.task, **own.task_options()), horizon=arguments.steps)
+    config = replace(config, environment=config.environment.for_evaluation(arguments.particles))
+    policy = policies.popitem()[1]
     case = Case("noise", action_noise=arguments.noise)
 
     def make_env(seed: int, count: int) -> Disturbed:
-        env = TorchEnv(
-            spec,
-            count,
-            policy.resolution,
-            particles=arguments.particles,
-            substeps=own.substeps,
-            dt=own.dt,
-            dtype=own.dtype,
-            action_layout=own.action_indexing,
-        )
-        return Disturbed(monitored(env), case, seed, policy.description["resolution"])
+        env = monitored(make_torch_env(config, policy.resolution, count), arguments.steps)
+        return Disturbed(env, case, seed, decision_grid(policy))
 
     successes = done = 0
     while done < arguments.episodes:

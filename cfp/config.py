@@ -7,14 +7,14 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import dittogym.tasks
 from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
 from cfp.agent.spec import ActorSpec
 from cfp.errors import ConfigError
 from cfp.from_dict import differences, flatten
-from cfp.sections import EnvironmentConfig, NetworkConfig, Particles, ReportConfig
+from cfp.sections import EnvironmentConfig, NetworkConfig, ReportConfig
 from cfp.validation import check_at_least, check_decay
 from dittogym import make_spec
 from dittogym.spec import TaskSpec
@@ -63,6 +63,15 @@ class RunConfig:
     def make_spec(self) -> TaskSpec:
         """The task, with its options."""
         return make_spec(self.task, **self.environment.task_options())
+
+    @property
+    def training_environment(self) -> EnvironmentConfig:
+        """Options of the simulations in training."""
+        return self.environment
+
+    def for_training(self) -> Self:
+        """These options, with the simulations of training as the environment."""
+        return replace(self, environment=self.training_environment)
 
     def ends(self) -> tuple[int, ...]:
         """Environment steps since the beginning of the run after which each stage ends."""
@@ -119,27 +128,7 @@ class RunConfig:
             if hasattr(section, "check"):
                 section.check()
         check_training_layouts("num_envs", self.environment.num_envs)
-
-
-@dataclass(frozen=True, kw_only=True)
-class OptimisationConfig(RunConfig):
-    """A run that differentiates simulations, or plans in them; they may have fewer particles and longer substeps."""
-
-    train_particles: Particles | None = None
-    """Particles of the simulations in training, at most the environment's; None: as many."""
-    train_dt: float | None = None
-    """Duration of a substep in training, s; None: 2e-4 in RUN unless substeps or dt are given, else as in the
-    environment."""
-
-    @property
-    def training_environment(self) -> EnvironmentConfig:
-        """Options of the simulations in training."""
-        return self.environment.for_optimisation(self.task, self.train_particles, self.train_dt)
-
-    def check(self) -> None:
-        """Check what the types do not express."""
-        super().check()
-        _ = self.training_environment  # checks train_dt
+        _ = self.training_environment  # checks its options
 
 
 @dataclass(frozen=True, kw_only=True)

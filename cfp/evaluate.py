@@ -46,8 +46,6 @@ class Selection:
     """Run folder, of a finished training or of one in progress."""
     policy: str | None = None
     """In place of a folder: a policy file, the name of a policy that comes with the package, or hf://OWNER/NAME."""
-    episodes: int = 5
-    """Episodes of each row."""
     seed: int | None = None
     """Seed of initial particle positions and noise; the run's own if not given."""
     particles: Particles | None = None
@@ -59,7 +57,6 @@ class Selection:
 
     def open(self, program: Program) -> tuple[RunConfig, dict[str, Policy]]:
         """Options to evaluate with, and policies by stage, the newest last."""
-        check_at_least(1, episodes=self.episodes)
         if self.folder is not None and self.policy is None:
             config, policies = open_run(program, self.folder, self.device, self.seed)
         elif self.policy is not None and self.folder is None:
@@ -94,6 +91,8 @@ class FilmOptions:
 class Command(Selection):
     """Evaluate the policies of a run, or a single policy, beside zero and random actions, in the same episodes."""
 
+    episodes: int = 5
+    """Episodes of each row."""
     noise: Noise = "default"
     """Action noise of the trained policies: with, without, both in rows of their own, or default, as trained."""
     json: bool = False
@@ -151,6 +150,7 @@ def open_policy(program: Program, path: str, device: str, seed: int | None) -> t
 
 def run(program: Program, command: Command) -> str:
     """Evaluate, film if asked to, and return the table."""
+    check_at_least(1, episodes=command.episodes)
     files, options = {"video": command.video, "replay": command.replay}, vars(command.film)
     check_files(files, options)
     if command.record is not None and command.record.suffix != ".npz":
@@ -170,10 +170,7 @@ def _record(command: Command, config: RunConfig, policy: Policy) -> list[Episode
     """The episodes of a policy that were evaluated, played again."""
     quiet, first = without_noise(policy, command.noise), evaluation_seed(config)
     recorder = partial(record_batch, fields=command.record_fields)
-    return [
-        record_episode(config, policy, policy.resolution, quiet, seed, recorder)
-        for seed in range(first, first + command.episodes)
-    ]
+    return [record_episode(config, policy, quiet, seed, recorder) for seed in range(first, first + command.episodes)]
 
 
 def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:

@@ -17,7 +17,7 @@ from cfp.envs.make import batch_size
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection
 from cfp.evaluation.episodes import Trial
-from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed
+from cfp.evaluation.evaluate import Result, decision_grid, evaluate, evaluation_seed
 from cfp.evaluation.plots import write_figure
 from cfp.evaluation.results import numbers
 from cfp.evaluation.table import Column, Table
@@ -25,7 +25,7 @@ from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import Folder, make_folder
 from cfp.experiment.training import Program
 from cfp.files import write_json, write_text
-from cfp.policy_protocols import DisturbablePolicy, Policy
+from cfp.policy_protocols import Policy
 from cfp.train import PROGRAM
 from cfp.validation import check_at_least
 from dittogym.spec import TaskSpec
@@ -51,6 +51,8 @@ class Command(Selection):
     Writes robustness.md, .csv, .json and .png.
     """
 
+    episodes: int = 5
+    """Episodes of each row."""
     out: Folder | None = None
     """Folder to write into; the run's own if not given."""
     dropout: float = 0.2
@@ -69,7 +71,7 @@ class Command(Selection):
 
     def check(self) -> None:
         """Refuse values that are out of range."""
-        check_at_least(1, latency=self.latency)
+        check_at_least(1, episodes=self.episodes, latency=self.latency)
         if self.out is None and self.folder is None:
             raise ConfigError("out must be given with a single policy: the folder to write into")
         for name in ("dropout", "shift"):
@@ -107,12 +109,11 @@ def report(
     if deterministic is None:
         deterministic = policy.deterministic_by_default
     spec, seed = config.make_spec(), evaluation_seed(config)
-    decides = policy.description.get("resolution", policy.resolution)
-    grid = 0 if isinstance(policy, DisturbablePolicy) else decides
+    grid = decision_grid(policy)
     trials = [
         Trial(
             name=case.name,
-            resolution=decides,
+            resolution=grid,
             policy=policy,
             make_env=partial(disturbed_env, config, policy.resolution, case, grid),
             episodes=episodes,

@@ -26,6 +26,7 @@ from cfp.from_dict import type_name, update_from_dict
 from cfp.hub import download, is_address
 from cfp.sections import TASK_OPTIONS, EnvironmentConfig
 from dittogym import make_spec
+from dittogym.action import trained_indexing
 from dittogym.geometry import NODES
 from dittogym.tasks import fingerprint
 
@@ -207,8 +208,7 @@ def policy_for(config: RunConfig, path: str) -> ActorPolicy:
     """Load the policy that a run starts from, which must be for its task, physics and orientation of actions."""
     policy = load(path)
     check_trained_for("start_from", policy.description, config.task, config.environment)
-    environment = update_from_dict(EnvironmentConfig(), policy.description["environment"])
-    if (found := environment.action_indexing) != (expected := config.environment.action_indexing):
+    if (found := trained_indexing(policy)) != (expected := config.environment.action_indexing):
         raise ConfigError(f"start_from must be a policy for action_layout {expected}, got {found}")
     return policy
 

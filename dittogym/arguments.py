@@ -28,12 +28,12 @@ def choice(name: str, given: Any, choices: Mapping[Any, Value]) -> Value:
     return choices[given]
 
 
-def find_resolution(spec: TaskSpec, resolution: str | int) -> int:
-    """Action cells per axis."""
+def find_resolution(spec: TaskSpec, resolution: str | int, name: str = "resolution") -> int:
+    """Action cells per axis; ``name`` is that of the argument."""
     named = {"coarse": spec.coarse, "fine": spec.fine}
     size: Any = named.get(resolution) if isinstance(resolution, str) else resolution
     if isinstance(size, bool) or not isinstance(size, Integral) or not 1 <= int(size) <= spec.patch:
-        raise ValueError(f"resolution must be 'coarse', 'fine' or 1 to {spec.patch}, got {resolution!r}")
+        raise ValueError(f"{name} must be 'coarse', 'fine' or 1 to {spec.patch}, got {resolution!r}")
     return int(size)
 
 

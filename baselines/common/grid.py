@@ -4,16 +4,20 @@ from dataclasses import dataclass
 from typing import Literal
 
 from cfp.config import COUNTED_LAYOUTS, RunConfig
+from cfp.errors import ConfigError
 from dittogym import make_spec
+from dittogym.arguments import find_resolution
 
 #: Action grid R: coarse, fine (the task's), or a number.
 Grid = int | Literal["coarse", "fine"]
 
 
-def grid_size(task: str, grid: Grid) -> int:
-    """Rows and columns of an action grid in a task."""
-    spec = make_spec(task)
-    return {"coarse": spec.coarse, "fine": spec.fine}[grid] if isinstance(grid, str) else grid
+def find_grid(option: str, task: str, grid: Grid) -> int:
+    """Rows and columns of the action grid that an option chooses in a task; `ConfigError` if it is too large."""
+    try:
+        return find_resolution(make_spec(task), grid, option)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
 
 
 @dataclass(frozen=True)
@@ -25,7 +29,13 @@ class GridConfig(RunConfig):
 
     def resolution(self, stage: int) -> int:
         """Action grid R."""
-        return grid_size(self.task, self.grid)
+        return find_grid("grid", self.task, self.grid)
+
+    def check(self) -> None:
+        """Check what the types do not express."""
+        super().check()
+        for stage in range(1, len(self.ends()) + 1):
+            self.resolution(stage)
 
     def ineffective(self) -> dict[str, str]:
         """Layouts are counted from the seed."""

@@ -8,7 +8,7 @@ from typing import Literal
 
 from baselines.common.reference_policies import REFERENCE_POLICIES
 from baselines.compare.executor import Executor, InProcessExecutor, LocalExecutor, RayExecutor, Resources, execute
-from baselines.compare.final_evaluation import Noise, Protocol, Robustness
+from baselines.compare.final_evaluation import Protocol, ProtocolNoise, Robustness
 from baselines.compare.jobs import Job, Plan, check_folder, make_jobs
 from baselines.compare.report import write_report
 from baselines.compare.results import RunResult, read_result
@@ -58,7 +58,7 @@ class Command:
     """Episodes of the final evaluation of each policy."""
     particles: Particles = "lite"
     """Particles of the final evaluation, for all policies."""
-    noise: Noise = "paper"
+    noise: ProtocolNoise = "paper"
     """Action noise of all policies in the final evaluation: with, without, or as in the paper, that is without in
     SHAPE MATCH and with it in all other tasks."""
     slot_episodes: int = 100

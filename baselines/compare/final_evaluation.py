@@ -27,7 +27,7 @@ BATCH = 10
 #: How many of `make_cases` the paper reports: unperturbed, action dropout, observation dropout.
 PAPER_CASES = 3
 
-Noise = Literal["paper", "with", "without"]
+ProtocolNoise = Literal["paper", "with", "without"]
 Robustness = Literal["none", "paper", "all"]
 #: ``returns`` of some episodes, and how many of them were ``successes`` (None if the task does not define success).
 Entry = dict[str, Any]
@@ -40,7 +40,7 @@ class Protocol:
     episodes: int  # on the same layouts for all policies
     particles: Particles = "lite"
     robustness: Robustness = "paper"
-    noise: Noise = "paper"  # whether policies act with their noise; paper: except in `paper.WITHOUT_NOISE`
+    noise: ProtocolNoise = "paper"  # whether policies act with their noise; paper: except in `paper.WITHOUT_NOISE`
 
     def disturbed_cases(self) -> list[Case]:
         """Cases of the robustness table."""
@@ -129,7 +129,7 @@ def evaluate_run(config: RunConfig, folder: Path, protocol: Protocol, check_stop
     config = evaluation_config(config, protocol.particles)
 
     def play(seed: int, count: int) -> Entry:
-        trial = make_trial(config, "", policy, policy.resolution, count, deterministic=deterministic, seed=seed)
+        trial = make_trial(config, "", policy, count, deterministic=deterministic, seed=seed)
         return _entry(evaluate([trial])[0])
 
     def play_disturbed(first: int, count: int, case: Case) -> Entry | None:

@@ -110,7 +110,7 @@ class Job:
         return self.folder.name
 
     @property
-    def observes(self) -> str:
+    def sees(self) -> str:
         """What the policy observes: image, state, simulator or nothing."""
         return str(getattr(self.config, "sees", sees(self.config.algo)))
 

@@ -29,8 +29,8 @@ Styles = dict[tuple[str, str], dict[str, Any]]
 def _styles(groups: Sequence[Group]) -> Styles:
     labels, styles = list(dict.fromkeys(group.label for group in groups)), Styles()
     for group in groups:
-        (line, marker), colour = LINES[group.observes], COLOURS[labels.index(group.label) % len(COLOURS)]
-        styles[group.label, group.observes] = {"color": colour, "linestyle": line, "marker": marker}
+        (line, marker), colour = LINES[group.sees], COLOURS[labels.index(group.label) % len(COLOURS)]
+        styles[group.label, group.sees] = {"color": colour, "linestyle": line, "marker": marker}
     return styles
 
 
@@ -63,7 +63,7 @@ def learning_curves(groups: Sequence[Group], *, minutes: bool = False) -> Figure
     shown = [group for group in groups if group.curves and (group.speed or not minutes)]
     figure, panels = _panels(list(dict.fromkeys(group.task for group in shown)), 3.4)
     for group in shown:
-        axes, style = panels[group.task], styles[group.label, group.observes]
+        axes, style = panels[group.task], styles[group.label, group.sees]
         steps, values = align_curves(group.curves)
         if minutes and group.speed:
             steps = (group.mean_cost("teacher_seconds") + steps / group.speed) / 60
@@ -87,14 +87,14 @@ def final_returns(groups: Sequence[Group]) -> Figure:
     for task, axes in panels.items():
         shown = members[task]
         for place, group in enumerate(shown):
-            style, (low, high) = styles[group.label, group.observes] | {"linestyle": "none"}, group.interval
+            style, (low, high) = styles[group.label, group.sees] | {"linestyle": "none"}, group.interval
             axes.plot(group.scores, [place] * len(group.scores), **style, alpha=0.35)
             if low is not None and high is not None:
                 axes.plot([low, high], [place, place], color=style["color"], linewidth=2.5)
             axes.plot(interquartile_mean(group.scores), place, **style, markersize=8, markeredgecolor="black")
-            if place and group.observes != shown[place - 1].observes:
+            if place and group.sees != shown[place - 1].sees:
                 axes.axhline(place - 0.5, color="black", linewidth=1)
-        axes.set_yticks(range(len(shown)), [f"{group.label} ({group.observes})" for group in shown], fontsize=8)
+        axes.set_yticks(range(len(shown)), [f"{group.label} ({group.sees})" for group in shown], fontsize=8)
         axes.set_ylim(len(shown) - 0.5, -0.5)
         axes.set_xlabel("return")
     return figure

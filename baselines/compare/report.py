@@ -79,8 +79,8 @@ def _describe_protocol(protocol: Protocol) -> str:
 def _describe_observations(groups: Sequence[Group]) -> str:
     labels: dict[str, list[str]] = {}
     for group in groups:
-        labels.setdefault(group.observes, []).append(group.label)
-    parts = (f"{observes}: {', '.join(dict.fromkeys(names))}" for observes, names in labels.items())
+        labels.setdefault(group.sees, []).append(group.label)
+    parts = (f"{sees}: {', '.join(dict.fromkeys(names))}" for sees, names in labels.items())
     return f"What the policies observe – {'; '.join(parts)}."
 
 

@@ -15,7 +15,7 @@ from cfp.sections import Particles
 from cfp.tables import read_table
 
 #: What policies observe, in the order of tables.
-OBSERVATIONS = get_args(Sees)
+SEES = get_args(Sees)
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Group:
     """The runs of one algorithm on one task, one per seed, finished or not."""
 
     task: str
-    observes: str
+    sees: str
     label: str
     job: Job  # the first run, for what all of them have in common
     evaluations: list[FinalEvaluation]  # of the runs that have one
@@ -99,9 +99,9 @@ def group_results(runs: Sequence[RunResult]) -> list[Group]:
     """Group runs by task, observation and algorithm; tasks and algorithms keep their order."""
     members: dict[tuple[str, str, str], list[RunResult]] = {}
     for run in runs:
-        members.setdefault((run.job.config.task, run.job.observes, run.job.label), []).append(run)
+        members.setdefault((run.job.config.task, run.job.sees, run.job.label), []).append(run)
     tasks, groups = list(dict.fromkeys(task for task, _, _ in members)), []
-    for key in sorted(members, key=lambda key: (tasks.index(key[0]), OBSERVATIONS.index(key[1]))):
+    for key in sorted(members, key=lambda key: (tasks.index(key[0]), SEES.index(key[1]))):
         evaluations = [run.evaluation for run in members[key] if run.evaluation is not None]
         curves = [run.curve for run in members[key] if len(run.curve[0])]
         costs = [run.cost for run in members[key] if run.cost is not None]

@@ -16,7 +16,7 @@ from dittogym import make_spec
 MILESTONES = (0.5, 0.75, 0.9)
 GROUP = (
     Column("task", "task", value=lambda group: group.task),
-    Column("sees", "observes", value=lambda group: group.observes),
+    Column("sees", "observes", value=lambda group: group.sees),
     Column("algo", "algorithm", value=lambda group: group.label),
 )
 
@@ -44,7 +44,7 @@ def _labels(groups: Iterable[Group]) -> str:
 RUNS = (
     Column("run", "run", value=lambda run: run.job.name),
     Column("algo", value=lambda run: run.job.label),
-    Column("sees", value=lambda run: run.job.observes),
+    Column("sees", value=lambda run: run.job.sees),
     Column("task", value=lambda run: run.job.config.task),
     Column("seed", value=lambda run: run.job.config.seed),
     Column("state", "state", value=lambda run: run.state),
@@ -112,11 +112,11 @@ def aggregate_table(groups: Sequence[Group]) -> Table:
     for group in groups:
         if group.scores:
             scores = [paper.normalised(group.task, score) for score in group.scores]
-            strata.setdefault((group.observes, group.label), []).append(scores)
+            strata.setdefault((group.sees, group.label), []).append(scores)
     rows, tasks = [], {group.task for group in groups}
-    for (observes, label), by_task in strata.items():
+    for (sees, label), by_task in strata.items():
         scores, (low, high) = [score for scores in by_task for score in scores], score_interval(by_task)
-        row = {"sees": observes, "algo": label, "tasks": len(by_task), "runs": len(scores), "low": low, "high": high}
+        row = {"sees": sees, "algo": label, "tasks": len(by_task), "runs": len(scores), "low": low, "high": high}
         rows.append(row | {"iqm": float(interquartile_mean(scores)), "all": len(by_task) == len(tasks)})
     rank([row for row in rows if row["all"]], ("sees",))
     description = (
@@ -149,11 +149,11 @@ def efficiency_table(groups: Sequence[Group], particles: Particles) -> Table:
     best: dict[tuple[str, str], float] = {}
     for group in trained:
         if group.particles == particles:
-            key = group.task, group.observes
+            key = group.task, group.sees
             best[key] = max(best.get(key, -np.inf), highest_point(group))
     rows = []
     for group in trained:
-        low, high = rest.get(group.task), best[group.task, group.observes] if group.particles == particles else None
+        low, high = rest.get(group.task), best[group.task, group.sees] if group.particles == particles else None
         row = make_row(GROUP, group) | {"seeds": len(group.curves), "rest": low, "best": high}
         if low is not None and high is not None and high > low:
             row |= _milestones(group, low, high)

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass, field
 
-from baselines.common.grid import Grid
+from baselines.common.grid import Grid, find_grid
 from baselines.planning.gradient import GradientPlannerConfig
 from cfp.config import COUNTED_LAYOUTS, StagedConfig, check_training_layouts
-from cfp.sections import Particles
+from cfp.sections import EnvironmentConfig, Particles
 from cfp.validation import check_at_least, check_fraction, check_positive
 
 
@@ -52,6 +52,16 @@ class DistillConfig(StagedConfig):
     """Action grid of the teacher mpc."""
 
     @property
+    def training_environment(self) -> EnvironmentConfig:
+        """Options of the simulations in training."""
+        return self.environment.for_training(self.train_particles)
+
+    @property
+    def planner_resolution(self) -> int:
+        """Action grid R of the teacher mpc."""
+        return find_grid("planner_grid", self.task, self.planner_grid)
+
+    @property
     def update_every(self) -> int:
         """Environment steps from one update to the next: a round of all robots."""
         return self.rollout_steps * self.environment.num_envs
@@ -64,6 +74,7 @@ class DistillConfig(StagedConfig):
     def check(self) -> None:
         """Check what the types do not express."""
         super().check()
+        _ = self.planner_resolution  # checks planner_grid
         check_at_least(1, rollout_steps=self.rollout_steps, updates=self.updates, batch_size=self.batch_size)
         check_at_least(1, switch_every=self.switch_every, capacity=self.capacity)
         check_at_least(1, max_episode_steps=self.max_episode_steps, num_layouts=self.num_layouts)

@@ -26,7 +26,7 @@ from cfp.policy_protocols import Policy, SeesState
 from cfp.sections import TASK_OPTIONS, EnvironmentConfig
 from cfp.weights import check_trained_for, copy_policy, read_policy, shipped
 from dittogym import TorchEnv
-from dittogym.action import ActionIndexing, bicubic_matrix, from_grid_indexing, to_grid_indexing
+from dittogym.action import ActionIndexing, bicubic_matrix, from_grid_indexing, to_grid_indexing, trained_indexing
 
 #: Teachers that are trained first if only their algorithm is named.
 TRAINED = ("shac", "gradient")
@@ -47,8 +47,8 @@ class Teacher(Stateful, ABC):
 class PolicyTeacher(Teacher):
     """A trained policy without noise; an open-loop one plays the action of the step that each episode is at."""
 
-    def __init__(self, policy: Policy, policy_indexing: ActionIndexing, indexing: ActionIndexing) -> None:
-        self.policy, self.policy_indexing, self.indexing = policy, policy_indexing, indexing
+    def __init__(self, policy: Policy, indexing: ActionIndexing) -> None:
+        self.policy, self.indexing = policy, indexing
         self._memory: tuple[np.ndarray, ...] | None = None
 
     @torch.no_grad()
@@ -58,8 +58,8 @@ class PolicyTeacher(Teacher):
         steps = env.env_state.steps.cpu().numpy()
         memory = (steps,) if isinstance(policy, OpenLoop) else self._memory
         array, self._memory = policy.predict(observation.cpu().numpy(), memory, steps == 0, deterministic=True)
-        action = torch.as_tensor(array, device=env.device)
-        return from_grid_indexing(to_grid_indexing(action, self.policy_indexing), self.indexing)
+        own = trained_indexing(self.policy) or self.indexing
+        return from_grid_indexing(to_grid_indexing(torch.as_tensor(array, device=env.device), own), self.indexing)
 
     def state_dict(self) -> dict[str, Any]:
         """The policy's memory."""
@@ -116,8 +116,9 @@ def teacher_path(folder: Path) -> Path:
 
 
 def copy_teacher(config: DistillConfig, folder: Path) -> None:
-    """Copy the teacher into the folder, if it is a policy."""
+    """Copy the teacher into the folder, if it is a policy; one that an earlier attempt has left there goes."""
     teacher = config.teacher
+    teacher_path(folder).unlink(missing_ok=True)
     if teacher in ("mpc", *TRAINED):
         return
     try:

@@ -13,12 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from baselines.common.grid import grid_size
 from baselines.distillation import teachers
 from baselines.distillation.config import DistillConfig
 from baselines.distillation.dagger import Collector, Dataset, Labels, drop_entries
 from baselines.distillation.teachers import PlannerTeacher, PolicyTeacher, Teacher, project, read_teacher
-from baselines.planning.gradient import GradientPlannerConfig
+from baselines.planning.mpc import planner_preset
 from cfp.agent.actor import Actor, build_actor
 from cfp.agent.actor_policy import ActorPolicy
 from cfp.analytic.critic import descend
@@ -34,7 +33,6 @@ from cfp.experiment.process import StopSignals
 from cfp.experiment.schedules import linear_decay
 from cfp.experiment.stages import CoarseToFineStages, copy_coarse_weights
 from cfp.presets import sac_preset
-from cfp.sections import EnvironmentConfig
 from cfp.weights import load
 from dittogym import make_spec
 
@@ -72,7 +70,7 @@ class Distill(Stateful, CoarseToFineStages):
         self, config: DistillConfig, stage: int = 1, start: ActorPolicy | None = None, teacher: Path | None = None
     ) -> None:
         self.config, self.stage = config, stage
-        training = replace(config, environment=config.environment.for_training(config.train_particles))
+        training = config.for_training()
         self.env = make_torch_env(training, make_spec(config.task).patch)
         self.spec = config.actor_spec(stage)
         with self._seeded():
@@ -91,13 +89,11 @@ class Distill(Stateful, CoarseToFineStages):
     def _make_teacher(self, training: RunConfig, path: Path | None) -> Teacher:
         config = self.config
         if path is None and config.teacher == "mpc":
-            size = grid_size(config.task, config.planner_grid)
             environment = training.environment.for_optimisation(config.task)
-            model = make_torch_env(replace(training, environment=environment), size)
+            model = make_torch_env(replace(training, environment=environment), config.planner_resolution)
             return PlannerTeacher(model, config.planner, config.seed)
         policy = read_teacher(path or config.teacher, config.task, config.environment)
-        trained_in = EnvironmentConfig(**policy.description["environment"])
-        return PolicyTeacher(policy, trained_in.action_indexing, config.environment.action_indexing)
+        return PolicyTeacher(policy, config.environment.action_indexing)
 
     def _seeded(self) -> AbstractContextManager[None]:
         """Seed torch's generators by run, stage and step, and restore them afterwards."""
@@ -173,6 +169,7 @@ class Distill(Stateful, CoarseToFineStages):
         """
         base, shape_match = sac_preset(task, name), task == "shapematch"
         steps = 24_000 if shape_match else 48_000
+        planner, grid = planner_preset(task)
         config = DistillConfig(
             task=task,
             preset=base.preset,
@@ -185,6 +182,8 @@ class Distill(Stateful, CoarseToFineStages):
             network=replace(base.network, encoder="full"),
             student_noise=not base.report.eval_deterministic,
             dropout=0.2,
+            planner=planner,
+            planner_grid=grid,
         )
         if not shape_match:
             return config
@@ -196,8 +195,6 @@ class Distill(Stateful, CoarseToFineStages):
             batch_size=64,
             student_learning_rate=2e-3,
             beta_decay=0.8,
-            planner=GradientPlannerConfig(iterations=30, learning_rate=0.1),
-            planner_grid=16,
         )
 
     @classmethod

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from baselines.compare.results import OBSERVATIONS
+from baselines.compare.results import SEES
 from baselines.compare.tables import rank
 from baselines.leaderboard.protocol import PROTOCOLS
 from baselines.leaderboard.submission import Submission, read_submissions
@@ -45,7 +45,7 @@ def rankings(submissions: Sequence[Submission]) -> list[Table]:
         for task in protocol.tasks:
             chosen = [each for each in submissions if (each.protocol, each.task) == (version, task)]
             rows = [asdict(each) | asdict(each.training) | asdict(each.scores) for each in chosen]
-            rows.sort(key=lambda row: (OBSERVATIONS.index(row["sees"]), -row["mean"]))
+            rows.sort(key=lambda row: (SEES.index(row["sees"]), -row["mean"]))
             rank(rows, ("sees",), "mean")
             if rows:
                 description = f"Mean return of {len(protocol.seeds)} episodes under protocol {version}."

@@ -17,11 +17,11 @@ from cfp.errors import ConfigError
 from cfp.evaluation.episodes import Trial, play
 from cfp.experiment.folder import make_folder
 from cfp.files import write_json
-from cfp.from_dict import update_from_dict
 from cfp.hub import is_address
 from cfp.policy_protocols import Policy
 from cfp.sections import EnvironmentConfig
 from cfp.weights import check_trained_for, policy_file, shipped
+from dittogym.action import trained_indexing
 
 #: Name under which the policies that come with the package are submitted, one for each task.
 PRETRAINED = "pretrained"
@@ -94,8 +94,7 @@ def _trained(protocol: FixedProtocol, path: str) -> Candidate:
         training=training,
         library=torchmpm.__version__,
     )
-    orientation = update_from_dict(EnvironmentConfig(), about["environment"]).action_indexing
-    return Candidate(submission, policy, replace(protocol.environment, action_layout=orientation))
+    return Candidate(submission, policy, replace(protocol.environment, action_layout=trained_indexing(policy)))
 
 
 def _name(path: str) -> str:

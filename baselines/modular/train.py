@@ -150,7 +150,7 @@ class Modular(SACAlgorithm):
     @property
     def policy(self) -> SegmentPolicy:
         """What has been learned so far; it must be attached to an environment."""
-        return self._policy({})
+        return self._policy({"resolution": self.config.resolution(self.stage)})
 
     def _policy(self, description: dict[str, Any]) -> SegmentPolicy:
         return SegmentPolicy(cast(ModularActor, self.model.trained_actor), self.config.nodes, description)

@@ -6,13 +6,13 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from baselines.common.grid import GridConfig
+from baselines.common.grid import Grid, GridConfig
 from baselines.common.open_loop import OpenLoop, OpenLoopAlgorithm
 from baselines.planning.base import Planner, PlannerConfig
 from baselines.planning.cem import CEMPlanner, CEMPlannerConfig
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
 from baselines.planning.surrogate import Surrogate
-from cfp.config import OptimisationConfig
+from cfp.analytic.config import OptimisationConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Scalars, Sees
@@ -77,8 +77,15 @@ class CEMConfig(PlannedConfig):
         self.planner.check_grid(self.resolution(1))
 
 
+def planner_preset(task: str) -> tuple[GradientPlannerConfig, Grid]:
+    """Planner and action grid for a task; SHAPE MATCH, whose reward is all detail, gets finer actions and steps."""
+    if task == "shapematch":
+        return GradientPlannerConfig(iterations=30, learning_rate=0.1), 16
+    return GradientPlannerConfig(), "coarse"
+
+
 def episode_preset(task: str, name: str) -> dict[str, Any]:
-    """Options of `PlannedConfig` for a task; SHAPE MATCH, whose reward is all detail, gets an action grid of 16."""
+    """Options of `PlannedConfig` for a task."""
     base, horizon = sac_preset(task, name), make_spec(task).horizon
     return {
         "task": task,
@@ -91,7 +98,7 @@ def episode_preset(task: str, name: str) -> dict[str, Any]:
             checkpoint_every=horizon // 20 + 1,
             log_every=10,
         ),
-        "grid": 16 if task == "shapematch" else "coarse",
+        "grid": planner_preset(task)[1],
         "train_particles": None if name == "quick" else "lite",
     }
 
@@ -113,7 +120,7 @@ class MPC(OpenLoopAlgorithm):
         self.env.reset(seed=config.seed)
         self.surrogate = None
         if config.training_environment != config.environment:
-            cheap = make_torch_env(replace(config, environment=config.training_environment), config.resolution(1), 1)
+            cheap = make_torch_env(config.for_training(), config.resolution(1), 1)
             cheap.reset(seed=config.seed)
             self.surrogate = Surrogate(self.env, cheap)
         planning_env = self.surrogate.env if self.surrogate else self.env
@@ -123,9 +130,8 @@ class MPC(OpenLoopAlgorithm):
 
     @staticmethod
     def preset(task: str, name: str) -> PlannedConfig:
-        """Defaults of a task; SHAPE MATCH gets more and smaller gradient steps."""
-        planner = GradientPlannerConfig(iterations=30, learning_rate=0.1) if task == "shapematch" else None
-        return MPCConfig(**episode_preset(task, name), planner=planner or GradientPlannerConfig())
+        """Defaults of a task."""
+        return MPCConfig(**episode_preset(task, name), planner=planner_preset(task)[0])
 
     @property
     def policy(self) -> OpenLoop:

@@ -101,8 +101,7 @@ class Shac(Stateful, Algorithm):
 
     def __init__(self, config: ShacConfig, stage: int = 1, start: ActorPolicy | None = None) -> None:
         self.config = config
-        training = replace(config, environment=config.training_environment)
-        self.env = make_torch_env(training, config.resolution(stage))
+        self.env = make_torch_env(config.for_training(), config.resolution(stage))
         self.features = StateFeatures(config.deformation, config.clock, config.displacement)
         with seeded(config.seed):
             self.actor, critic = self._make_networks()

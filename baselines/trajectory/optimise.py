@@ -8,12 +8,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from baselines.common.grid import Grid, GridConfig, grid_size
+from baselines.common.grid import Grid, GridConfig, find_grid
 from baselines.common.open_loop import OpenLoop, OpenLoopAlgorithm
 from baselines.common.rollout import check_differentiable
 from baselines.trajectory.objective import Objective, matches_shape
+from cfp.analytic.config import OptimisationConfig
 from cfp.analytic.stateful import Stateful
-from cfp.config import OptimisationConfig, RunConfig
+from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.algorithm import Scalars, Sees
@@ -82,7 +83,7 @@ class GradientConfig(OptimisationConfig, GridConfig):
 
     def resolution(self, stage: int) -> int:
         """Action grid R of a stage."""
-        return grid_size(self.task, self.polish_grid if stage > 1 else self.grid)
+        return find_grid("polish_grid", self.task, self.polish_grid) if stage > 1 else super().resolution(stage)
 
     def evaluation(self, stage: int) -> tuple[int, int]:
         """The second stage is evaluated on its own layout."""
@@ -128,9 +129,8 @@ class Gradient(Stateful, OpenLoopAlgorithm):
 
     def __init__(self, config: GradientConfig, stage: int = 1, start: OpenLoop | None = None) -> None:
         self.config, self.stage, polishes = config, stage, stage > 1
-        environment = config.environment if polishes else config.training_environment
-        training = replace(config, environment=environment)
-        self.env = make_torch_env(training, config.resolution(stage), 1 if polishes else None)
+        own, num_envs = (config, 1) if polishes else (config.for_training(), None)
+        self.env = make_torch_env(own, config.resolution(stage), num_envs)
         self.env.reset(seed=config.seed)
         self.initial = self.env.save()  # with reference parity, another reset would keep the last episode's end
         self.horizon = self.env.spec.horizon

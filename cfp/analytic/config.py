@@ -1,4 +1,4 @@
-"""The options of the learner ``analytic``, and of learners on windows of simulation in general."""
+"""The options of the learner ``analytic``, and of what differentiates simulations or plans in them in general."""
 
 from __future__ import annotations
 
@@ -6,9 +6,25 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from cfp.analytic.reward import RewardConfig
-from cfp.config import COUNTED_LAYOUTS, CoarseToFineConfig, Learner, OptimisationConfig, check_training_layouts
+from cfp.config import COUNTED_LAYOUTS, CoarseToFineConfig, Learner, RunConfig, check_training_layouts
 from cfp.sections import EnvironmentConfig, Particles
 from cfp.validation import check_at_least, check_decay, check_fraction, check_positive
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptimisationConfig(RunConfig):
+    """A run that differentiates simulations, or plans in them; they may have fewer particles and longer substeps."""
+
+    train_particles: Particles | None = None
+    """Particles of the simulations in training, at most the environment's; None: as many."""
+    train_dt: float | None = None
+    """Duration of a substep in training, s; None: 2e-4 in RUN unless substeps or dt are given, else as in the
+    environment."""
+
+    @property
+    def training_environment(self) -> EnvironmentConfig:
+        """Options of the simulations in training."""
+        return self.environment.for_optimisation(self.task, self.train_particles, self.train_dt)
 
 
 @dataclass(frozen=True, kw_only=True)

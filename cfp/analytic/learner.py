@@ -58,8 +58,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
 
     def __init__(self, config: AnalyticConfig, stage: int, actor: Actor) -> None:
         self.config, self.stage = config, stage
-        training = replace(config, environment=config.training_environment)
-        self.env = make_torch_env(training, config.action_size(stage))
+        self.env = make_torch_env(config.for_training(), config.action_size(stage))
         actor.fix_std()
         self.actor = actor
         self.regression = Regression(actor, config.learning_rate, config.weight_average, config.max_grad_norm)

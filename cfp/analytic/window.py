@@ -133,7 +133,7 @@ def reward_warnings(config: WindowConfig) -> list[str]:
     """A line if no term of the task's own reward has a gradient in the actions, so that only the critic guides."""
     if config.reward.form == "speed":
         return []
-    env = make_torch_env(replace(config, environment=config.training_environment), config.action_size(1), 1)
+    env = make_torch_env(config.for_training(), config.action_size(1), 1)
     env.reset(seed=config.seed)
     differentiable: list[bool] = []
 

@@ -93,7 +93,7 @@ class Disturbed(VecEnvWrapper):
         venv: The environment, with actions (B, 2, A, A) and observations uint8 (B, 3, 64, 64).
         case: The disturbance; its constants are not applied here.
         seed: Seed of the generator, which restarts at each ``reset``.
-        grid: Rows and columns R of the grid on which the policy decides; None: A; 0: none, the policy calls `disturb`.
+        grid: Rows and columns R of the grid on which the policy decides; None: A.
     """
 
     def __init__(self, venv: VecEnv, case: Case, seed: int, grid: int | None = None) -> None:
@@ -101,7 +101,7 @@ class Disturbed(VecEnvWrapper):
         self.case, self.noise_seed = case, seed
         assert self.action_space.shape is not None
         self.size = self.action_space.shape[-1]
-        self.grid = self.size if grid is None else grid
+        self.grid: int | None = grid or self.size  # None with a `DisturbablePolicy`, which calls `disturb` itself
         self._restart()
 
     def _restart(self) -> None:
@@ -118,7 +118,7 @@ class Disturbed(VecEnvWrapper):
         """Pass on disturbed actions (B, 2, A, A)."""
         self._delayed.append(np.array(actions, np.float32))
         actions = self._delayed.popleft()
-        if self.grid:
+        if self.grid is not None:
             actions = self.disturb(actions, (len(actions), 2, self.grid, self.grid))
         self.venv.step_async(actions)
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from scipy.special import stdtrit  # scipy.stats takes a second to import
-from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from cfp.config import EVALUATION_SEED, RunConfig
 from cfp.envs.make import batch_size, make_env, on_cpu
@@ -55,16 +54,19 @@ def evaluation_seed(config: RunConfig) -> int:
     return config.seed + 2 * EVALUATION_SEED
 
 
-def make_trial(
-    config: RunConfig, name: str, policy: PolicyPredictor, size: int, episodes: int, *, deterministic: bool, seed: int
-) -> Trial:
-    """Episodes of a policy with actions (2, size, size) in the environment of a run."""
-    batch, cache = batch_size(config, episodes), None
+def decision_grid(policy: Policy) -> int:
+    """Rows and columns on which a policy decides; one of several stages returns an enlarged blend."""
+    return int(policy.description.get("resolution", policy.resolution))
+
+
+def make_trial(config: RunConfig, name: str, policy: Policy, episodes: int, *, deterministic: bool, seed: int) -> Trial:
+    """Episodes of a policy in the environment of a run."""
+    size, batch, cache = policy.resolution, batch_size(config, episodes), None
     if isinstance(policy, UntrainedPolicy) and on_cpu(config):  # on a GPU episodes do not repeat
         cache = EpisodeCache.of(config, policy.kind, size)
     return Trial(
         name=name,
-        resolution=size,
+        resolution=decision_grid(policy),
         policy=policy,
         make_env=lambda _, count: make_env(config, size, count),
         episodes=episodes,
@@ -99,21 +101,17 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, no
     """Evaluate policies beside zero and random action on the same layouts; one made for a single layout also there."""
     coarsest, seed = config.resolution(1), evaluation_seed(config)
     trials = [
-        make_trial(
-            config, f"{kind} action", UntrainedPolicy(kind, coarsest), coarsest, episodes, deterministic=True, seed=seed
-        )
+        make_trial(config, f"{kind} action", UntrainedPolicy(kind, coarsest), episodes, deterministic=True, seed=seed)
         for kind in ("zero", "random")
     ]
     for name, trained in policies.items():
         deterministic = without_noise(trained, noise)
-        size = trained.resolution
         for quiet in (False, True) if noise == "both" else (deterministic,):
             label = f"{name}, {'mean' if quiet else 'noisy'}" if noise == "both" else name
-            trial = make_trial(config, label, trained, size, episodes, deterministic=quiet, seed=seed)
-            trials.append(replace(trial, resolution=trained.description.get("resolution", size)))
+            trials.append(make_trial(config, label, trained, episodes, deterministic=quiet, seed=seed))
         if "layout" in trained.description:
             own = trained.description["layout"]
-            trials.append(make_trial(config, "  own layout", trained, size, 1, deterministic=deterministic, seed=own))
+            trials.append(make_trial(config, "  own layout", trained, 1, deterministic=deterministic, seed=own))
     return evaluate(trials, config.make_spec().horizon)
 
 

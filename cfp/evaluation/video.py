@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, TextIO, TypeVar
 
 import numpy as np
-from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
@@ -26,19 +25,18 @@ Recorded = TypeVar("Recorded")
 def record_policy(config: RunConfig, policy: Policy, noise: Noise = "default") -> Recording:
     """The first episode of the policy's evaluation; of one made for a single layout, that layout."""
     seed = policy.description.get("layout", evaluation_seed(config))
-    return record_episode(config, policy, policy.resolution, without_noise(policy, noise), seed, record)
+    return record_episode(config, policy, without_noise(policy, noise), seed, record)
 
 
 def record_episode(
     config: RunConfig,
-    policy: PolicyPredictor,
-    size: int,
+    policy: Policy,
     deterministic: bool,
     seed: int,
     recorder: Callable[[TorchEnv, Act, int], Recorded],
 ) -> Recorded:
-    """One episode of a policy with actions (2, size, size)."""
-    venv = TorchVecEnv(make_torch_env(config, size, 1))
+    """One episode of a policy."""
+    venv = TorchVecEnv(make_torch_env(config, policy.resolution, 1))
     acting, memory, start = SeededPolicy(attached(policy, venv), seed), None, np.array([True])
 
     def act(observation: np.ndarray) -> np.ndarray:
@@ -56,8 +54,9 @@ def check_files(paths: Mapping[str, Path | None], options: Mapping[str, Any]) ->
     Raises:
         ConfigError: A file has another suffix than what it is to hold, or an option is out of range.
     """
+    films = (".mp4", ".gif", ".webp", ".png")
     for name, path in paths.items():
-        allowed = (".html",) if name == "replay" else (".mp4", ".gif", ".webp", ".png")
+        allowed = {"replay": (".html",), "video": films}.get(name, (".html", *films))
         if path is not None and path.suffix not in allowed:
             raise ConfigError(f"{name} must end in {' or '.join(allowed)}, got {path}")
     try:

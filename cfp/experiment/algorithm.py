@@ -13,7 +13,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.type_aliases import PolicyPredictor
 
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
@@ -138,7 +137,7 @@ class Algorithm(ABC):
 
     @property
     @abstractmethod
-    def policy(self) -> PolicyPredictor:
+    def policy(self) -> Policy:
         """What has been learned so far."""
 
     @abstractmethod

@@ -196,8 +196,8 @@ class EvaluationCallback(StageCallback):
     def _act(self) -> None:
         start, stage, config = time.perf_counter(), self.stage, self.stage.config
         seed, episodes = config.evaluation(stage.number)
-        size, deterministic = config.action_size(stage.number), config.report.eval_deterministic
-        trial = make_trial(config, "", stage.algorithm.policy, size, episodes, deterministic=deterministic, seed=seed)
+        deterministic = config.report.eval_deterministic
+        trial = make_trial(config, "", stage.algorithm.policy, episodes, deterministic=deterministic, seed=seed)
         try:
             result = evaluate([trial], should_stop=lambda: self.signals.number != 0)[0]
         except EpisodesStopped:
@@ -238,9 +238,8 @@ class FilmCallback(StageCallback):
     def _act(self) -> None:
         stage, config = self.stage, self.stage.config
         path = stage.folder / "videos" / f"step{stage.step:09d}.mp4"
-        size, (seed, _) = config.action_size(stage.number), config.evaluation(stage.number)
-        deterministic = config.report.eval_deterministic
-        record_episode(config, stage.algorithm.policy, size, deterministic, seed, record).save(path)
+        (seed, _), deterministic = config.evaluation(stage.number), config.report.eval_deterministic
+        record_episode(config, stage.algorithm.policy, deterministic, seed, record).save(path)
         self.tracker.film(stage.step, path)
 
 

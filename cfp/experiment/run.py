@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
 from tqdm import tqdm
 
-from cfp.config import CoarseToFineConfig, OptimisationConfig, RunConfig, to_json
+from cfp.config import CoarseToFineConfig, RunConfig, to_json
 from cfp.envs.make import choose_device, make_env
 from cfp.errors import CFPError, CheckpointError, ConfigError, NonFiniteError
 from cfp.evaluation.evaluate import compare
@@ -50,9 +49,9 @@ def check_options(config: RunConfig) -> None:
     check_trackers(config)
     for stage in range(1, len(config.ends()) + 1):
         make_env(config, config.action_size(stage), 1)
-    if isinstance(config, OptimisationConfig) and config.training_environment != config.environment:
+    if config.training_environment != config.environment:
         try:
-            make_env(replace(config, environment=config.training_environment), config.action_size(1), 1)
+            make_env(config.for_training(), config.action_size(1), 1)
         except ConfigError as error:
             raise ConfigError(f"train_dt or train_particles: {error}") from error
 

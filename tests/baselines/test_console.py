@@ -96,7 +96,8 @@ def test_tasks_of_the_working_directory_are_found(tmp_path):
 
 MODULES = (
     *(f"cfp.{name}" for name in ("train", "evaluate", "robustness")),
-    *(f"baselines.{name}" for name in ("train", "evaluate", "robustness", "distill", "compare", "leaderboard")),
+    *(f"baselines.{name}" for name in ("train", "evaluate", "replay", "robustness")),
+    *(f"baselines.{name}" for name in ("distill", "compare", "leaderboard")),
     *("baselines.gradlab", "dittogym.play"),
 )
 

@@ -255,14 +255,15 @@ def test_projected_action_drives_the_muscles_alike(given, wanted):
 
 
 def test_action_of_the_other_layout_acts_at_the_same_place():
-    record = OpenLoop(torch.rand(5, 2, 8, 8))
+    record = OpenLoop(torch.rand(5, 2, 8, 8), {"environment": {"action_layout": "image"}})
     env = TorchEnv("run", 1, particles=100)
     env.reset(seed=0)
     seen = torch.zeros(1, 3, 64, 64, dtype=torch.uint8)
-    action = PolicyTeacher(record, "image", "image").act(env, seen)
-    as_grid = PolicyTeacher(record, "image", "grid").act(env, seen)
+    action = PolicyTeacher(record, "image").act(env, seen)
+    as_grid = PolicyTeacher(record, "grid").act(env, seen)
     assert torch.equal(as_grid, to_grid_indexing(action, "image"))
-    back = PolicyTeacher(record, "grid", "image").act(env, seen)
+    record.description["environment"] = {"action_layout": "grid"}
+    back = PolicyTeacher(record, "image").act(env, seen)
     assert torch.equal(to_grid_indexing(back, "image"), action)
 
 
@@ -271,7 +272,7 @@ def test_sequence_teaches_by_the_step_of_the_episode():
     env = TorchEnv("run", 3, particles=100, substeps=1)
     seen, _ = env.reset(seed=0)
     env.env_state = replace(env.env_state, steps=torch.tensor([0, 4, 20]))
-    action = PolicyTeacher(record, "image", "image").act(env, seen)
+    action = PolicyTeacher(record, "image").act(env, seen)
     assert action[:, 0, 0, 0].tolist() == pytest.approx([0.0, 0.4, 0.0])
 
 
@@ -319,6 +320,8 @@ def test_teacher_that_is_only_named_is_trained_first(tmp_path, monkeypatch, caps
     tiny = replace(tiny, report=ReportConfig(eval_every=0, eval_episodes=1, video=False))
     monkeypatch.setattr(Shac, "preset", staticmethod(lambda task, name: tiny))
     folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "teacher.safetensors").write_bytes(b"of an attempt with other options that left no checkpoint")
     assert distill.main([*TINY, *LESSONS, "--teacher", "shac", "--out", str(folder)]) == 0
     assert read_table(folder / "teacher" / "progress.csv")
     trained = (folder / "teacher" / "policy.safetensors").read_bytes()

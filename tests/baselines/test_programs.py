@@ -11,10 +11,11 @@ import baselines
 import cfp.evaluate
 import cfp.robustness
 import dittogym
-from baselines import evaluate, robustness, train
+from baselines import evaluate, replay, robustness, train
 from baselines.registry import sees
 from cfp.agent.actor import build_actor
 from cfp.errors import ConfigError
+from cfp.evaluation.evaluate import evaluate as play
 from cfp.experiment.callbacks import EvaluationCallback
 from cfp.experiment.training import parse
 from cfp.policy_protocols import SeesState
@@ -211,22 +212,39 @@ def test_algorithm_is_asked_for_its_scalars_when_a_row_is_written(tmp_path, monk
     assert asked == [24, 48, 72, 96] == [int(row["step"]) for row in read_table(tmp_path / "progress.csv")]
 
 
-def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, monkeypatch, stop_at):
+@pytest.mark.parametrize("step", [0, 12])
+def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, monkeypatch, stop_at, step):
+    """Also if the run is stopped in that evaluation, and continues when the policy is no longer there."""
     config = baselines.registry.configure(
         {"algo": "coarse", "resolutions": [8], "environment": {"substeps": 1}, "network": {"encoder": "full"}}
     )
     start = tmp_path / "start.safetensors"
     save_actor(start, build_actor(config.actor_spec(1)), config, 1, 5)
     words = ["--sees", "image", "--start-from", str(start), "--steps", "24", "--eval-every", "24"]
-    stop_at(12)
+    stop_at(step or -1)
+    if step == 0:
+        interrupted = lambda *given, **named: signal.raise_signal(signal.SIGINT) or play(*given, **named)  # noqa: E731
+        monkeypatch.setattr("cfp.experiment.callbacks.evaluate", interrupted)
     assert run("shac", tmp_path / "run", *words) == 128 + signal.SIGINT
+    assert (tmp_path / "run" / "evaluations.csv").exists() == (step > 0)
     assert baselines.load(tmp_path / "run").description["steps"] == 0
     monkeypatch.undo()
+    start.unlink()
     assert train.main(["--out", str(tmp_path / "run"), "--resume"]) == 0
     rows = read_table(tmp_path / "run" / "evaluations.csv")
     assert [row["step"] for row in rows] == ["0", "24"]
     best = max(rows, key=lambda row: float(row["mean"]))
     assert baselines.load(tmp_path / "run").description["steps"] == int(best["step"])
+
+
+@pytest.mark.parametrize("finished", ["gnn-16"], indirect=True)
+def test_episode_is_written_to_watch(finished, tmp_path, capsys):
+    _, folder = finished
+    page = tmp_path / "replay.html"
+    assert replay.main([str(folder), "--out", str(page)]) == 0 and "<!doctype html>" in page.read_text()[:100].lower()
+    assert capsys.readouterr().out == f"replay: {page}\n"
+    assert replay.main([str(folder), "--out", "replay.txt"]) == 2
+    assert "out must end in .html or .mp4" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("algo", ["shac", "distill", "gradient"])

@@ -274,7 +274,7 @@ def test_policy_goes_through_its_file(sees, tmp_path):
     actions = [attached(each, env).predict(images, deterministic=True)[0] for each in (algorithm.policy, policy)]
     assert np.array_equal(*actions) and np.abs(actions[0]).max() > 0
     options = {"deterministic": False, "seed": 3}
-    results = evaluate([make_trial(algorithm.config, "", each, 8, 2, **options) for each in (algorithm.policy, policy)])
+    results = evaluate([make_trial(algorithm.config, "", each, 2, **options) for each in (algorithm.policy, policy)])
     assert results[0] == results[1]
     assert len(record_policy(algorithm.config, policy).shots) == 31
 

@@ -23,6 +23,8 @@ from dittogym import TorchEnv
 class LinearPolicy:
     """Actions are a linear function of the pixels, with noise; torch sums them in parts, one for each thread."""
 
+    resolution, description = 8, {}
+
     def __init__(self):
         self.weights = torch.randn(3 * 64 * 64, 2 * 8 * 8, generator=torch.Generator().manual_seed(0))
 
@@ -76,18 +78,18 @@ def _ending(step):
 def test_evaluation_does_not_depend_on_threads_and_on_what_else_is_evaluated(short, threads):
     config, before = tiny(), torch.get_num_threads()
     options = {"deterministic": False, "seed": 5}
-    trial = make_trial(config, "", LinearPolicy(), 8, 4, **options)
+    trial = make_trial(config, "", LinearPolicy(), 4, **options)
     state = torch.get_rng_state()
     try:
         torch.set_num_threads(1)
         alone = evaluate([trial])[0]
         torch.set_num_threads(threads)
-        _, together = evaluate([make_trial(config, "", UntrainedPolicy("random", 8), 8, 3, **options), trial])
+        _, together = evaluate([make_trial(config, "", UntrainedPolicy("random", 8), 3, **options), trial])
         assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
     assert together.returns == alone.returns and len(set(alone.returns)) == 4
-    first, third = (make_trial(config, "", LinearPolicy(), 8, 1, deterministic=False, seed=s) for s in (5, 7))
+    first, third = (make_trial(config, "", LinearPolicy(), 1, deterministic=False, seed=s) for s in (5, 7))
     assert [result.returns[0] for result in evaluate([first, third])] == [alone.returns[0], alone.returns[2]]
     assert torch.equal(torch.get_rng_state(), state)
 
