@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Literal
 
 from baselines.train import PROGRAM
+from cfp.errors import ConfigError
 from cfp.evaluate import Selection
-from cfp.evaluation.video import check_files, record_policy, save_media
+from cfp.evaluation.video import check_files, record_policy
 from cfp.experiment.cli import read_command, run_command
+from dittogym.render.film import available
 
 EXAMPLES = ("runs/run", "--policy run --particles full --out run.html", "runs/run --out run.mp4")
 
@@ -27,9 +29,10 @@ class Command(Selection):
 def run(command: Command) -> None:
     """Play the episode and write the file."""
     check_files({"out": command.out}, {})
+    if command.out.suffix == ".mp4" and not available():
+        raise ConfigError("out needs the extra video for .mp4 (pip install 'torchmpm[video]'), or another suffix")
     config, policies = command.open(PROGRAM)
-    recording = record_policy(config, list(policies.values())[-1], command.noise)
-    save_media(recording, {"replay" if command.out.suffix == ".html" else "video": command.out})
+    print(f"episode: {record_policy(config, list(policies.values())[-1], command.noise).save(command.out)}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
 import dittogym.tasks
 from cfp.agent.hyperparameters import Hyperparameters, LearningConfig
@@ -69,7 +69,7 @@ class RunConfig:
         """Options of the simulations in training."""
         return self.environment
 
-    def for_training(self) -> Self:
+    def for_training(self) -> RunConfig:
         """These options, with the simulations of training as the environment."""
         return replace(self, environment=self.training_environment)
 

@@ -152,8 +152,8 @@ def solid(name: str, i: Range, j: Range, *, visible: bool = True, friction: floa
 
     Args:
         name: For messages and docs.
-        i: Inclusive range of world node indices in x; ``None`` leaves an end open.
-        j: Inclusive range of world node indices in y.
+        i: Inclusive range of world node indices in x; ``None`` at an end leaves it open.
+        j: The same in y.
         visible: Whether the robot sees it.
         friction: Coulomb coefficient of its faces; ``math.inf`` sticks, as the floor does.
 

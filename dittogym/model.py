@@ -189,7 +189,8 @@ def check_stability(model: Model, physics: Physics) -> None:
         robot = stable_dt(solver.bodies[:1], GRID.h, actuation) == limit
         matter = f"the material, muscles and mass of the {'robot' if robot else 'object'}"
         raise ValueError(f"dt must be at most {limit} s to be stable with {matter}, got {solver.dt}")
-    check_gravity(solver.gravity, GRID.h, solver.dt)
+    name = "physics['gravity']" if "gravity" in physics else "gravity"
+    check_gravity(name, solver.gravity, GRID.h, solver.dt)
 
 
 def next_physics(model: Model, present: Physics, given: object, mask: Tensor, like: Tensor) -> Physics:

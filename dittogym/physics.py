@@ -64,8 +64,7 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
         if not bool(allowed.all()):
             kind = f"finite, {sign}" if sign else "finite"
             raise ValueError(f"physics[{name!r}] must be {kind}, got {tensor.detach()[~allowed].flatten()[0].item()}")
-        largest = float(tensor.detach().abs().max())
-        if name == "mass" and largest > _LARGEST_MASS:
+        if name == "mass" and (largest := float(tensor.detach().max())) > _LARGEST_MASS:
             raise ValueError(f"physics['mass'] must be at most {_LARGEST_MASS:g}, got {largest:g}")
         values[name] = _expanded(tensor, name, batch)
     return values

@@ -109,7 +109,7 @@ class Solver:
                 checks.entries(name, tensor, above=0.0 if name.endswith(("].mass", "].volume")) else None)
         if not self.allow_unstable:
             self._check_stability()
-            stability.check_gravity(self.gravity, self.grid.h, self.dt)
+            stability.check_gravity("gravity", self.gravity, self.grid.h, self.dt)
 
     def _check_stability(self) -> None:
         try:

@@ -38,8 +38,8 @@ def stable_dt(bodies: Sequence[Body], h: float, actuation: Value = 0.0) -> float
     return h / fastest if fastest > 0 else math.inf
 
 
-def check_gravity(gravity: tuple[float, float] | Tensor, h: float, dt: float) -> None:
+def check_gravity(name: str, gravity: tuple[float, float] | Tensor, h: float, dt: float) -> None:
     """Raise a ValueError if a particle at rest would cross a cell of width ``h``, m, within a substep of ``dt``, s."""
     largest = h / dt**2
     for part in (gravity,) if isinstance(gravity, Tensor) else gravity:
-        checks.entries("gravity", part, above=-largest, below=largest)
+        checks.entries(f"{name}, with substeps of {dt} s,", part, above=-largest, below=largest)

@@ -13,7 +13,7 @@ Grid = int | Literal["coarse", "fine"]
 
 
 def find_grid(option: str, task: str, grid: Grid) -> int:
-    """Rows and columns of the action grid that an option chooses in a task; `ConfigError` if it is too large."""
+    """Rows and columns of the action grid that an option chooses in a task; `ConfigError` if it is out of range."""
     try:
         return find_resolution(make_spec(task), grid, option)
     except ValueError as error:

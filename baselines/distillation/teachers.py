@@ -116,10 +116,10 @@ def teacher_path(folder: Path) -> Path:
 
 
 def copy_teacher(config: DistillConfig, folder: Path) -> None:
-    """Copy the teacher into the folder, if it is a policy; one that an earlier attempt has left there goes."""
+    """Copy the teacher into the folder, if it is a policy; else remove what an earlier attempt has left there."""
     teacher = config.teacher
-    teacher_path(folder).unlink(missing_ok=True)
     if teacher in ("mpc", *TRAINED):
+        teacher_path(folder).unlink(missing_ok=True)
         return
     try:
         read_teacher(teacher, config.task, config.environment)

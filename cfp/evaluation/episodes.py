@@ -165,4 +165,4 @@ def play(
             pool.shutdown(cancel_futures=True)
             torch.set_num_threads(threads)
     known |= {key: future.result() for key, future in futures.items()}
-    return [[episode for span in trial.spans() for episode in known[(trial, *span)] or ()] for trial in trials]
+    return [[each for first, count in trial.spans() for each in known[trial, first, count] or ()] for trial in trials]

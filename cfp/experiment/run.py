@@ -53,7 +53,8 @@ def check_options(config: RunConfig) -> None:
         try:
             make_env(config.for_training(), config.action_size(1), 1)
         except ConfigError as error:
-            raise ConfigError(f"train_dt or train_particles: {error}") from error
+            names = (name for name in ("train_dt", "train_particles") if hasattr(config, name))
+            raise ConfigError(f"{' or '.join(names)}: {error}") from error
 
 
 class TrainingRun:

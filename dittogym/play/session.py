@@ -73,7 +73,7 @@ class Session:
         seed: int = 0,
         **options: Any,
     ) -> None:
-        self.task, self.seed, self.options = task, seed, {**options, "action_layout": "image"}  # that of the page
+        self.task, self.seed, self.options = task, seed, dict(action_layout="image", **options)  # that of the page
         self.policies, self.env = dict(policies or {}), TorchEnv(task, 1, **self.options)
         self.own_resolution = self.env.action_resolution
         self.control_step = self.env.model.substeps * self.env.model.solver.dt

@@ -128,7 +128,7 @@ OTHERS = [
     learning("gradient", "no iterations", "--iterations 0", "iterations must be at least 1, got 0"),
     learning("gradient", "a grid of 99", "--grid 99", "grid must be 'coarse', 'fine' or 1 to 64, got 99"),
     learning("gradient", "a fine grid of 0", "--polish 1 --polish-grid 0", "polish_grid must be 'coarse', 'fine' or"),
-    learning("distill", "no particles", "--train-particles 0", "train_dt or train_particles: particles must be"),
+    learning("distill", "no particles", "--train-particles 0", "error: train_particles: particles must be at least 1"),
     learning("distill", "plans on 99", "--teacher mpc --planner-grid 99", "planner_grid must be 'coarse', 'fine' or"),
     learning("mpc", "two robots", "--num-envs 2", "num_envs", "got 2"),
     learning("mpc", "no horizon", "--horizon 0", "horizon must be at least 1, got 0"),

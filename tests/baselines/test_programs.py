@@ -242,7 +242,7 @@ def test_episode_is_written_to_watch(finished, tmp_path, capsys):
     _, folder = finished
     page = tmp_path / "replay.html"
     assert replay.main([str(folder), "--out", str(page)]) == 0 and "<!doctype html>" in page.read_text()[:100].lower()
-    assert capsys.readouterr().out == f"replay: {page}\n"
+    assert capsys.readouterr().out == f"episode: {page}\n"
     assert replay.main([str(folder), "--out", "replay.txt"]) == 2
     assert "out must end in .html or .mp4" in capsys.readouterr().err
 

@@ -440,5 +440,5 @@ def test_gravity_moves_a_particle_at_rest_by_less_than_a_cell(as_tensor: bool) -
     for value in (0.999 * largest, -0.999 * largest):
         robot(5, gravity=torch.tensor([0.0, value]) if as_tensor else (0.0, value))
     for value in (1.001 * largest, -1.001 * largest):
-        with pytest.raises(ValueError, match=r"^gravity must be (above -|below )"):
+        with pytest.raises(ValueError, match=r"^gravity, with substeps of 0.0001 s, must be (above -|below )"):
             robot(5, gravity=torch.tensor([0.0, value]) if as_tensor else (0.0, value))
