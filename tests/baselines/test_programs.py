@@ -223,7 +223,11 @@ def test_policy_that_a_run_starts_from_is_evaluated_first_and_once(tmp_path, mon
     words = ["--sees", "image", "--start-from", str(start), "--steps", "24", "--eval-every", "24"]
     stop_at(step or -1)
     if step == 0:
-        interrupted = lambda *given, **named: signal.raise_signal(signal.SIGINT) or play(*given, **named)  # noqa: E731
+
+        def interrupted(*given, **named):
+            signal.raise_signal(signal.SIGINT)
+            return play(*given, **named)
+
         monkeypatch.setattr("cfp.experiment.callbacks.evaluate", interrupted)
     assert run("shac", tmp_path / "run", *words) == 128 + signal.SIGINT
     assert (tmp_path / "run" / "evaluations.csv").exists() == (step > 0)
