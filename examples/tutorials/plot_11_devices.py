@@ -42,7 +42,7 @@ def throughput(num_envs: int, gradient: bool = False) -> float:
 
 
 # %%
-# A batch of independent robots can be divided among many cores, a single robot cannot. On a GPU, double the batch
+# A batch of robots can be divided among many cores; a single robot uses only a few. On a GPU, double the batch
 # size until the curve is flat or the memory is full. `torchmpm.estimate_memory` predicts the memory that gradients
 # need.
 
