@@ -109,12 +109,16 @@ def check_action(action: Tensor, shape: tuple[int, ...], dtype: torch.dtype, dev
     """The action as a tensor of this type and device, if it is a finite floating point tensor of this shape."""
     if not isinstance(action, Tensor) or not action.is_floating_point():
         kind = action.dtype if isinstance(action, Tensor) else type(action).__name__
-        raise ValueError(f"action must be a floating point tensor, got {kind}")
+        hint = "" if isinstance(action, Tensor) else "; torch.as_tensor(action) makes a tensor of an array"
+        raise ValueError(f"action must be a floating point tensor, got {kind}{hint}")
     checks.tensor("action", action)
     if action.is_meta:
         raise ValueError("action must hold numbers, got a tensor on the device meta")
     if tuple(action.shape) != shape:
-        raise ValueError(f"action must have shape {shape}, got {tuple(action.shape)}")
+        raise ValueError(
+            f"action must have shape {shape}, got {tuple(action.shape)}; the option resolution of the environment sets "
+            "its last two numbers"
+        )
     action = action.to(device, dtype)
     # A sum that is finite spares the test of every entry; one of finite entries may overflow.
     if not math.isfinite(float(action.detach().sum())) and (wrong := int((~torch.isfinite(action)).sum())):

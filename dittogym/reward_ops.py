@@ -125,8 +125,14 @@ def distance(x: Tensor, point: Tensor | Sequence[float]) -> Tensor:
 
     Returns:
         (B, N) or (B,).
+
+    Raises:
+        ValueError: The point has another number of coordinates.
     """
-    return safe_sqrt(_squared_distance(x, point if isinstance(point, Tensor) else x.new_tensor(point)))
+    point = point if isinstance(point, Tensor) else x.new_tensor(point)
+    if point.ndim == 0 or point.shape[-1] != 2:
+        raise ValueError(f"point must be two numbers or of shape (B, 2), got shape {tuple(point.shape)}")
+    return safe_sqrt(_squared_distance(x, point))
 
 
 def _squared_distance(x: Tensor, point: Tensor) -> Tensor:

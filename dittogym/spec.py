@@ -139,7 +139,8 @@ class TaskSpec:
 
     def _check_numbers(self) -> None:
         for name, value in self.weights.items():
-            checks.number(f"weights[{name!r}]", value)
+            # Tearing and actions are costs, whose terms are negative.
+            checks.number(f"weights[{name!r}]", value, least=0.0 if name in ("split", "action") else None)
         checks.number("mu", self.mu, above=0.0)
         checks.number("lam", self.lam)
         for name in ("yield_stress", "max_actuation", "damping"):

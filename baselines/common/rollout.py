@@ -8,8 +8,9 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
+from cfp.analytic.reward import has_gradient
 from cfp.errors import ConfigError
-from dittogym import core
+from dittogym import TorchEnv, core
 from dittogym.action import ActionIndexing, to_grid_indexing
 from dittogym.core import StepResult
 from dittogym.model import EnvState, Model
@@ -24,10 +25,10 @@ def soft_step(model: Model, state: EnvState, action: Tensor) -> StepResult:
     return core.step(model, state, action, soft=True)
 
 
-def check_differentiable(value: Tensor, task: str) -> None:
-    """Refuse a return that does not depend on the actions through operations that have a gradient."""
-    if not value.requires_grad:
-        raise ConfigError(f"task: the reward of {task!r} has no gradient in the actions")
+def check_differentiable(env: TorchEnv) -> None:
+    """Raise a `ConfigError` if the reward of the environment's task has no gradient in the actions."""
+    if not has_gradient(env):
+        raise ConfigError(f"task: the reward of {env.spec.name!r} has no gradient in the actions")
 
 
 class Rollout(NamedTuple):

@@ -11,6 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from baselines.common.rollout import check_differentiable
 from baselines.gradlab.measure import ReturnFunction, measure
 from baselines.gradlab.report import write
 from cfp.envs.make import choose_device
@@ -101,6 +102,7 @@ def run(config: GradLabConfig) -> str:
     """Measure, write the folder, and return the text to print."""
     assert config.out is not None
     env = make_env(config)
+    check_differentiable(env)
     make_folder(config.out)  # before the long measurement, not after it
     horizons = [horizon for horizon in config.horizons if horizon <= env.spec.horizon - config.warmup]
     generator = torch.Generator().manual_seed(config.seed)

@@ -132,6 +132,8 @@ class Gradient(Stateful, OpenLoopAlgorithm):
         own, num_envs = (config, 1) if polishes else (config.for_training(), None)
         self.env = make_torch_env(own, config.resolution(stage), num_envs)
         self.env.reset(seed=config.seed)
+        if not matches_shape(self.env.spec):
+            check_differentiable(self.env)
         self.initial = self.env.save()  # with reference parity, another reset would keep the last episode's end
         self.horizon = self.env.spec.horizon
         self.theta = torch.zeros(self.horizon, *self.env.action_shape, device=self.env.device)
@@ -155,8 +157,14 @@ class Gradient(Stateful, OpenLoopAlgorithm):
             self.best_loss, self.phase = math.inf, phase
         loss, size, total, gradient = self.play(progress)
         scalars = {"train/learning_rate": learning_rate, "train/loss": loss, "train/return": total}
-        useful = math.isfinite(loss) and bool(torch.isfinite(gradient).all() and gradient.any())
-        if useful and loss <= self.best_loss + MAX_RISE * self.best_size:
+        failure = None
+        if not (math.isfinite(loss) and torch.isfinite(gradient).all()):
+            failure = "the return or its gradient is not finite"
+        elif not gradient.any():
+            failure = "the gradient is zero"
+        elif loss > self.best_loss + MAX_RISE * self.best_size:
+            failure = "the return is far below the best"
+        if failure is None:
             if loss < self.best_loss:
                 self.best_loss, self.best_size, self.best = loss, size, self.theta.detach().clone()
             scalars["train/gradient_norm"] = float(gradient.norm())
@@ -164,7 +172,7 @@ class Gradient(Stateful, OpenLoopAlgorithm):
             self.adam.step()
             self.failed_in_a_row = 0
         else:
-            self._undo()
+            self._undo(failure)
         self.num_timesteps += self.horizon * self.env.num_envs
         return scalars | {"train/failed": float(self.failed)}
 
@@ -188,7 +196,6 @@ class Gradient(Stateful, OpenLoopAlgorithm):
             running = running & ~terminated
             is_last = step + 1 == self.horizon or not bool(running.any())
             if is_last or (step + 1) % window == 0:
-                check_differentiable(window_loss, self.config.task)
                 window_loss.backward()
                 loss += float(window_loss.detach())
                 window_loss = torch.zeros_like(window_loss)
@@ -208,13 +215,14 @@ class Gradient(Stateful, OpenLoopAlgorithm):
         scale = torch.where(norm > 0, clipped / norm, 1.0)
         return gradient * scale[:, None, None, None], float((norm > limit).float().mean())
 
-    def _undo(self) -> None:
-        """Return to the best point with a smaller learning rate, or give up."""
+    def _undo(self, failure: str) -> None:
+        """Return to the best point with a smaller learning rate, or give up after too many failures in a row."""
         self.failed += 1
         self.failed_in_a_row += 1
         if self.failed_in_a_row >= PATIENCE:
             raise NonFiniteError(
-                f"{PATIENCE} iterations in a row failed after {self.num_timesteps} environment steps of the stage"
+                f"{PATIENCE} iterations in a row failed after {self.num_timesteps} environment steps of the stage: "
+                f"{failure}"
             )
         self.backoff *= BACKOFF
         self._return_to_best()

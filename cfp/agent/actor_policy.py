@@ -26,7 +26,7 @@ Start: TypeAlias = np.ndarray | None
 def check_images(observation: object) -> None:
     """Refuse anything but a uint8 image or a batch of them: networks take other numbers as normalised already."""
     if not isinstance(observation, np.ndarray):
-        found = type(observation).__name__
+        found = type(observation).__name__ + ("; call its numpy()" if isinstance(observation, Tensor) else "")
     elif observation.dtype == np.uint8 and observation.shape[-3:] == SHAPE and observation.ndim in (3, 4):
         return
     else:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from cfp.validation import check_at_least, check_positive
-from dittogym import TorchEnv
+from dittogym import TorchEnv, core
+from dittogym.contract import Moment, Outcome
+from dittogym.spec import TaskSpec
 from torchmpm import tree
 
 #: Reward for a mean speed of 1 m/s.
@@ -110,3 +112,22 @@ def training_reward(
     if config.integrity_weight:
         reward = reward - config.integrity_weight * neighbours.drift(env.state.x[:, : env.model.num_robot_particles])
     return config.scale * torch.where(info["finite"], reward, terms["failure"])
+
+
+def has_gradient(env: TorchEnv) -> bool:
+    """Whether a term of the task's own reward, made smooth, has a gradient in the next action.
+
+    The reward as a whole always has one: the environment adds a cost of actions and of tearing.
+    """
+    differentiable: list[bool] = []
+
+    def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
+        outcome = env.spec.reward_fn(moment, spec)
+        differentiable.extend(term.requires_grad for term in outcome.terms.values())
+        return outcome
+
+    shape = (env.num_envs, *env.action_shape)
+    with torch.enable_grad():
+        action = torch.zeros(shape, dtype=env.dtype, device=env.device, requires_grad=True)
+        core.step(replace(env.model, spec=replace(env.spec, reward_fn=reward_fn)), env.env_state, action, soft=True)
+    return any(differentiable)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -12,13 +11,11 @@ from torch import Tensor
 
 from cfp.analytic.config import WindowConfig
 from cfp.analytic.episodes import Episodes
-from cfp.analytic.reward import Neighbours, training_reward
+from cfp.analytic.reward import Neighbours, has_gradient, training_reward
 from cfp.analytic.stateful import Stateful
 from cfp.envs.make import make_torch_env
 from cfp.errors import NonFiniteError
-from dittogym import TorchEnv, core
-from dittogym.contract import Moment, Outcome
-from dittogym.spec import TaskSpec
+from dittogym import TorchEnv
 from torchmpm import tree
 
 #: What ``WindowCollector.scalars`` returns, and what it means.
@@ -135,17 +132,7 @@ def reward_warnings(config: WindowConfig) -> list[str]:
         return []
     env = make_torch_env(config.for_training(), config.action_size(1), 1)
     env.reset(seed=config.seed)
-    differentiable: list[bool] = []
-
-    def reward_fn(moment: Moment, spec: TaskSpec) -> Outcome:
-        outcome = env.spec.reward_fn(moment, spec)
-        differentiable.extend(term.requires_grad for term in outcome.terms.values())
-        return outcome
-
-    action = torch.zeros(1, *env.action_shape, dtype=env.dtype, device=env.device, requires_grad=True)
-    model = replace(env.model, spec=replace(env.spec, reward_fn=reward_fn))
-    core.step(model, env.env_state, action, soft=True)
-    if any(differentiable):
+    if has_gradient(env):
         return []
     return [f"the reward of {config.task} has no gradient in the actions; --learner sac learns from rewards alone"]
 

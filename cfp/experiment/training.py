@@ -45,6 +45,8 @@ class Program:
 class Command:
     """Default values come from the preset of the task, then from the --config file, then from the command line.
 
+    This help shows those of one task; --task TASK --help shows those of another.
+
     Ctrl-C writes a checkpoint and stops the run; --resume continues it.
     """
 

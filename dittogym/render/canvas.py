@@ -51,12 +51,15 @@ class Canvas:
         font = max(10, self.pixels // 40)
         if MARK * self.scale < 3.5 * font:
             marks = [(x, column) for x, column in marks if round(x / MARK) % 5 == 0]
+        written = -4 * font
         for x, column in marks:
             dark = self.image[-font, min(column, self.pixels - 1)].mean() < 150
             colour = (235, 235, 235) if dark else SOLID
             cv2.line(self.image, (column, self.pixels - font // 2), (column, self.pixels), colour, 2)
             middle = min(max(column, 2 * font), self.pixels - 2 * font)  # so that all of it is in the picture
-            self.text(f"{x + 0.0:.1f} m", (middle, self.pixels - 5 * font // 3), font, colour, 0.5)
+            if middle - written >= 3.5 * font:  # also from one that was moved
+                self.text(f"{x + 0.0:.1f} m", (middle, self.pixels - 5 * font // 3), font, colour, 0.5)
+                written = middle
 
     def box(self, box: Solid) -> None:
         """A box, or only its outline."""

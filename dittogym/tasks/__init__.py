@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import inspect
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -73,15 +74,18 @@ def _allowed_instead(task: object) -> str | None:
         return f"{allowed}; dittogym.register gives a function a name" if callable(task) else allowed
     module, colon, name = task.rpartition(":")
     if colon:
+        if not module.isidentifier():  # options from elsewhere must not reach files below the current folder
+            return f"{allowed} (the name of a module must be a word, without dots)"
         try:
-            if not module.isidentifier():  # options from elsewhere must not reach files below the current folder
-                raise ImportError("its name must be a word, without dots")
-            if getattr(importlib.import_module(module), "__file__", None) is None:
-                raise ImportError("that is a folder, not a file")
-        except ModuleNotFoundError as error:
-            return f"{allowed} (there is no module {error.name!r} in the working directory or on the Python path)"
+            imported = importlib.import_module(module)
         except Exception as error:  # whatever the module does
-            return f"{allowed} (module {module!r}: {type(error).__name__}: {error})"
+            if isinstance(error, ModuleNotFoundError) and error.name == module:
+                return f"{allowed} (there is no module {module!r} in the working directory or on the Python path)"
+            last = traceback.extract_tb(error.__traceback__)[-1]  # of a SyntaxError, the message names the line
+            place = "" if isinstance(error, SyntaxError) else f"{Path(last.filename).name}, line {last.lineno}, "
+            return f"{allowed} (module {module!r}: {place}{type(error).__name__}: {error})"
+        if getattr(imported, "__file__", None) is None:
+            return f"{allowed} (module {module!r} is a folder, not a file)"
     if name in TASKS:
         return None
     return f"{allowed} (module {module!r} does not register {name!r})" if colon else allowed

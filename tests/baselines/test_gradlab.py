@@ -143,9 +143,9 @@ def test_folder_is_made_before_the_measurement(tmp_path, capsys, monkeypatch) ->
 
 
 def test_task_without_a_gradient_is_named(tmp_path, capsys, monkeypatch) -> None:
-    spec = dittogym.make_spec("shapematch")
     outcome = lambda moment, _: dittogym.Outcome({"n": moment.now.split.detach()})  # noqa: E731
-    counts = replace(spec, name="count", reward_fn=outcome, weights={"n": 1.0})
+    weights = {"n": 1.0, "action": 2e-4, "split": 1.0}  # whose costs have a gradient
+    counts = replace(dittogym.make_spec("run"), name="count", reward_fn=outcome, weights=weights)
     monkeypatch.setitem(dittogym.TASKS, "count", lambda: counts)
     assert command.main(["--quick", "--task", "count", "--out", str(tmp_path)]) == 2
     assert "'count' has no gradient" in capsys.readouterr().err

@@ -166,6 +166,19 @@ def test_plans_that_are_not_finite_are_counted_and_not_carried_out(monkeypatch) 
     assert plan.isfinite().all() and not torch.equal(calls[2][:, 0], calls[0][:, 0])
 
 
+def test_a_search_without_any_finite_gradient_warns(monkeypatch) -> None:
+    planner = GradientPlanner(small(), GradientPlannerConfig(horizon=2, commit=1, iterations=2))
+    returns = planner._returns
+
+    def without_derivative(start, plan):
+        climbed, value = returns(start, plan)
+        return climbed + (climbed - climbed.detach()).square().sqrt(), value
+
+    monkeypatch.setattr(planner, "_returns", without_derivative)
+    with pytest.warns(UserWarning, match="no gradient of a plan was finite: plans are not improved"):
+        planner.plan()
+
+
 def test_spread_near_the_limit_costs() -> None:
     env = small("run")
     plan = torch.zeros(1, 1, *env.action_shape)

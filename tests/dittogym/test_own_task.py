@@ -124,17 +124,19 @@ def test_a_module_that_registers_the_task_is_imported_by_name(tmp_path, monkeypa
         "dittogym.register('leap', leap)"
     )
     (tmp_path / "torn.py").write_text("1 / 0")
+    (tmp_path / "lame.py").write_text("\nimport absent_one")
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "hidden.py").write_text("raise AssertionError('is never imported')")
     env = tiny("hopping:leap", substeps=1)
     assert (env.spec.name, env.spec.horizon) == ("leap", dittogym.make_spec("run").horizon)
     for task, reason in (
         ("hopping:fly", "module 'hopping' does not register 'fly'"),
-        ("torn:leap", "module 'torn': ZeroDivisionError: division by zero"),
+        ("torn:leap", "module 'torn': torn.py, line 1, ZeroDivisionError: division by zero"),
+        ("lame:leap", "module 'lame': lame.py, line 2, ModuleNotFoundError: No module named 'absent_one'"),
         ("missing_one:leap", "there is no module 'missing_one' in the working directory or on the Python path"),
-        ("folder.hidden:leap", "module 'folder.hidden': ImportError: its name must be a word, without dots"),
-        (":leap", "module '': ImportError"),
-        ("folder:leap", "module 'folder': ImportError: that is a folder, not a file"),
+        ("folder.hidden:leap", "the name of a module must be a word, without dots"),
+        (":leap", "the name of a module must be a word"),
+        ("folder:leap", "module 'folder' is a folder, not a file"),
     ):
         with pytest.raises(ValueError, match=rf"task must be one of catch.* MODULE:NAME \({reason}.* got '{task}'"):
             dittogym.make_spec(task)
@@ -477,6 +479,7 @@ def test_a_function_that_is_written_anew_takes_the_place_of_the_old_one() -> Non
             ValueError,
             r"target must be bool of shape \(64, 64\), got bool of shape \(3, 3\)",
         ),
+        ({"weights": {"action": -2e-4}}, ValueError, r"weights\['action'\] must not be negative, got -0.0002"),
         ({"weights": 1.0}, TypeError, "weights must be a Mapping, got 1.0"),
         ({"obstacles": (VelocityRule("-y"),)}, TypeError, r"obstacles\[0\] must be a Obstacle, got VelocityRule"),
         ({"coarse": 16}, ValueError, "coarse must be at most fine, 8, got 16"),

@@ -212,3 +212,6 @@ def test_distances_of_particles_and_of_averages() -> None:
     torch.testing.assert_close(distance(x, point), expected)
     torch.testing.assert_close(distance(x[:, 1], point), expected[:, 1])
     torch.testing.assert_close(distance(x, point[0])[0], expected[0])
+    for wrong in (1.0, (0.0, 0.0, 9.0)):
+        with pytest.raises(ValueError, match=r"point must be two numbers or of shape \(B, 2\), got shape"):
+            distance(torch.zeros(1, 2), wrong)
