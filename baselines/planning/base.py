@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
-from baselines.common.rollout import StepFunction, rollout, soft_step
+from baselines.common.rollout import StepFunction, check_differentiable, rollout, soft_step
 from cfp.analytic.reward import split_cost
 from cfp.analytic.stateful import Stateful
 from cfp.errors import ConfigError
@@ -74,7 +74,7 @@ class Planner(Stateful, ABC, Generic[Config]):
         num_failed: Plans so far whose return or gradient was not finite. They are never carried out.
 
     Raises:
-        ConfigError: An option is out of range.
+        ConfigError: An option is out of range, or gradients are to be followed in a task whose reward has none.
     """
 
     config_type: type[Config]
@@ -87,6 +87,8 @@ class Planner(Stateful, ABC, Generic[Config]):
         self.config = config = config or self.config_type()
         config.check()
         self.env, self.step = env, step or self.default_step
+        if self.step is soft_step:
+            check_differentiable(env)
         self.generator = torch.Generator().manual_seed(seed)
         self.num_plans = self.num_failed = 0
         self.reset()

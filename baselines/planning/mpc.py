@@ -8,7 +8,6 @@ from torch import Tensor
 
 from baselines.common.grid import Grid, GridConfig
 from baselines.common.open_loop import OpenLoop, OpenLoopAlgorithm
-from baselines.common.rollout import check_differentiable
 from baselines.planning.base import Planner, PlannerConfig
 from baselines.planning.cem import CEMPlanner, CEMPlannerConfig
 from baselines.planning.gradient import GradientPlanner, GradientPlannerConfig
@@ -125,8 +124,6 @@ class MPC(OpenLoopAlgorithm):
             cheap.reset(seed=config.seed)
             self.surrogate = Surrogate(self.env, cheap)
         planning_env = self.surrogate.env if self.surrogate else self.env
-        if issubclass(self.planner_type, GradientPlanner):
-            check_differentiable(planning_env)
         self.planner = self.planner_type(planning_env, config.planner, seed=config.seed)
         self.actions = torch.zeros(0, *self.env.action_shape)
         self.total_reward, self.reward = 0.0, 0.0
