@@ -19,6 +19,7 @@ from dittogym.reward_ops import EXACT, SMOOTH, RewardOps, action_cost
 from dittogym.window import centre_in_window, contains
 from torchmpm import ParticleState, diagnostics, tree
 from torchmpm.backends import cached_tensors, transforming
+from torchmpm.rollout import Reads, changed, versions
 
 #: Reward of a step of an element whose state is no longer valid; its episode ends.
 FAILURE_REWARD = -16.0
@@ -78,9 +79,9 @@ def reset(model: Model, positions: Tensor, physics: Physics | None = None) -> tu
     state = EnvState(particles, spec.window.origin(start.com), start.com, start, {}, physics or {}, steps)
     observation = observe(model, state)
     moment = _moment(model, state, start, observation, EXACT)
-    before = _versions(moment)
+    before = versions(moment._asdict())
     memory = spec.initial_memory(moment, spec)
-    _check_versions(f"initial_memory of task {spec.name!r}", before)
+    _refuse_changes(f"initial_memory of task {spec.name!r}", before)
     check_memory(spec.name, memory, spec.stale_memory, len(positions))
     # Of any kind of mapping, and a copy: it may hold what the state does.
     return replace(state, memory=tree.map(Tensor.clone, dict(memory))), observation
@@ -228,9 +229,9 @@ def _weighted_reward(
 ) -> tuple[Outcome, dict[str, Tensor], Tensor]:
     """Outcome, weighted terms and their sum; of simulations that are not valid (B,) only ``failure`` counts."""
     spec, now = model.spec, moment.now
-    before = _versions(moment)
+    before = versions(moment._asdict())
     outcome = spec.reward_fn(moment, spec)
-    _check_versions(f"reward_fn of task {spec.name!r}", before)
+    _refuse_changes(f"reward_fn of task {spec.name!r}", before)
     check_outcome(spec.name, outcome, moment.memory, spec.weights, len(now.split))
     terms, weights = dict(outcome.terms), spec.weights
     if spec.split_limit is not None:
@@ -240,7 +241,7 @@ def _weighted_reward(
     terms["alive"] = torch.ones_like(now.split)
     terms["failure"] = torch.zeros_like(now.split)
     factors, failed = _columns(tuple(weights.get(name, 0.0) for name in terms), now.split.dtype, now.split.device)
-    values = torch.stack(tuple(terms.values())) * factors
+    values = torch.stack(tuple(terms.values())).to(factors) * factors
     counted = torch.where(valid, values, failed)
     first, *others = counted.unbind()
     reward = sum(others, first)  # in an order that does not depend on the size of the batch, as that of Tensor.sum does
@@ -250,26 +251,10 @@ def _weighted_reward(
     return outcome, dict(zip(terms, counted.unbind(), strict=True)), reward
 
 
-def _versions(moment: Moment) -> list[tuple[str, Tensor, int]]:
-    """The tensors of a moment, with its field and how often each was changed in place, where torch counts that."""
-    if transforming() or torch.compiler.is_compiling():
-        return []
-    state = moment.particles
-    parts = {
-        "particles": (state.x, state.v, state.C, state.F, state.Jp),
-        "now": moment.now,
-        "start": moment.start,
-        "observation": (moment.observation,),
-        "memory": moment.memory.values(),
-    }
-    tensors = [(name, tensor) for name, part in parts.items() for tensor in part if tensor is not None]
-    return [(name, tensor, tensor._version) for name, tensor in tensors if not tensor.is_inference()]
-
-
-def _check_versions(who: str, before: list[tuple[str, Tensor, int]]) -> None:
-    """Refuse changes in place since :func:`_versions`."""
-    if changed := dict.fromkeys(name for name, tensor, version in before if tensor._version != version):
-        raise ValueError(f"{who} must not change its moment in place, but it changed {', '.join(changed)}")
+def _refuse_changes(who: str, before: Reads) -> None:
+    """Refuse changes in place of the moment whose versions were noted."""
+    if names := changed(before):
+        raise ValueError(f"{who} must not change its moment in place, but it changed {', '.join(names)}")
 
 
 @cached_tensors

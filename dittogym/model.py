@@ -131,6 +131,8 @@ def _as_text(value: Any) -> str:
         return f"{tuple(value.shape)} learned" if value.requires_grad else _as_text(value.detach().cpu().numpy())
     if isinstance(value, np.ndarray):
         return f"{tuple(value.shape)} {hashlib.sha256(value.tobytes()).hexdigest()}"
+    if isinstance(value, functools.partial):
+        return _as_text([value.func, value.args, value.keywords])
     if callable(value):
         return str(getattr(value, "__qualname__", type(value).__name__))
     text = repr(value)
@@ -198,7 +200,7 @@ def next_physics(model: Model, present: Physics, given: object, mask: Tensor, li
 
     ``like`` (B,) has the dtype and device of the simulations.
     """
-    values = physics_values(given, len(like), model.solver.num_particles, like)
+    values = physics_values(given, model.solver.num_particles, like)
     check_effect(model.spec, values)
     physics = merged(model.spec, present, values, mask, like)
     check_stability(model, physics)
@@ -226,5 +228,6 @@ def _bodies(spec: TaskSpec, counts: tuple[int, ...], weight: tuple[float, ...], 
         first, robot = sum(earlier.count for earlier in bodies), not bodies
         own = {name: part_of(value, slice(first, first + count)) for name, value in values.items()}
         default = VonMises(own["mu"], own["lam"], own["yield_stress"]) if robot else Elastic(own["mu"], own["lam"])
-        bodies.append(Body(count, body.material or default, w * body.mass * own["mass"], w, muscle=robot))
+        material = default if body.material is None else body.material
+        bodies.append(Body(count, material, w * body.mass * own["mass"], w, muscle=robot))
     return tuple(bodies)

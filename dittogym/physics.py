@@ -32,16 +32,15 @@ def defaults(spec: TaskSpec, like: Tensor) -> dict[str, Tensor]:
     return {name: _expanded(like.new_tensor(value), name, len(like)) for name, value in own.items()}
 
 
-def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict[str, Tensor]:
+def physics_values(given: Any, particles: int, like: Tensor) -> dict[str, Tensor]:
     """Check constants and bring them to one value per simulation or particle; gradients flow through.
 
     Args:
         given: Mapping from ``dittogym.physics.NAMES`` to numbers or arrays of shape () or (B,); for ``gravity`` (2,) or
             (B, 2); for those of ``PER_PARTICLE`` also (B, N), robot first; the values of particles whose body has a
             material of its own (the soil of DIG), and the yield stress of objects, have no effect.
-        batch: Number B of simulations.
         particles: Number N of particles.
-        like: Gives dtype and device.
+        like: (B,), gives dtype and device.
 
     Raises:
         ValueError: Not a mapping, an unknown name, a wrong shape, or values that are not finite, have a wrong sign, or
@@ -49,7 +48,7 @@ def physics_values(given: Any, batch: int, particles: int, like: Tensor) -> dict
     """
     if not isinstance(given, Mapping):
         raise ValueError(f"physics must be a mapping from {', '.join(NAMES)} to values, got {type(given).__name__}")
-    values = {}
+    values, batch = {}, len(like)
     for name, value in given.items():
         if name not in NAMES:
             raise ValueError(f"physics may hold {', '.join(NAMES)}, got {name!r}")

@@ -11,7 +11,7 @@ import gymnasium
 
 from dittogym.env import Env
 from dittogym.spec import TaskSpec
-from dittogym.tasks import TASKS, make_spec
+from dittogym.tasks import TASKS, make_spec, task_name
 from dittogym.torch_env import TorchEnv
 from dittogym.vector import BatchEnv
 from torchmpm import checks
@@ -67,7 +67,8 @@ def register(task: str, make: Callable[..., TaskSpec], *, namespace: str = "ditt
         raise ValueError(f"task must be the name in the specification, got {task!r} for a TaskSpec {spec.name!r}")
     if TASKS.get(task, make) is not make:
         for known in list(gymnasium.registry.values()):
-            if known.entry_point == ENTRY_POINT and known.kwargs["task"].rpartition(":")[2] == task:
+            its_task = known.kwargs.get("task")
+            if known.entry_point == ENTRY_POINT and isinstance(its_task, str) and task_name(its_task) == task:
                 del gymnasium.registry[known.id]
     for resolution in ("coarse", "fine"):
         name = f"{namespace}/{task}-{resolution}-v{version}"

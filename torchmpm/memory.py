@@ -1,16 +1,19 @@
 """Memory that gradients need, estimated before they are computed."""
 
+import copy
 from bisect import bisect
 from collections.abc import Callable
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchmpm import checks
 from torchmpm.rollout import SEGMENT, Segment, check_repetition
 from torchmpm.solver import Solver
 from torchmpm.state import ParticleState
-from torchmpm.substep import Planes, substep
+from torchmpm.substep import Planes
 
 #: Component planes of a state.
 PLANES = 13
@@ -143,6 +146,7 @@ def _eager(solver: Solver, state: ParticleState, substeps: int, env_steps: int) 
 def _graph_bytes(solver: Solver, state: ParticleState) -> int:
     """Bytes that one further substep adds to the graph of a step."""
     empty, nodes = state.to("meta"), solver.grid.resolution
+    solver = solver.with_constants(tuple(map(_on_meta, solver.bodies)), solver.gravity)
     field = empty.x.new_empty(state.batch_size, 2, nodes, nodes, requires_grad=True)
     scene = solver.scene(empty, field)
     planes: Planes = tuple(plane.detach().requires_grad_() for plane in empty.planes())
@@ -156,9 +160,20 @@ def _graph_bytes(solver: Solver, state: ParticleState) -> int:
     sizes = []
     with torch.enable_grad(), torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
         for _ in range(2):
-            planes = substep(scene, planes)
+            planes = solver.substep(scene, planes)
             sizes.append(sum(storage.nbytes() for storage in kept.values()))
     return sizes[1] - sizes[0]
+
+
+def _on_meta(holder: Any) -> Any:
+    """A body or material whose modules, of learned materials, are copies without memory."""
+    if isinstance(holder, nn.Module):
+        return copy.deepcopy(holder).to("meta")
+    if not is_dataclass(holder) or isinstance(holder, type):
+        return holder
+    parts = {field.name: getattr(holder, field.name) for field in fields(holder)}
+    held = {name: part for name, part in parts.items() if isinstance(part, nn.Module) or is_dataclass(part)}
+    return replace(holder, **{name: _on_meta(part) for name, part in held.items()})
 
 
 def _reached(solver: Solver, x: Tensor) -> float:

@@ -44,14 +44,16 @@ def note_reads(reads: Mapping[str, Any]) -> None:
 
     They must not change before the replay. What a checkpoint's function itself makes is made anew then, and not kept.
     """
-    running = _running.get()
-    if running and not transforming():
-        found = _versions(reads)
+    if running := _running.get():
+        found = versions(reads)
         for record in running:
             record += found
 
 
-def _versions(reads: Mapping[str, Any]) -> Reads:
+def versions(reads: Mapping[str, Any]) -> Reads:
+    """Note how often tensors, by name, were changed in place, where torch counts that."""
+    if transforming() or torch.compiler.is_compiling():
+        return []
     # Tensor._version is the counter that torch's documentation of in-place checks describes; it has no public name.
     # Views share it with their base, which lives on where a function makes a new view in each call.
     tensors = [(name, tensor) for name, read in reads.items() for tensor in tree.leaves(read)]
@@ -62,16 +64,10 @@ def _base(tensor: Tensor) -> Tensor:
     return tensor if tensor._base is None else tensor._base
 
 
-def _check_versions(before: Reads) -> None:
-    """Raise an error if a tensor was changed in place since its version was noted."""
-    for name, reference, version in before:
-        tensor = reference()
-        if tensor is not None and tensor._version != version:
-            raise RuntimeError(
-                f"{name} was changed in place after a step had read it, and the backward pass replays that step: "
-                "give each step tensors of its own, such as a clone, or keep the whole graph (checkpointed=False, "
-                "segment=None)"
-            )
+def changed(before: Reads) -> list[str]:
+    """The names of the tensors that were changed in place since :func:`versions` noted them."""
+    tensors = ((name, reference(), version) for name, reference, version in before)
+    return list(dict.fromkeys(name for name, t, version in tensors if t is not None and t._version != version))
 
 
 class _Replay(torch.autograd.Function):
@@ -116,7 +112,7 @@ def _checkpointed(function: Callable[[State], State], state: State, reads: Mappi
     """
     if not torch.is_grad_enabled() or transforming() or torch.compiler.is_compiling():
         return function(state)
-    before, replaying = _versions({"state": state, **reads}), False
+    before, replaying = versions({"state": state, **reads}), False
 
     def replayable(state: State) -> State:
         nonlocal replaying
@@ -127,7 +123,12 @@ def _checkpointed(function: Callable[[State], State], state: State, reads: Mappi
                 return function(state)
             finally:
                 _running.reset(token)
-        _check_versions(before)
+        if names := changed(before):
+            raise RuntimeError(
+                f"{names[0]} was changed in place after a step had read it, and the backward pass replays that step: "
+                "give each step tensors of its own, such as a clone, or keep the whole graph (checkpointed=False, "
+                "segment=None)"
+            )
         return function(state)
 
     return cast(State, checkpoint(replayable, state, use_reentrant=False, preserve_rng_state=False))

@@ -21,7 +21,7 @@ def stable_dt(bodies: Sequence[Body], h: float, actuation: Value = 0.0) -> float
     rates, pull = [0.0], torch.as_tensor(detached_column(actuation), dtype=torch.float64, device="cpu").abs()
     for k, body in enumerate(bodies):
         try:
-            stiffness: Value = body.material.stiffness()
+            stiffness = detached_column(body.material.stiffness())
             if body.muscle:
                 stiffness = stiffness + 2.0 * pull
             rate = stiffness * detached_column(body.volume) / detached_column(body.mass)

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from dittogym.action import from_grid_indexing, patch_corner, to_grid_indexing, trained_indexing
 from dittogym.geometry import NODES
-from dittogym.model import check_stability
+from dittogym.model import Snapshot, check_stability
 from dittogym.physics import check_effect, physics_values
 from dittogym.play import protocol
+from dittogym.play.episode import Episode, same_physics, stacked
 from dittogym.play.hand import Direction, Grip, press, reach, wave
-from dittogym.play.saved import SavedEpisode, same_physics, stacked
 from dittogym.render.recording import Recording
 from dittogym.render.scene import Shot, describe
 from dittogym.tasks import TASKS, headline, task_name
@@ -36,7 +36,8 @@ LONGEST = 3000
 CHANGED_MATTER = "other matter or gravity"
 #: Channels of an action image, by the name of their muscles.
 CHANNELS = {"both": slice(0, 2), "horizontal": slice(0, 1), "vertical": slice(1, 2)}
-#: Loads a policy with ``predict(observation, memory, episode_start, deterministic)``, as stable-baselines3 has it.
+#: Loads a policy with ``predict(observation, memory, episode_start, deterministic)``, as stable-baselines3 has it, and
+#: the ``resolution`` of its actions.
 LoadPolicy = Callable[[], Any]
 Answers = list[dict[str, Any]]
 
@@ -56,10 +57,7 @@ class Session:
         TypeError: The task has no such option.
     """
 
-    invalid: bool
-    terminated: bool
-    truncated: bool
-    total: float
+    episode: Episode
     shot: Shot
     grip: Grip | None
     direction: Direction | None = None
@@ -83,7 +81,7 @@ class Session:
         self.policy_name: str | None = None
         self.hand = protocol.Hand(None)
         self.physics: dict[str, Any] = {}
-        self.saved: SavedEpisode | None = None
+        self.saved: tuple[Snapshot, Episode] | None = None
         self.num_frames = self.num_steps = 0
         self._reset(seed)
         self._apply_policy(protocol.Policy(policy))
@@ -125,7 +123,8 @@ class Session:
         Raises:
             Exception: What a task or a policy of the user's does wrong; time is stopped.
         """
-        if self.invalid:
+        episode = self.episode
+        if episode.invalid:
             return
         playing, self.playing = self.playing, False  # until it has worked
         self.action = self._next_action()
@@ -133,24 +132,25 @@ class Session:
         with torch.no_grad():
             self.observation, reward, terminated, truncated, info = self.env.step(torch.from_numpy(self.action)[None])
         self.num_steps, self.terms = self.num_steps + 1, info["reward_terms"]
-        earned = 0.0 if self.terminated or self.truncated else float(reward[0])
-        self.total += earned
-        self.rows.append([self.total, *(float(term[0]) for term in self.terms.values())])
-        self.terminated, self.truncated = self.terminated or bool(terminated[0]), self.truncated or bool(truncated[0])
-        self.success = "is_success" in info and bool(info["is_success"][0])
-        self.invalid = not bool(info["finite"][0])
-        self.playing, self.shot = playing and not self.invalid, self.env.shot()
-        if len(self.actions) == LONGEST:
-            return self._note(f"only the first {LONGEST} steps are kept")
-        self.actions.append(self.action)
-        self.recording.shots.append(self.shot)
-        self.recording.rewards.append(earned)
-        self.recording.success = self.success if "is_success" in info else None
+        earned = 0.0 if episode.terminated or episode.truncated else float(reward[0])
+        episode.total += earned
+        self.rows.append([episode.total, *(float(term[0]) for term in self.terms.values())])
+        episode.terminated |= bool(terminated[0])
+        episode.truncated |= bool(truncated[0])
+        episode.success = "is_success" in info and bool(info["is_success"][0])
+        episode.invalid = not bool(info["finite"][0])
+        self.playing, self.shot = playing and not episode.invalid, self.env.shot()
+        if len(episode.actions) == LONGEST:
+            return episode.note(f"only the first {LONGEST} steps are kept")
+        episode.actions.append(self.action)
+        episode.recording.shots.append(self.shot)
+        episode.recording.rewards.append(earned)
+        episode.recording.success = episode.success if "is_success" in info else None
 
     def frame(self, rate: float) -> bytes:
         """The present moment for the page, at ``rate`` simulated seconds per second; see `protocol.pack_frame`."""
         self.num_frames, shot = self.num_frames + 1, self.shot
-        flags = sum(getattr(self, name) << bit for bit, name in enumerate(FLAGS))
+        flags = sum(getattr(self if name == "playing" else self.episode, name) << bit for bit, name in enumerate(FLAGS))
         codes = np.full(len(shot.x), 127, np.uint8)
         own = shot.values.get(self.colour, codes)
         codes[: len(own)] = own
@@ -161,23 +161,21 @@ class Session:
         )
         rows = np.array(self.rows, np.float32).reshape(len(self.rows), 1 + len(self.terms))
         self.rows.clear()
-        numbers = (*shot.origin, *shot.centre, *self._corner(), self.total, rate)
+        numbers = (*shot.origin, *shot.centre, *self._corner(), self.episode.total, rate)
         counters = self.num_frames, shot.step, self.hand.id, flags
         return protocol.pack_frame(counters, numbers, rows, (protocol.quantise(shot.x, shot.origin), codes, *images))
 
     def _reset(self, seed: int | None) -> None:
         seed = self.seed if seed is None else seed  # also that of a moment that was gone back to
         self.observation, self.seed = self.env.reset(seed=seed, options={"physics": self.physics})[0], seed
-        self.terminated = self.truncated = self.success = self.invalid = False
-        self.total, self.grip, self.memory, self.terms = 0.0, None, None, {}
+        self.grip, self.terms = None, {}
         self.rows: list[list[float]] = []
-        self.actions: list[np.ndarray] = []
-        drawn = [name for name, value in self.options.items() if isinstance(value, np.ndarray)]
-        self.touched = [CHANGED_MATTER] * bool(self.physics) + [f"a drawn {name}" for name in drawn]
         self.painted = self.action = np.zeros(self.env.action_shape, np.float32)
         self.gate = np.zeros((2, 0, 0), np.float32)
         self.shot = self.env.shot()
-        self.recording = Recording(describe(self.env.model), [self.shot])
+        drawn = [name for name, value in self.options.items() if isinstance(value, np.ndarray)]
+        touched = [CHANGED_MATTER] * bool(self.physics) + [f"a drawn {name}" for name in drawn]
+        self.episode = Episode(seed, Recording(describe(self.env.model), [self.shot]), touched)
 
     def _next_action(self) -> np.ndarray:
         """What policy, paint, waves and hand add up to, float32 (2, R, R) in [-1, 1]."""
@@ -194,12 +192,13 @@ class Session:
     def _decide(self) -> np.ndarray:
         """The policy's action (2, R, R); it may tell the gate, too."""
         policy, images = self.policy, self.observation.cpu().numpy()
+        deterministic = getattr(policy, "deterministic_by_default", False)
         if hasattr(policy, "predict_with_gate"):
-            chosen, gate = policy.predict_with_gate(images, policy.deterministic_by_default)
+            chosen, gate = policy.predict_with_gate(images, deterministic)
             self.gate = self.gate if gate is None else self._as_image(gate)[0]
         else:
-            start = np.array([not self.actions])
-            chosen, self.memory = policy.predict(images, self.memory, start, policy.deterministic_by_default)
+            episode, start = self.episode, np.array([not self.episode.actions])
+            chosen, episode.memory = policy.predict(images, episode.memory, start, deterministic)
         return self._as_image(chosen)[0]
 
     def _as_image(self, array: np.ndarray) -> np.ndarray:
@@ -216,12 +215,7 @@ class Session:
         self.grip = self.grip or Grip.take(state.particles, point)
         if self.grip is not None:
             self.env.env_state = replace(state, particles=self.grip.pull(state.particles, point))
-            self._note("pulled by hand")
-
-    def _note(self, change: str) -> None:
-        """Remember a change that replaying the actions of the episode does not reproduce."""
-        if change not in self.touched:
-            self.touched.append(change)
+            self.episode.note("pulled by hand")
 
     def _corner(self) -> np.ndarray:
         """Lower left corner (2,) of the action image in the world, m."""
@@ -230,7 +224,7 @@ class Session:
         return (state.origin[0] + corner[0] / NODES).cpu().double().numpy()
 
     def _apply_play(self, message: protocol.Play) -> None:
-        self.playing = message.playing and not self.invalid
+        self.playing = message.playing and not self.episode.invalid
 
     def _apply_speed(self, message: protocol.Speed) -> None:
         self.speed = message.factor
@@ -275,8 +269,9 @@ class Session:
         if env is not self.env:
             self.env = env
             self.action = self.painted = np.zeros(env.action_shape, np.float32)
-        self.policy_name, self.memory, self.gate = message.name, None, np.zeros((2, 0, 0), np.float32)
-        self.saved = self.saved and self.saved._replace(memory=None)  # it belongs to the policy before
+        self.policy_name, self.gate = message.name, np.zeros((2, 0, 0), np.float32)
+        for episode in (self.episode, *(self.saved or ())[1:]):
+            episode.memory = None  # it belongs to the policy before
         return [{"type": "policy", "name": message.name, "reach": reach(self.env.spec.patch / NODES, resolution)}]
 
     def _apply_colour(self, message: protocol.Colour) -> None:
@@ -291,42 +286,40 @@ class Session:
             physics["yield_stress"] = message.yield_stress * spec.yield_stress
         if message.gravity != -spec.gravity[1]:
             physics["gravity"] = (spec.gravity[0], -message.gravity)
-        values = physics_values(physics, 1, self.env.num_particles, state.centre[:, 0])
+        values = physics_values(physics, self.env.num_particles, state.centre[:, 0])
         check_effect(spec, values)
         check_stability(self.env.model, values)
         if physics != self.physics:
-            self._note(CHANGED_MATTER)
+            self.episode.note(CHANGED_MATTER)
         self.physics, self.env.env_state = physics, replace(state, physics=values)
 
     def _apply_save(self, message: protocol.Save) -> Answers:
         file, name = io.BytesIO(), f"{self.env.spec.name}-{self.shot.step}"
         if message.what == "moment":
-            past = {field: getattr(self, field) for field in SavedEpisode._fields[1:]}
-            name, self.saved = f"{name}.pt", SavedEpisode(self.env.save(), **past).copy()
-            torch.save(self.saved.snapshot, file)
-        elif not self.actions:
+            name, self.saved = f"{name}.pt", (self.env.save(), self.episode.copy())
+            torch.save(self.saved[0], file)
+        elif not self.episode.actions:
             raise ValueError(f"{message.what} must be of at least one step, got none since the reset")
         elif message.what == "actions":
             name += "-actions.npz"
-            actions, touched = stacked(self.actions, self.env.spec.patch), np.array(self.touched, str)
-            np.savez_compressed(file, actions=actions, seed=self.seed, touched=touched)
+            actions, touched = stacked(self.episode.actions, self.env.spec.patch), np.array(self.episode.touched, str)
+            np.savez_compressed(file, actions=actions, seed=self.episode.seed, touched=touched)
         else:
             name += ".html"
-            file.write(self.recording.page().encode())
+            file.write(self.episode.recording.page().encode())
         return [{"type": "file", "name": name, "content": base64.b64encode(file.getvalue()).decode()}]
 
     def _apply_back(self, message: protocol.Back) -> Answers:
         if self.saved is None:
             raise ValueError("there is no moment to go back to: save one first")
-        then = self.saved.copy()  # what came after it did not happen
-        for name in SavedEpisode._fields[1:]:
-            setattr(self, name, getattr(then, name))
-        self.observation, state = self.env.load(then.snapshot), self.env.env_state
-        values = physics_values(self.physics, 1, self.env.num_particles, state.centre[:, 0])
+        snapshot, episode = self.saved
+        self.episode, self.seed = episode.copy(), episode.seed  # what came after it did not happen
+        self.observation, state = self.env.load(snapshot), self.env.env_state
+        values = physics_values(self.physics, self.env.num_particles, state.centre[:, 0])
         self.env.env_state = replace(state, physics=values)
         self.grip, self.shot = None, self.env.shot()
         if not same_physics(state.physics, values):
-            self._note(CHANGED_MATTER)
+            self.episode.note(CHANGED_MATTER)
         return [{"type": "reset"}]
 
     def _apply_draw(self, message: protocol.Draw) -> Answers:

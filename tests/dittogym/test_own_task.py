@@ -318,6 +318,16 @@ def test_weights_name_every_term() -> None:
         env.step(actions(env, 1)[0])
 
 
+def test_a_term_in_double_precision_leaves_that_of_the_reward() -> None:
+    def precise(moment: Moment, spec: TaskSpec) -> Outcome:
+        return Outcome({"height": moment.now.com[:, 1].double()})
+
+    env = tiny(dataclasses.replace(hop(), reward_fn=precise), dtype="float32")
+    env.reset(seed=0)
+    _, reward, _, _, info = env.step(actions(env, 1)[0])
+    assert reward.dtype == info["reward_terms"]["height"].dtype == torch.float32
+
+
 @pytest.mark.parametrize("task", ["grow", "dig", "catch"])
 def test_a_goal_that_is_replaced_is_rewarded_and_marked(task: str) -> None:
     spec = dittogym.make_spec(task)
@@ -454,12 +464,13 @@ def test_a_horizon_among_the_options_holds_through_gymnasium() -> None:
 
 
 def test_a_function_that_is_written_anew_takes_the_place_of_the_old_one() -> None:
+    gymnasium.register("mine/hop-v0", "dittogym.env:Env", kwargs={"task": hop()})  # by hand, and left alone
     cell = "def jump(): return dittogym.spec.TaskSpec(**{**vars(hop()), 'name': 'jump', 'horizon': %d})"
     for horizon in (40, 20):
         names = {"dittogym": dittogym, "hop": hop, "__name__": "notebook"}
         exec(cell % horizon, names)
         dittogym.register("jump", names["jump"])
-    assert gymnasium.spec("dittogym/jump-coarse-v0").max_episode_steps == 20
+    assert gymnasium.spec("dittogym/jump-coarse-v0").max_episode_steps == 20 and "mine/hop-v0" in gymnasium.registry
     assert tiny("jump").spec.horizon == 20
     exec(cell % 10, names)
     dittogym.register("jump", names["jump"], version=1)

@@ -75,7 +75,7 @@ def test_every_task_can_be_played(task: str) -> None:
         played.advance()
     frame, state = shown(played), played.env.env_state
     assert frame.step == 2 and "playing" in frame.flags and len(frame.rows) == 2
-    assert frame.rows[-1, 0] == pytest.approx(frame.numbers[6]) == played.total
+    assert frame.rows[-1, 0] == pytest.approx(frame.numbers[6]) == played.episode.total
     sent = protocol.LOW + frame.positions / (protocol.HIDDEN - 1) * (protocol.HIGH - protocol.LOW) + frame.numbers[:2]
     assert np.abs(sent - state.particles.x[0].numpy()).max() < 2e-5
     assert np.array_equal(frame.observation, played.observation[0])
@@ -108,7 +108,7 @@ def test_muscles_under_the_pointer(parity: str) -> None:
     for tool, sign in (("contract", 1), ("expand", -1)):
         played.apply(Hand(tool, corner[0] + 5.5 * cell, corner[1] + 0.5 - 7.5 * cell))
         played.advance()
-        action = sign * played.actions[-1]
+        action = sign * played.episode.actions[-1]
         corner = played._corner()
         assert np.unravel_index(action[0].argmax(), (16, 16)) == (7, 5) and action.max() == pytest.approx(1, abs=0.1)
         at = (played.shot.x[:, 0] - played.hand.x) ** 2 + (played.shot.x[:, 1] - played.hand.y) ** 2
@@ -124,15 +124,15 @@ def test_paint_waves_and_policy_add_up() -> None:
     played.advance()
     expected = np.zeros((2, 4, 4))
     expected[0, 0], expected[1, 3, :2] = 0.5, -1.0
-    assert np.array_equal(played.actions[-1], expected)
+    assert np.array_equal(played.episode.actions[-1], expected)
     played.apply(protocol.Clear())
     played.apply(Wave("up"))
     played.advance()
     assert np.allclose(
-        played.actions[-1],
+        played.episode.actions[-1],
         np.clip(wave("up", 1, 4) + Constant().predict(np.zeros((1, 3, 64, 64)), None, None, True)[0][0], -1, 1),
     )
-    assert played.memory[0][0] == 2
+    assert played.episode.memory[0][0] == 2
     with pytest.raises(ValueError, match="cells must be rows and columns below 4"):
         played.apply(Paint("both", 1.0, [[4, 0]]))
     with pytest.raises(ValueError, match="name must be one of constant, got '/etc/passwd'"):
@@ -156,7 +156,7 @@ def test_policies_with_other_orientations_and_gates() -> None:
     turned = Constant(description={"environment": {"action_layout": "grid"}})
     played = session(policies={"turned": lambda: turned}, policy="turned")
     played.advance()
-    assert (played.actions[-1][0, :, 0] == 0.5).all() and played.actions[-1].sum() == 2.0
+    assert (played.episode.actions[-1][0, :, 0] == 0.5).all() and played.episode.actions[-1].sum() == 2.0
     fine = ActorPolicy(ActorSpec((8, 16), gate_bias=(0.0,)), deterministic_by_default=True)
     played = session(policies={"fine": lambda: fine}, policy="fine")
     played.advance()
@@ -176,12 +176,12 @@ def test_matter_changes_while_it_moves_and_stays_after_a_reset() -> None:
         }  # fmt: skip
         played.apply(Reset())
     played.apply(Matter(stiffness=1.0, yield_stress=1.0, gravity=9.0))
-    assert played.env.env_state.physics == {} and played.touched
+    assert played.env.env_state.physics == {} and played.episode.touched
     played.apply(Reset())
-    assert not played.touched  # nothing but the actions decides about the episode
+    assert not played.episode.touched  # nothing but the actions decides about the episode
     played.apply(Matter(stiffness=2.0, yield_stress=1.0, gravity=9.0))
     played.apply(Reset())
-    assert played.touched == ["other matter or gravity"]
+    assert played.episode.touched == ["other matter or gravity"]
     with pytest.raises(ValueError, match="dt must be at most"):
         played.apply(Matter(stiffness=1e4, yield_stress=1.0, gravity=9.0))
     played.advance()
@@ -213,13 +213,14 @@ def test_moments() -> None:
     played.advance()
     (answer,) = played.apply(Save("moment"))
     snapshot = torch.load(io.BytesIO(base64.b64decode(answer["content"])), weights_only=True)
-    then, total = played.env.state.x.clone(), played.total
+    then, total = played.env.state.x.clone(), played.episode.total
     played.advance()
     played.apply(protocol.Back())
-    assert torch.equal(played.env.state.x, then) and shown(played).step == 1 and played.total == total
+    assert torch.equal(played.env.state.x, then) and shown(played).step == 1 and played.episode.total == total
     played.advance()
-    header, _ = encode(played.recording.scene, played.recording.shots)
-    assert header["steps"] == [0, 1, 2] and len(played.actions) == 2  # without what was played before going back
+    header, _ = encode(played.episode.recording.scene, played.episode.recording.shots)
+    # Without what was played before going back.
+    assert header["steps"] == [0, 1, 2] and len(played.episode.actions) == 2
     env = TorchEnv("run", **SMALL)
     env.load(snapshot)
     assert torch.equal(env.state.x, then)
@@ -228,13 +229,13 @@ def test_moments() -> None:
 def test_going_back_restores_success_and_failure() -> None:
     played = session()
     played.advance()
-    played.success = played.invalid = True
+    played.episode.success = played.episode.invalid = True
     played.apply(Save("moment"))
     played.apply(Reset())
-    assert not played.success and not played.invalid
+    assert not played.episode.success and not played.episode.invalid
     played.apply(protocol.Back())
     played.apply(protocol.Play(True))
-    assert played.success and played.invalid and not played.playing
+    assert played.episode.success and played.episode.invalid and not played.playing
 
 
 def test_going_back_restores_the_memory_of_the_same_policy() -> None:
@@ -244,10 +245,23 @@ def test_going_back_restores_the_memory_of_the_same_policy() -> None:
     played.apply(Save("moment"))
     played.advance()
     played.apply(protocol.Back())
-    assert played.memory[0][0] == 1
+    assert played.episode.memory[0][0] == 1
     played.apply(protocol.Policy("constant"))
     played.apply(protocol.Back())
-    assert played.memory is None
+    assert played.episode.memory is None
+
+
+def test_a_policy_as_stable_baselines3_has_it() -> None:
+    class Plain:
+        resolution = 4
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            assert not deterministic
+            return np.full((1, 2, 4, 4), 0.5, np.float32), state
+
+    played = session(policies={"plain": Plain}, policy="plain")
+    played.advance()
+    assert (played.episode.actions[-1] == 0.5).all()
 
 
 def test_the_reach_of_the_hand_follows_the_resolution() -> None:
@@ -260,7 +274,8 @@ def test_going_back_to_a_moment_of_other_matter_is_told() -> None:
     played.advance()
     played.apply(Save("moment"))
     played.apply(protocol.Matter(stiffness=2, yield_stress=1, gravity=9))
-    assert played.apply(protocol.Back()) == [{"type": "reset"}] and played.touched == ["other matter or gravity"]
+    assert played.apply(protocol.Back()) == [{"type": "reset"}]
+    assert played.episode.touched == ["other matter or gravity"]
     assert played.describe()["saved"] and not session().describe()["saved"]
 
 
@@ -290,7 +305,7 @@ def test_a_drawing_with_which_the_policy_cannot_act_changes_nothing() -> None:
         played.apply(protocol.Draw("body", np.full((64, 64), 255, np.uint8).tobytes()))
     assert vars(played) is not before and all(vars(played)[name] is value for name, value in before.items())
     played.advance()
-    assert len(played.actions) == 2 and played.recording.rewards
+    assert len(played.episode.actions) == 2 and played.episode.recording.rewards
 
 
 def test_files_after_going_back_are_of_what_led_there() -> None:
@@ -301,17 +316,17 @@ def test_files_after_going_back_are_of_what_led_there() -> None:
         for _ in range(3):
             played.advance()
     played.apply(Save("moment"))
-    kept, total = played.actions.copy(), played.total
+    kept, total = played.episode.actions.copy(), played.episode.total
     for reset in (None, None, Reset(seed=8)):
         if reset is not None:
             played.apply(reset)
         for _ in range(4):
             played.advance()
         played.apply(protocol.Back())
-        assert played.total == pytest.approx(total) == sum(played.recording.rewards)
-        assert [shot.step for shot in played.recording.shots] == list(range(7))
+        assert played.episode.total == pytest.approx(total) == sum(played.episode.recording.rewards)
+        assert [shot.step for shot in played.episode.recording.shots] == list(range(7))
         played.advance()
-        assert played.total == pytest.approx(sum(played.recording.rewards))
+        assert played.episode.total == pytest.approx(sum(played.episode.recording.rewards))
     (answer,) = played.apply(Save("actions"))
     saved = np.load(io.BytesIO(base64.b64decode(answer["content"])))
     assert np.array_equal(saved["actions"][:6], kept) and len(saved["actions"]) == 7 and saved["seed"] == 3
@@ -352,9 +367,9 @@ def test_the_end_of_an_episode_is_told_and_failure_stops_time() -> None:
     for _ in range(31):
         played.advance()
     assert {"truncated", "playing"} <= shown(played).flags
-    total = played.total
+    total = played.episode.total
     played.advance()
-    assert played.total == total
+    assert played.episode.total == total
     played.env.state.v.fill_(torch.nan)
     played.advance()
     frame = shown(played)
@@ -381,7 +396,7 @@ def test_a_shipped_policy_acts_as_it_does_elsewhere() -> None:
     played = Session("shapematch", {"shapematch": lambda: policy}, "shapematch", particles="lite")
     for _ in range(30):
         played.advance()
-    assert played.success and 350 < played.total < 500
+    assert played.episode.success and 350 < played.episode.total < 500
 
 
 GOOD = [

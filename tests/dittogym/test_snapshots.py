@@ -1,6 +1,7 @@
 """Saved moments: what goes on from one is, to the last bit, what would have gone on without."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -176,6 +177,19 @@ def test_physics_travels_with_a_moment() -> None:
     assert env.env_state.physics["gravity"].tolist() == [[0.0, -9.0], [0.0, -30.0]]
     assert env.env_state.physics["mass"].tolist() == [1.0, 2.0]
     assert torch.allclose(go_on(env, drive)[-1][1][0][1], future[-1][1][0][1], rtol=0, atol=1e-12)
+
+
+def test_a_snapshot_fits_functions_with_the_same_arguments() -> None:
+    def scaled(factor: float) -> TorchEnv:
+        spec = make_spec("run")
+        reward_fn = partial(lambda moment, spec, factor: factor * spec.reward_fn(moment, spec), factor=factor)
+        env = tiny(replace(spec, reward_fn=reward_fn), 2)
+        env.reset(seed=0)
+        return env
+
+    scaled(2.0).load(scaled(2.0).save())
+    with pytest.raises(ValueError, match="an environment with the same reward_fn, got another"):
+        scaled(2.0).load(scaled(3.0).save())
 
 
 @pytest.mark.parametrize(

@@ -110,6 +110,18 @@ def test_muscles_count_where_there_are_any() -> None:
     assert solver.stable_dt(torch.tensor([0.0, 200.0])) == pytest.approx(GRID.h / math.sqrt(1400.0))
 
 
+def test_a_stiffness_with_a_graph() -> None:
+    """Of a material that does not detach it; (B,) goes together with (B, 1) and (B, count)."""
+
+    class Learned(Elastic):
+        def stiffness(self) -> torch.Tensor:
+            return 2.0 * (self.mu + self.lam)
+
+    mu = torch.tensor([MU, 1.5 * MU], requires_grad=True)
+    solver = Solver(GRID, (Body(5, Learned(mu, LAM), mass=torch.ones(2), muscle=True),))
+    assert solver.stable_dt(torch.tensor([100.0, 0.0])) == pytest.approx(GRID.h / math.sqrt(1300.0))
+
+
 def test_shapes_that_do_not_go_together() -> None:
     odd = Body(5, Elastic(torch.ones(2), 1.0), mass=torch.ones(3))
     with pytest.raises(ValueError, match=r"values of bodies\[1\] must have shapes that go together"):

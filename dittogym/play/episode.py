@@ -1,40 +1,44 @@
-"""Episodes up to a saved moment, to which one can go back, and their actions."""
+"""An episode that is played, and its actions."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from dittogym.action import bicubic
-from dittogym.model import Snapshot
 from dittogym.render.recording import Recording
 
 
-class SavedEpisode(NamedTuple):
-    """An episode up to a moment: its state, and how it came there."""
+@dataclass
+class Episode:
+    """What happened since the last reset."""
 
-    snapshot: Snapshot
-    total: float  # Return
-    terminated: bool
-    truncated: bool
-    success: bool
-    invalid: bool
-    memory: Any  # Of the policy
     seed: int  # Of the particles
-    actions: list[np.ndarray]
     recording: Recording
-    touched: list[str]
+    touched: list[str]  # Changes that replaying the actions does not reproduce
+    actions: list[np.ndarray] = field(default_factory=list)
+    total: float = 0.0  # Return
+    terminated: bool = False
+    truncated: bool = False
+    success: bool = False
+    invalid: bool = False
+    memory: Any = None  # Of the policy
 
-    def copy(self) -> SavedEpisode:
+    def copy(self) -> Episode:
         """The same, with lists that do not grow with those of an episode that goes on."""
         shots, rewards = self.recording.shots.copy(), self.recording.rewards.copy()
         recording = replace(self.recording, shots=shots, rewards=rewards)
-        return self._replace(actions=self.actions.copy(), recording=recording, touched=self.touched.copy())
+        return replace(self, recording=recording, touched=self.touched.copy(), actions=self.actions.copy())
+
+    def note(self, change: str) -> None:
+        """Remember a change that replaying the actions does not reproduce."""
+        if change not in self.touched:
+            self.touched.append(change)
 
 
 def stacked(actions: list[np.ndarray], patch: int) -> np.ndarray:
