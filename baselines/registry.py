@@ -16,7 +16,7 @@ from cfp.weights import policy_file, read_policy
 
 #: ``"module:Class"`` of each algorithm, a subclass of `cfp.experiment.algorithm.Algorithm`.
 ALGORITHMS: dict[str, str] = {
-    "cfp": "cfp.experiment.coarse_to_fine:CoarseToFine",
+    "cfp": "cfp.experiment.sac_learner:SACLearner",
     "analytic": "cfp.analytic.learner:AnalyticLearner",
     "coarse": "baselines.common.single_stage:Coarse",
     "fine": "baselines.common.single_stage:Fine",

@@ -23,14 +23,14 @@ from torch.nn import functional as F
 from torch.utils.flop_counter import FlopCounterMode
 
 import dittogym  # noqa: F401  (registers the environments)
-from cfp import CFP, CFPPolicy, Config
+from cfp import CFP, CFPPolicy, SACConfig
 from cfp.agent.hyperparameters import LearningConfig
 from cfp.envs.make import make_env
 from cfp.experiment.process import keep_memory
 from cfp.presets import sac_preset
 
 
-def make_model(config: Config, stage: int, num_envs: int) -> CFP:
+def make_model(config: SACConfig, stage: int, num_envs: int) -> CFP:
     """The model of one stage of a configuration, with updates of all networks from the first steps on."""
     hyperparameters = replace(
         config.hyperparameters(stage),
@@ -96,7 +96,7 @@ def count_flop(model: CFP, batch: ReplayBufferSamples) -> int:
     return counter.get_total_flops()
 
 
-def updates(config: Config, repeats: int) -> None:
+def updates(config: SACConfig, repeats: int) -> None:
     """Print the cost of an update next to that of a matrix product."""
     matrix = torch.randn(1024, 1024)
     peak = 2 * 1024**3 / minimum_seconds(lambda: matrix @ matrix, repeats)
@@ -133,7 +133,7 @@ def timed(owner: object, name: str, clock: dict[str, float]) -> Iterator[None]:
         delattr(owner, name)
 
 
-def former_quick(task: str) -> Config:
+def former_quick(task: str) -> SACConfig:
     """Options of the preset quick before its networks became lean."""
     learning = LearningConfig(
         batch_size=64, learning_rate=1e-3, gamma=0.9, tau=0.01, buffer_size=20_000, gradient_steps=4

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.hyperparameters import Hyperparameters
 from cfp.agent.spec import ActorSpec
-from cfp.config import Config
+from cfp.analytic.config import AnalyticConfig
+from cfp.config import CoarseToFineConfig, SACConfig
 from cfp.errors import CFPError, CheckpointError, ConfigError, NonFiniteError
 from cfp.presets import preset
 from cfp.weights import load
@@ -22,15 +23,17 @@ __all__ = [
     "CFP",
     "ActorPolicy",
     "ActorSpec",
+    "AnalyticConfig",
     "CFPError",
     "CFPPolicy",
     "CheckpointError",
-    "Config",
+    "CoarseToFineConfig",
     "ConfigError",
     "Hyperparameters",
     "ImageFeatures",
     "NonFiniteError",
     "Run",
+    "SACConfig",
     "TorchVecEnv",
     "fit",
     "load",

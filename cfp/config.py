@@ -27,7 +27,7 @@ LARGEST_SEED = 2**31 - 1
 #: Added to a run's seed for evaluations, so that they start from initial positions that are not trained on.
 EVALUATION_SEED = 10_000
 #: Entry of ``RunConfig.ineffective`` where every episode begins on a layout that is counted from the seed.
-COUNTED_LAYOUTS = {"environment.resample": "soft actor-critic (cfp, coarse, fine, gnn-*, transformer-*)"}
+RESAMPLE_NEEDS_SAC = {"environment.resample": "learner sac, or algo coarse, fine, gnn-* or transformer-*"}
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class RunConfig:
     """Name of the algorithm."""
     preset: Preset = "quick"
     """Set of default options: quick (minutes), paper (the published values; not with learner analytic), or long (a
-    night; only cfp with learner sac)."""
+    night; only for algorithms that learn by soft actor-critic)."""
     seed: int = 0
     """Seed of everything that is random."""
     device: str = "auto"
@@ -248,7 +248,7 @@ class CoarseToFineConfig(StagedConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(CoarseToFineConfig):
+class SACConfig(CoarseToFineConfig):
     """A run of the coarse-to-fine policy that learns from rewards alone, by soft actor-critic."""
 
     learner: Learner = "sac"
@@ -269,7 +269,7 @@ class Config(CoarseToFineConfig):
     def with_derived(self, base: RunConfig, given: Collection[str]) -> RunConfig:
         """Scale the start of the actor's updates, too, if there are fewer steps."""
         config = super().with_derived(base, given)
-        assert isinstance(config, Config) and isinstance(base, Config)
+        assert isinstance(config, SACConfig) and isinstance(base, SACConfig)
         return replace(config, learning=scale_start(self.learning, base.learning, self.steps / base.steps, given))
 
     def hyperparameters(self, stage: int) -> Hyperparameters:

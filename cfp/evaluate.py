@@ -142,7 +142,9 @@ def open_policy(program: Program, path: str, device: str, seed: int | None) -> t
     network = about["network"] if isinstance(about.get("network"), dict) else {}
     # in a custom task, the stages of the preset may not fit the networks
     stages = {name: network[name] for name in ("resolutions", "gate_bias") if name in network}
-    config = update_from_dict(base, {"environment": about["environment"], **stages}).with_derived(base, stages)
+    # Stages must be long enough for the number of robots that they are trained with, which does not matter here.
+    environment = {**about["environment"], "num_envs": base.environment.num_envs}
+    config = update_from_dict(base, {"environment": environment, **stages}).with_derived(base, stages)
     config = replace(config, device=device, seed=about["seed"] if seed is None else seed)
     config.check()
     return config, {file.stem: policy}
@@ -168,9 +170,9 @@ def run(program: Program, command: Command) -> str:
 
 def _record(command: Command, config: RunConfig, policy: Policy) -> list[Episode]:
     """The episodes of a policy that were evaluated, played again."""
-    quiet, first = without_noise(policy, command.noise), evaluation_seed(config)
-    recorder = partial(record_batch, fields=command.record_fields)
-    return [record_episode(config, policy, quiet, seed, recorder) for seed in range(first, first + command.episodes)]
+    deterministic, first = without_noise(policy, command.noise), evaluation_seed(config)
+    recorder, seeds = partial(record_batch, fields=command.record_fields), range(first, first + command.episodes)
+    return [record_episode(config, policy, deterministic, seed, recorder) for seed in seeds]
 
 
 def main(arguments: Sequence[str] | None = None, program: Program = PROGRAM) -> int:

@@ -1,6 +1,7 @@
 """The presets of the eight tasks.
 
-Those of ``paper`` are from the reference's configuration files and the paper (DittoGym, ICLR 2024, 5 and Appendix B).
+Those of ``paper`` are from the reference's configuration files and the paper (DittoGym, ICLR 2024, Section 5 and
+Appendix B).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import dittogym
 from cfp.agent.hyperparameters import LearningConfig
 from cfp.analytic.config import AnalyticConfig
 from cfp.analytic.reward import RewardConfig
-from cfp.config import CoarseToFineConfig, Config, Learner, Preset, check_task
+from cfp.config import CoarseToFineConfig, Learner, Preset, SACConfig, check_task
 from cfp.errors import ConfigError
 from cfp.from_dict import Options, update_from_dict
 from cfp.sections import EnvironmentConfig, NetworkConfig, ReportConfig
@@ -131,7 +132,7 @@ def preset(task: str, name: Preset = "quick", learner: Learner | None = None) ->
     return sac_preset(task, name) if learner == "sac" else analytic_preset(task, name)
 
 
-def sac_preset(task: str, name: str = "quick") -> Config:
+def sac_preset(task: str, name: str = "quick") -> SACConfig:
     """The defaults of the learner ``sac``, see `preset`."""
     check_task(task)
     allowed = typing.get_args(Preset) if task in TASKS else ("quick", "long")
@@ -172,8 +173,8 @@ def _numbers(task: str) -> TaskNumbers:
     return replace(CUSTOM_TASK, resolutions=(spec.coarse, spec.fine))
 
 
-def _paper(task: str, numbers: TaskNumbers) -> Config:
-    return Config(
+def _paper(task: str, numbers: TaskNumbers) -> SACConfig:
+    return SACConfig(
         task=task,
         preset="paper",
         seed=numbers.seed,
@@ -190,7 +191,7 @@ def _paper(task: str, numbers: TaskNumbers) -> Config:
     )
 
 
-def _quick(task: str, numbers: TaskNumbers) -> Config:
+def _quick(task: str, numbers: TaskNumbers) -> SACConfig:
     """Minutes instead of days: many small robots, small networks, coarser actions first."""
     paper, horizon, many = _paper(task, numbers), dittogym.make_spec(task).horizon, task in MANY_UPDATES
     steps = 48_000 if many else 38_400
@@ -229,7 +230,7 @@ def _quick(task: str, numbers: TaskNumbers) -> Config:
     return update_from_dict(config, SAC.get(task, {}))
 
 
-def _long(task: str, numbers: TaskNumbers) -> Config:
+def _long(task: str, numbers: TaskNumbers) -> SACConfig:
     """A night of eight hours on two cores: more steps and a longer memory."""
     quick = _quick(task, numbers)
     steps = 819_200 if task in MANY_UPDATES else 1_638_400
@@ -266,7 +267,7 @@ def like_start(base: Options, values: dict[str, Any]) -> Options:
         return base
     spec, lean = load(values["start_from"]).spec, base.network.encoder == "lean"
     base = replace(base, network=replace(base.network, encoder=spec.encoder))
-    if isinstance(base, Config) and lean and spec.encoder != "lean":
+    if isinstance(base, SACConfig) and lean and spec.encoder != "lean":
         usual = {name: getattr(LearningConfig(), name) for name in ("n_steps", "weight_average", "max_episode_steps")}
         base = replace(base, learning=replace(base.learning, gradient_steps=4, batch_size=64, noise_cells=0, **usual))
         if len(base.resolutions) > 1:

@@ -82,22 +82,22 @@ class EnvironmentConfig:
 
         Args:
             task: The task.
-            particles: As in `for_training`; None: these options as they are.
+            particles: As in `with_particles`; None: these options as they are.
             dt: Duration of a substep, s; None: `LONG_DT` in `LONG_DT_TASKS` if these options leave ``substeps`` and
                 ``dt`` at their defaults, else as it is.
         """
         if dt is None:
             is_default = self.substeps is None and self.dt == DT
             dt = LONG_DT if is_default and task in LONG_DT_TASKS else self.dt
-        return (self if particles is None else self.for_training(particles)).with_dt(dt, "train_dt")
+        return (self if particles is None else self.with_particles(particles)).with_dt(dt, "train_dt")
 
-    def for_training(self, particles: Particles) -> EnvironmentConfig:
+    def with_particles(self, particles: Particles) -> EnvironmentConfig:
         """These options with other particles, without the reference's faults, and with actions oriented as here."""
         return replace(self, particles=particles, parity="clean", action_layout=self.action_indexing)
 
     def for_evaluation(self, particles: Particles) -> EnvironmentConfig:
         """These options with other particles; if few, without the reference's faults, which make the robot lighter."""
-        return replace(self, particles=particles) if particles == "full" else self.for_training(particles)
+        return replace(self, particles=particles) if particles == "full" else self.with_particles(particles)
 
     def check(self) -> None:
         """Raise a `ConfigError` for values out of range."""

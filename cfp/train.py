@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from cfp.analytic.config import AnalyticConfig
 from cfp.analytic.learner import AnalyticLearner
 from cfp.experiment import training
-from cfp.experiment.coarse_to_fine import CoarseToFine
+from cfp.experiment.sac_learner import SACLearner
 from cfp.presets import from_json
 from cfp.weights import load
 
@@ -22,7 +22,7 @@ PROGRAM = training.Program(
         "--task run --dry-run",
     ),
     from_json,
-    lambda config: AnalyticLearner if isinstance(config, AnalyticConfig) else CoarseToFine,
+    lambda config: AnalyticLearner if isinstance(config, AnalyticConfig) else SACLearner,
     load,
 )
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
-from torchmpm.backends import cached_tensors, transforming
+from torchmpm.tree import cached_tensors, transforming
 
 #: How an action array is indexed: as the observation (row from the top, column), or as the grid (x, y).
 ActionIndexing = Literal["image", "grid"]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dittogym.spec import CONTROL_STEP, TaskSpec
 from torchmpm import checks
-from torchmpm.backends import transforming
+from torchmpm.tree import transforming
 
 Value = TypeVar("Value")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}

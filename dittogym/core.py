@@ -18,8 +18,8 @@ from dittogym.physics import NAMES, Physics
 from dittogym.reward_ops import EXACT, SMOOTH, RewardOps, action_cost
 from dittogym.window import centre_in_window, contains
 from torchmpm import ParticleState, diagnostics, tree
-from torchmpm.backends import cached_tensors, transforming
 from torchmpm.rollout import Reads, changed, versions
+from torchmpm.tree import cached_tensors, transforming
 
 #: Reward of a step of an element whose state is no longer valid; its episode ends.
 FAILURE_REWARD = -16.0

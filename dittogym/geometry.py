@@ -57,7 +57,7 @@ class Obstacle:
 
     Attributes:
         name: For messages and docs.
-        boxes: Boxes with edges on nodes, at least 4 nodes wide and high.
+        boxes: Boxes with edges on nodes, at least 4 nodes wide and high unless ``rules`` are given.
         friction: Coulomb coefficient of their faces; ``math.inf`` sticks, ``None`` stands for 0. Rules have their own.
         rules: What it does to matter instead of what follows from the boxes; of several rules for one direction on a
             node the first in the task's list counts.

@@ -1,22 +1,16 @@
-"""Names of the backends, and what can and cannot go through them."""
+"""Names of the backends, and what they need."""
 
 import functools
 import logging
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import torch
-from torch import Tensor
 
-from torchmpm import tree
 from torchmpm.native.cpu.compiler import find_compiler
 from torchmpm.native.cpu.library import NO_COMPILER, provenance
 
-Parameters = ParamSpec("Parameters")
-Result = TypeVar("Result")
 BACKENDS = ("auto", "eager", "compile", "native")
-#: Results that a function of :func:`cached_tensors` keeps.
-LARGEST_CACHE = 64
 _logger = logging.getLogger(__name__)
 
 
@@ -30,37 +24,6 @@ def missing(backend: str) -> str | None:
     if backend == "native":
         return None if provenance() else NO_COMPILER
     return NO_COMPILER if backend == "compile" and not compiler_found() else None
-
-
-def transforming() -> bool:
-    """Whether a transform of ``torch.func`` is active."""
-    return bool(torch._C._are_functorch_transforms_active())  # torch.func has no public query for this
-
-
-def cached_tensors(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Keep the tensors that a function of hashable arguments returns, for as long as they serve all later calls.
-
-    Those made in inference mode could not serve gradients; those made under a transform of ``torch.func`` end with it,
-    and so do those of a trace, such as that of ``torch.export``, whose tensors hold no numbers.
-    """
-    kept: dict[Any, Result] = {}
-
-    @functools.wraps(function)
-    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        if transforming() or torch.compiler.is_compiling():
-            return function(*args, **kwargs)
-        key = args, tuple(kwargs.items())
-        result = kept.get(key)
-        if result is None:
-            with torch.inference_mode(False):
-                result = function(*args, **kwargs)
-            if all(type(tensor) is Tensor for tensor in tree.leaves(result)):
-                if len(kept) >= LARGEST_CACHE:
-                    kept.clear()
-                kept[key] = result
-        return result
-
-    return call
 
 
 @functools.cache

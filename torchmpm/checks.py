@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchmpm.backends import transforming
+from torchmpm.tree import transforming
 
 
 def whole(name: str, value: Any, least: int, most: int | None = None) -> int:

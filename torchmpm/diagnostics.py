@@ -92,6 +92,4 @@ def impulses(
 
 def _check(solver: Solver, state: ParticleState) -> None:
     checks.instance("solver", solver, Solver)
-    checks.instance("state", state, ParticleState)
-    if state.num_particles != solver.num_particles:
-        raise ValueError(f"state has {state.num_particles} particles, the solver's bodies {solver.num_particles}")
+    solver.check_state(state)

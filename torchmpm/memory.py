@@ -112,8 +112,7 @@ def _state(start: Start) -> ParticleState:
 def _estimate(solver: Solver, start: Start, substeps: int, env_steps: int) -> Need:
     checks.instance("solver", solver, Solver)
     state = _state(start)
-    if state.num_particles != solver.num_particles:
-        raise ValueError(f"state has {state.num_particles} particles, the solver's bodies {solver.num_particles}")
+    solver.check_state(state)
     checks.whole("substeps", substeps, 1)
     checks.whole("env_steps", env_steps, 1)
     checks.whole("the state's batch size", state.batch_size, 1)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from torchmpm import checks, tree
-from torchmpm.backends import transforming
+from torchmpm.tree import transforming
 
 State = TypeVar("State")
 Input = TypeVar("Input")

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchmpm import checks
-from torchmpm.backends import transforming
+from torchmpm.tree import transforming
 
 Points = NDArray[np.float64]
 #: Most points that are made at once; a Sobol sequence of torch has no more.

@@ -11,7 +11,7 @@ from torch.autograd.forward_ad import unpack_dual
 from torch.nn.functional import pad
 
 from torchmpm import checks, stability, tree
-from torchmpm.backends import BACKENDS, compiled, missing, transforming, warn_eager
+from torchmpm.backends import BACKENDS, compiled, missing, warn_eager
 from torchmpm.boundary import VelocityRule, faces
 from torchmpm.grid import PAD, Grid
 from torchmpm.materials.base import Value
@@ -21,6 +21,7 @@ from torchmpm.native.kernels import Kernels
 from torchmpm.rollout import Segment, check_repetition, note_reads, repeated, replayed
 from torchmpm.state import ParticleState
 from torchmpm.substep import Planes, Scene, substep
+from torchmpm.tree import transforming
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +211,6 @@ class Solver:
         """
         if self.backend != "eager" and torch.compiler.is_compiling():  # with fullgraph=True; else it runs as it is
             raise ValueError(f"backend {self.backend!r} cannot be traced by torch.compile, use 'eager'")
-        checks.instance("state", state, ParticleState)
         substeps, segment = check_repetition(substeps, segment, "substeps")
         origin = self._check_arguments(state, actuation, origin)
         if substeps == 0 or state.batch_size == 0:
@@ -273,8 +273,8 @@ class Solver:
 
     def _has_tangents(self, state: ParticleState, *fields: Tensor | None) -> bool:
         """Whether a tensor that a step reads carries a tangent of ``torch.autograd.forward_ad``."""
-        tensors = (state.x, state.v, state.C, state.F, state.Jp, *fields, *self.constants.values())
-        return not transforming() and any(unpack_dual(t).tangent is not None for t in tensors if t is not None)
+        tensors = tree.leaves((state, fields, self.constants))
+        return not transforming() and any(unpack_dual(tensor).tangent is not None for tensor in tensors)
 
     def _not_native(self, device: torch.device, tangents: bool) -> str | None:
         """Why the kernels cannot run a step on a device, or ``None`` if they can."""
@@ -307,11 +307,21 @@ class Solver:
             actuation=actuation,
         )
 
-    def _check_arguments(self, state: ParticleState, actuation: Tensor | None, origin: Tensor | None) -> Tensor:
-        """Check the arguments of a step; returns the origin (B, 2), m."""
-        batch, nodes = state.batch_size, self.grid.resolution
+    def check_state(self, state: ParticleState) -> None:
+        """Raise an error unless this is a state of as many particles as the bodies have.
+
+        Raises:
+            ValueError: It has another number of particles.
+            TypeError: It has another type.
+        """
+        checks.instance("state", state, ParticleState)
         if state.num_particles != self.num_particles:
             raise ValueError(f"state has {state.num_particles} particles, the solver's bodies {self.num_particles}")
+
+    def _check_arguments(self, state: ParticleState, actuation: Tensor | None, origin: Tensor | None) -> Tensor:
+        """Check the arguments of a step; returns the origin (B, 2), m."""
+        self.check_state(state)
+        batch, nodes = state.batch_size, self.grid.resolution
         field_shape = (batch, 2, nodes, nodes)
         for name, value, shape in (("actuation", actuation, field_shape), ("origin", origin, (batch, 2))):
             if value is None:

@@ -72,9 +72,8 @@ def particles_to_grid(scene: Scene, planes: Planes) -> Scattered:
     inside = takes_part(grid, x, y, scene.origin)
     nodes = stencil(grid, x, y, scene.origin)
     # Particles outside get neutral values: zero times NaN would reach the derivatives of constants that all share.
-    zero, one = x.new_zeros(()), x.new_ones(())
-    rest = (*[zero] * 6, one, zero, zero, one, one)
-    still = (torch.where(inside, plane, number) for plane, number in zip(others, rest, strict=True))
+    neutral = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 1.0)  # v, C, F and Jp at rest
+    still = (torch.where(inside, plane, number) for plane, number in zip(others, neutral, strict=True))
     vx, vy, c0, c1, c2, c3, f0, f1, f2, f3, Jp = still
     trial = matmul((1.0 + dt * c0, dt * c1, dt * c2, 1.0 + dt * c3), (f0, f1, f2, f3))
     F, Jp, stress_momentum = _deform(scene, nodes, inside, trial, Jp)

@@ -5,15 +5,20 @@ that ``torch.func``, ``torch.utils.checkpoint`` and ``torch.compile`` consult. I
 release of torch offers it under a public name, and a second registry would not be seen by those functions.
 """
 
+import functools
 from collections.abc import Callable, Iterable
 from dataclasses import fields
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
 Tree = TypeVar("Tree")
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+#: Results that a function of :func:`cached_tensors` keeps.
+LARGEST_CACHE = 64
 
 
 def register(cls: type[Tree]) -> type[Tree]:
@@ -119,3 +124,34 @@ def where(mask: Tensor, tree: Tree, other: Tree) -> Tree:
         return torch.where(mask.view(-1, *[1] * (chosen.ndim - 1)), chosen, otherwise)
 
     return map(select, tree, other)
+
+
+def transforming() -> bool:
+    """Whether a transform of ``torch.func`` is active."""
+    return bool(torch._C._are_functorch_transforms_active())  # torch.func has no public query for this
+
+
+def cached_tensors(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Keep the tensors that a function of hashable arguments returns, for as long as they serve all later calls.
+
+    Those made in inference mode could not serve gradients; those made under a transform of ``torch.func`` end with it,
+    and so do those of a trace, such as that of ``torch.export``, whose tensors hold no numbers.
+    """
+    kept: dict[Any, Result] = {}
+
+    @functools.wraps(function)
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        if transforming() or torch.compiler.is_compiling():
+            return function(*args, **kwargs)
+        key = args, tuple(kwargs.items())
+        result = kept.get(key)
+        if result is None:
+            with torch.inference_mode(False):
+                result = function(*args, **kwargs)
+            if all(type(tensor) is Tensor for tensor in leaves(result)):
+                if len(kept) >= LARGEST_CACHE:
+                    kept.clear()
+                kept[key] = result
+        return result
+
+    return call

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from cfp.config import COUNTED_LAYOUTS, RunConfig
+from cfp.config import RESAMPLE_NEEDS_SAC, RunConfig
 from cfp.errors import ConfigError
 from dittogym import make_spec
 from dittogym.arguments import find_resolution
@@ -39,4 +39,4 @@ class GridConfig(RunConfig):
 
     def ineffective(self) -> dict[str, str]:
         """Layouts are counted from the seed."""
-        return super().ineffective() | COUNTED_LAYOUTS
+        return super().ineffective() | RESAMPLE_NEEDS_SAC

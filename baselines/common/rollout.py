@@ -53,7 +53,7 @@ def rollout(
     actions: Tensor,
     step: StepFunction = soft_step,
     *,
-    layout: ActionIndexing = "image",
+    indexing: ActionIndexing = "image",
     checkpointed: bool = True,
 ) -> Rollout:
     """Drive simulations through some control steps.
@@ -63,12 +63,12 @@ def rollout(
         start: Where the simulations start, B of them.
         actions: (T, B, 2, R, R), as :meth:`dittogym.TorchEnv.step` takes them.
         step: Advances the simulations; by default the reward is the smooth one.
-        layout: How the actions are indexed.
+        indexing: How the actions are indexed.
         checkpointed: Keep only the states between the steps and replay each step in the backward pass.
     """
 
     def advance(before: _Step, action: Tensor) -> _Step:
-        result = step(model, before.state, to_grid_indexing(action, layout))
+        result = step(model, before.state, to_grid_indexing(action, indexing))
         reward, true_reward = (
             torch.where(before.ended, 0.0, value) for value in (result.reward, result.true_reward.detach())
         )

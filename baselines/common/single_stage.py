@@ -3,15 +3,15 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from cfp.config import Config
+from cfp.config import SACConfig
 from cfp.errors import ConfigError
-from cfp.experiment.coarse_to_fine import CoarseToFine
+from cfp.experiment.sac_learner import SACLearner
 from cfp.presets import sac_preset
 from dittogym.tasks import task_name
 
 
 @dataclass(frozen=True)
-class SingleStageConfig(Config):
+class SingleStageConfig(SACConfig):
     """Options of a single stage. ``--resolutions 4``, 8 or 16 is the study of resolutions."""
 
     @property
@@ -27,7 +27,7 @@ class SingleStageConfig(Config):
         super().check()
 
 
-class Coarse(CoarseToFine):
+class Coarse(SACLearner):
     """The first stage of CFP, for all its steps."""
 
     algo: ClassVar[str] = "coarse"

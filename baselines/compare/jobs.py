@@ -52,8 +52,9 @@ class Plan:
             raise ConfigError(f"plan: {path} cannot be read as JSON ({error})") from error
         if not set(values) <= {"common", "tasks", "algos"}:
             raise ConfigError(f"plan: {path} must hold common, tasks and algos only, got {', '.join(values)}")
-        for part, options in values.items():
-            _check_options(part, options, named=part != "common")
+        _check_options("common", values.get("common", {}))
+        for part in ("tasks", "algos"):
+            _check_named_options(part, values.get(part, {}))
         algos = {ALIASES.get(name, name): options for name, options in values.get("algos", {}).items()}
         return cls(**{**values, "algos": algos})
 
@@ -75,15 +76,26 @@ class Plan:
         return {part: sorted(names) for part, names in parts.items() if names}
 
 
-def _check_options(name: str, value: Any, named: bool) -> None:
-    """Check options of runs, or if ``named`` such options by the name of a task or an algorithm."""
+def _check_options(name: str, options: Any) -> None:
+    """Check options of runs."""
+    _check_object(name, options)
+    for key in COMMAND_LINE_OPTIONS:
+        if key in options:
+            raise ConfigError(f"plan: {name} must not hold {key}, which the command line gives")
+
+
+def _check_named_options(name: str, sections: Any) -> None:
+    """Check options by the name of a task or an algorithm; those of an algorithm may hold some by task."""
+    _check_object(name, sections)
+    for key, options in sections.items():
+        _check_options(f"{name}.{key}", options)
+        if name == "algos" and "tasks" in options:
+            _check_named_options(f"{name}.{key}.tasks", options["tasks"])
+
+
+def _check_object(name: str, value: Any) -> None:
     if not isinstance(value, dict):
         raise ConfigError(f"plan: {name} must be a JSON object, got {value!r}")
-    for key, item in value.items():
-        if named or key == "tasks":
-            _check_options(f"{name}.{key}", item, named=not named)
-        elif key in COMMAND_LINE_OPTIONS:
-            raise ConfigError(f"plan: {name} must not hold {key}, which the command line gives")
 
 
 def _merge(base: Options, values: Options) -> Options:

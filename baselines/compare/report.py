@@ -109,7 +109,7 @@ def _curve_caption(groups: Sequence[Group]) -> str:
     if len(set(particles.values())) > 1:
         listed = ", ".join(f"{label} {value}" for label, value in particles.items())
         text += f" The numbers of particles differ: {listed}."
-    if own := sorted({group.label for group in groups if group.job.config.evaluation(1)[1] == 1}):
+    if own := sorted({group.label for group in groups if group.job.config.evaluation(1)[0] == group.job.config.seed}):
         text += f" On the one layout they are made for: {', '.join(own)}."
     return text
 

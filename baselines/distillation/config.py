@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from baselines.common.grid import Grid, find_grid
 from baselines.planning.gradient import GradientPlannerConfig
-from cfp.config import COUNTED_LAYOUTS, StagedConfig, check_training_layouts
+from cfp.config import RESAMPLE_NEEDS_SAC, StagedConfig, check_training_layouts
 from cfp.sections import EnvironmentConfig, Particles
 from cfp.validation import check_at_least, check_fraction, check_positive
 
@@ -54,7 +54,7 @@ class DistillConfig(StagedConfig):
     @property
     def training_environment(self) -> EnvironmentConfig:
         """Options of the simulations in training."""
-        return self.environment.for_training(self.train_particles)
+        return self.environment.with_particles(self.train_particles)
 
     @property
     def planner_resolution(self) -> int:
@@ -69,7 +69,7 @@ class DistillConfig(StagedConfig):
     def ineffective(self) -> dict[str, str]:
         """Options of the planner have no effect with other teachers; layouts are counted from the seed."""
         planner = {} if self.teacher == "mpc" else dict.fromkeys(("planner.", "planner_grid"), "teacher mpc")
-        return super().ineffective() | planner | COUNTED_LAYOUTS
+        return super().ineffective() | planner | RESAMPLE_NEEDS_SAC
 
     def check(self) -> None:
         """Check what the types do not express."""

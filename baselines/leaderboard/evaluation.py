@@ -23,7 +23,7 @@ from cfp.sections import EnvironmentConfig
 from cfp.weights import check_trained_for, policy_file, shipped
 from dittogym.action import trained_indexing
 
-#: Name under which the policies that come with the package are submitted, one for each task.
+#: Name under which the policy of the package with a task's own name is submitted.
 PRETRAINED = "pretrained"
 
 
@@ -88,7 +88,7 @@ def _trained(protocol: FixedProtocol, path: str) -> Candidate:
     submission = Submission(
         protocol=protocol.version,
         task=about["task"],
-        policy=_name(path),
+        policy=_name(path, about["task"]),
         sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
         sees=about.get("sees", sees(about["kind"])),
         training=training,
@@ -97,9 +97,9 @@ def _trained(protocol: FixedProtocol, path: str) -> Candidate:
     return Candidate(submission, policy, replace(protocol.environment, action_layout=trained_indexing(policy)))
 
 
-def _name(path: str) -> str:
+def _name(path: str, task: str) -> str:
     """The name of a policy: that of its run folder, its file or its repository."""
-    if path in shipped() and not Path(path).exists():
+    if path == task and path in shipped() and not Path(path).exists():
         return PRETRAINED
     place = Path(re.split("[@?]", path)[0] if is_address(path) else path).resolve()
     name = place.parent.name if place.stem == "policy" else place.name.removesuffix(".safetensors")

@@ -93,8 +93,8 @@ class ModularActor(SquashedActor):
 
     def sample(self, observation: Tensor, deterministic: bool = False) -> Sample:
         """Draw actions (B, K, 2) for rows (B, K, columns)."""
-        mean, width = self.head(self.trunk(observation)).chunk(2, -1)
-        return Sample(*sample_squashed_gaussian(mean, width, deterministic), None)
+        mean, raw_std = self.head(self.trunk(observation)).chunk(2, -1)
+        return Sample(*sample_squashed_gaussian(mean, raw_std, deterministic), None)
 
 
 class ModularCritics(nn.Module):

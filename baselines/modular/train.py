@@ -19,7 +19,7 @@ from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Sees
-from cfp.experiment.coarse_to_fine import SACAlgorithm
+from cfp.experiment.sac_learner import SACAlgorithm
 from cfp.presets import sac_preset
 from cfp.validation import check_at_least
 from dittogym import make_spec
@@ -144,8 +144,7 @@ class Modular(SACAlgorithm):
         env = SegmentedEnv(make_torch_env(config, config.resolution(stage)), config.nodes)
         networks = {"kind": config.kind, "features": config.nodes.num_features(env.env.spec)}
         monitor = VecMonitor(TorchVecEnv(env, env.spaces, config.learning.max_episode_steps))
-        model = cls.make_model(config, monitor, ModularPolicy, networks, cls.hyperparameters(config, stage, folder))
-        return cls(config, stage, model)
+        return cls(config, stage, monitor, ModularPolicy, networks, cls.hyperparameters(config, stage, folder))
 
     @property
     def policy(self) -> SegmentPolicy:

@@ -42,7 +42,7 @@ class ImageActor(nn.Module):
     def __init__(self, resolution: int) -> None:
         super().__init__()
         self.spec = ActorSpec((resolution,))
-        self.actor = Actor(resolution)
+        self.actor = Actor(resolution, self.spec)
         self.actor.fix_std()
 
     def forward(self, image: Tensor) -> Tensor:

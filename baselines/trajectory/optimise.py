@@ -18,7 +18,7 @@ from cfp.config import RunConfig
 from cfp.envs.make import make_torch_env
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.experiment.algorithm import Scalars, Sees
-from cfp.experiment.schedules import cosine_decay
+from cfp.experiment.schedules import FINAL_FRACTION
 from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig, Particles, ReportConfig
 from cfp.validation import check_at_least, check_positive
@@ -40,9 +40,14 @@ METRICS: dict[str, str] = {
     "train/return": "mean return of the iteration's episodes, at the particle count of training",
     "train/gradient_norm": "norm of the gradient before it is clipped",
     "train/clipped": "fraction of control steps whose gradient was clipped",
-    "train/learning_rate": "Adam's step size in the next iteration",
+    "train/learning_rate": "Adam's step size in this iteration",
     "train/failed": "iterations of this stage that were undone",
 }
+
+
+def cosine_decay(progress: float) -> float:
+    """Factor that falls from 1 to `FINAL_FRACTION` along a cosine as ``progress`` goes from 0 to 1."""
+    return FINAL_FRACTION + (1.0 - FINAL_FRACTION) * 0.5 * (1.0 + math.cos(math.pi * progress))
 
 
 @dataclass(frozen=True)

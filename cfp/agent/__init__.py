@@ -1,1 +1,4 @@
-"""The method: networks, actors, losses, soft actor-critic. Imports nothing of `cfp.experiment` or `cfp.evaluation`."""
+"""The method: networks, actors, losses, soft actor-critic.
+
+Imports nothing of `cfp.envs`, `cfp.evaluation` or `cfp.experiment`.
+"""

@@ -28,7 +28,7 @@ class Outputs(NamedTuple):
 
     Attributes:
         mean: (B, 2, R, R), before tanh.
-        raw_std: (B, 2, R, R), see `sample_squashed_gaussian`.
+        raw_std: (B, 2, R, R), see `standard_deviation`.
         gate_logit: (B, 2, R, R) before `ActorSpec.gate_bias`, or None for a plain actor.
         coarse: Sample of the coarser actor, or None for a plain actor.
     """
@@ -117,10 +117,10 @@ class Actor(SquashedActor):
     critic_size: int | None = None
     """Size on which actions for critics are blended; None: `ActorSpec.action_size`."""
 
-    def __init__(self, resolution: int, spec: ActorSpec | None = None) -> None:
+    def __init__(self, resolution: int, spec: ActorSpec) -> None:
         super().__init__()
         self.resolution = resolution
-        lean = spec is not None and spec.encoder == "lean"
+        lean = spec.encoder == "lean"
         self.encoder: nn.Module = LeanEncoder() if lean else Encoder(3, 32)
         self.trunk = Trunk() if lean else None
         self.mean = make_head(resolution)
@@ -231,7 +231,8 @@ class ResidualActor(Actor):
         residual, log_prob = sample_squashed_gaussian(mean, raw_std, deterministic, generator)
         gate = self.gate_scale * torch.sigmoid(gate_logit + self.gate_bias)
         size = coarse.action.shape[-1]
-        action = blend(coarse.action, residual, gate, lambda image: upsample(image, size, self.interpolation))
+        large_residual, weight = (upsample(image, size, self.interpolation) for image in (residual, gate))
+        action = blend(coarse.action, large_residual, weight)
         return Sample(action, log_prob, gate, (*coarse.parts, residual, gate))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -12,10 +12,9 @@ from cfp.agent.networks import upsample
 from cfp.agent.spec import ActorSpec, Interpolation
 
 
-def blend(coarse: Tensor, residual: Tensor, gate: Tensor, enlarge: Callable[[Tensor], Tensor]) -> Tensor:
-    """``up(g) up(a_res) + (1 - up(g)) a_coarse`` for a coarse action that is upsampled already (paper, Section 4.2)."""
-    weight = enlarge(gate)
-    return weight * enlarge(residual) + (1 - weight) * coarse
+def blend(coarse: Tensor, residual: Tensor, gate: Tensor) -> Tensor:
+    """``g a_res + (1 - g) a_coarse``, of actions and gates that are upsampled already (paper, Section 4.2)."""
+    return gate * residual + (1 - gate) * coarse
 
 
 def compose(parts: Sequence[Tensor], size: int, interpolation: Interpolation) -> Tensor:
@@ -26,7 +25,7 @@ def compose(parts: Sequence[Tensor], size: int, interpolation: Interpolation) ->
 
     action = enlarge(parts[0])
     for residual, gate in zip(parts[1::2], parts[2::2], strict=True):
-        action = blend(action, residual, gate, enlarge)
+        action = blend(action, enlarge(residual), enlarge(gate))
     return action
 
 

@@ -8,7 +8,6 @@ clipped separately, the gate is penalised, and the random phase is independent o
 from __future__ import annotations
 
 from collections.abc import Iterable
-from functools import partial
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -18,6 +17,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples
+from stable_baselines3.common.utils import LinearSchedule
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
@@ -57,11 +57,6 @@ FROM_HYPERPARAMETERS = {*SHARED, "learning_rate", "learning_starts", "ent_coef",
 #: Arguments of SAC that CFP does not take: targets follow each update, the temperature is a constant, and exploration
 #: noise and replay buffer are its own.
 UNUSED = {"target_update_interval", "target_entropy", "action_noise", "replay_buffer_class"}
-
-
-def falling_rate(rate: float, final: float, remaining: float) -> float:
-    """A learning rate that falls to the fraction ``final`` on a line; ``remaining`` goes from 1 to 0, or just below."""
-    return rate * (final + (1 - final) * max(remaining, 0.0))
 
 
 def clip_each(parameters: Iterable[nn.Parameter], max_norm: float) -> Tensor:
@@ -118,7 +113,7 @@ class CFP(SAC):
         sac_options["replay_buffer_class"] = ReplayRing
         sac_options |= {name: getattr(hyperparameters, name) for name in SHARED}
         rate, final = hyperparameters.learning_rate, hyperparameters.final_rate
-        sac_options["learning_rate"] = rate if final == 1 else partial(falling_rate, rate, final)
+        sac_options["learning_rate"] = rate if final == 1 else LinearSchedule(rate, final * rate, 1.0)
         starts, alpha = hyperparameters.update_start, hyperparameters.alpha
         super().__init__(policy, env, learning_starts=starts, ent_coef=alpha, **sac_options)
 
@@ -159,8 +154,8 @@ class CFP(SAC):
         self._update_learning_rate([actor.optimizer, critic.optimizer])
         own = self.hyperparameters
         if own.actor_rate is not None:
-            remaining = self._current_progress_remaining
-            actor.optimizer.param_groups[0]["lr"] = falling_rate(own.actor_rate, own.final_rate, remaining)
+            schedule = LinearSchedule(own.actor_rate, own.final_rate * own.actor_rate, 1.0)
+            actor.optimizer.param_groups[0]["lr"] = schedule(self._current_progress_remaining)
         for _ in range(gradient_steps):
             scalars = self.update(self.replay_buffer.sample(batch_size))
             self._n_updates += 1

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from cfp.analytic.reward import RewardConfig
-from cfp.config import COUNTED_LAYOUTS, CoarseToFineConfig, Learner, RunConfig, check_training_layouts
+from cfp.config import RESAMPLE_NEEDS_SAC, CoarseToFineConfig, Learner, RunConfig, check_training_layouts
 from cfp.sections import EnvironmentConfig, Particles
 from cfp.validation import check_at_least, check_decay, check_fraction, check_positive
 
@@ -102,12 +102,12 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
     @property
     def training_environment(self) -> EnvironmentConfig:
         """Options of the simulations in training."""
-        environment = self.environment.for_training(self.train_particles)
+        environment = self.environment.with_particles(self.train_particles)
         return environment if self.train_dt is None else environment.with_dt(self.train_dt, "train_dt")
 
     def ineffective(self) -> dict[str, str]:
         """Options without effect: layouts are counted from the seed."""
-        return super().ineffective() | COUNTED_LAYOUTS
+        return super().ineffective() | RESAMPLE_NEEDS_SAC
 
     def check(self) -> None:
         """Check what the types do not express."""

@@ -94,7 +94,8 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
     @classmethod
     def warnings(cls, config: AnalyticConfig, folder: Path, first_stage: int) -> list[str]:
         """Stages that end before their policy learns, and a reward without gradient."""
-        lines, warmup = reward_warnings(config), config.warmup * config.update_every
+        lines = [f"{line}; --learner sac learns from rewards alone" for line in reward_warnings(config)]
+        warmup = config.warmup * config.update_every
         for stage in range(first_stage, len(config.ends()) + 1):
             starts_trained = stage > 1 or refines(config, folder, stage)
             if starts_trained and (steps := config.stage_steps(stage)) <= warmup:

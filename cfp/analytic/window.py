@@ -23,7 +23,7 @@ WINDOW_METRICS = {
     "rollout/return": "mean undiscounted true return of the episodes that ended since the last row; empty if none did",
     "train/reward": "mean training reward of a step, before its scale",
     "train/true_reward": "mean true reward of a step, at the particle count of training",
-    "train/value": "mean value that the target critic gives to the window's states",
+    "train/value": "mean value of the window's states by the target critic, and of the ends of its episodes",
     "train/episodes": "episodes ended in this stage",
     "train/terminated": "training episodes of this stage that terminated early",
     "train/nonfinite": "simulations that were not finite and were reset",
@@ -54,13 +54,14 @@ class WindowCollector(Stateful):
     """
 
     parts = ("episodes",)
+    values = ("dropped",)
 
     def __init__(self, env: TorchEnv, observe: Callable[[], Tensor], config: WindowConfig) -> None:
         self.env, self.observe = env, observe
         self.episodes = Episodes(env, config.seed, config.max_episode_steps, config.num_layouts)
         self.reward, self.steps = config.reward, config.window
         self.success_value = config.reward.success_value(config.gamma)
-        self.episodes.counts["dropped"] = 0
+        self.dropped = self.dropped_before = 0
 
     def collect(self, act: Callable[[Tensor], Tensor], value: Callable[[Tensor], Tensor]) -> Window:
         """Collect the next window.
@@ -73,7 +74,7 @@ class WindowCollector(Stateful):
             NonFiniteError: Actions are not finite.
         """
         env, true_reward = self.env, 0.0
-        self.dropped_before = self.episodes.counts["dropped"]
+        self.dropped_before = self.dropped
         steps: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
         observation, neighbours = self.observe(), Neighbours.find(self._robot_positions())
         for _ in range(self.steps):
@@ -97,14 +98,14 @@ class WindowCollector(Stateful):
 
     def scalars(self, window: Window) -> dict[str, float | None]:
         """What to log of a window, see `WINDOW_METRICS`; warns if most of its gradients were left out."""
-        dropped = self.episodes.counts["dropped"] - self.dropped_before
-        if dropped > window.rewards.numel() / 2:
+        if self.dropped - self.dropped_before > window.rewards.numel() / 2:
             reason = "the reward or the simulation has no finite derivative there"
             warnings.warn(f"most gradients of a window are not finite and were left out: {reason}", stacklevel=2)
         return self.episodes.scalars() | {
             "train/reward": float(window.rewards.detach().mean()) / self.reward.scale,
             "train/true_reward": window.true_reward,
             "train/value": float(window.next_values.detach().mean()),
+            "train/dropped": float(self.dropped),
         }
 
     def _robot_positions(self) -> Tensor:
@@ -122,7 +123,7 @@ class WindowCollector(Stateful):
 
     def _drop_nonfinite(self, gradient: Tensor) -> Tensor:
         finite = gradient.isfinite().flatten(1).all(1)
-        self.episodes.counts["dropped"] += int((~finite).sum())
+        self.dropped += int((~finite).sum())
         return torch.where(finite[:, None, None, None], gradient, 0.0)
 
 
@@ -134,7 +135,7 @@ def reward_warnings(config: WindowConfig) -> list[str]:
     env.reset(seed=config.seed)
     if has_gradient(env):
         return []
-    return [f"the reward of {config.task} has no gradient in the actions; --learner sac learns from rewards alone"]
+    return [f"the reward of {config.task} has no gradient in the actions"]
 
 
 def short_horizon_loss(window: Window, gamma: float) -> Tensor:

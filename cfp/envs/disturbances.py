@@ -101,7 +101,8 @@ class Disturbed(VecEnvWrapper):
         self.case, self.noise_seed = case, seed
         assert self.action_space.shape is not None
         self.size = self.action_space.shape[-1]
-        self.grid: int | None = grid or self.size  # None with a `DisturbablePolicy`, which calls `disturb` itself
+        self.grid = grid or self.size
+        self.disturbs_actions = True  # not with a `DisturbablePolicy`, which calls `disturb` itself
         self._restart()
 
     def _restart(self) -> None:
@@ -118,7 +119,7 @@ class Disturbed(VecEnvWrapper):
         """Pass on disturbed actions (B, 2, A, A)."""
         self._delayed.append(np.array(actions, np.float32))
         actions = self._delayed.popleft()
-        if self.grid is not None:
+        if self.disturbs_actions:
             actions = self.disturb(actions, (len(actions), 2, self.grid, self.grid))
         self.venv.step_async(actions)
 

@@ -33,7 +33,7 @@ def attached(policy: PolicyPredictor, env: VecEnv) -> PolicyPredictor:
     """A policy for an environment: one that sees the state is shown it, one with decisions of its own is disturbed."""
     inner = env.unwrapped
     if isinstance(policy, DisturbablePolicy) and isinstance(env, Disturbed):
-        policy, env.grid = policy.through(env.disturb), None
+        policy, env.disturbs_actions = policy.through(env.disturb), False
     if isinstance(policy, SeesState) and isinstance(inner, TorchVecEnv):
         return policy.attached(inner.torch_env)
     return policy

@@ -105,13 +105,13 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, no
         for kind in ("zero", "random")
     ]
     for name, trained in policies.items():
-        deterministic = without_noise(trained, noise)
-        for quiet in (False, True) if noise == "both" else (deterministic,):
-            label = f"{name}, {'mean' if quiet else 'noisy'}" if noise == "both" else name
-            trials.append(make_trial(config, label, trained, episodes, deterministic=quiet, seed=seed))
+        default = without_noise(trained, noise)
+        for deterministic in (False, True) if noise == "both" else (default,):
+            label = f"{name}, {'mean' if deterministic else 'noisy'}" if noise == "both" else name
+            trials.append(make_trial(config, label, trained, episodes, deterministic=deterministic, seed=seed))
         if "layout" in trained.description:
             own = trained.description["layout"]
-            trials.append(make_trial(config, "  own layout", trained, 1, deterministic=deterministic, seed=own))
+            trials.append(make_trial(config, "  own layout", trained, 1, deterministic=default, seed=own))
     return evaluate(trials, config.make_spec().horizon)
 
 

@@ -60,12 +60,11 @@ class ReplayArchive:
     def load(self, buffer: ReplayBuffer, rows: int, chunks: list[dict[str, Any]]) -> None:
         """Fill a fresh ring from the chunks that a checkpoint names."""
         self.chunks = [Chunk(**chunk) for chunk in chunks]
-        oldest = max(0, rows - buffer.buffer_size)
-        starts = [max(oldest, chunk.start) for chunk in self.chunks]
-        for stop, start in zip([oldest, *(chunk.stop for chunk in self.chunks)], [*starts, rows], strict=True):
-            if stop != start:
-                raise CheckpointError(f"{self.folder}: rows {stop} to {start} of the replay buffer are missing")
-        for chunk, first in zip(self.chunks, starts, strict=True):
+        oldest = stop = max(0, rows - buffer.buffer_size)
+        for chunk in self.chunks:
+            if (first := max(oldest, chunk.start)) != stop:
+                raise CheckpointError(f"{self.folder}: rows {stop} to {first} of the replay buffer are missing")
+            stop = chunk.stop
             if Path(chunk.file).name != chunk.file:
                 raise CheckpointError(f"{self.folder}: chunks must be files in this folder, got {chunk.file!r}")
             index = np.arange(first, chunk.stop) % buffer.buffer_size
@@ -74,6 +73,8 @@ class ReplayArchive:
                 if values.shape[1:] != ring.shape[1:]:
                     raise ValueError(f"{chunk.file}: {name} must have shape {ring.shape[1:]}, got {values.shape[1:]}")
                 ring[index] = values[first - chunk.start :]
+        if stop != rows:
+            raise CheckpointError(f"{self.folder}: rows {stop} to {rows} of the replay buffer are missing")
         buffer.pos = rows % buffer.buffer_size
         buffer.full = rows >= buffer.buffer_size
 

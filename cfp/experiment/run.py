@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -161,6 +162,8 @@ class TrainingRun:
         except CFPError:
             if not self.checkpoint.path.exists():  # options that it refuses leave no run behind
                 (self.folder / "config.json").unlink()
+                self.logger.close()
+                shutil.rmtree(self.folder / "tensorboard")
             raise
         algorithm.set_logger(self.logger)
         if self.state is not None:

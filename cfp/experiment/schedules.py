@@ -1,7 +1,5 @@
 """Schedules of learning rates over a stage of a run."""
 
-import math
-
 #: Fraction of the learning rate that is left at the end of a stage.
 FINAL_FRACTION = 0.1
 
@@ -9,8 +7,3 @@ FINAL_FRACTION = 0.1
 def linear_decay(progress: float, final: float = FINAL_FRACTION) -> float:
     """Factor that falls from 1 to ``final`` along a line as ``progress`` goes from 0 to 1."""
     return 1.0 - (1.0 - final) * progress
-
-
-def cosine_decay(progress: float) -> float:
-    """Factor that falls from 1 to `FINAL_FRACTION` along a cosine as ``progress`` goes from 0 to 1."""
-    return FINAL_FRACTION + (1.0 - FINAL_FRACTION) * 0.5 * (1.0 + math.cos(math.pi * progress))

@@ -105,27 +105,27 @@ class InitialPositions:
         """The initial positions of the next episodes; elements outside ``mask`` (B,) keep theirs."""
         seeds, generators = self._seeds(seed), dict(self.generators)
         # Every element has positions from the first draw on.
-        mask = np.ones_like(mask) if self.positions is None else mask.copy()
-        for i in np.flatnonzero(mask).tolist():
+        redrawn = np.ones_like(mask) if self.positions is None else mask.copy()
+        for i in np.flatnonzero(redrawn).tolist():
             if seeds[i] is not None or i not in generators:
                 generators[i] = np.random.RandomState(seeds[i])
             elif self.resample:
                 generators[i] = copy.deepcopy(generators[i])
             else:
-                mask[i] = given is not None
+                redrawn[i] = given is not None
         if given is not None:
             positions = self._given(given, like)
-        elif mask.any():
+        elif redrawn.any():
             stacked = np.zeros((self.num_envs, sum(self.counts), 2))
             bodies = tuple(zip(self.spec.bodies, self.counts, strict=True))
-            for i in np.flatnonzero(mask).tolist():
+            for i in np.flatnonzero(redrawn).tolist():
                 drawn = [body_positions(body, n, generators[i], random=self.random) for body, n in bodies]
                 stacked[i] = np.concatenate(drawn)
             positions = torch.from_numpy(stacked).to(like)
         else:
             return self
         if self.positions is not None:
-            positions = tree.where(torch.as_tensor(mask, device=like.device), positions, self.positions)
+            positions = tree.where(torch.as_tensor(redrawn, device=like.device), positions, self.positions)
         self._check_inside(positions)
         return replace(self, generators=generators, positions=positions)
 

@@ -12,7 +12,8 @@ from dittogym.observation import native, raster
 from dittogym.observation.image import CLIP, encode
 from dittogym.observation.raster import RasterInput
 from dittogym.window import GRID, Centre, Window, centre_in_window
-from torchmpm.backends import cached_tensors, transforming, warn_eager
+from torchmpm.backends import warn_eager
+from torchmpm.tree import cached_tensors, transforming
 
 
 @dataclass(frozen=True, eq=False)

@@ -157,7 +157,9 @@ def take(
     index = int(index)
     one = slice(index, index + 1)
     view = centre_in_window(model.spec.view, state.centre[one], state.origin[one])
-    places = (value.detach().cpu().double().numpy()[0] for value in (state.origin[one], view, state.centre[one]))
+    origin, view, centre = (
+        place.detach().cpu().double().numpy()[0] for place in (state.origin[one], view, state.centre[one])
+    )
     values = {}
     for by in quantities:
         if by != "muscle":
@@ -165,7 +167,7 @@ def take(
         elif actuation is not None:
             values[by] = SCALES[by].codes(muscle_activity(model, state, index, actuation))
     x = state.particles.x[index].detach().cpu().numpy().astype(np.float32)
-    return Shot(x, values, next(places), next(places), next(places), int(state.steps[index]))
+    return Shot(x, values, origin, view, centre, int(state.steps[index]))
 
 
 def check_size(name: str, size: int) -> None:

@@ -191,6 +191,7 @@ def test_policies_of_other_tasks_are_refused(tmp_path, capsys):
         assert expected in error(*protocol, str(tmp_path / "a.safetensors"))
     assert "there is no policy" in error(*protocol, "none")
     assert "got several for run-pretrained.json" in error(*protocol, "run", "run")
+    assert "got several for grow-grow-success.json" in error(*protocol, "grow", "grow-success", "grow-success")
     assert "policies requires protocol" in error("--policies", "run")
     assert "policies requires protocol, and none of only" in error(*protocol, "run", "--dry-run")
     assert not (tmp_path / "out").exists()

@@ -4,19 +4,17 @@ import pytest
 import torch
 from fakes import FakeEnv
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
 
 from cfp.agent.hyperparameters import Hyperparameters
 from cfp.agent.policies import CFPPolicy
-from cfp.agent.sac import CFP
 from cfp.envs.vec_env import monitored
 from cfp.errors import CheckpointError
 from cfp.experiment.algorithm import Position
 from cfp.experiment.checkpoint import Checkpoint
-from cfp.experiment.coarse_to_fine import CoarseToFine
+from cfp.experiment.sac_learner import SACLearner
 from cfp.presets import sac_preset
 
-CONFIG = replace(sac_preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,))
+CONFIG = replace(sac_preset("shapematch"), resolutions=(4, 8), gate_bias=(-1.0,), device="cpu")
 
 
 def make(stage=2):
@@ -24,9 +22,7 @@ def make(stage=2):
     env = monitored(FakeEnv(num_envs=2, resolution=CONFIG.action_size(stage), horizon=7))
     spec = CONFIG.actor_spec(stage)
     hyperparameters = Hyperparameters(buffer_size=40, batch_size=4, update_start=6, random_steps=10, gate_penalty=0.1)
-    model = CFP(CFPPolicy, env, hyperparameters, policy_kwargs={"spec": spec}, seed=3, device="cpu")
-    model.set_logger(Logger(None, []))
-    return CoarseToFine(CONFIG, stage, model)
+    return SACLearner(CONFIG, stage, env, CFPPolicy, {"spec": spec}, hyperparameters)
 
 
 class Hook(BaseCallback):

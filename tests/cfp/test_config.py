@@ -180,7 +180,7 @@ def test_a_step_keeps_its_duration_with_other_substeps():
 
 def test_gradient_methods_simulate_with_longer_substeps_where_that_was_measured():
     own = EnvironmentConfig()
-    assert own.for_optimisation("run", 500) == replace(own.for_training(500), dt=2e-4, substeps=50)
+    assert own.for_optimisation("run", 500) == replace(own.with_particles(500), dt=2e-4, substeps=50)
     for task in ("shapematch", "dig", "custom:task"):
         assert own.for_optimisation(task) == own
     for given in (replace(own, substeps=100), replace(own, dt=5e-5)):

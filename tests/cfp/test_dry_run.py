@@ -8,9 +8,9 @@ import pytest
 from baselines import train as modular
 from cfp import train
 from cfp.analytic.learner import AnalyticLearner
-from cfp.config import Config
+from cfp.config import SACConfig
 from cfp.evaluation.page import command_words
-from cfp.experiment.coarse_to_fine import CoarseToFine
+from cfp.experiment.sac_learner import SACLearner
 from cfp.experiment.training import parse
 from cfp.from_dict import update_from_dict
 from cfp.presets import like_start, sac_preset
@@ -22,7 +22,7 @@ def test_dry_run_prints_the_options_and_writes_nothing(tmp_path, capsys, monkeyp
     monkeypatch.chdir(tmp_path)
     assert train.main([*TINY, "--dry-run"]) == 0
     assert not list(tmp_path.iterdir())
-    config: Config = update_from_dict(sac_preset("shapematch"), json.loads(capsys.readouterr().out))
+    config: SACConfig = update_from_dict(sac_preset("shapematch"), json.loads(capsys.readouterr().out))
     assert (config.steps, config.handover, config.environment.particles) == (400, (300,), 100)
     assert train.main([*TINY, "--task", "run", "--resume", "--dry-run"]) == 0
     assert json.loads(capsys.readouterr().out)["task"] == "run"
@@ -51,7 +51,7 @@ def test_the_command_that_repeats_a_run(program, options):
 def test_stages_that_learn_nothing_are_named(tmp_path):
     def warnings(*options, first_stage=1):
         config = parse(train.PROGRAM, [*TINY, "--task", "run", *options]).run
-        return CoarseToFine.warnings(config, tmp_path, first_stage)
+        return SACLearner.warnings(config, tmp_path, first_stage)
 
     assert warnings("--handover", "200") == [
         "stage 1: all its 200 steps are random (--random-steps 480)",

@@ -12,7 +12,7 @@ from tiny_runs import run
 from cfp import train
 from cfp.agent.actor import build_actor
 from cfp.evaluation.evaluate import Result
-from cfp.experiment.coarse_to_fine import CoarseToFine
+from cfp.experiment.sac_learner import SACLearner
 from cfp.presets import sac_preset
 from cfp.tables import read_table
 from cfp.train import PROGRAM
@@ -85,7 +85,7 @@ def test_second_stage_begins_with_the_lean_encoder_of_the_first(tmp_path):
         coarse, actor = (build_actor(config.actor_spec(stage)) for stage in (1, 2))
         (tmp_path / encoder).mkdir()
         save_actor(tmp_path / encoder / "stage1.safetensors", coarse, config, 1, 5)
-        assert CoarseToFine.warm_start(config, 2, tmp_path / encoder, actor)
+        assert SACLearner.warm_start(config, 2, tmp_path / encoder, actor)
         before, after = coarse.encoder.state_dict(), actor.encoder.state_dict()
         assert all(torch.equal(value, actor.coarse.encoder.state_dict()[key]) for key, value in before.items())
         same = before.keys() == after.keys() and all(torch.equal(value, after[key]) for key, value in before.items())

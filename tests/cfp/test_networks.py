@@ -67,7 +67,7 @@ def test_upsampling_is_bicubic(before, after, interpolation):
 
 def test_linear_layers_are_xavier():
     torch.manual_seed(0)
-    actor = Actor(4)
+    actor = Actor(4, ActorSpec((4,)))
     for layer in actor.modules():
         if isinstance(layer, nn.Linear):
             bound = (6 / (layer.in_features + layer.out_features)) ** 0.5

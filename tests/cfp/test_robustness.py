@@ -20,7 +20,7 @@ from cfp.errors import ConfigError
 from cfp.evaluate import open_policy, open_run
 from cfp.evaluation.evaluate import Result
 from cfp.files import write_json
-from cfp.presets import sac_preset
+from cfp.presets import preset, sac_preset
 from cfp.train import PROGRAM
 from dittogym import make_spec
 from dittogym.action import bicubic
@@ -166,6 +166,14 @@ def test_single_policy_with_other_particles_needs_a_folder_to_write_into(folder,
     config = replace(config, environment=replace(config.environment, particles=500))
     rows = robustness.to_rows(robustness.report(config, policies["policy"], make_cases()[:1], 1))
     assert json.loads((tmp_path / "new" / "robustness.json").read_text())[0] == rows[0]
+
+
+def test_policy_of_a_run_with_more_robots_than_the_preset_has_steps_for(tmp_path):
+    config = preset("run")
+    there = replace(config, environment=replace(config.environment, num_envs=1024))
+    save_actor(tmp_path / "a.safetensors", build_actor(config.actor_spec(1)), there, 1, 0)
+    config, policies = open_policy(PROGRAM, str(tmp_path / "a.safetensors"), "cpu", None)
+    assert list(policies) == ["a"] and config.environment.num_envs == preset("run").environment.num_envs
 
 
 def test_cases_are_chosen_by_words(folder):

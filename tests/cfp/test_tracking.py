@@ -18,8 +18,8 @@ from cfp.agent.sac import METRICS
 from cfp.agent.spec import ActorSpec
 from cfp.evaluation.pictures import PICTURES, muscles, policy_pictures
 from cfp.experiment.callbacks import EVALUATION_COLUMNS, LOG_METRICS
-from cfp.experiment.coarse_to_fine import ROLLOUT_METRICS
 from cfp.experiment.loggers import EVALUATION_METRICS
+from cfp.experiment.sac_learner import ROLLOUT_METRICS
 from cfp.tables import read_table
 
 pytestmark = pytest.mark.usefixtures("short")

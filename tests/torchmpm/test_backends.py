@@ -13,7 +13,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.autograd import forward_ad
 
-from torchmpm import Body, Grid, ParticleState, Solver, VelocityRule, VonMises, backends, trajectory
+from torchmpm import Body, Grid, ParticleState, Solver, VelocityRule, VonMises, backends, trajectory, tree
 from torchmpm.backends import compiler_found
 from torchmpm.native.cpu import library
 from torchmpm.native.kernels import triton_missing
@@ -256,7 +256,7 @@ def test_a_compiled_function_holds_an_eager_step_whole_and_runs_around_other_bac
 def test_tensors_of_a_trace_are_not_kept() -> None:
     """They hold no numbers for those who come after it."""
 
-    @backends.cached_tensors
+    @tree.cached_tensors
     def row(count: int) -> tuple[Tensor, Tensor]:
         return torch.arange(count, device="cpu"), torch.ones(count, device="cpu")
 
@@ -278,13 +278,13 @@ def test_tensors_of_a_trace_are_not_kept() -> None:
 def test_kept_tensors_do_not_pile_up() -> None:
     calls = []
 
-    @backends.cached_tensors
+    @tree.cached_tensors
     def number(value: int) -> Tensor:
         calls.append(value)
         return torch.tensor(value, device="cpu")
 
-    for value in range(backends.LARGEST_CACHE + 1):
+    for value in range(tree.LARGEST_CACHE + 1):
         number(value)
-    assert number(backends.LARGEST_CACHE).item() == backends.LARGEST_CACHE
+    assert number(tree.LARGEST_CACHE).item() == tree.LARGEST_CACHE
     number(0)
-    assert calls == [*range(backends.LARGEST_CACHE + 1), 0]
+    assert calls == [*range(tree.LARGEST_CACHE + 1), 0]

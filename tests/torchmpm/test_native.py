@@ -128,7 +128,7 @@ def test_unsupported_scenes_are_named() -> None:
     ):
         robot(10, bodies=(body,), backend="native").step(lively(10))
     rules = (VelocityRule("-y"),) * 300
-    with pytest.raises(ValueError, match="at most 254 velocity rules, got 300"):
+    with pytest.raises(ValueError, match="at most 255 velocity rules, got 300"):
         robot(10, rules=rules, backend="native").step(lively(10))
 
 

@@ -13,7 +13,7 @@ from torchmpm.materials.linalg import Mat2, Sym2
 Value: TypeAlias = float | Tensor
 
 
-@runtime_checkable
+@runtime_checkable  # for checks of annotations, as the tests make them
 class Material(Protocol):
     """Interface of a constitutive law.
 

@@ -20,8 +20,8 @@ from torchmpm.native.tables import KINDS, make_tables, make_values, upload
 from torchmpm.rollout import Segment
 from torchmpm.state import ParticleState
 
-#: A node remembers its rule in one byte.
-MAX_RULES = 254
+#: A node remembers its rule for each direction in one byte, in which 0 stands for none.
+MAX_RULES = 255
 #: Addresses within one simulation have 32 bits on CUDA, where a node has at most eight numbers.
 MAX_RESOLUTION, MAX_PARTICLES = 16_000, 2**30
 #: The tape on CUDA takes no more than this, bytes.

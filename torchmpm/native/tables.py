@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchmpm.backends import cached_tensors
 from torchmpm.boundary import VelocityRule, limits
 from torchmpm.grid import Grid
 from torchmpm.materials.base import Value, broadcast_plane
@@ -18,6 +17,7 @@ from torchmpm.materials.elastic import Elastic
 from torchmpm.materials.snow import Snow
 from torchmpm.materials.von_mises import STRETCH_FLOOR, VonMises, yield_surface
 from torchmpm.substep import MASS_EPSILON
+from torchmpm.tree import cached_tensors
 
 #: The materials that the kernels implement, in the order of ``enum class Kind``.
 KINDS: tuple[type, ...] = (Elastic, VonMises, Snow)

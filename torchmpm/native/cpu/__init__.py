@@ -1,7 +1,7 @@
 """The kernels in C++: ``compiler`` has the flags, ``library`` loads them, ``call`` runs them on tensors.
 
-The C++ files, in the order in which they build on each other: ``simd``, ``linalg``, ``material``, ``scene``,
-``transfer``, ``grid``, ``team``, ``workspace``, ``step``; the adjoint: ``material_adjoint``, ``grid_adjoint``,
+The C++ files, in the order in which they build on each other: ``simd``, ``linalg``, ``material``, ``team``,
+``scene``, ``transfer``, ``grid``, ``workspace``, ``step``; the adjoint: ``material_adjoint``, ``grid_adjoint``,
 ``adjoint_block``, ``adjoint``; ``native.cpp`` is the C interface.
 
 A simulation's particles are cut into blocks of 64, each of one body. One pass over the blocks reads velocities from the

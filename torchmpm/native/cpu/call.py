@@ -11,7 +11,8 @@ from torchmpm.native.cpu.library import POOL, load, thread_pool
 from torchmpm.native.tables import Inputs, Tables, tables_of
 
 #: Scratch memory up to this size, bytes, is kept for the next call, as fresh pages cost a third of a backward pass.
-#: It is enough for 190 substeps of 22,000 particles in single precision; longer steps are cut.
+#: It is enough for 190 substeps of one simulation of 22,000 particles in single precision; longer steps are cut.
+#: Simulations that run at the same time share it.
 KEPT_BYTES = 2**28
 _kept: list[Tensor] = []
 #: Derivatives that the adjoint writes.

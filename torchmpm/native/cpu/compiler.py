@@ -38,16 +38,20 @@ def find_compiler() -> tuple[str, ...] | None:
     return None
 
 
-def arguments(source: Path, options: Sequence[str], processor: str) -> list[str]:
-    """Arguments of the compiler up to the name of its output; ``processor`` is a value of ``-march``."""
+def flags(options: Sequence[str], processor: str) -> list[str]:
+    """Flags of the compiler; ``processor`` is a value of ``-march``."""
     x86 = processor.startswith("x86-64") or (processor == "native" and os.uname().machine == "x86_64")
-    return [*_FLAGS, *_X86_FLAGS * x86, f"-march={processor}", *options, f"-I{HEADERS}", str(source)]
+    return [*_FLAGS, *_X86_FLAGS * x86, f"-march={processor}", *options]
+
+
+def arguments(source: Path, options: Sequence[str], processor: str) -> list[str]:
+    """Arguments of the compiler up to the name of its output."""
+    return [*flags(options, processor), f"-I{HEADERS}", str(source)]
 
 
 def compiled_path(source: Path, options: Sequence[str], processor: str) -> Path:
     """Where a wheel has the library for a class of processors; the name changes with the sources and all flags."""
-    flags = arguments(Path(source.name), options, processor)
-    digest = digest_of(source, *(flag for flag in flags if not flag.startswith("-I")))
+    digest = digest_of(source, *flags(options, processor))
     return source.with_name(f"{source.stem}-{processor}-{digest[:12]}.so")
 
 

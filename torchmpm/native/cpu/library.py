@@ -118,10 +118,9 @@ def _load(source: Path, options: tuple[str, ...], folder: str, *_: str | None) -
     program = compiler.find_compiler()
     if program is None:
         return NO_COMPILER
-    flags = compiler.arguments(source, options, "native")
-    command = [*program, *flags, "-o"]
-    independent = [each for each in flags if each != str(source) and not each.startswith("-I")]  # of where it is
-    path = Path(folder) / f"{source.stem}-{_key([*program, *independent], source)}.so"
+    command = [*program, *compiler.arguments(source, options, "native"), "-o"]
+    key = _key([*program, *compiler.flags(options, "native")], source)  # does not depend on where the source is
+    path = Path(folder) / f"{source.stem}-{key}.so"
     try:
         return ctypes.CDLL(str(path))
     except OSError:

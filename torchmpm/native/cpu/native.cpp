@@ -13,7 +13,7 @@ struct Shape {
 
 Shape choose_shape(const Scene& scene) {
     const Call& call = scene.call;
-    // A thread costs as much to start as some thousand particle-substeps to compute.
+    // A thread costs as much to start as some 20,000 particle-substeps to compute.
     const int64_t useful = 1 + call.batch * call.particles * call.substeps / 20000;
     const int64_t threads = std::max<int64_t>(1, std::min(call.threads, useful));
     const int64_t team = std::max<int64_t>(1, std::min<int64_t>(scene.parts, threads / call.batch));

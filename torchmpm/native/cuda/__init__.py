@@ -4,9 +4,9 @@
 in the order in which they build on each other: ``linalg``, ``material``, ``transfer``, ``grid``, ``step``; for the
 adjoint ``material_adjoint``, ``adjoint``. They compute the formulas of the C++ kernels, one thread a particle or node.
 
-A substep takes two launches: one over the particles, which reads velocities from the nodes, moves and deforms the
-particles, and adds mass and momentum to the nodes for the next substep; one over the nodes that are in use. Additions
-are atomic, in no fixed order: results differ from call to call in their last bits.
+A substep takes one launch for each body, which reads velocities from the nodes, moves and deforms the particles, and
+adds mass and momentum to the nodes for the next substep, and one over the nodes that are in use. Additions are atomic,
+in no fixed order: results differ from call to call in their last bits.
 """
 
 from typing import Any

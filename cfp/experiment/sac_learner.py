@@ -1,4 +1,4 @@
-"""Soft actor-critic as an algorithm of a run, and the stages of CFP."""
+"""Soft actor-critic as an algorithm of a run, and the learner ``sac`` of the coarse-to-fine policy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cfp.agent.actor import Actor
 from cfp.agent.hyperparameters import Hyperparameters
 from cfp.agent.policies import CFPPolicy, NetworkPolicy
 from cfp.agent.sac import CFP
-from cfp.config import Config, Preset, RunConfig
+from cfp.config import Preset, SACConfig
 from cfp.envs.make import choose_device, make_env
 from cfp.evaluation.pictures import policy_pictures
 from cfp.experiment.algorithm import Algorithm, Scalars
@@ -40,9 +40,21 @@ class SACAlgorithm(Algorithm):
 
     presets = get_args(Preset)
 
-    def __init__(self, config: Any, stage: int, model: CFP) -> None:
-        self.config, self.stage, self.model = config, stage, model
-        self.replay_buffer = model.replay_buffer
+    def __init__(
+        self,
+        config: Any,
+        stage: int,
+        env: VecMonitor,
+        policy: type[NetworkPolicy],
+        networks: dict[str, Any],
+        hyperparameters: Hyperparameters,
+    ) -> None:
+        self.config, self.stage = config, stage
+        window, device = max(10, env.num_envs), choose_device(config.device)
+        options: dict[str, Any] = {"policy_kwargs": networks, "seed": config.seed, "stats_window_size": window}
+        self.model = CFP(policy, env, hyperparameters, device=device, **options)
+        self.model.set_logger(Logger(None, []))
+        self.replay_buffer = self.model.replay_buffer
 
     @property
     def num_timesteps(self) -> int:
@@ -57,22 +69,6 @@ class SACAlgorithm(Algorithm):
     def steps_without_change(self) -> int:
         """Environment steps at the beginning of the stage before actor updates (a lean encoder learns earlier)."""
         return max(self.model.hyperparameters.actor_start, self.model.hyperparameters.update_start)
-
-    @classmethod
-    def make_model(
-        cls,
-        config: RunConfig,
-        env: VecMonitor,
-        policy: type[NetworkPolicy],
-        networks: dict[str, Any],
-        hyperparameters: Hyperparameters,
-    ) -> CFP:
-        """Create the model of a stage."""
-        window, device = max(10, env.num_envs), choose_device(config.device)
-        options: dict[str, Any] = {"policy_kwargs": networks, "seed": config.seed, "stats_window_size": window}
-        model = CFP(policy, env, hyperparameters, device=device, **options)
-        model.set_logger(Logger(None, []))
-        return model
 
     @classmethod
     def hyperparameters(cls, config: Any, stage: int, folder: Path) -> Hyperparameters:
@@ -124,29 +120,30 @@ class SACAlgorithm(Algorithm):
         load_model_state_dict(self.model, state)
 
 
-class CoarseToFine(CoarseToFineStages, SACAlgorithm):
-    """The stages of the coarse-to-fine policy, each over the frozen policy of the coarser one (paper, Section 4.2)."""
+class SACLearner(CoarseToFineStages, SACAlgorithm):
+    """Trains the stages of the coarse-to-fine policy from rewards alone, as the paper does."""
 
-    config: Config
+    config: SACConfig
 
     @staticmethod
-    def preset(task: str, name: str) -> Config:
+    def preset(task: str, name: str) -> SACConfig:
         """Default options for a task, see `cfp.preset`."""
         return sac_preset(task, name)
 
     @classmethod
-    def hyperparameters(cls, config: Config, stage: int, folder: Path) -> Hyperparameters:
+    def hyperparameters(cls, config: SACConfig, stage: int, folder: Path) -> Hyperparameters:
         """Hyperparameters of a stage; a policy that is refined does not act at random."""
         own = super().hyperparameters(config, stage, folder)
         return replace(own, random_steps=0) if refines(config, folder, stage) else own
 
     @classmethod
-    def create(cls, config: Config, stage: int, folder: Path) -> CoarseToFine:
+    def create(cls, config: SACConfig, stage: int, folder: Path) -> SACLearner:
         """Networks, replay memory and environment of a stage."""
         limit, spec = config.learning.max_episode_steps, config.actor_spec(stage)
         env = make_env(config, config.action_size(stage), max_episode_steps=limit)
-        model = cls.make_model(config, env, CFPPolicy, {"spec": spec}, cls.hyperparameters(config, stage, folder))
-        algorithm = cls(config, stage, model)
+        hyperparameters = cls.hyperparameters(config, stage, folder)
+        algorithm = cls(config, stage, env, CFPPolicy, {"spec": spec}, hyperparameters)
+        model = algorithm.model
         algorithm.starts_trained = cls.warm_start(config, stage, folder, model.networks()[0])
         model.restart_average()
         if refines(config, folder, stage):
