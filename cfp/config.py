@@ -27,7 +27,9 @@ LARGEST_SEED = 2**31 - 1
 #: Added to a run's seed for evaluations, so that they start from initial positions that are not trained on.
 EVALUATION_SEED = 10_000
 #: Entry of ``RunConfig.ineffective`` where every episode begins on a layout that is counted from the seed.
-RESAMPLE_NEEDS_SAC = {"environment.resample": "learner sac, or algo coarse, fine, gnn-* or transformer-*"}
+RESAMPLE_NEEDS_SAC = {
+    "environment.resample": "soft actor-critic (learner sac, or algo coarse, fine, gnn-*, transformer-*)"
+}
 
 
 @dataclass(frozen=True)
