@@ -4,7 +4,7 @@ PYTHON ?= python3
 PIP_FLAGS ?=
 
 BIN := .venv/bin
-PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt $(PIP_FLAGS)
+PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints.txt $(PIP_FLAGS)
 STAMP := .venv/.stamp-install
 TRITON_STAMP := .venv/.stamp-triton
 DOCS_STAMP := .venv/.stamp-docs
@@ -27,6 +27,8 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(PIP) torch==2.13.0
 	@echo "Installing torchmpm and its tools ..."
 	@$(PIP) -e ".[dev,minari,play,video]"
+	@# On all cores at once, which pip does on one. Some packages contain files for other versions of Python.
+	@$(BIN)/python -m compileall -q -j 0 .venv/lib >/dev/null || true
 	@touch $@
 
 $(DOCS_STAMP): $(STAMP)

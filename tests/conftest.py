@@ -33,10 +33,9 @@ def short() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def one_thread(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Batches of four images are too small to share: waiting for a second thread costs more than it brings."""
+def one_thread() -> Iterator[None]:
+    """Tests run in as many processes as there are cores: more threads than that wait for each other."""
     before = torch.get_num_threads()
-    if request.path.parent.name in ("cfp", "baselines"):
-        torch.set_num_threads(1)
+    torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)

@@ -139,12 +139,12 @@ def size_faults(source: str) -> list[str]:
 def global_state_faults(source: str) -> list[str]:
     """Uses of random generators and settings that the whole process shares."""
     tree = ast.parse(source)
-    faults = []
-    for node, name in used(tree):
+    faults, uses = [], list(used(tree))
+    for node, name in uses:
         module, _, leaf = name.rpartition(".")
         if name in GLOBAL_STATE or (module in OWN_GENERATORS and leaf not in OWN_GENERATORS[module]):
             faults.append(f"{node.lineno}: {name}")
-    names = {id(node): name for node, name in used(tree)}
+    names = {id(node): name for node, name in uses}
     for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
         name = names.get(id(call.func), "")
         method = call.func.attr if isinstance(call.func, ast.Attribute) else ""
@@ -159,13 +159,14 @@ def global_state_faults(source: str) -> list[str]:
 def unsafe_loading_faults(source: str) -> list[str]:
     """Ways of reading a file that could run code from it."""
     tree = ast.parse(source)
-    mentions = {*imported(tree), *((node.lineno, name) for node, name in used(tree))}
+    uses = list(used(tree))
+    mentions = {*imported(tree), *((node.lineno, name) for node, name in uses)}
     faults = []
     for line, name in sorted(mentions):
         module, _, leaf = name.partition(".")
         if module in UNSAFE_MODULES and leaf and leaf not in HARMLESS:
             faults.append(f"{line}: {name}")
-    names = {id(node): name for node, name in used(tree)}
+    names = {id(node): name for node, name in uses}
     for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
         arguments = {keyword.arg: ast.unparse(keyword.value) for keyword in call.keywords}
         name = names.get(id(call.func), "")

@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 from threading import Timer
@@ -6,11 +7,15 @@ import pytest
 
 from cfp.experiment.run_lock import FolderInUse, run_lock
 
+# What `run_lock` does, without the imports of the package, which take seconds.
 HOLD = """
-import sys
+import os, sys
 from pathlib import Path
-from cfp.experiment.run_lock import run_lock
-with run_lock(Path(sys.argv[1])):
+from filelock import FileLock
+folder = Path(sys.argv[1])
+folder.mkdir()
+with FileLock(folder / ".lock"):
+    (folder / ".lock").write_text(f"process {os.getpid()} on a machine")
     print(1, flush=True)
     input()
 """
@@ -34,7 +39,7 @@ def test_folder_is_held_by_one_process_until_it_ends(tmp_path):
                 pass
         Timer(0.3, process.kill).start()
         with run_lock(folder, 60):  # waits for it
-            assert (folder / ".lock").exists()
+            assert (folder / ".lock").read_text().startswith(f"process {os.getpid()} on ")
     finally:
         process.kill()
         process.communicate()

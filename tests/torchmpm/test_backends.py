@@ -122,7 +122,7 @@ def test_long_steps_go_through_torch_func() -> None:
     def loss(shift: Tensor, mu: Tensor) -> Tensor:
         solver = robot(5, bodies=(Body(5, VonMises(mu, 50.0, 60.0), mass=2.0),), rules=rules, backend="auto")
         last, _ = trajectory(
-            lambda s, _: solver.step(s, substeps=50), replace(state, x=state.x + shift), range(2), observe=id
+            lambda s, _: solver.step(s, substeps=12), replace(state, x=state.x + shift), range(2), observe=id
         )
         return last.F.square().sum()
 

@@ -86,10 +86,9 @@ def test_against_central_differences(scene: tuple[str, dict[str, Tensor]], name:
     assert slope == pytest.approx((ahead - behind) / (2 * step), rel=1e-5)
 
 
-@pytest.mark.parametrize("segment", [3, 10])
-def test_segments_do_not_change_gradients(scene: tuple[str, dict[str, Tensor]], segment: int) -> None:
+def test_segments_do_not_change_gradients(scene: tuple[str, dict[str, Tensor]]) -> None:
     label, plain = scene
-    for name, value in gradients(label, segment).items():
+    for name, value in gradients(label, 3).items():
         torch.testing.assert_close(value, plain[name], rtol=0, atol=1e-12 * max(plain[name].abs().max().item(), 1e-9))
 
 
