@@ -289,9 +289,8 @@ def test_algorithm_with_a_count_has_two_spellings(given, name):
 @pytest.mark.parametrize("finished", algorithms(slow=set(TINY) - {"cfp", "gradient", "gnn-16"}), indirect=True)
 def test_robustness_is_reported_whatever_trained_it(finished, monkeypatch):
     _, folder = finished
-    monkeypatch.setattr(
-        "cfp.robustness.make_cases", lambda *options: make_cases(*options)[:4]
-    )  # test_robustness.py plays all
+    # Not all of them, which test_robustness.py plays.
+    monkeypatch.setattr("cfp.robustness.make_cases", lambda *options: make_cases(*options)[:4])
     assert robustness.main([str(folder), "--episodes", "1", "--device", "cpu"]) == 0
     rows = json.loads((folder / "robustness.json").read_text())
     assert rows[0]["case"] == "unperturbed" and rows[0]["ratio"] in (1, None)

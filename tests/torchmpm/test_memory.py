@@ -3,14 +3,13 @@
 import gc
 import subprocess
 import sys
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from peak_memory import PeakMemory
-from scenes import lively, normal, robot, robot_and_ball
+from scenes import Learned, Wrapped, lively, normal, robot, robot_and_ball
 
 from torchmpm import Body, Grid, ParticleState, Solver, VonMises, estimate_memory, segment_for, trajectory
 from torchmpm.backends import compiler_found
@@ -51,33 +50,10 @@ def test_eager(count: int, batch: int, substeps: int, segment: int | None, env_s
     assert predicted == pytest.approx(measured(solver, batch, substeps, segment, env_steps), rel=0.25)
 
 
-class Learned(torch.nn.Module):
-    """A law whose stiffness is a parameter."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.mu = torch.nn.Parameter(torch.tensor(500.0, dtype=torch.float64))
-
-    def __getattr__(self, name: str) -> Any:
-        if name in ("return_map", "stress", "energy", "stiffness"):
-            return getattr(VonMises(self.mu + 0.0, 50.0, 60.0), name)
-        return super().__getattr__(name)
-
-
-@dataclass(frozen=True)
-class Holder:
-    """A law that holds another one."""
-
-    base: Learned
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.base, name)
-
-
 @pytest.mark.parametrize("wrapped", [False, True])
 def test_learned_materials(wrapped: bool) -> None:
     law = Learned()
-    solver = robot(300, bodies=(Body(300, Holder(law) if wrapped else law, mass=2.0, muscle=True),))
+    solver = robot(300, bodies=(Body(300, Wrapped(law) if wrapped else law, mass=2.0, muscle=True),))
     predicted = estimate_memory(solver, (1, 300, torch.float64), substeps=8, segment=None)
     assert predicted == pytest.approx(measured(solver, 1, 8, None), rel=0.25)
     assert law.mu.device.type == "cpu"

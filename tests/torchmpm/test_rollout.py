@@ -2,14 +2,14 @@
 
 import gc
 import weakref
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from peak_memory import PeakMemory
-from scenes import lively, normal, robot
+from scenes import Learned, Wrapped, lively, normal, robot
 from torch import Tensor
 
 from torchmpm import Body, Elastic, ParticleState, estimate_memory, repeated, trajectory
@@ -227,41 +227,6 @@ def test_checkpoints_bound_the_memory() -> None:
     assert peak_memory(40, 4) < 1.4 * segmented
     assert count_nodes(40) == count_nodes(8), "the forward pass must not keep a graph of operations"
     assert peak_memory(20, None, checkpointed=True) < 0.4 * whole
-
-
-class Learned(torch.nn.Module):
-    """A law whose stiffness is a parameter of a module."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.mu = torch.nn.Parameter(torch.tensor([500.0], dtype=torch.float64))
-        self.register_buffer("scale", torch.ones(1, dtype=torch.float64))
-        self.lam = torch.tensor([50.0], dtype=torch.float64)
-
-    def law(self) -> Elastic:
-        return Elastic(self.mu * self.scale, self.lam)
-
-    def return_map(self, F: Any, Jp: Tensor) -> Any:
-        return self.law().return_map(F, Jp)
-
-    def stress(self, F: Any, Jp: Tensor) -> Any:
-        return self.law().stress(F, Jp)
-
-    def energy(self, F: Any, Jp: Tensor) -> Any:
-        return self.law().energy(F, Jp)
-
-    def stiffness(self) -> Any:
-        return self.law().stiffness()
-
-
-@dataclass
-class Wrapped:
-    """A law that holds another one."""
-
-    base: Learned
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.base, name)
 
 
 @pytest.mark.parametrize("name", ["mu", "scale", "lam"])
