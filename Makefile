@@ -27,7 +27,8 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(PIP) torch==2.13.0
 	@echo "Installing torchmpm and its tools ..."
 	@$(PIP) -e ".[dev,minari,play,video]"
-	@# On all cores at once, which pip does on one. Some packages contain files for other versions of Python.
+	@# On all cores at once; pip uses one. No harm if a file fails, as torch's for Python 3.12 does in older versions:
+	@# modules are compiled on import, too.
 	@$(BIN)/python -m compileall -q -j 0 .venv/lib >/dev/null || true
 	@touch $@
 

@@ -24,10 +24,11 @@ def drive(env: TorchEnv, planner: GradientPlanner | None, steps: int) -> torch.T
     return total
 
 
-def test_planned_episode_beats_rest() -> None:
-    env = small("kick", substeps=60)
+@pytest.mark.parametrize(("task", "more"), [("kick", 0.5), ("grow", 0.5)])
+def test_planned_episode_beats_rest(task: str, more: float) -> None:
+    env = small(task, substeps=60)
     planned = drive(env, GradientPlanner(env, GradientPlannerConfig(horizon=8, commit=4, iterations=4)), 12)
-    assert float(planned) > float(drive(small("kick", substeps=60), None, 12)) + 0.5
+    assert float(planned) > float(drive(small(task, substeps=60), None, 12)) + more
 
 
 def test_simulations_of_a_batch_are_planned_apart() -> None:

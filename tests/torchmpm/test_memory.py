@@ -42,7 +42,7 @@ def measured(solver: Solver, batch: int, substeps: int, segment: int | None, env
 
 @pytest.mark.parametrize(
     ("count", "batch", "substeps", "segment", "env_steps"),
-    [(300, 1, 8, None, 1), (1000, 1, 6, 2, 1), (150, 3, 4, None, 1), (300, 1, 3, None, 4)],
+    [(300, 1, 8, None, 1), (300, 1, 12, 3, 1), (1000, 1, 6, 2, 1), (150, 3, 4, None, 1), (300, 1, 3, None, 4)],
 )
 def test_eager(count: int, batch: int, substeps: int, segment: int | None, env_steps: int) -> None:
     solver, options = robot_and_ball(count - 50, 50), {"substeps": substeps, "segment": segment, "env_steps": env_steps}
