@@ -44,7 +44,7 @@ demo test test-all test-gpu-kernels test-oldest coverage: export OMP_WAIT_POLICY
 demo test test-all test-gpu-kernels test-oldest coverage: export GOMP_SPINCOUNT ?= 10000
 
 demo: install  ## train a small policy on SHAPE MATCH, with a video and a learning curve at the end
-	$(BIN)/python -m cfp.train --task shapematch --preset quick --steps 3200 --seed 0 --out $(DEMO) --resume
+	$(BIN)/python -m cfp.train --task shapematch --preset quick --steps 3200 --seed 0 --device cpu --out $(DEMO) --resume
 	@echo "Video: $(DEMO)/video.mp4   Learning curve: $(DEMO)/curve.png"
 
 test: install  ## fast tests

@@ -14,7 +14,7 @@ PROGRAMS = {
     "play": ("dittogym.play.__main__", "play with a robot on a page in the browser"),
     "compare": ("baselines.compare.__main__", "train and evaluate several algorithms, and report about them"),
     "leaderboard": ("baselines.leaderboard.__main__", "check and rank submissions of policies under a fixed protocol"),
-    "teach": ("baselines.distill", "let an image policy learn from a teacher that observes more"),
+    "distill": ("baselines.distill", "let an image policy learn from a teacher that observes more"),
     "gradlab": ("baselines.gradlab.__main__", "measure up to which horizon gradients are useful"),
 }
 EXAMPLES = """Examples:

@@ -41,8 +41,8 @@ class RunConfig:
     algo: str = "cfp"
     """Name of the algorithm."""
     preset: Preset = "quick"
-    """Set of default options: quick (minutes), paper (the published values; not with learner analytic), or long (a
-    night; only for algorithms that learn by soft actor-critic)."""
+    """Set of default options: quick (minutes), paper (the published values), or long (a night; only for algorithms that
+    learn by soft actor-critic). With paper and long CFP has learner sac."""
     seed: int = 0
     """Seed of everything that is random."""
     device: str = "auto"

@@ -89,7 +89,10 @@ class FilmOptions:
 
 @dataclass(frozen=True)
 class Command(Selection):
-    """Evaluate the policies of a run, or a single policy, beside zero and random actions, in the same episodes."""
+    """Evaluate the policies of a run, or a single policy, beside zero and random actions, in the same episodes.
+
+    They are evaluated in the task that they were trained for.
+    """
 
     episodes: int = 5
     """Episodes of each row."""

@@ -48,9 +48,9 @@ class EnvironmentConfig:
     """Draw the particles anew at every reset."""
     target: str | None = None
     """Target shape, for tasks that have one: star, I, M, T, or the path of an image; None: the task's default."""
-    variant: Literal["registered", "published"] | None = None
-    """Material, for tasks that have variants: that of the registered environment (also None) or that of the published
-    training run."""
+    variant: str | None = None
+    """For tasks that have variants: in SLOT the material, that of the registered environment (registered, also None) or
+    of the published training run (published)."""
 
     def task_options(self) -> dict[str, Any]:
         """The options that belong to the task, for `dittogym.make_spec`."""

@@ -92,8 +92,9 @@ This task has the [arguments of all tasks](../tasks.md#arguments).
 ```
 
 [](../results.md) explains how the pretrained policies and the planners were evaluated, and
-[](../experiments/algorithms.md) the other algorithms. `cfp`, `coarse`, `fine`, `gnn-*` and `transformer-*` were
-measured with earlier defaults of `--learner sac`.
+[](../experiments/rewards.md) the coarse stage of `--learner sac`, and [](../experiments/algorithms.md) the other
+algorithms. `coarse`, `fine`, `gnn-*` and `transformer-*`, and `cfp` where no learner is named, were measured with
+earlier defaults.
 
 ## Geometry
 

@@ -28,12 +28,12 @@ def number(name: str, value: Any, *, least: float | None = None, above: float | 
     """Raise a ValueError unless this is a finite number, at least ``least`` and above ``above``."""
     if isinstance(value, bool) or not isinstance(value, Real):
         raise ValueError(f"{name} must be a number, got {value!r}")
+    if not math.isfinite(value):
+        raise ValueError(f"{name} must be finite, got {value}")
     if least is not None and not float(value) >= least:
         raise ValueError(f"{name} must {_at_least(least)}, got {value}")
     if above is not None and not float(value) > above:
         raise ValueError(f"{name} must be {'positive' if above == 0 else f'above {above}'}, got {value}")
-    if not math.isfinite(value):
-        raise ValueError(f"{name} must be finite, got {value}")
 
 
 def value(name: str, given: Any, *, least: float | None = None, above: float | None = None) -> None:

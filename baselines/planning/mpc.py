@@ -112,6 +112,7 @@ class MPC(OpenLoopAlgorithm):
     """
 
     sees: ClassVar[Sees] = "simulator"
+    keeps_best: ClassVar[bool] = False  # an earlier policy is only the beginning of the episode
     planner_type: ClassVar[type[Planner[Any]]] = GradientPlanner
 
     def __init__(self, config: PlannedConfig, stage: int = 1, start: Any = None) -> None:

@@ -95,6 +95,11 @@ class AnalyticConfig(WindowConfig, CoarseToFineConfig):
     per_stage: ClassVar[tuple[str, ...]] = ("action_step",)
 
     @property
+    def name(self) -> str:
+        """Name of the run, used for its folder; with learner sac it begins with the algorithm."""
+        return f"{self.learner}{super().name.removeprefix(self.algo)}"
+
+    @property
     def update_every(self) -> int:
         """Environment steps from one update to the next: a window of all robots."""
         return self.window * self.environment.num_envs

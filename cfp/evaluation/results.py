@@ -32,7 +32,7 @@ def numbers(result: Result) -> dict[str, Any]:
 def format_table(config: RunConfig, results: Sequence[Result]) -> str:
     """Results as a plain text table: mean return, its 95 % confidence interval, and the spread of the episodes."""
     counts = {len(result.returns) for result in results}
-    title = f"{config.task}, return over {'/'.join(map(str, sorted(counts)))} episodes"
+    title = f"{config.task}, return over {' or '.join(map(str, sorted(counts)))} episodes"
     lines = [title, f"{'policy':<16}{'action':>8}{'mean':>10}{'± 95 %':>9}{'± std':>9}{'lowest':>10}{'highest':>10}"]
     for result in results:
         grid = f"{result.resolution}x{result.resolution}"

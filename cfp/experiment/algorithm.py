@@ -49,6 +49,7 @@ class Algorithm(ABC):
 
     sees: ClassVar[Sees] = "image"  # what its policies look at; their training may use more
     presets: ClassVar[tuple[str, ...]] = ("quick", "paper")
+    keeps_best: ClassVar[bool] = True  # the policy of a run is that of the best evaluation, otherwise the newest
     num_timesteps: int = 0  # environment steps taken in this stage
     config: Any  # options of the run, a RunConfig
     stage: int = 1  # in training, 1 is the first

@@ -162,7 +162,7 @@ class LogCallback(StageCallback):
 
 
 class EvaluationCallback(StageCallback):
-    """Evaluates the policy and keeps the best of the stage.
+    """Evaluates the policy and keeps the best of the stage, if the algorithm does not keep the newest.
 
     A trained one is evaluated before its first step, and then not again until it learns.
     """
@@ -206,7 +206,7 @@ class EvaluationCallback(StageCallback):
             stage.evaluation_due = True
             return
         stage.evaluation_due = False
-        if result.mean > max(self.means, default=-float("inf")):
+        if not stage.algorithm.keeps_best or result.mean > max(self.means, default=-float("inf")):
             stage.save_policy()  # before the row: a crash between the two repeats the evaluation
         self.means.append(result.mean)
         self.evaluated = stage.step
@@ -252,9 +252,9 @@ class CheckpointCallback(StageCallback):
         self._saved = stage.step
 
     def _act(self) -> None:
-        if not self.evaluation.every or not self.evaluation.means:  # without evaluations the newest is the best
-            self.stage.save_policy()
         stage = self.stage
+        if not (stage.algorithm.keeps_best and self.evaluation.every and self.evaluation.means):
+            stage.save_policy()
         self.checkpoint.save(stage.algorithm, stage.config, stage.position, stage.evaluation_due)
         self._saved = self.stage.step
 

@@ -102,5 +102,5 @@ def check_same(stored: dict[str, Any], given: RunConfig) -> None:
         if not name.startswith(given.changeable):
             raise ConfigError(
                 f"{name.split('.')[-1]}: the run was started with {old!r}, got {new!r}; a resumed run may change only: "
-                + ", ".join(given.changeable)
+                + ", ".join(each.rpartition(".")[2] for each in given.changeable)
             )

@@ -61,8 +61,8 @@ def check_options(config: RunConfig) -> None:
 class TrainingRun:
     """Trains all stages of a run in its folder.
 
-    ``policy.safetensors`` is the policy with the best evaluation of its stage so far (without evaluations: the newest),
-    from which the next stage starts.
+    ``policy.safetensors`` is the policy with the best evaluation of its stage so far, from which the next stage starts.
+    Without evaluations, or if the algorithm says so, it is the newest.
     """
 
     def __init__(

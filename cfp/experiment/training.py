@@ -205,11 +205,11 @@ def train(program: Program, command: Command, hint: str) -> None:
         return
     if command.resume and not holds_run(folder):
         print(f"{folder} holds no run yet: starting a new one")
-    learner = f", learner {config.learner}" if isinstance(config, CoarseToFineConfig) else ""
-    print(f"{config.algo} on {config.task}{learner}, preset {config.preset}, seed {config.seed} -> {folder}")
     with run_lock(folder):
         with StopSignals() as signals:
             run = TrainingRun(program.find(config), config, folder, command.resume, signals)
+            learner = f", learner {config.learner}" if isinstance(config, CoarseToFineConfig) else ""
+            print(f"{config.algo} on {config.task}{learner}, preset {config.preset}, seed {config.seed} -> {folder}")
             if config.environment.backend == "compile":
                 print("compiling the physics; the first time on a machine this takes half a minute ...")
             try:

@@ -63,6 +63,9 @@ def check_task(task: object) -> None:
     Raises:
         ValueError: There is no such task.
     """
+    if isinstance(task, TaskSpec):
+        needs = "must be the name under which dittogym.register knows the function that makes it"
+        raise ValueError(f"task {needs}, got the TaskSpec {task.name!r} itself")
     if (allowed := _allowed_instead(task)) is not None:
         raise ValueError(f"task must be one of {allowed}, got {task!r}")
 
@@ -124,7 +127,7 @@ def make_spec(
         takes_all = any(each.kind is each.VAR_KEYWORD for each in parameters)
         if unknown := [name for name in options if name not in known and not takes_all]:
             # The words are Python's own, which programs that try out options look for.
-            names = f"it takes the arguments of TorchEnv, and {', '.join(('body', 'obstacles', *known))}"
+            names = f"its options are {', '.join(('body', 'obstacles', *known))}, beside those of TorchEnv"
             raise TypeError(f"task {task_name(task)!r} got an unexpected keyword argument {unknown[0]!r}; {names}")
         spec = make(**options)
     if obstacles is not None:

@@ -133,7 +133,7 @@ SOLVER = table(
     [
         ("Grid of half a node", lambda: Grid(128.5), "resolution must be a whole number, got 128.5"),
         ("Grid all margin", lambda: Grid(16, margin=0.5), "margin must be below half the window's width, 0.5, got 0.5"),
-        ("Grid, margin not a number", lambda: Grid(16, margin=math.nan), "margin must not be negative, got nan"),
+        ("Grid, margin not a number", lambda: Grid(16, margin=math.nan), "margin must be finite, got nan"),
         ("rule on one index", lambda: VelocityRule("-y", 3), "i must be an inclusive range (low, high)"),
         (
             "mass of other particles",
@@ -365,7 +365,7 @@ ENVIRONMENT = table(
         (
             "unknown option",
             lambda: env(colour="red"),
-            ("'run' got an unexpected keyword argument 'colour'; it takes", "body, obstacles"),
+            ("'run' got an unexpected keyword argument 'colour'; its options", "body, obstacles"),
         ),
         ("single environment of three", lambda: single(num_envs=3), ("num_envs must not be given", "make_vec")),
         ("reward of nothing", lambda: rewarded(lambda moment, spec: None), "must return an Outcome, got NoneType"),

@@ -48,7 +48,7 @@ def test_every_program_is_started_under_its_name_with_examples(name, capsys):
     ("words", "basic"),
     [
         ("train", "task target algo preset learner steps seed device out resume"),
-        ("teach", "task target algo preset steps seed device out resume"),
+        ("distill", "task target algo preset steps seed device out resume"),
         ("compare", "tasks algos seeds preset steps device workers episodes out report-only"),
     ],
 )

@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -157,6 +158,21 @@ def test_matter_of_the_published_run_of_slot_can_be_chosen():
     assert matter("--task", "slot", "--preset", "paper") == (650.0, 90.0, 45.0)
     with pytest.raises(ConfigError, match="unexpected keyword argument 'variant'"):
         matter("--task", "run", "--variant", "published")
+
+
+def test_runs_of_both_learners_have_folders_of_their_own():
+    assert parse(PROGRAM, ["--task", "run"]).out == Path("runs/analytic-run-quick-0")
+    assert parse(PROGRAM, ["--task", "run", "--learner", "sac"]).out == Path("runs/cfp-run-quick-0")
+
+
+def test_variants_of_custom_tasks_have_their_own_names(monkeypatch):
+    def wide(variant: str = "soft") -> dittogym.TaskSpec:
+        stiffness = {"soft": 100.0, "stiff": 200.0}
+        return replace(dittogym.make_spec("run"), name="wide", mu=stiffness[variant])
+
+    monkeypatch.setattr("dittogym.tasks.TASKS", {**dittogym.TASKS, "wide": wide})
+    run = parse(PROGRAM, ["--task", "wide", "--variant", "stiff"]).run
+    assert run.make_spec().mu == 200.0
 
 
 def test_a_step_keeps_its_duration_with_other_substeps():

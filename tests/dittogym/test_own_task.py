@@ -109,7 +109,7 @@ def test_options_of_the_function_arrive() -> None:
     assert env.action_space.shape == (2, 6, 6)
     assert env.unwrapped.torch_env.spec.robot.shape.size == (0.1, 0.1)
     assert tiny("hop", pull=-2.0).spec.gravity == (0.0, -2.0)
-    message = "task 'hop' got an unexpected keyword argument 'push'; it takes .*, and body, obstacles, pull"
+    message = "task 'hop' got an unexpected keyword argument 'push'; its options are body, obstacles, pull"
     with pytest.raises(TypeError, match=message):
         gymnasium.make("dittogym/hop-coarse-v0", push=1.0)
     with pytest.raises(ValueError, match=r"task must be one of catch, .*, hop, .* got 'hope'"):
@@ -209,6 +209,11 @@ def test_a_function_that_returns_something_else_is_refused(result: object, kind:
     assert "hop" not in dittogym.TASKS and "dittogym/hop-coarse-v0" not in gymnasium.registry
     with pytest.raises(TypeError, match="make must be a function that returns a TaskSpec, got TaskSpec"):
         dittogym.register("hop", hop())
+
+
+def test_a_specification_is_no_name_of_a_task() -> None:
+    with pytest.raises(ValueError, match=r"dittogym\.register knows the function .*, got the TaskSpec 'hop' itself"):
+        dittogym.tasks.check_task(hop())
 
 
 def test_a_specification_needs_no_registration() -> None:

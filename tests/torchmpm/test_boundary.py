@@ -211,7 +211,7 @@ def test_gradient_of_friction() -> None:
         ({"direction": "down"}, "direction must be one of .*'-y'.*got 'down'"),
         ({"frame": "robot"}, "frame must be 'world' or 'window', got 'robot'"),
         ({"friction": -0.1}, "friction must not be negative, got -0.1"),
-        ({"friction": math.nan}, "friction must not be negative, got nan"),
+        ({"friction": math.nan}, "friction must be finite, got nan"),
         ({"i": (4, 3)}, r"i must be an inclusive range .* got \(4, 3\)"),
         ({"j": (4, 3)}, r"j must be an inclusive range .* got \(4, 3\)"),
     ],

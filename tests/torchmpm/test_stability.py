@@ -146,7 +146,7 @@ def test_tensors_that_mean_nothing_are_refused(values: dict, message: str) -> No
 @pytest.mark.parametrize(
     ("material", "constants", "message"),
     [
-        (Elastic, {"mu": torch.tensor(math.nan), "lam": 50.0}, "mu must not be negative, got nan"),
+        (Elastic, {"mu": torch.tensor(math.nan), "lam": 50.0}, "mu must be finite, got nan"),
         (Elastic, {"mu": torch.tensor([1.0, -100.0]), "lam": 50.0}, "mu must not be negative, got -100.0"),
         (VonMises, {"mu": torch.tensor(0.0), "lam": 50.0, "yield_stress": 60.0}, "mu must be positive, got 0.0"),
         (VonMises, {"mu": MU, "lam": LAM, "yield_stress": torch.tensor(-5.0)}, "yield_stress must not be negative"),

@@ -42,7 +42,7 @@ class Kernels:
     def unsupported(self, device: torch.device) -> str | None:
         """Why the kernels cannot run on a device, or ``None`` if they can."""
         if device.type not in ("cpu", "cuda"):
-            return f"it runs on the CPU and on CUDA, the state is on {device}"
+            return f"its kernels run on the CPU and on CUDA, the state is on {device}"
         if device.type == "cuda":
             missing = triton_missing(os.environ.get("CC"), os.environ.get("PATH"))
             if missing is not None:
@@ -54,18 +54,18 @@ class Kernels:
     @functools.cached_property
     def _unsupported(self) -> str | None:
         if type(self.grid) is not Grid:
-            return f"it supports torchmpm.Grid itself, the grid is a {type(self.grid).__name__}"
+            return f"its kernels support torchmpm.Grid itself, the grid is a {type(self.grid).__name__}"
         for body in self.bodies:
             if type(body.material) not in KINDS:
                 names = ", ".join(kind.__name__ for kind in KINDS)
-                return f"it supports the materials {names}, a body has {type(body.material).__name__}"
+                return f"its kernels support the materials {names}, a body has {type(body.material).__name__}"
         if len(self.rules) > MAX_RULES:
-            return f"it takes at most {MAX_RULES} velocity rules, got {len(self.rules)}"
+            return f"its kernels take at most {MAX_RULES} velocity rules, got {len(self.rules)}"
         if self.grid.resolution > MAX_RESOLUTION:
-            return f"it takes at most {MAX_RESOLUTION:,} nodes per axis, got {self.grid.resolution:,}"
+            return f"its kernels take at most {MAX_RESOLUTION:,} nodes per axis, got {self.grid.resolution:,}"
         particles = sum(body.count for body in self.bodies)
         if particles > MAX_PARTICLES:
-            return f"it takes at most {MAX_PARTICLES:,} particles per simulation, got {particles:,}"
+            return f"its kernels take at most {MAX_PARTICLES:,} particles per simulation, got {particles:,}"
         return None
 
     @functools.cached_property
