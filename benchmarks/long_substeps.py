@@ -1,4 +1,4 @@
-"""Substeps of 0.2 ms next to those of 0.1 ms, at the lite tier: the tables of docs/concepts/fidelity.md.
+"""Substeps of 0.2 ms next to those of 0.1 ms, with lite particles: the tables of docs/concepts/fidelity.md.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/long_substeps.py --out docs` for `substeps-returns.csv` and
 `substeps-gradients.csv`. The same episodes are played with both, from the same layouts of particles: a moving wave, the
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tiers import wave
+from fidelity import wave
 from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
@@ -49,7 +49,7 @@ class Episode:
 
 
 def make_envs(task: str, dt: float, count: int, **options: Any) -> list[dittogym.TorchEnv]:
-    """The task at the lite tier from several layouts of particles, ``count`` in all.
+    """The task with lite particles from several layouts, ``count`` in all.
 
     They are a batch; or where nothing is drawn at random, single robots of 2,000, 1,960, 1,920, ... particles.
     """

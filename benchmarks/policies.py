@@ -79,7 +79,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("policies", nargs="+", help="names, policy files or run folders")
     parser.add_argument("--out", type=Path, required=True, help="the table")
-    parser.add_argument("--episodes", type=int, default=10, help="episodes of each policy and tier")
+    parser.add_argument("--episodes", type=int, default=10, help="episodes of each policy and number of particles")
     parser.add_argument("--untrained", type=int, default=3, help="episodes of zero and random action")
     parser.add_argument("--success", type=int, default=100, help="lite episodes for the share of successes; 0: none")
     arguments = parser.parse_args()

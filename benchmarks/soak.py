@@ -1,9 +1,9 @@
 """Memory, speed and NaNs of long runs with random actions, as a CSV file.
 
-`OMP_NUM_THREADS=1 python benchmarks/soak.py --out soak.csv` takes 100,000 environment steps of RUN's lite tier in a
-batch of 16 and resets episodes that have ended. With `--endless --robots 1 --particles 20 --substeps 10000 --steps
-86400` one episode lasts 24 hours of simulated time. Speed is given per second of processor time, which other programs
-hardly affect.
+`OMP_NUM_THREADS=1 python benchmarks/soak.py --out soak.csv` takes 100,000 environment steps of RUN with lite particles
+in a batch of 16 and resets episodes that have ended. With `--endless --robots 1 --particles 20 --substeps 10000
+--steps 86400` one episode lasts 24 hours of simulated time. Speed is given per second of processor time, which other
+programs hardly affect.
 """
 
 from __future__ import annotations

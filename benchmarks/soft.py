@@ -6,7 +6,7 @@ Run `python benchmarks/soft.py`; `--tasks run kick` for some tasks only.
 import argparse
 
 import torch
-from tiers import wave, zeros
+from fidelity import wave, zeros
 
 import dittogym
 from dittogym.observation.image import silhouette, soft_silhouette
@@ -15,9 +15,9 @@ STEPS = 30
 
 
 @torch.no_grad()
-def gaps(task: str, tier: str, policy) -> list[float]:
+def gaps(task: str, particles: str, policy) -> list[float]:
     """Mean differences over 30 steps (or until the episode ends) from seed 0, and those to another layout."""
-    env, other = (dittogym.TorchEnv(task, particles=p, action_layout="grid") for p in (tier, "full"))
+    env, other = (dittogym.TorchEnv(task, particles=p, action_layout="grid") for p in (particles, "full"))
     env.reset(seed=0)
     other.reset(seed=1)
     rows = []
@@ -46,14 +46,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--tasks", nargs="+", default=list(dittogym.TASKS), choices=dittogym.TASKS)
     tasks = parser.parse_args().tasks
-    print("| task | tier | actions | pixels wrong | (another layout) | occupancy | velocity | reward, mean | at most |")
+    print("| task | particles | actions | pixels wrong | (other) | occupancy | velocity | reward, mean | at most |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for task in tasks:
-        for tier in ("full", "lite"):
+        for particles in ("full", "lite"):
             for policy in (zeros, wave):
-                wrong, layout, occupancy, velocity, mean, most = gaps(task, tier, policy)
+                wrong, layout, occupancy, velocity, mean, most = gaps(task, particles, policy)
                 pixels = f"{wrong:.0f} | {layout:.0f} | {occupancy:.2f} | {velocity:.2f}"
-                print(f"| {task} | {tier} | {policy.__name__} | {pixels} | {mean:+.3f} | {most:.3f} |", flush=True)
+                print(f"| {task} | {particles} | {policy.__name__} | {pixels} | {mean:+.3f} | {most:.3f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""The lite tier compared with full size: returns under the same actions, and the ranking of random policies.
+"""Lite particles compared with full ones: returns under the same actions, and the ranking of random policies.
 
-Run `python benchmarks/tiers.py` for the table of returns, with `--policies 20` for rankings as well.
+Run `python benchmarks/fidelity.py` for the table of returns, with `--policies 20` for rankings as well.
 """
 
 import argparse
@@ -70,7 +70,7 @@ def main() -> None:
     for task in dittogym.TASKS:
         for policy in (zeros, wave):
             (full, com), (lite, other) = (
-                rewards(task, tier, policy, STEPS, arguments.backend) for tier in ("full", "lite")
+                rewards(task, particles, policy, STEPS, arguments.backend) for particles in ("full", "lite")
             )
             both = min(len(full), len(lite))
             apart = np.abs(com[:both] - other[:both]).max()
@@ -80,7 +80,7 @@ def main() -> None:
     for task, steps in RANKED.items() if arguments.policies else ():
         returns = np.array(
             [
-                [rewards(task, tier, RandomWaves(seed), steps, arguments.backend)[0].sum() for tier in ("full", "lite")]
+                [rewards(task, name, RandomWaves(seed), steps, arguments.backend)[0].sum() for name in ("full", "lite")]
                 for seed in range(arguments.policies)
             ]
         )
