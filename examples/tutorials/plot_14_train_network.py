@@ -27,7 +27,8 @@ class Policy(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.layers = nn.Sequential(nn.Linear(256 + 1, 128), nn.ELU(), nn.Linear(128, 128), nn.ELU())
+        first, second = nn.Linear(256 + 1, 128), nn.Linear(128, 128)
+        self.layers = nn.Sequential(first, nn.ELU(), second, nn.ELU())
         self.last = nn.Linear(128, 2 * SIZE**2)
         nn.init.zeros_(self.last.weight)  # begins with zero actions
 
@@ -43,7 +44,7 @@ class Policy(nn.Module):
 # ----------
 #
 # The elongation of a robot is the difference between its horizontal and its vertical variance, divided by their sum:
-# positive for a wide robot, negative for a tall one. The command is the elongation that the robot shall have.
+# positive for a wide robot, negative for a tall one. The command is the elongation that the robot should reach.
 #
 # The image consists of integers, so the gradient takes one path only: from the particles back through the physics to
 # the actions, and from each action to the weights of the network. ``env.step(action, soft=True)`` returns an image that
@@ -110,14 +111,19 @@ right.set(xlabel="command", ylabel="elongation after the episode")
 right.legend()
 figure.tight_layout()
 
+# %%
+# Three of the robots at the end of the episode.
+
 figure, axes = plt.subplots(1, 3, figsize=(9, 3.2))
 for axis, robot in zip(axes, (0, ROBOTS // 2, ROBOTS - 1), strict=True):
-    axis.scatter(*(env.state.x[robot] - env.state.x[robot].mean(dim=0)).T, s=3)
-    title = f"command {command[robot].item():.2f}, reached {reached[robot].item():.2f}"
-    axis.set(aspect="equal", xlim=(-0.13, 0.13), ylim=(-0.13, 0.13), xticks=[], yticks=[], title=title)
+    centred = env.state.x[robot] - env.state.x[robot].mean(dim=0)
+    axis.scatter(*centred.T, s=3)
+    axis.set(aspect="equal", xlim=(-0.13, 0.13), ylim=(-0.13, 0.13), xticks=[], yticks=[])
+    axis.set_title(f"command {command[robot].item():.2f}, reached {reached[robot].item():.2f}")
 figure.tight_layout()
-error = (reached - command).square().mean().sqrt().item()
-print(f"root mean square error {error:.3f}, with zero actions {command.square().mean().sqrt().item():.3f}")
+
+error, untrained = ((x - command).square().mean().sqrt().item() for x in (reached, 0))
+print(f"root mean square error {error:.3f}, with zero actions about {untrained:.3f}")
 
 # %%
 # Longer episodes
@@ -127,4 +133,4 @@ print(f"root mean square error {error:.3f}, with zero actions {command.square().
 # after every few steps, and estimate the rest of the return by a critic:
 # :doc:`the learner analytic </concepts/analytic>` works in this way.
 
-assert error < 0.5 * command.square().mean().sqrt().item()
+assert error < 0.5 * untrained
