@@ -184,7 +184,8 @@ def _carry_out(command: Command, jobs: Sequence[Job], signals: StopSignals) -> l
     def on_outcome(job: Job, outcome: Outcome) -> None:
         outcomes.append(outcome)
         reason = f" ({job.error})" if outcome == "failed" and job.error else ""
-        print(f"[{len(outcomes)}/{len(jobs)}] {job.name}: {outcome}{reason}", flush=True)
+        ending = "not begun" if outcome == "stopped" and job.state == "missing" else outcome
+        print(f"[{len(outcomes)}/{len(jobs)}] {job.name}: {ending}{reason}", flush=True)
 
     execute(command.make_executor(signals), jobs, signals, on_outcome)
     return outcomes

@@ -72,7 +72,7 @@ def learning_curves(groups: Sequence[Group], *, minutes: bool = False) -> Figure
             axes.fill_between(steps, *band, color=style["color"], alpha=0.15, linewidth=0)
     for axes in panels.values():
         axes.set(xlabel="minutes of training" if minutes else "environment steps", ylabel="return of an evaluation")
-    _add_legend(figure, styles)
+    _add_legend(figure, {(group.label, group.sees): styles[group.label, group.sees] for group in shown})
     return figure
 
 

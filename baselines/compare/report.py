@@ -33,19 +33,20 @@ class Picture:
 
 
 def write_report(folder: Path, runs: Sequence[RunResult], protocol: Protocol, description: str) -> Path:
-    """Write all files of the report, over those of an earlier one."""
+    """Write all files of the report, over those of an earlier one; another process may do the same."""
     groups = group_results(runs)
     complete = make_tables(runs, groups, protocol)
     for table in complete:
-        write_text(folder / f"{table.name}.csv", table.to_csv())
+        write_text(folder / f"{table.name}.csv", table.to_csv(), shared=True)
     shown = {table.name: table for table in complete if table.rows}
     shown["runs"] = replace(complete[0], rows=tables.unfinished(complete[0].rows))
     pictures = _make_pictures(groups)
     for picture in pictures.values():
-        write_figure(folder / picture.file, picture.figure)
+        write_figure(folder / picture.file, picture.figure, shared=True)
     head = f"{description} {_describe_protocol(protocol)} {_describe_observations(groups)}"
-    write_text(folder / "report.md", _markdown(shown, pictures, head))
-    write_text(folder / "index.html", _page(shown, pictures, head, [table.name for table in complete]))
+    write_text(folder / "report.md", _markdown(shown, pictures, head), shared=True)
+    page = _page(shown, pictures, head, [table.name for table in complete])
+    write_text(folder / "index.html", page, shared=True)
     return folder / "index.html"
 
 

@@ -44,9 +44,9 @@ def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Pat
     return run / "curve.png"
 
 
-def write_figure(path: Path, figure: Figure) -> None:
-    """Write a figure as PNG, atomically."""
-    write_atomically(path, lambda file: figure.savefig(file, format="png"))
+def write_figure(path: Path, figure: Figure, shared: bool = False) -> None:
+    """Write a figure as PNG, see `cfp.files.write_atomically`."""
+    write_atomically(path, lambda file: figure.savefig(file, format="png"), shared)
 
 
 def _column(rows: Sequence[dict[str, str]], name: str) -> tuple[list[float], list[float]]:

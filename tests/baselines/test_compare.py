@@ -135,7 +135,9 @@ def test_interrupted_comparison_goes_on(finished, tmp_path, monkeypatch, capsys,
     stop_at(30)
     out, arguments = tmp_path / "out", ["--algos", "shac-image", "mpc", "--seeds", "0"]
     assert compare(out, *arguments) == 128 + signal.SIGINT
-    assert "the same command resumes" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "the same command resumes" in output
+    assert "shac-image-shapematch-quick-0: stopped" in output and "mpc-shapematch-quick-0: not begun" in output
     assert [path.name for path in (out / "runs").iterdir()] == ["shac-image-shapematch-quick-0"]
     monkeypatch.undo()
     assert compare(out, *arguments) == 0

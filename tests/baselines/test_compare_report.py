@@ -193,6 +193,14 @@ def test_training_of_a_teacher_is_counted_by_itself(tmp_path):
     assert line.get_xdata().tolist() == pytest.approx([1 + 50 / 60, 1 + 100 / 60])
 
 
+def test_legend_of_learning_curves_names_those_that_are_drawn(tmp_path):
+    jobs = plan_jobs(tmp_path, ["run"], ["zero", "shac"], [0], lambda _: Protocol(1))
+    write_run(jobs[0], [1.0], {})
+    write_run(jobs[1], [1.0], {500: 1.0, 1000: 2.0})
+    (legend,) = learning_curves(read_groups(jobs)).legends
+    assert [text.get_text() for text in legend.get_texts()] == ["shac (observes state)"]
+
+
 def test_success_of_slot(report):
     row = find(rows(report, "success"), task="slot", algo="cfp")
     assert (row["successes"], row["episodes"], row["rate"], row["paper"]) == ("1", "4", "0.25", "0.154")
