@@ -4,11 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import dittogym
+from cfp.analytic.episodes import Episodes
 from cfp.config import to_json
 from cfp.envs.make import make_env
 from cfp.errors import ConfigError
+from cfp.evaluation.evaluate import evaluation_seed
 from cfp.experiment.checkpoint import check_same
 from cfp.experiment.training import parse
 from cfp.from_dict import update_from_dict
@@ -163,6 +166,26 @@ def test_matter_of_the_published_run_of_slot_can_be_chosen():
 def test_runs_of_both_learners_have_folders_of_their_own():
     assert parse(PROGRAM, ["--task", "run"]).out == Path("runs/analytic-run-quick-0")
     assert parse(PROGRAM, ["--task", "run", "--learner", "sac"]).out == Path("runs/cfp-run-quick-0")
+
+
+def test_layouts_of_training_evaluations_and_the_final_table_are_disjoint():
+    trained = []
+
+    class Recording(dittogym.TorchEnv):
+        def reset(self, *, seed=None, options=None):
+            trained.extend(seed if isinstance(seed, list) else [])
+            return super().reset(seed=seed, options=options)
+
+    env = Recording("run", 3, particles=20, substeps=1)
+    done = torch.ones(3, dtype=torch.bool)
+    episodes = Episodes(env, 5, max_episode_steps=2, num_layouts=4)
+    for _ in range(3):
+        episodes.restart(done, done, done)
+    assert len(set(trained)) == 4 and min(trained) >= 5 and max(trained) < 5 + 8
+
+    config = parse(PROGRAM, "--task run --seed 5 --eval-episodes 7".split()).run
+    assert config.evaluation(1) == config.evaluation(2) == (10_005, 7)
+    assert evaluation_seed(config) == 20_005
 
 
 def test_variants_of_custom_tasks_have_their_own_names(monkeypatch):

@@ -2,13 +2,14 @@
 
 The ids end in a version, and published figures rest on what happens under it. A change of the dynamics, the rewards or
 the observations that moves these numbers therefore means a new version id (``-v1``), not only a new file. After a
-change that is meant to be seen here, such as a new task, write the file anew with
-``python tests/dittogym/test_golden.py`` and look at the difference.
+change that is meant to be seen here, such as a new task, write its rollout anew with
+``python tests/dittogym/test_golden.py TASK`` and look at the difference.
 """
 
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -74,10 +75,11 @@ def settings() -> dict[str, Any]:
 
 
 def main() -> None:
-    """Write the file anew, a line for each step."""
-    blocks = []
+    """Write the rollouts of the tasks that are given, or of all, anew, a line for each step."""
+    kept, blocks = json.loads(FILE.read_text())["rollouts"], []
     for task in TASKS:
-        lines = ",\n    ".join(json.dumps(row) for row in rollout(task))
+        rows = rollout(task) if task in (sys.argv[1:] or TASKS) else kept[task]
+        lines = ",\n    ".join(map(json.dumps, rows))
         blocks.append(f'  "{task}": [\n    {lines}\n  ]')
     body = ",\n".join(blocks)
     FILE.write_text(f'{{"settings": {json.dumps(settings())},\n "rollouts": {{\n{body}\n}}}}\n')

@@ -108,6 +108,20 @@ def test_soft_rewards_pass_thresholds_without_a_jump(task: str) -> None:
     assert jumps(true) > 0.3
 
 
+@torch.no_grad()
+def test_soft_bonus_of_grow_is_a_sigmoid_of_the_published_width() -> None:
+    """0.04 m from the goal GROW's robot succeeds; the width of the sigmoid is 0.005 m."""
+    env, x, _ = at_threshold("grow")
+    field = torch.zeros(env.num_envs, 2, env.spec.patch, env.spec.patch, dtype=env.dtype)
+    for shift in (0.0, 0.005):
+        z = x.clone()
+        z[0] += shift
+        result = evaluate(env.model, placed(env, z), field, soft=True)
+        bonus = result.terms["success"][0] / env.spec.weights["success"]
+        assert 0.01 < bonus < 0.99
+        torch.testing.assert_close(bonus, torch.sigmoid((0.04 - result.info["distance"][0]) / 0.005))
+
+
 @pytest.mark.parametrize("task", TASKS)
 @torch.no_grad()
 def test_gap_from_rest(task: str) -> None:
