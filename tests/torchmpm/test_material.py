@@ -244,9 +244,9 @@ def test_values_per_simulation_and_particle_equal_separate_materials(shape: tupl
 
 
 @pytest.mark.parametrize("name", ["mu", "yield_stress"])
-@pytest.mark.parametrize("value", [-1.0, math.nan])
-def test_negative_values_are_named(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=f"{name} must not be negative, got {value}"):
+@pytest.mark.parametrize(("value", "must"), [(-1.0, "not be negative"), (math.nan, "be finite")])
+def test_wrong_values_are_named(name: str, value: float, must: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} must {must}, got {value}"):
         VonMises(**{"mu": MU, "lam": LAM, "yield_stress": YIELD} | {name: value})
     with pytest.raises(ValueError, match="lam must be finite, got nan"):
         Elastic(MU, math.nan)

@@ -320,7 +320,7 @@ MISTAKES: dict[str, tuple[Callable[[], object], str]] = {
         "mass must be a number or have shape",
     ),
     "bodies": (lambda: robot(5, bodies=()), "bodies must hold at least one Body, got none"),
-    "dt": (lambda: robot(5, dt=math.nan), "dt must be positive, got nan"),
+    "dt": (lambda: robot(5, dt=math.nan), "dt must be finite, got nan"),
     "count": (lambda: Body(0, Elastic(1.0, 1.0)), "count must be at least 1, got 0"),
     "volume": (lambda: Body(1, Elastic(1.0, 1.0), volume=-1.0), "volume must be positive, got -1.0"),
 }
