@@ -30,7 +30,7 @@ class Policy(nn.Module):
         first, second = nn.Linear(256 + 1, 128), nn.Linear(128, 128)
         self.layers = nn.Sequential(first, nn.ELU(), second, nn.ELU())
         self.last = nn.Linear(128, 2 * SIZE**2)
-        nn.init.zeros_(self.last.weight)  # begins with zero actions
+        nn.init.zeros_(self.last.weight)  # begins with weak, constant actions
 
     def forward(self, image: Tensor, command: Tensor) -> Tensor:
         """Choose the actions."""
