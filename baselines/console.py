@@ -47,8 +47,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: PROGRAM must be one of {', '.join(PROGRAMS)}, got {name!r}", file=sys.stderr)
         return 2
     module, _ = PROGRAMS[name]
-    if name == "train" and not any(word.partition("=")[0] == "--algo" for word in words):
-        module = "cfp.train"
     sys.path.insert(0, os.getcwd())  # as `python -m` does, for tasks that are defined there
     sys.argv = [f"torchmpm {name}", *words]  # from which the programs read their options and their name
     code: int = import_module(module).main()

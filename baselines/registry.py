@@ -11,7 +11,7 @@ from cfp.errors import ConfigError
 from cfp.experiment.algorithm import Algorithm, Sees
 from cfp.from_dict import update_from_dict
 from cfp.policy_protocols import Policy
-from cfp.presets import DEFAULT_TASK, like_start
+from cfp.presets import DEFAULT_TASK, from_json, like_start
 from cfp.weights import policy_file, read_policy
 
 #: ``"module:Class"`` of each algorithm, a subclass of `cfp.experiment.algorithm.Algorithm`.
@@ -61,15 +61,17 @@ def sees(name: str) -> Sees:
 
 
 def configure(values: dict[str, Any]) -> RunConfig:
-    """Options from JSON values, else from the preset they name; a `ConfigError` for a wrong name or type."""
-    algo, task, preset = (
-        values.get(name, default) for name, default in (("algo", "cfp"), ("task", DEFAULT_TASK), ("preset", "quick"))
-    )
+    """Options from JSON values, else from the preset they name; a `ConfigError` for a wrong name or type.
+
+    Without ``algo`` they are those of ``python -m cfp.train``, whose learner depends on the preset; ``"cfp"`` is its
+    learner ``sac``.
+    """
+    if "algo" not in values or (values["algo"] == "cfp" and "learner" in values):
+        return from_json(values)  # as cfp.train, the program of both learners
+    algo, task, preset = values["algo"], values.get("task", DEFAULT_TASK), values.get("preset", "quick")
     if isinstance(algo, str) and algo in ALIASES:
         algo = ALIASES[algo]
         values = {**values, "algo": algo}
-    if algo == "cfp" and values.get("learner") == "analytic":  # as cfp.train, the program of both learners, writes it
-        algo, values = "analytic", {**values, "algo": "cfp"}
     reference = isinstance(algo, str) and algo in REFERENCE_POLICIES
     if not reference and preset not in (allowed := find(algo).presets):
         raise ConfigError(f"preset must be {' or '.join(allowed)} for {algo}, got {preset!r}")

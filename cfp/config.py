@@ -52,10 +52,11 @@ class RunConfig:
 
     changeable: ClassVar[tuple[str, ...]] = (
         "device",
-        *(f"report.{name}" for name in ("eval_every", "patience", "checkpoint_every", "log_every", "video", "wandb")),
+        *(f"report.{name}" for name in ("eval_every", "patience", "checkpoint_every", "log_every")),
+        *(f"report.{name}" for name in ("video", "video_every", "wandb", "wandb_project")),
         "environment.backend",
     )
-    """Prefixes of the names of the options that a resumed run may change."""
+    """Options that a resumed run may change."""
 
     @property
     def name(self) -> str:
@@ -262,6 +263,9 @@ class SACConfig(CoarseToFineConfig):
     """Weight of the gate penalty, for each stage but the first."""
     critics_first: float = 0.0
     """Fraction of every stage but the first in which only the critics learn, if that is more than actor_start."""
+    max_episode_steps: int | None = None
+    """Steps after which training episodes are truncated, if the task's horizon is not shorter; robots begin at
+    different ages. None: the horizon, and all begin together."""
     learning: LearningConfig = field(default_factory=LearningConfig)
 
     own_learner: ClassVar[Learner] = "sac"
@@ -299,6 +303,8 @@ class SACConfig(CoarseToFineConfig):
         for name in ("random_steps", "alpha", "gate_penalty"):
             check_at_least(0, **{name: min(getattr(self, name), default=0)})
         check_decay(critics_first=self.critics_first)
+        if self.max_episode_steps is not None:
+            check_at_least(1, max_episode_steps=self.max_episode_steps)
         if (cells := self.learning.noise_cells) > (coarsest := self.resolutions[0]):
             raise ConfigError(f"noise_cells must be at most {coarsest}, the coarsest of resolutions, got {cells}")
 

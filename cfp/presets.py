@@ -97,7 +97,7 @@ SAC: dict[str, dict[str, Any]] = {
     "shapematch": {"learning": {"noise_cells": 0, "n_steps": 1, "actor_start": 600}},
     "obstacle": {"alpha": (0.005, 0.005)},  # that of RUN; with five times as much the robot does not reach the stairs
     # Without these options returns are lower, and differ more from episode to episode.
-    "slot": {"alpha": (0.005, 0.005), "learning": {"gamma": 0.99, "n_steps": 10, "max_episode_steps": 1_000}},
+    "slot": {"alpha": (0.005, 0.005), "learning": {"gamma": 0.99, "n_steps": 10}, "max_episode_steps": 1_000},
     # The way through the soil takes hundreds of steps. The paper's penalty closes the gate for good.
     "dig": {"learning": {"gamma": 0.99}, "gate_penalty": (0.01,)},
 }
@@ -208,6 +208,7 @@ def _quick(task: str, numbers: TaskNumbers) -> SACConfig:
         alpha=(0.5 * numbers.alpha[0],) * 2,
         gate_bias=(-3.0,),
         critics_first=0.5,
+        max_episode_steps=max(30, horizon // 4),
         environment=EnvironmentConfig(),
         network=replace(paper.network, interpolation="half_pixel", encoder="lean"),
         learning=LearningConfig(
@@ -223,7 +224,6 @@ def _quick(task: str, numbers: TaskNumbers) -> SACConfig:
             final_rate=0.1,
             n_steps=3,
             weight_average=0.998,
-            max_episode_steps=max(30, horizon // 4),
         ),
         report=ReportConfig(eval_every=steps // 8, checkpoint_every=steps // 16, log_every=320),
     )
@@ -268,8 +268,9 @@ def like_start(base: Options, values: dict[str, Any]) -> Options:
     spec, lean = load(values["start_from"]).spec, base.network.encoder == "lean"
     base = replace(base, network=replace(base.network, encoder=spec.encoder))
     if isinstance(base, SACConfig) and lean and spec.encoder != "lean":
-        usual = {name: getattr(LearningConfig(), name) for name in ("n_steps", "weight_average", "max_episode_steps")}
-        base = replace(base, learning=replace(base.learning, gradient_steps=4, batch_size=64, noise_cells=0, **usual))
+        usual = {name: getattr(LearningConfig(), name) for name in ("n_steps", "weight_average")}
+        learning = replace(base.learning, gradient_steps=4, batch_size=64, noise_cells=0, **usual)
+        base = replace(base, learning=learning, max_episode_steps=None)
         if len(base.resolutions) > 1:
             base = replace(base, resolutions=_numbers(base.task).resolutions)
     if values.get("refine") and len(spec.resolutions) == len(base.resolutions):

@@ -56,7 +56,7 @@ class Run:
 
     @cached_property
     def policy(self) -> Policy:
-        """The policy of the last stage, that with its best evaluation."""
+        """The policy of the last stage, that with its best evaluation; read at the first access."""
         return self.program.load(policy_path(self.folder), choose_device(self.config.device))
 
     @property
@@ -125,7 +125,8 @@ def fit(
 ) -> Run:
     """Train the coarse-to-fine policy, as ``python -m cfp.train`` does, with the same folder of the run.
 
-    Ctrl-C writes a checkpoint and raises `KeyboardInterrupt`; the same call with ``resume=True`` continues.
+    Ctrl-C writes a checkpoint and raises `KeyboardInterrupt`; the same call with ``resume=True`` continues. On Linux
+    glibc keeps freed memory from then on, which makes updates of the networks a third faster.
 
     Args:
         task: Task, or ``"MODULE:NAME"`` for a custom one.

@@ -93,7 +93,8 @@ class EnvironmentConfig:
 
     def with_particles(self, particles: Particles) -> EnvironmentConfig:
         """These options with other particles, without the reference's faults, and with actions oriented as here."""
-        return replace(self, particles=particles, parity="clean", action_layout=self.action_indexing)
+        layout = self.action_layout if self.parity == "clean" else self.action_indexing
+        return replace(self, particles=particles, parity="clean", action_layout=layout)
 
     def for_evaluation(self, particles: Particles) -> EnvironmentConfig:
         """These options with other particles; if few, without the reference's faults, which make the robot lighter."""

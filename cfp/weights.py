@@ -27,6 +27,7 @@ from cfp.hub import download, is_address
 from cfp.sections import TASK_OPTIONS, EnvironmentConfig
 from dittogym import make_spec
 from dittogym.action import trained_indexing
+from dittogym.arguments import find_device
 from dittogym.geometry import NODES
 from dittogym.tasks import fingerprint
 
@@ -111,9 +112,9 @@ def read_policy(path: str | Path, device: str = "cpu") -> tuple[dict[str, Tensor
     """Weights by name and description of a policy that `write_policy` wrote; nothing is unpickled."""
     file = policy_file(path)
     try:
-        torch.empty(0, device=device)
-    except (AssertionError, RuntimeError, TypeError) as error:  # the first one: torch without CUDA
-        raise ConfigError(f"device must be one that torch finds here, such as 'cpu', got {device!r}") from error
+        find_device(device)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
     try:
         with safetensors.safe_open(file, framework="pt", device=device) as content:
             metadata = content.metadata() or {}

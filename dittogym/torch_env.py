@@ -169,8 +169,8 @@ class TorchEnv:
         """The particles of all simulations."""
         return self.env_state.particles
 
-    def _present_observation(self) -> Tensor:
-        """The last observation, computed again if the state was assigned."""
+    def observation(self) -> Tensor:
+        """The last image (B, 3, 64, 64) uint8, computed again if the state was assigned; do not write to it."""
         if self._observation is None:
             self._observation = core.observe(self.model, self.env_state)
         return self._observation
@@ -182,7 +182,7 @@ class TorchEnv:
 
     def save(self) -> Snapshot:
         """Return a snapshot of all simulations, which :meth:`load` restores; it keeps the autograd graph."""
-        state, observation = tree.map(Tensor.clone, (self.env_state, self._present_observation()))
+        state, observation = tree.map(Tensor.clone, (self.env_state, self.observation()))
         return Snapshot(self.model.kind, state, observation, self.model.constants)
 
     def load(self, snapshot: Snapshot, mask: Any = None) -> Tensor:
@@ -210,7 +210,7 @@ class TorchEnv:
             mine = self.env_state
             physics = merged(self.spec, mine.physics, state.physics, chosen, self._like)
             state, mine = (replace(each, physics=physics) for each in (state, mine))
-            state, observation = tree.where(chosen, (state, observation), (mine, self._present_observation()))
+            state, observation = tree.where(chosen, (state, observation), (mine, self.observation()))
         actuation = self._actuation_of_others(chosen)
         self.env_state = state
         self._actuation, self._observation = actuation, observation.clone()
@@ -255,11 +255,11 @@ class TorchEnv:
         info = core.measured_info(self.model, fresh, fresh.start)
         if self._env_state is not None:
             if self._as_reference:  # its reset leaves the last episode's centre, memory and observation
-                old, observation = self._env_state, self._present_observation()[index]
+                old, observation = self._env_state, self.observation()[index]
                 memory = {name: old.memory[name][index].detach() for name in self.spec.stale_memory}
                 fresh = replace(fresh, centre=old.centre[index].detach(), memory={**fresh.memory, **memory})
             if len(index) < self.num_envs:
-                kept = core.seen(self.model, self.env_state, self._present_observation())
+                kept = core.seen(self.model, self.env_state, self.observation())
                 others = replace(fresh, physics={}), observation, info
                 fresh, observation, info = tree.map(lambda whole, part: whole.index_copy(0, index, part), kept, others)
                 fresh = replace(fresh, physics=merged(self.spec, self.env_state.physics, physics, mask, self._like))

@@ -14,7 +14,7 @@ from dittogym import TorchEnv, core
 from dittogym.action import ActionIndexing, to_grid_indexing
 from dittogym.core import StepResult
 from dittogym.model import EnvState, Model
-from torchmpm import trajectory, tree
+from torchmpm import trajectory
 
 #: From the task, a state and actions (B, 2, R, R) in grid indexing, such as :func:`dittogym.core.step`.
 StepFunction: TypeAlias = Callable[[Model, EnvState, Tensor], StepResult]
@@ -93,13 +93,3 @@ class _Step(NamedTuple):
     reward: Tensor
     true_reward: Tensor
     ended: Tensor
-
-
-def repeat(state: EnvState, copies: int) -> EnvState:
-    """The first simulation of a state, ``copies`` times."""
-    return tree.map(lambda t: t[:1].expand(copies, *t.shape[1:]), state)
-
-
-def to_dtype(state: EnvState, dtype: torch.dtype) -> EnvState:
-    """The same state in another floating point type."""
-    return tree.map(lambda t: t.to(dtype) if t.is_floating_point() else t, state)

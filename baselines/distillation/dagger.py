@@ -11,7 +11,6 @@ from cfp.analytic.episodes import Episodes
 from cfp.analytic.stateful import Stateful, compress, decompress
 from cfp.envs import disturbances
 from dittogym import TorchEnv
-from dittogym import core as dynamics
 from torchmpm import tree
 
 
@@ -104,7 +103,7 @@ class Collector(Stateful):
         """
         env, images, actions = self.env, [], []
         self.episodes.recent_returns = []
-        observation = dynamics.observe(env.model, env.env_state)
+        observation = env.observation()
         for _ in range(steps):
             teacher_action = self.teacher.act(env, observation)
             if self.teacher.fresh:
@@ -132,5 +131,5 @@ class Collector(Stateful):
         if bool(done.any()):
             self.episodes.restart(done, terminated, info["finite"])
             self.restarted = self.restarted | done
-            observation = dynamics.observe(self.env.model, self.env.env_state)
+            observation = self.env.observation()
         return observation

@@ -11,8 +11,9 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity
 from tqdm import tqdm
 
-from baselines.common.rollout import repeat, rollout, to_dtype
+from baselines.common.rollout import rollout
 from dittogym.model import EnvState, Model
+from torchmpm import tree
 
 #: Step sizes of the finite differences, root mean square per action value.
 STEP_SIZES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
@@ -49,7 +50,8 @@ class ReturnFunction:
 
     def to(self, dtype: torch.dtype) -> ReturnFunction:
         """Return the same function computed in another precision."""
-        return replace(self, state=to_dtype(self.state, dtype))
+        state = tree.map(lambda t: t.to(dtype) if t.is_floating_point() else t, self.state)
+        return replace(self, state=state)
 
     @torch.no_grad()
     def returns(self, actions: Tensor) -> Tensor:
@@ -65,7 +67,8 @@ class ReturnFunction:
         return torch.cat(gradients)
 
     def _rewards(self, batch: Tensor) -> Tensor:
-        return rollout(self.model, repeat(self.state, batch.shape[1]), batch).rewards
+        copies = tree.map(lambda t: t[:1].expand(batch.shape[1], *t.shape[1:]), self.state)
+        return rollout(self.model, copies, batch).rewards
 
     def _batches(self, actions: Tensor) -> list[Tensor]:
         like = self.state.particles.x

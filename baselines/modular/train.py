@@ -37,6 +37,9 @@ class ModularConfig(RunConfig):
     """Uniformly random environment steps at the start."""
     alpha: float = 0.01
     """Entropy temperature."""
+    max_episode_steps: int | None = None
+    """Steps after which training episodes are truncated, if the task's horizon is not shorter; robots begin at
+    different ages. None: the horizon, and all begin together."""
     learning: LearningConfig = field(default_factory=LearningConfig)
 
     changeable: ClassVar[tuple[str, ...]] = ("steps", *RunConfig.changeable)
@@ -90,6 +93,8 @@ class ModularConfig(RunConfig):
         super().check()
         check_at_least(1, steps=self.steps)
         check_at_least(0, random_steps=self.random_steps, alpha=self.alpha)
+        if self.max_episode_steps is not None:
+            check_at_least(1, max_episode_steps=self.max_episode_steps)
         particles = self.environment.particles
         robot = particles[0] if isinstance(particles, tuple) else particles
         if isinstance(robot, int) and robot < self.segments:
@@ -127,6 +132,7 @@ class Modular(SACAlgorithm):
             preset=base.preset,
             environment=base.environment,
             report=base.report,
+            max_episode_steps=base.max_episode_steps,
             learning=replace(
                 base.learning,
                 noise_cells=0,
@@ -143,7 +149,7 @@ class Modular(SACAlgorithm):
         """The algorithm at the beginning of its only stage."""
         env = SegmentedEnv(make_torch_env(config, config.resolution(stage)), config.nodes)
         networks = {"kind": config.kind, "features": config.nodes.num_features(env.env.spec)}
-        monitor = VecMonitor(TorchVecEnv(env, env.spaces, config.learning.max_episode_steps))
+        monitor = VecMonitor(TorchVecEnv(env, env.spaces, config.max_episode_steps))
         return cls(config, stage, monitor, ModularPolicy, networks, cls.hyperparameters(config, stage, folder))
 
     @property

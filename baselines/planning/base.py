@@ -35,7 +35,8 @@ class PlannerConfig:
     noise: float = 0.1
     """Standard deviation of the random actions that extend a plan."""
     termination_steps: float = 32.0
-    """A plan that ends the episode early is charged this many control steps at its own mean reward."""
+    """A plan that ends the episode early is charged this many control steps at its own mean reward, if it is
+    positive."""
     split_weight: float = 1000.0
     """Weight of the cost of a large spread: the square of the amount by which the spread, divided by the task's limit,
     exceeds 0.8."""

@@ -6,7 +6,6 @@ from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from baselines.common.grid import Grid, GridConfig, find_grid
 from baselines.common.open_loop import OpenLoop, OpenLoopAlgorithm
@@ -23,6 +22,7 @@ from cfp.presets import sac_preset
 from cfp.sections import EnvironmentConfig, Particles, ReportConfig
 from cfp.validation import check_at_least, check_positive
 from dittogym import make_spec
+from dittogym.action import bicubic
 
 #: Of Adam.
 BETAS = (0.9, 0.98)
@@ -270,5 +270,4 @@ class Gradient(Stateful, OpenLoopAlgorithm):
 
 def _to_theta(actions: Tensor, resolution: int) -> Tensor:
     """Parameters of a sequence of actions (T, 2, R, R) on another grid, interpolated as the environment does."""
-    larger = interpolate(actions, size=(resolution, resolution), mode="bicubic", align_corners=False)
-    return torch.atanh(larger.clamp(-0.999, 0.999))
+    return torch.atanh(bicubic(actions, resolution).clamp(-0.999, 0.999))

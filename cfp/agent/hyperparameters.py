@@ -48,9 +48,6 @@ class LearningConfig:
     """Fraction of the learning rates at the end of a stage; they fall linearly."""
     weight_average: float = 0.0
     """Decay of the average of the actor's weights over updates, which is the policy; 0: the actor itself."""
-    max_episode_steps: int | None = None
-    """Steps after which training episodes are truncated, if the task's horizon is not shorter; robots begin at
-    different ages. None: the horizon, and all begin together."""
 
     def check(self) -> None:
         """Raise a `ConfigError` for values out of range."""
@@ -63,8 +60,6 @@ class LearningConfig:
         check_at_least(1, n_steps=self.n_steps)
         if self.n_steps > 1 and self.gamma == 1:
             raise ConfigError("gamma must be below 1 with several n_steps, got 1")
-        if self.max_episode_steps is not None:
-            check_at_least(1, max_episode_steps=self.max_episode_steps)
         check_fraction(gamma=self.gamma, tau=self.tau, reward_momentum=self.reward_momentum, final_rate=self.final_rate)
         check_decay(weight_average=self.weight_average)
         check_positive(learning_rate=self.learning_rate, max_grad_norm=self.max_grad_norm)

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from cfp.analytic.config import WindowConfig
+from cfp.analytic.reward import effective_horizon
 from cfp.analytic.stateful import Stateful
 from cfp.analytic.window import Window, td_lambda_targets
 from cfp.errors import NonFiniteError
@@ -59,7 +60,8 @@ class Critic(Stateful):
         return self._value(self.target, observations)
 
     def _value(self, network: nn.Module, observations: Tensor) -> Tensor:
-        value: Tensor = network(observations)[..., 0] / max(1.0 - self.options.gamma, 1e-2)
+        # what the network learns is of the size of a reward
+        value: Tensor = network(observations)[..., 0] * effective_horizon(self.options.gamma)
         return value
 
     def update(self, window: Window, learning_rate: float) -> float:

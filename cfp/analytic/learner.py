@@ -29,7 +29,6 @@ from cfp.experiment.algorithm import Scalars
 from cfp.experiment.schedules import linear_decay
 from cfp.experiment.stages import CoarseToFineStages, refines
 from cfp.presets import analytic_preset
-from dittogym import core
 
 #: Every scalar that ``AnalyticLearner.update`` logs, and what it means.
 METRICS: dict[str, str] = {
@@ -70,7 +69,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         self.action_step = ActionStep()
         self.empty_windows = 0
         self.generator = torch.Generator().manual_seed(config.seed)  # on the CPU, so that a run can change its device
-        image = self._image()
+        image = self.env.observation()
         with torch.no_grad():
             outputs = actor.outputs(image, deterministic=True, generator=self.generator)
         example = (image[0], outputs.location[0])
@@ -107,9 +106,6 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
     def steps_without_change(self) -> int:
         """Environment steps of the warm-up, in which only the critic of a trained policy learns."""
         return self.config.warmup * self.config.update_every
-
-    def _image(self) -> Tensor:
-        return core.observe(self.env.model, self.env.env_state)
 
     def update(self) -> Scalars:
         """Play one window and learn from it.
@@ -153,7 +149,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
         leaves: list[Tensor] = []
 
         def act(_: Tensor) -> Tensor:
-            images.append(self._image())
+            images.append(self.env.observation())
             with torch.no_grad():
                 outputs = self.actor.outputs(images[-1], generator=self.generator)
                 leaves.append(outputs.location.clamp(-BOUND, BOUND))
@@ -182,7 +178,7 @@ class AnalyticLearner(Stateful, CoarseToFineStages):
 
     def images(self) -> dict[str, np.ndarray]:
         """What the policy does with the observation of the first robot."""
-        return policy_pictures(self.trained_actor, self._image()[:1])
+        return policy_pictures(self.trained_actor, self.env.observation()[:1])
 
     @property
     def trained_actor(self) -> Actor:

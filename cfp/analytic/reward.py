@@ -41,8 +41,8 @@ class RewardConfig:
     scale: float = 0.05
     """Factor on the training reward that keeps the critic's values near one."""
     success_reward: float = 0.0
-    """Reward per step, discounted, as if the episode went on forever after it ended in success; 0: none, as in the
-    task."""
+    """Reward per step, discounted, as if the episode went on after it ended in success, for the effective horizon of
+    at most 100 steps; 0: none, as in the task."""
 
     def check(self) -> None:
         """Check what the types do not express."""
@@ -52,7 +52,7 @@ class RewardConfig:
 
     def success_value(self, gamma: float) -> float:
         """Value of the end of an episode that ended in success."""
-        return self.scale * self.success_reward / max(1.0 - gamma, 1e-2)
+        return self.scale * self.success_reward * effective_horizon(gamma)
 
 
 @tree.register
@@ -84,6 +84,11 @@ class Neighbours:
         distance = (gap.square().sum(-1) + 1e-12).sqrt()
         excess = ((distance - self.distance) / RADIUS - TOLERANCE).clamp_min(0.0) * self.is_close
         return excess.square().sum((1, 2)) / self.is_close.sum((1, 2)).clamp_min(1)
+
+
+def effective_horizon(gamma: float) -> float:
+    """The number of steps 1 / (1 - gamma) that a value sums up, at most 100, so that also gamma = 1 has one."""
+    return 1.0 / max(1.0 - gamma, 1e-2)
 
 
 def split_cost(split: Tensor, limit: float, margin: float, weight: float) -> Tensor:

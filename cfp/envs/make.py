@@ -12,6 +12,7 @@ from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from cfp.sections import TASK_OPTIONS
 from dittogym import TorchEnv
+from dittogym.arguments import find_device
 
 
 def choose_device(name: str) -> str:
@@ -19,12 +20,9 @@ def choose_device(name: str) -> str:
     if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     try:
-        kind = torch.device(name).type
-    except RuntimeError as error:
-        raise ConfigError(f"device must be auto, cpu or cuda, got {name!r}") from error
-    if kind == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(f"device must be auto or cpu where torch finds no CUDA device, got {name!r}")
-    return name
+        return str(find_device(name))
+    except ValueError as error:
+        raise ConfigError(f"{error}; auto chooses one") from error
 
 
 def make_env(

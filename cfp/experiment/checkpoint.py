@@ -99,7 +99,7 @@ class Checkpoint:
 def check_same(stored: dict[str, Any], given: RunConfig) -> None:
     """Refuse to resume a checkpoint with other options than its own, but for those that may change."""
     for name, (old, new) in differences(stored, json.loads(json.dumps(to_json(given)))).items():
-        if not name.startswith(given.changeable):
+        if name not in given.changeable:
             raise ConfigError(
                 f"{name.split('.')[-1]}: the run was started with {old!r}, got {new!r}; a resumed run may change only: "
                 + ", ".join(each.rpartition(".")[2] for each in given.changeable)

@@ -1,4 +1,4 @@
-"""Settings of a command line's own process: stop signals and the allocator."""
+"""Settings of the process that trains: stop signals and the allocator."""
 
 from __future__ import annotations
 

@@ -139,8 +139,8 @@ class SACLearner(CoarseToFineStages, SACAlgorithm):
     @classmethod
     def create(cls, config: SACConfig, stage: int, folder: Path) -> SACLearner:
         """Networks, replay memory and environment of a stage."""
-        limit, spec = config.learning.max_episode_steps, config.actor_spec(stage)
-        env = make_env(config, config.action_size(stage), max_episode_steps=limit)
+        spec = config.actor_spec(stage)
+        env = make_env(config, config.action_size(stage), max_episode_steps=config.max_episode_steps)
         hyperparameters = cls.hyperparameters(config, stage, folder)
         algorithm = cls(config, stage, env, CFPPolicy, {"spec": spec}, hyperparameters)
         model = algorithm.model

@@ -188,9 +188,7 @@ def main(program: Program, arguments: Sequence[str] | None = None, started: str 
 
 def _train(program: Program, arguments: Sequence[str], started: str) -> None:
     command = parse(program, arguments, started)
-    needed = started == "torchmpm train" and command.run.algo != "cfp"  # else it would start cfp.train
-    algo = f" --algo {command.run.algo}" if needed else ""
-    train(program, command, f"resume with: {started} --resume --out {command.out}{algo}")
+    train(program, command, f"resume with: {started} --resume --out {command.out}")
 
 
 def train(program: Program, command: Command, hint: str) -> None:

@@ -105,7 +105,7 @@ POLICIES = [
         Case(
             f"policy onto {device!r}",
             lambda desk, device=device: cfp.load("run", device=device),
-            ("device must be one that torch finds here", repr(device)),
+            ("device must be 'cpu' or 'cuda'", repr(device)),
         )
         for device in ("abacus", 1.5)
     ),

@@ -1,5 +1,6 @@
 """The console command ``torchmpm``."""
 
+import json
 import re
 import runpy
 import subprocess
@@ -71,6 +72,16 @@ def test_options_and_exit_codes_reach_the_program_and_the_shell(tmp_path, capsys
         capsys, "train", "--algo=cem", "--task", "run", "--dry-run", "--out", str(tmp_path / "run")
     )
     assert code == 0 and '"algo": "cem"' in text
+
+
+def test_train_takes_the_algorithm_from_a_file_and_its_default_from_cfp(tmp_path, capsys):
+    file = tmp_path / "cem.json"
+    file.write_text('{"algo": "cem", "task": "run"}')
+    code, text, _ = output_of(capsys, "train", "--config", str(file), "--dry-run")
+    assert code == 0 and json.loads(text)["algo"] == "cem"
+    _, text, _ = output_of(capsys, "train", "--task", "run", "--dry-run")
+    _, also, _ = output_of(capsys, "train", "--task", "run", "--preset", "long", "--dry-run")
+    assert [json.loads(each)["learner"] for each in (text, also)] == ["analytic", "sac"]
 
 
 def test_no_program_shows_the_help_and_a_wrong_one_the_choice(capsys):

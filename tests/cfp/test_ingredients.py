@@ -252,8 +252,9 @@ def test_a_policy_with_the_papers_networks_goes_on_with_smaller_batches_and_with
     quick, started = sac_preset("run"), from_json({"task": "run", "learner": "sac", "start_from": "run"})
     assert (quick.network.encoder, started.network.encoder) == ("lean", "full")
     assert (quick.resolutions, started.resolutions) == ((4, 8), (8, 16))
-    usual = {"n_steps": 1, "weight_average": 0.0, "max_episode_steps": None}
+    usual = {"n_steps": 1, "weight_average": 0.0}
     assert started.learning == replace(quick.learning, batch_size=64, noise_cells=0, **usual)
+    assert (quick.max_episode_steps, started.max_episode_steps) == (200, None)
     asked = {"task": "run", "learner": "sac", "start_from": "run", "learning": {"noise_cells": 2, "gradient_steps": 8}}
     assert (from_json(asked).learning.noise_cells, from_json(asked).learning.gradient_steps) == (2, 8)
     assert from_json({"task": "run", "learner": "sac", "start_from": "run", "network": {"encoder": "full"}}) == started
