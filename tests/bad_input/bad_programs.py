@@ -160,7 +160,9 @@ OTHERS = [
     ),
     evaluating("a policy and a folder", "{folder} --policy run", "either policy or a folder must be given"),
     evaluating(
-        "a policy on an abacus", "--policy run --device abacus", "device must be 'cpu' or 'cuda', got 'abacus'; auto chooses one"
+        "a policy on an abacus",
+        "--policy run --device abacus",
+        "device must be 'cpu' or 'cuda', got 'abacus'; auto chooses one",
     ),
     evaluating("an empty folder", "{folder}", "there is no run", main=baselines.evaluate.main),
     evaluating("a disturbed nothing", "{folder}", "there is no run", main=ROBUSTNESS),
