@@ -21,12 +21,13 @@ from cfp.evaluation.video import check_files, record_episode, record_policy, sav
 from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import policy_files, read_config
 from cfp.experiment.training import Program
+from cfp.files import check_output
 from cfp.from_dict import update_from_dict
 from cfp.policy_protocols import Policy
 from cfp.sections import Particles
 from cfp.train import PROGRAM
 from cfp.validation import check_at_least
-from cfp.weights import is_of_another_task, policy_file
+from cfp.weights import is_of_another_task, policy_file, shipped
 from dittogym.trajectories import Episode, save_episodes
 from dittogym.trajectories.episode import record_batch
 
@@ -58,11 +59,14 @@ class Selection:
     def open(self, program: Program) -> tuple[RunConfig, dict[str, Policy]]:
         """Options to evaluate with, and policies by stage, the newest last."""
         if self.folder is not None and self.policy is None:
+            if not self.folder.exists() and str(self.folder) in shipped():
+                raise ConfigError(f"{self.folder}: there is no such folder; --policy {self.folder} names the policy")
             config, policies = open_run(program, self.folder, self.device, self.seed)
         elif self.policy is not None and self.folder is None:
             config, policies = open_policy(program, self.policy, self.device, self.seed)
         else:
-            raise ConfigError(f"either policy or a folder must be given, got {self.policy!r} and {self.folder}")
+            given = "neither" if self.policy is None else "both"
+            raise ConfigError(f"either policy or a folder must be given, got {given}")
         if self.particles is not None and self.particles != config.environment.particles:
             config = replace(config, environment=config.environment.for_evaluation(self.particles))
         if self.dt is not None:
@@ -156,10 +160,13 @@ def open_policy(program: Program, path: str, device: str, seed: int | None) -> t
 def run(program: Program, command: Command) -> str:
     """Evaluate, film if asked to, and return the table."""
     check_at_least(1, episodes=command.episodes)
-    files, options = {"video": command.video, "replay": command.replay}, vars(command.film)
+    files, usual = {"video": command.video, "replay": command.replay}, vars(FilmOptions())
+    options = {name: value for name, value in vars(command.film).items() if value != usual[name]}
     check_files(files, options)
-    if command.record is not None and command.record.suffix != ".npz":
-        raise ConfigError(f"record must end in .npz, got {command.record}")
+    if command.record is not None:
+        if command.record.suffix != ".npz":
+            raise ConfigError(f"record must end in .npz, got {command.record}")
+        check_output("record", command.record)
     config, policies = command.open(program)
     results = compare(config, policies, command.episodes, command.noise)
     if any(files.values()):

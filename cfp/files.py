@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +13,8 @@ from typing import Any, BinaryIO
 
 import safetensors.torch
 from torch import Tensor
+
+from cfp.errors import ConfigError
 
 LARGEST_JSON = 2**20  # bytes
 #: Key of the description in the metadata of a policy file.
@@ -39,6 +43,18 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], Any], shared: bool 
         raise
     os.replace(aside, path)
     _sync_folder(path.parent)
+
+
+def check_output(option: str, path: Path) -> None:
+    """Refuse a file that cannot be written before its content is computed; a `ConfigError` names the option."""
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise ConfigError(f"{option}: {path} cannot be written ({error.strerror})") from error
 
 
 @contextmanager
@@ -94,8 +110,15 @@ def write_text(path: Path, text: str, shared: bool = False) -> None:
     write_atomically(path, lambda file: file.write(text.encode()), shared)
 
 
-def write_policy(path: Path, tensors: Mapping[str, Tensor], description: dict[str, Any]) -> None:
-    """Write a policy of any kind: weights with the description, `cfp.weights.describe_run`'s and more, and its JSON."""
+def write_policy(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], description: dict[str, Any]) -> None:
+    """Write a policy of any kind: weights with the description, `cfp.weights.describe_run`'s and more, and its JSON.
+
+    Raises:
+        ConfigError: ``path`` does not end in ``.safetensors``.
+    """
+    path = Path(path)
+    if path.suffix != ".safetensors":
+        raise ConfigError(f"path must end in .safetensors, got {str(path)!r}")
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     content = safetensors.torch.save(plain, {FORMAT: json.dumps(description)})
     write_atomically(path, lambda file: file.write(content))

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any, Literal, TypeVar
 
 from cfp.errors import ConfigError
+from cfp.validation import brief
 
 Options = TypeVar("Options")
 
@@ -33,7 +34,10 @@ def update_from_dict(base: Options, values: Any, path: str = "") -> Options:
     for name, value in values.items():
         where = f"{path}.{name}" if path else name
         if name not in types:
-            raise ConfigError(f"{where} is not an option; options are {', '.join(types)}")
+            places = [section for section in types if dataclasses.is_dataclass(getattr(base, section))]
+            found = [f"{section}.{name}" for section in places if hasattr(getattr(base, section), name)]
+            allowed = f"did you mean {found[0]}?" if found else f"options are {', '.join(types)}"
+            raise ConfigError(f"{where} is not an option; {allowed}")
         old = getattr(base, name)
         nested = dataclasses.is_dataclass(old)
         changes[name] = update_from_dict(old, value, where) if nested else _convert(value, types[name], where)
@@ -63,7 +67,7 @@ def _convert(value: Any, kind: Any, where: str) -> Any:
         if kind is int and abs(value) >= 2**63:
             raise ConfigError(f"{where} must be between -2**63 and 2**63, got a number of {len(str(value))} digits")
         return value
-    raise ConfigError(f"{where} must be {type_name(kind)}, got {value!r}")
+    raise ConfigError(f"{where} must be {type_name(kind)}, got {brief(value)}")
 
 
 def type_name(kind: Any) -> str:

@@ -72,7 +72,7 @@ class Command(Selection):
     def check(self) -> None:
         """Refuse values that are out of range."""
         check_at_least(1, episodes=self.episodes, latency=self.latency)
-        if self.out is None and self.folder is None:
+        if self.out is None and self.policy is not None:
             raise ConfigError("out must be given with a single policy: the folder to write into")
         for name in ("dropout", "shift"):
             if not 0 < getattr(self, name) < 1:
@@ -136,15 +136,15 @@ def to_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
     ]
 
 
-def make_table(config: RunConfig, rows: Sequence[dict[str, Any]]) -> Table:
-    """The table of the report."""
+def make_table(name: str, config: RunConfig, rows: Sequence[dict[str, Any]]) -> Table:
+    """The table of the report about the policy ``name``."""
     description = (
         f"Mean return of {rows[0]['episodes']} episodes, particles {config.environment.particles}, "
         "and ratio to the unperturbed."
     )
     if rows[0]["ratio"] is None:
         description += " The unperturbed return is not positive, so that there are no ratios to it."
-    return Table("robustness", f"Robustness of {config.name}", description, COLUMNS, rows)
+    return Table("robustness", f"Robustness of {name}", description, COLUMNS, rows)
 
 
 def draw(config: RunConfig, results: Sequence[Result]) -> Figure:
@@ -175,7 +175,7 @@ def run(program: Program, command: Command) -> str:
     make_folder(folder)
     results = report(config, policy, cases, command.episodes, progress=True)
     rows, path = to_rows(results), folder / "robustness"
-    table = make_table(config, rows)
+    table = make_table(command.policy or config.name, config, rows)
     write_json(path.with_suffix(".json"), rows)
     write_text(path.with_suffix(".csv"), table.to_csv())
     write_text(path.with_suffix(".md"), table.to_markdown() + "\n")

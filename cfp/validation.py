@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from cfp.errors import ConfigError
+
+
+def brief(value: Any) -> str:
+    """A value in an error message, on one line of at most 200 characters."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 200 else f"{text[:197]}..."
 
 
 def check_at_least(minimum: float, **values: float) -> None:

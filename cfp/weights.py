@@ -25,6 +25,7 @@ from cfp.files import FORMAT, parse_json, write_policy
 from cfp.from_dict import type_name, update_from_dict
 from cfp.hub import download, is_address
 from cfp.sections import TASK_OPTIONS, EnvironmentConfig
+from cfp.validation import brief
 from dittogym import make_spec
 from dittogym.action import trained_indexing
 from dittogym.arguments import find_device
@@ -91,7 +92,7 @@ def shipped() -> list[str]:
 def policy_file(path: str | Path) -> Path:
     """The ``.safetensors`` file of a policy; see `load` for what ``path`` may be."""
     if not isinstance(path, str | os.PathLike) or not str(path):
-        raise CheckpointError(f"path must be a folder, a file or the name of a policy, got {path!r}")
+        raise CheckpointError(f"path must be a folder, a file or the name of a policy, got {brief(path)}")
     if is_address(path):
         return download(str(path))
     file = Path(path)
@@ -228,7 +229,9 @@ def check_trained_for(option: str, description: Mapping[str, Any], task: str, en
         except (ValueError, TypeError, OSError) as error:
             raise ConfigError(f"{option}: cannot compare its {name} {given} with {expected} ({error})") from error
         if not same:
-            raise ConfigError(f"{option} must be a policy for the {name} {expected}, got {given}")
+            raise ConfigError(
+                f"{option} must be a policy for the {name} {expected or 'of the task'}, got {given or 'the default'}"
+            )
 
 
 def is_same_task(task: str, option: str, value: str | None, other: str | None) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any, cast
 
@@ -64,8 +65,8 @@ class OpenLoop(Shareable):
         actions[playing] = self.actions.numpy()[step[playing]]
         return actions[0] if single else actions, (step + 1,)
 
-    def save(self, path: Path) -> None:
-        """Write ``path`` (``.safetensors``) and the ``.json`` beside it."""
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write ``path``, which must end in ``.safetensors``, and a description beside it, which ends in ``.json``."""
         write_policy(path, {"actions": self.actions}, self.description)
 
     @classmethod

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -168,8 +169,8 @@ class SegmentPolicy(StateBasedPolicy):
         action = self.nodes.to_grid(env, labels, values.to(env.device))
         return from_grid_indexing(action, trained_indexing(self) or env.action_layout), (labels.cpu().numpy(),)
 
-    def save(self, path: Path) -> None:
-        """Write ``path`` (``.safetensors``) and the ``.json`` beside it."""
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write ``path``, which must end in ``.safetensors``, and a description beside it, which ends in ``.json``."""
         trunk = self.actor.trunk
         network = {"kind": trunk.kind, "features": trunk.features}
         own = {"nodes": dataclasses.asdict(self.nodes), "network": network}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Any
 
@@ -89,8 +90,8 @@ class StatePolicy(StateBasedPolicy):
             mean = mean + self.noise * torch.randn_like(mean)
         return mean.tanh(), state
 
-    def save(self, path: Path) -> None:
-        """Write ``path`` (``.safetensors``) and the ``.json`` beside it."""
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write ``path``, which must end in ``.safetensors``, and a description beside it, which ends in ``.json``."""
         own = {"features": dataclasses.asdict(self.features), "noise": self.noise, "inputs": self.actor.inputs}
         write_policy(path, self.actor.state_dict(), self.description | own)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from pathlib import Path
+import os
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -64,8 +64,8 @@ class ActorPolicy(nn.Module, Shareable):
         action: Tensor = self.actor(observation, deterministic)
         return action
 
-    def save(self, path: Path) -> None:
-        """Write ``path`` (``.safetensors``) and the ``.json`` beside it."""
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write ``path``, which must end in ``.safetensors``, and a description beside it, which ends in ``.json``."""
         write_policy(path, self.actor.state_dict(), self.description)
 
     @torch.no_grad()

@@ -165,7 +165,7 @@ def _about(seconds: float) -> str:
     spans = {"h": minutes // 60, "min": minutes % 60, "s": rest}
     time = " ".join(f"{number} {unit}" for unit, number in spans.items() if number)
     with_version = f"with torchmpm {torchmpm.__version__}"
-    return f"Trained {f'in {time} ' if time else ''}{with_version}. The command that repeats it:"
+    return f"Trained {f'in {time} ' if time else ''}{with_version}. The command with all of its options:"
 
 
 def _changes(config: RunConfig, preset: RunConfig) -> str:

@@ -85,6 +85,8 @@ class TrainingRun:
         else:
             if holds_progress(folder):  # the evaluation of the policy it starts from, which precedes any checkpoint
                 check_same(self._stored_options(), config)
+            if (folder / "results.json").exists():
+                raise CheckpointError(f"{folder}: the run is finished, but its checkpoint is missing")
             if holds_run(folder):
                 print(f"{folder} holds no checkpoint: starting from the beginning")
             self.position = algorithm.initialize(config, folder)

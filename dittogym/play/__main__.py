@@ -82,7 +82,10 @@ def play(command: Command) -> None:
         new_session()  # what is wrong with the options shows before a page is opened
     except (TypeError, pkgutil.resolve_name("cfp:CFPError")) as error:
         raise ValueError(str(error)) from error
-    server = Server(new_session, secrets.token_urlsafe(16), command.port)
+    try:
+        server = Server(new_session, secrets.token_urlsafe(16), command.port)
+    except OSError as error:
+        raise OSError(f"port: {command.port} cannot be used ({error.strerror})") from error
     print(f"Play at {server.address}\nCtrl-C stops the program.", flush=True)
     if command.browser:
         webbrowser.open(server.address)

@@ -61,7 +61,8 @@ def record(env: Any, policy: Any, *, seed: int = 0, fields: Sequence[str] = ("x"
     seed = checks.whole("seed", seed, 0, MAX_SEED)  # a file stores it as a number
     inner: Any = env.unwrapped if isinstance(env, gymnasium.Env) else env
     torch_env = inner.torch_env if isinstance(inner, Env) else inner
-    checks.instance("env", torch_env, TorchEnv)
+    if not isinstance(torch_env, TorchEnv):
+        raise TypeError(f"env must be a TorchEnv or a Gymnasium environment of this package, got {env!r}")
     act = as_function(policy, torch_env.action_layout)
     if isinstance(inner, Env):
         return record_batch(torch_env, lambda images: as_tensor(act(images[0]), torch_env, single=True), seed, fields)

@@ -13,6 +13,7 @@ from typing import Any, BinaryIO
 import gymnasium
 import numpy as np
 
+from dittogym.env import Env
 from dittogym.render.files import replacing
 from dittogym.trajectories.episode import Episode
 from torchmpm import checks
@@ -38,9 +39,7 @@ def save_episodes(path: str | os.PathLike[str], episodes: Sequence[Episode]) -> 
         TypeError: An item is not an :class:`Episode`.
     """
     file = check_archive(path)
-    if not episodes:
-        raise ValueError("episodes must hold at least 1 episode, got 0")
-    checks.instances("episodes", episodes, Episode)
+    _check(episodes)
     arrays: dict[str, Any] = {}
     for i, episode in enumerate(episodes):
         arrays |= {f"{i}/{name}": getattr(episode, name) for name in ARRAYS}
@@ -50,6 +49,12 @@ def save_episodes(path: str | os.PathLike[str], episodes: Sequence[Episode]) -> 
     with replacing(file) as aside:
         np.savez_compressed(aside, about=np.array(about), **arrays)
     return file
+
+
+def _check(episodes: Sequence[Episode]) -> None:
+    checks.instances("episodes", episodes, Episode)
+    if not episodes:
+        raise ValueError("episodes must hold at least 1 episode, got 0")
 
 
 def load_episodes(path: str | os.PathLike[str]) -> list[Episode]:
@@ -110,13 +115,21 @@ def save_minari(dataset_id: str, episodes: Sequence[Episode], env: gymnasium.Env
 
     Raises:
         ImportError: Minari or h5py is not installed.
-        ValueError: There is no episode, or they are of several tasks.
+        ValueError: There is no episode, or they are of several tasks, or the environment has another task or other
+            actions.
+        TypeError: An item is not an :class:`Episode`, or the environment is not a Gymnasium environment of this
+            package.
     """
     minari = _minari()
-    if not episodes:
-        raise ValueError("episodes must be at least one, got none")
+    _check(episodes)
     if len(tasks := {episode.task for episode in episodes}) > 1:
         raise ValueError(f"episodes must be of one task, got {', '.join(sorted(tasks))}")
+    inner: Any = getattr(env, "unwrapped", env)
+    if not isinstance(inner, Env):
+        raise TypeError(f"env must be a Gymnasium environment of this package, got {env!r}")
+    given = f"{inner.torch_env.spec.name} with actions {inner.action_space.shape}"
+    if given != (allowed := f"{episodes[0].task} with actions {episodes[0].actions.shape[1:]}"):
+        raise ValueError(f"env must be of task {allowed}, got {given}")
     buffers = [
         minari.data_collector.EpisodeBuffer(
             id=i,

@@ -109,6 +109,14 @@ POLICIES = [
         )
         for device in ("abacus", 1.5)
     ),
+    *(
+        Case(
+            f"policy into {name!r}",
+            lambda desk, name=name: cfp.load("run").save(name),
+            ("path must end in .safetensors", repr(name)),
+        )
+        for name in ("run", "run.json", "run.pt")
+    ),
     Case("run of nothing", lambda desk: cfp.Run(None), ("folder must be the path of a folder, got None",)),
     Case("run in an unset variable", lambda desk: cfp.Run(""), ("folder must be the path of a folder, got ''",)),
     Case(

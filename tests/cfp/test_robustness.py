@@ -199,7 +199,7 @@ def test_ratios_need_a_positive_return():
     rows = robustness.to_rows([Result("unperturbed", 8, (-2.0, -1.0)), Result("noise", 8, (-4.0, -3.0))])
     assert [row["ratio"] for row in rows] == [None, None]
     config = sac_preset("dig")
-    assert "not positive" in robustness.make_table(config, rows).description
+    assert "not positive" in robustness.make_table("run", config, rows).description
 
 
 def test_amounts_of_the_command_line_reach_the_cases(folder, tmp_path, monkeypatch):

@@ -376,3 +376,6 @@ def test_a_run_that_failed_before_its_first_checkpoint_does_not_block_its_folder
     assert [row["step"] for row in read_table(tmp_path / "run" / "progress.csv")] == ["10", "20", "30", "40"]
     assert run(tmp_path / "run", *options) == 2
     assert "already holds a run" in capsys.readouterr().err
+    shutil.rmtree(tmp_path / "run" / "checkpoint")  # a finished run is not started anew
+    assert run(tmp_path / "run", "--resume", *options) == 2
+    assert "the run is finished, but its checkpoint is missing" in capsys.readouterr().err

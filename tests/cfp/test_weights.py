@@ -84,11 +84,8 @@ def test_description_stands_beside_and_inside_the_weights(saved):
 def test_default_of_a_task_may_be_named_or_not(task, option, one, other, same):
     for given, wanted in ((one, other), (other, one)):
         description = {"task": task, "environment": {option: given}}
-        with (
-            nullcontext()
-            if same
-            else pytest.raises(ConfigError, match=f"must be a policy for the {option} {wanted}, got {given}")
-        ):
+        message = f"must be a policy for the {option} {wanted or 'of the task'}, got {given or 'the default'}"
+        with nullcontext() if same else pytest.raises(ConfigError, match=message):
             check_trained_for("start_from", description, task, EnvironmentConfig(**{option: wanted}))
 
 

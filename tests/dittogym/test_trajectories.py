@@ -95,6 +95,11 @@ def test_minari_gives_the_same_back(env, episodes, tmp_path, monkeypatch):
     assert read.storage.metadata["description"] == "Actions without a plan."
     with pytest.raises(ValueError, match="episodes must be of one task, got run, shapematch"):
         trajectories.save_minari("a/b-v0", [*episodes, dataclasses.replace(episodes[0], task="run")], env)
+    coarser = gymnasium.make("dittogym/shapematch-coarse-v0", particles=100, resolution=4)
+    with pytest.raises(ValueError, match=r"env must be of task shapematch with actions .*, got .* \(2, 4, 4\)"):
+        trajectories.save_minari("a/b-v0", episodes, coarser)
+    with pytest.raises(TypeError, match="env must be a Gymnasium environment of this package, got None"):
+        trajectories.save_minari("a/b-v0", episodes, None)
 
 
 @pytest.mark.parametrize(
