@@ -183,7 +183,7 @@ def test_policies_of_other_tasks_are_refused(tmp_path, capsys):
     protocol = ["--protocol", "v1", "--policies"]
     config = preset("shapematch", "quick")
     for changes, expected in (
-        ({"target": "T"}, "policies must be a policy for the target None, got T"),
+        ({"target": "T"}, "policies must be a policy for the target of the task, got T"),
         ({"substeps": 50}, "policies must be a policy for environment steps of 0.01 s, got 0.005"),
     ):
         there = replace(config, environment=replace(config.environment, **changes))

@@ -99,7 +99,7 @@ def test_second_stage_begins_with_the_lean_encoder_of_the_first(tmp_path):
         (["--refine", "--resolutions", "8", "16"], "start_from must be a policy of the first resolutions of (8, 16)"),
         (["--start-from", "no/such"], "there is no policy"),
         (["--encoder", "full"], "start_from must be a policy with encoder full, got lean"),
-        (["--target", "T"], "start_from must be a policy for the target T, got None"),
+        (["--target", "T"], "start_from must be a policy for the target T, got the default"),
     ],
 )
 def test_policy_that_does_not_fit_is_refused(coarse, tmp_path, capsys, options, message):
