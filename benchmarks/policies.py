@@ -16,7 +16,7 @@ from typing import Any
 
 from cfp.config import RunConfig
 from cfp.evaluate import open_policy, open_run
-from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed, make_trial
+from cfp.evaluation.returns import Result, evaluate, evaluation_seed, make_trial
 from cfp.evaluation.untrained import UntrainedPolicy
 from cfp.files import write_text
 from cfp.policy_protocols import Policy

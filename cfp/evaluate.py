@@ -15,8 +15,8 @@ import tyro
 from cfp.config import RunConfig
 from cfp.envs.make import choose_device
 from cfp.errors import CheckpointError, ConfigError
-from cfp.evaluation.evaluate import Noise, compare, evaluation_seed, without_noise
 from cfp.evaluation.results import format_table, to_rows
+from cfp.evaluation.returns import Noise, compare, evaluation_seed, without_noise
 from cfp.evaluation.video import check_files, record_episode, record_policy, save_media
 from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import policy_files, read_config

@@ -17,9 +17,9 @@ from cfp.envs.make import batch_size
 from cfp.errors import ConfigError
 from cfp.evaluate import Selection
 from cfp.evaluation.episodes import Trial
-from cfp.evaluation.evaluate import Result, decision_grid, evaluate, evaluation_seed
 from cfp.evaluation.plots import write_figure
 from cfp.evaluation.results import numbers
+from cfp.evaluation.returns import Result, decision_grid, evaluate, evaluation_seed
 from cfp.evaluation.table import Column, Table
 from cfp.experiment.cli import read_command, run_command
 from cfp.experiment.folder import Folder, make_folder

@@ -16,7 +16,7 @@ from cfp.config import RunConfig
 from cfp.envs.disturbances import Case, make_cases
 from cfp.envs.make import choose_device
 from cfp.errors import CheckpointError
-from cfp.evaluation.evaluate import Result, evaluate, evaluation_seed, make_trial
+from cfp.evaluation.returns import Result, evaluate, evaluation_seed, make_trial
 from cfp.files import read_json, write_json
 from cfp.robustness import report
 from cfp.sections import Particles

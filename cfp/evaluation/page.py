@@ -12,9 +12,9 @@ from typing import Any
 
 import torchmpm
 from cfp.config import RunConfig, to_json
-from cfp.evaluation.evaluate import Result
 from cfp.evaluation.pictures import match_pictures
 from cfp.evaluation.results import to_rows
+from cfp.evaluation.returns import Result
 from cfp.evaluation.table import Table, columns
 from cfp.files import write_atomically, write_text
 from cfp.from_dict import differences

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from cfp.config import RunConfig
-from cfp.evaluation.evaluate import Result
+from cfp.evaluation.returns import Result
 
 
 def to_rows(results: Sequence[Result]) -> list[dict[str, Any]]:

@@ -13,7 +13,7 @@ from cfp.envs.make import make_torch_env
 from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
 from cfp.evaluation.episodes import SeededPolicy, attached
-from cfp.evaluation.evaluate import Noise, evaluation_seed, without_noise
+from cfp.evaluation.returns import Noise, evaluation_seed, without_noise
 from cfp.files import check_output
 from cfp.policy_protocols import Policy
 from dittogym import TorchEnv

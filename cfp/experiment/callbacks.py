@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from cfp.config import RunConfig
 from cfp.evaluation.episodes import EpisodesStopped
-from cfp.evaluation.evaluate import evaluate, make_trial
+from cfp.evaluation.returns import evaluate, make_trial
 from cfp.evaluation.video import record_episode
 from cfp.experiment.algorithm import Algorithm, Position
 from cfp.experiment.checkpoint import Checkpoint

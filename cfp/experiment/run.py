@@ -17,10 +17,10 @@ from tqdm import tqdm
 from cfp.config import CoarseToFineConfig, RunConfig, to_json
 from cfp.envs.make import choose_device, make_env
 from cfp.errors import CFPError, CheckpointError, ConfigError, NonFiniteError
-from cfp.evaluation.evaluate import compare
 from cfp.evaluation.page import write_page
 from cfp.evaluation.plots import plot_curve
 from cfp.evaluation.results import format_table, to_rows
+from cfp.evaluation.returns import compare
 from cfp.evaluation.video import record_policy, save_media
 from cfp.experiment.algorithm import Algorithm, Position
 from cfp.experiment.callbacks import (

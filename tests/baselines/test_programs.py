@@ -16,7 +16,7 @@ from baselines.registry import sees
 from cfp.agent.actor import build_actor
 from cfp.envs.disturbances import make_cases
 from cfp.errors import ConfigError
-from cfp.evaluation.evaluate import evaluate as play
+from cfp.evaluation.returns import evaluate as play
 from cfp.experiment.callbacks import EvaluationCallback
 from cfp.experiment.training import parse
 from cfp.policy_protocols import SeesState

@@ -21,7 +21,7 @@ from cfp.analytic.window import Window, short_horizon_loss, td_lambda_targets
 from cfp.envs.make import make_env
 from cfp.errors import CheckpointError, ConfigError, NonFiniteError
 from cfp.evaluation.episodes import attached
-from cfp.evaluation.evaluate import evaluate, make_trial
+from cfp.evaluation.returns import evaluate, make_trial
 from cfp.evaluation.video import record_policy
 from cfp.sections import EnvironmentConfig
 from cfp.weights import describe_run

@@ -11,7 +11,7 @@ from cfp.analytic.episodes import Episodes
 from cfp.config import to_json
 from cfp.envs.make import make_env
 from cfp.errors import ConfigError
-from cfp.evaluation.evaluate import evaluation_seed
+from cfp.evaluation.returns import evaluation_seed
 from cfp.experiment.checkpoint import check_same
 from cfp.experiment.training import parse
 from cfp.from_dict import update_from_dict

@@ -13,7 +13,7 @@ from cfp.errors import ConfigError
 from cfp.evaluate import Selection
 from cfp.evaluation.cache import VARIABLE
 from cfp.evaluation.episodes import Trial
-from cfp.evaluation.evaluate import compare, evaluate, make_trial
+from cfp.evaluation.returns import compare, evaluate, make_trial
 from cfp.evaluation.untrained import UntrainedPolicy
 from cfp.presets import preset
 from cfp.train import PROGRAM

@@ -11,7 +11,7 @@ from tiny_runs import run
 
 from cfp import train
 from cfp.agent.actor import build_actor
-from cfp.evaluation.evaluate import Result
+from cfp.evaluation.returns import Result
 from cfp.experiment.sac_learner import SACLearner
 from cfp.presets import sac_preset
 from cfp.tables import read_table

@@ -18,7 +18,7 @@ from cfp.envs.disturbances import Case, Disturbed, disturbed_env, make_cases, re
 from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from cfp.evaluate import open_policy, open_run
-from cfp.evaluation.evaluate import Result
+from cfp.evaluation.returns import Result
 from cfp.files import write_json
 from cfp.presets import preset, sac_preset
 from cfp.train import PROGRAM

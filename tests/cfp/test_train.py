@@ -23,7 +23,7 @@ from cfp.agent.actor import build_actor
 from cfp.agent.actor_policy import ActorPolicy
 from cfp.agent.spec import ActorSpec
 from cfp.config import to_json
-from cfp.evaluation.evaluate import compare
+from cfp.evaluation.returns import compare
 from cfp.experiment import callbacks
 from cfp.experiment.cli import program_name
 from cfp.experiment.training import parse
