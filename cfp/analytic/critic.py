@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from cfp.analytic.config import WindowConfig
-from cfp.analytic.reward import effective_horizon
+from cfp.analytic.reward import discount_rate
 from cfp.analytic.stateful import Stateful
 from cfp.analytic.window import Window, td_lambda_targets
 from cfp.errors import NonFiniteError
@@ -61,7 +61,7 @@ class Critic(Stateful):
 
     def _value(self, network: nn.Module, observations: Tensor) -> Tensor:
         # what the network learns is of the size of a reward
-        value: Tensor = network(observations)[..., 0] * effective_horizon(self.options.gamma)
+        value: Tensor = network(observations)[..., 0] / discount_rate(self.options.gamma)
         return value
 
     def update(self, window: Window, learning_rate: float) -> float:

@@ -41,8 +41,8 @@ class RewardConfig:
     scale: float = 0.05
     """Factor on the training reward that keeps the critic's values near one."""
     success_reward: float = 0.0
-    """Reward per step, discounted, as if the episode went on after it ended in success, for the effective horizon of
-    at most 100 steps; 0: none, as in the task."""
+    """Reward per step, discounted, as if the episode went on after it ended in success, for 1 / (1 - gamma) steps,
+    at most 100; 0: none, as in the task."""
 
     def check(self) -> None:
         """Check what the types do not express."""
@@ -52,7 +52,7 @@ class RewardConfig:
 
     def success_value(self, gamma: float) -> float:
         """Value of the end of an episode that ended in success."""
-        return self.scale * self.success_reward * effective_horizon(gamma)
+        return self.scale * self.success_reward / discount_rate(gamma)
 
 
 @tree.register
@@ -86,9 +86,9 @@ class Neighbours:
         return excess.square().sum((1, 2)) / self.is_close.sum((1, 2)).clamp_min(1)
 
 
-def effective_horizon(gamma: float) -> float:
-    """The number of steps 1 / (1 - gamma) that a value sums up, at most 100, so that also gamma = 1 has one."""
-    return 1.0 / max(1.0 - gamma, 1e-2)
+def discount_rate(gamma: float) -> float:
+    """1 - gamma, at least 0.01: a value sums up the rewards of 1 / (1 - gamma) steps, here at most 100."""
+    return max(1.0 - gamma, 1e-2)
 
 
 def split_cost(split: Tensor, limit: float, margin: float, weight: float) -> Tensor:
