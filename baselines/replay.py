@@ -11,6 +11,7 @@ from cfp.errors import ConfigError
 from cfp.evaluate import Selection
 from cfp.evaluation.video import check_files, record_policy
 from cfp.experiment.cli import read_command, run_command
+from cfp.files import check_output
 from dittogym.render.film import available
 
 EXAMPLES = ("runs/run", "--policy run --particles full --out run.html", "runs/run --out run.mp4")
@@ -32,6 +33,7 @@ def run(command: Command) -> None:
     if command.out.suffix == ".mp4" and not available():
         raise ConfigError("out needs the extra video for .mp4 (pip install 'torchmpm[video]'), or another suffix")
     config, policies = command.open(PROGRAM)
+    check_output("out", command.out)
     print(f"episode: {record_policy(config, list(policies.values())[-1], command.noise).save(command.out)}")
 
 

@@ -163,11 +163,12 @@ def run(program: Program, command: Command) -> str:
     files, usual = {"video": command.video, "replay": command.replay}, vars(FilmOptions())
     options = {name: value for name, value in vars(command.film).items() if value != usual[name]}
     check_files(files, options)
-    if command.record is not None:
-        if command.record.suffix != ".npz":
-            raise ConfigError(f"record must end in .npz, got {command.record}")
-        check_output("record", command.record)
+    if command.record is not None and command.record.suffix != ".npz":
+        raise ConfigError(f"record must end in .npz, got {command.record}")
     config, policies = command.open(program)
+    for name, path in {**files, "record": command.record}.items():
+        if path is not None:
+            check_output(name, path)
     results = compare(config, policies, command.episodes, command.noise)
     if any(files.values()):
         recording = record_policy(config, list(policies.values())[-1], command.noise)

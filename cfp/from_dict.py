@@ -34,8 +34,8 @@ def update_from_dict(base: Options, values: Any, path: str = "") -> Options:
     for name, value in values.items():
         where = f"{path}.{name}" if path else name
         if name not in types:
-            places = [section for section in types if dataclasses.is_dataclass(getattr(base, section))]
-            found = [f"{section}.{name}" for section in places if hasattr(getattr(base, section), name)]
+            sections = [section for section in types if dataclasses.is_dataclass(getattr(base, section))]
+            found = [f"{section}.{name}" for section in sections if name in vars(getattr(base, section))]
             allowed = f"did you mean {found[0]}?" if found else f"options are {', '.join(types)}"
             raise ConfigError(f"{where} is not an option; {allowed}")
         old = getattr(base, name)

@@ -72,7 +72,7 @@ class Command(Selection):
     def check(self) -> None:
         """Refuse values that are out of range."""
         check_at_least(1, episodes=self.episodes, latency=self.latency)
-        if self.out is None and self.policy is not None:
+        if self.out is None and self.folder is None and self.policy is not None:
             raise ConfigError("out must be given with a single policy: the folder to write into")
         for name in ("dropout", "shift"):
             if not 0 < getattr(self, name) < 1:

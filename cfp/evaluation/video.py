@@ -14,7 +14,6 @@ from cfp.envs.vec_env import TorchVecEnv
 from cfp.errors import ConfigError
 from cfp.evaluation.episodes import SeededPolicy, attached
 from cfp.evaluation.returns import Noise, evaluation_seed, without_noise
-from cfp.files import check_output
 from cfp.policy_protocols import Policy
 from dittogym import TorchEnv
 from dittogym.render.film import VideoUnavailable
@@ -53,16 +52,14 @@ def check_files(paths: Mapping[str, Path | None], options: Mapping[str, Any]) ->
     """Check the arguments of `save_media`.
 
     Raises:
-        ConfigError: A file has another suffix than what it is to hold or cannot be written, or an option is out of
-            range or has no effect on any of the files.
+        ConfigError: A file has another suffix than what it is to hold, or an option is out of range or has no effect
+            on any of the files.
     """
     films = (".mp4", ".gif", ".webp", ".png")
     for name, path in paths.items():
         allowed = {"replay": (".html",), "video": films}.get(name, (".html", *films))
         if path is not None and path.suffix not in allowed:
             raise ConfigError(f"{name} must end in {' or '.join(allowed)}, got {path}")
-        if path is not None:
-            check_output(name, path)
     for name in options:
         if not any(path is not None and name in OPTIONS[path.suffix] for path in paths.values()):
             suffixes = " or ".join(suffix for suffix, names in OPTIONS.items() if name in names)

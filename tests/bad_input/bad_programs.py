@@ -155,6 +155,7 @@ OTHERS = [
     evaluating("the size of no film", "--policy run --size 100", "size requires a file that ends in .gif or "),
     evaluating("the zoom of a replay", "--policy run --replay a.html --zoom 3", "zoom requires a file that ends in "),
     evaluating("a folder that is not there", "{folder}/none", "none: there is no run (no config.json)"),
+    evaluating("an unknown policy on film", "--policy alchemy --video new/a.webp", "no shipped one has that name"),
     evaluating("an unknown policy", "--policy alchemy", "no shipped one has that name (catch, dig, grow, "),
     evaluating("no episodes", "--policy run --episodes 0", "episodes must be at least 1, got 0"),
     evaluating(
