@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import torchmpm
-from cfp.config import RunConfig, to_json
+from cfp.config import RunConfig, differences, to_json
 from cfp.evaluation.pictures import match_pictures
 from cfp.evaluation.results import to_rows
 from cfp.evaluation.returns import Result
 from cfp.evaluation.table import Table, columns
 from cfp.files import write_atomically, write_text
-from cfp.from_dict import differences
 from cfp.tables import read_table
 from dittogym.render.frame import png
 from dittogym.render.recording import Recording
@@ -86,23 +85,16 @@ def write_page(
 
 
 def changed_options(config: RunConfig, preset: RunConfig) -> dict[str, tuple[Any, Any]]:
-    """Options, by their dotted names, that differ from the preset: their value, and that of the preset."""
-    changes = differences(to_json(config), to_json(preset))
-    changes.pop("algo", None)  # each algorithm has presets of its own, CFP one for each learner
-    return changes
+    """Options that differ from the preset: their value, and that of the preset."""
+    return differences(to_json(config), to_json(preset))
 
 
 def command_words(config: RunConfig, preset: RunConfig) -> list[str]:
     """The words of the command that trains with these options."""
-    decisive = {"algo": config.algo, "learner": getattr(config, "learner", None)}
-    package = "cfp" if config.algo == "cfp" else "baselines"
-    given = {name: value for name, value in decisive.items() if value and (name, value) != ("algo", "cfp")}
-    given |= {"task": config.task, "preset": config.preset, "seed": config.seed}
-    changed = {name.rpartition(".")[2]: value for name, (value, _) in changed_options(config, preset).items()}
-    derived = config.with_derived(preset, changed.keys())  # what training would compute from the others
-    changed |= {name.rpartition(".")[2]: value for name, (value, _) in changed_options(config, derived).items()}
-    words = ["python", "-m", f"{package}.train"]
-    for name, value in (given | changed).items():
+    given: dict[str, Any] = {"task": config.task, "algo": config.algo, "preset": config.preset, "seed": config.seed}
+    given |= {name: value for name, (value, _) in changed_options(config, preset).items()}
+    words = ["torchmpm", "train"]
+    for name, value in given.items():
         option = name.replace("_", "-")
         if isinstance(value, bool):
             words.append(f"--{option}" if value else f"--no-{option}")

@@ -24,7 +24,7 @@ def plot_curve(run: Path, config: RunConfig, baselines: dict[str, float]) -> Pat
         axes.plot(steps, values, color="tab:gray", alpha=0.8, label="training episodes (with noise)")
     steps, means = _column(evaluations, "mean")
     _, stds = _column(evaluations, "std")
-    how = "without noise" if config.report.eval_deterministic else "with noise"
+    how = "without noise" if config.eval_deterministic else "with noise"
     if steps:
         axes.plot(steps, means, "o-", color="tab:blue", markersize=3, label=f"evaluation ({how}), mean ± std")
     low, high = np.subtract(means, stds), np.add(means, stds)
