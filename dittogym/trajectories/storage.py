@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 
 from dittogym.env import Env
-from dittogym.render.files import replacing
+from dittogym.files import replacing
 from dittogym.trajectories.episode import Episode
 from torchmpm import checks
 

@@ -19,7 +19,7 @@ from PIL import Image
 from tiny import SMALL
 
 import dittogym
-from dittogym.render import files
+from dittogym import files
 from dittogym.render.film import VideoUnavailable, write_film
 from dittogym.render.frame import pace
 from dittogym.render.recording import Recording, as_function
@@ -198,11 +198,8 @@ def test_policies_act_with_noise_or_without_as_they_were_evaluated_in_training()
         ({"path": "film.png", "speed": 1}, ".png, which takes size, zoom, muscles, pictures"),
         ({"path": "film.webp", "pictures": 4}, ".webp, which takes size, rate, speed, zoom, muscles"),
         ({"size": 64}, "path must be given with size"),
-        (
-            {"sped": 1},
-            "film got an unexpected keyword argument 'sped'; it takes size, rate, speed, zoom, muscles, pict",
-        ),
-        ({"path": "film.mp4", "size": 64, "sped": 1}, "film got an unexpected keyword argument 'sped'"),
+        ({"sped": 1}, "unexpected keyword argument 'sped'"),
+        ({"path": "film.mp4", "size": 64, "sped": 1}, "unexpected keyword argument 'sped'"),
     ],
 )
 def test_options_are_checked_before_the_episode(options: dict, message: str) -> None:

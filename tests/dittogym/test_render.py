@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from dittogym import BatchEnv, Env, TorchEnv, make_spec
-from dittogym.render.canvas import GROUND, SOLID, TARGET, Canvas
-from dittogym.render.colours import CONTRACT, EXPAND, RELAX, ROBOT, SCALES, shear_strain, speed
-from dittogym.render.scene import describe
+from dittogym.render.frame import GROUND, SOLID, TARGET, Canvas
+from dittogym.render.scene import CONTRACT, EXPAND, RELAX, ROBOT, SCALES, describe, shear_strain, speed
 
 
 def near(image: np.ndarray, colour) -> np.ndarray:

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 import dittogym
-from dittogym import trajectories
-from dittogym.render import files
+from dittogym import files, trajectories
 from dittogym.trajectories.storage import ARRAYS
 
 OPTIONS = {"particles": 100, "substeps": 1}
