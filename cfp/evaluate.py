@@ -28,8 +28,7 @@ from cfp.sections import Particles
 from cfp.train import PROGRAM
 from cfp.validation import check_at_least
 from cfp.weights import is_of_another_task, policy_file, shipped
-from dittogym.trajectories import Episode, save_episodes
-from dittogym.trajectories.episode import record_batch
+from dittogym.trajectories import Episode, record_batch, save_episodes
 
 EXAMPLES = (
     "runs/run --episodes 10 --video run.mp4",

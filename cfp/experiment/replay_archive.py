@@ -12,7 +12,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 from cfp.errors import CheckpointError
 from cfp.files import write_atomically
-from dittogym.trajectories.storage import ZIP_ERRORS
+from dittogym.trajectories import ZIP_ERRORS
 
 FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 _COMPRESSED = ("observations", "next_observations")  # images shrink thirtyfold, actions are noise
