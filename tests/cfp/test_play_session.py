@@ -13,11 +13,11 @@ import torch
 
 import cfp
 from cfp import ActorPolicy, ActorSpec
+from cfp.play import protocol
+from cfp.play.hand import wave
+from cfp.play.protocol import HEAD, Draw, Hand, Matter, Paint, Reset, Save, Step, Wave, parse
+from cfp.play.session import FLAGS, Session
 from dittogym import TASKS, TorchEnv, make_spec
-from dittogym.play import protocol
-from dittogym.play.hand import MUSCLE_REACH, REACH, press, wave
-from dittogym.play.protocol import HEAD, Draw, Hand, Matter, Paint, Reset, Save, Step, Wave, parse
-from dittogym.play.session import FLAGS, Session
 from dittogym.render.replay import encode
 
 SMALL = {"particles": 200, "substeps": 10}
@@ -50,8 +50,8 @@ def shown(played: Session) -> SimpleNamespace:
     result.flags = {name for bit, name in enumerate(FLAGS) if flags >> bit & 1}
     shapes = {
         "rows": ("<f4", (rows, width)),
-        "positions": ("<u2", (count, 2)),
-        "colours": ("u1", (count,)),
+        "positions": ("<f4", (count, 2)),
+        "codes": ("u1", (count,)),
         "observation": ("u1", (3, 64, 64)),
         "action": ("i1", (2, resolution, resolution)),
         "gate": ("u1", (2, gate, gate)),
@@ -75,9 +75,8 @@ def test_every_task_can_be_played(task: str) -> None:
         played.advance()
     frame, state = shown(played), played.env.env_state
     assert frame.step == 2 and "playing" in frame.flags and len(frame.rows) == 2
-    assert frame.rows[-1, 0] == pytest.approx(frame.numbers[6]) == played.episode.total
-    sent = protocol.LOW + frame.positions / (protocol.HIDDEN - 1) * (protocol.HIGH - protocol.LOW) + frame.numbers[:2]
-    assert np.abs(sent - state.particles.x[0].numpy()).max() < 2e-5
+    assert frame.rows[-1, 0] == pytest.approx(frame.numbers[4]) == played.episode.total
+    assert np.array_equal(frame.positions, state.particles.x[0])
     assert np.array_equal(frame.observation, played.observation[0])
     assert len(shown(played).rows) == 0
 
@@ -100,10 +99,9 @@ def test_pulling_moves_matter_towards_the_pointer() -> None:
         assert played.grip is None
 
 
-@pytest.mark.parametrize("parity", ["clean", "reference"])
-def test_muscles_under_the_pointer(parity: str) -> None:
+def test_muscles_under_the_pointer() -> None:
     """The action has its largest value in the cell that holds the pointer, and acts there."""
-    played = session(resolution=16, parity=parity)
+    played = session(resolution=16)
     corner, cell = played._corner(), 0.5 / 16
     for tool, sign in (("contract", 1), ("expand", -1)):
         played.apply(Hand(tool, corner[0] + 5.5 * cell, corner[1] + 0.5 - 7.5 * cell))
@@ -113,8 +111,6 @@ def test_muscles_under_the_pointer(parity: str) -> None:
         assert np.unravel_index(action[0].argmax(), (16, 16)) == (7, 5) and action.max() == pytest.approx(1, abs=0.1)
         at = (played.shot.x[:, 0] - played.hand.x) ** 2 + (played.shot.x[:, 1] - played.hand.y) ** 2
         assert np.abs(played.shot.values["muscle"][at < 0.01**2] - 127.5).min() > 100
-    near = press(np.array((0.1, 0.2)), np.zeros(2), 0.5, 8)
-    assert near.shape == (2, 8, 8) and near.max() <= 1
 
 
 def test_paint_waves_and_policy_add_up() -> None:
@@ -133,9 +129,9 @@ def test_paint_waves_and_policy_add_up() -> None:
         np.clip(wave("up", 1, 4) + Constant().predict(np.zeros((1, 3, 64, 64)), None, None, True)[0][0], -1, 1),
     )
     assert played.episode.memory[0][0] == 2
-    with pytest.raises(ValueError, match="cells must be rows and columns below 4"):
+    with pytest.raises(ValueError, match="cells must"):
         played.apply(Paint("both", 1.0, [[4, 0]]))
-    with pytest.raises(ValueError, match="name must be one of constant, got '/etc/passwd'"):
+    with pytest.raises(ValueError, match="name must"):
         played.apply(protocol.Policy("/etc/passwd"))
     played.apply(protocol.Policy(None))
     assert played.env.action_resolution == make_spec("run").coarse
@@ -182,7 +178,7 @@ def test_matter_changes_while_it_moves_and_stays_after_a_reset() -> None:
     played.apply(Matter(stiffness=2.0, yield_stress=1.0, gravity=9.0))
     played.apply(Reset())
     assert played.episode.touched == ["other matter or gravity"]
-    with pytest.raises(ValueError, match="dt must be at most"):
+    with pytest.raises(ValueError, match="dt must"):
         played.apply(Matter(stiffness=1e4, yield_stress=1.0, gravity=9.0))
     played.advance()
 
@@ -208,7 +204,7 @@ def test_saved_actions_repeat_an_episode() -> None:
 
 def test_moments() -> None:
     played = session()
-    with pytest.raises(ValueError, match="save one first"):
+    with pytest.raises(ValueError, match="moment"):
         played.apply(protocol.Back())
     played.advance()
     (answer,) = played.apply(Save("moment"))
@@ -226,29 +222,22 @@ def test_moments() -> None:
     assert torch.equal(env.state.x, then)
 
 
-def test_going_back_restores_success_and_failure() -> None:
-    played = session()
+def test_going_back_restores_the_outcome_and_the_memory_of_the_same_policy() -> None:
+    played = session(policies={"constant": Constant}, policy="constant")
     played.advance()
     played.episode.success = played.episode.invalid = True
     played.apply(Save("moment"))
     played.apply(Reset())
-    assert not played.episode.success and not played.episode.invalid
+    played.advance()
+    played.advance()
+    assert not played.episode.success and not played.episode.invalid and played.episode.memory[0][0] == 2
     played.apply(protocol.Back())
     played.apply(protocol.Play(True))
     assert played.episode.success and played.episode.invalid and not played.playing
-
-
-def test_going_back_restores_the_memory_of_the_same_policy() -> None:
-    played = session(policies={"constant": Constant})
-    played.apply(protocol.Policy("constant"))
-    played.advance()
-    played.apply(Save("moment"))
-    played.advance()
-    played.apply(protocol.Back())
     assert played.episode.memory[0][0] == 1
     played.apply(protocol.Policy("constant"))
     played.apply(protocol.Back())
-    assert played.episode.memory is None
+    assert played.episode.memory is None  # of another policy
 
 
 def test_a_policy_as_stable_baselines3_has_it() -> None:
@@ -264,11 +253,6 @@ def test_a_policy_as_stable_baselines3_has_it() -> None:
     assert (played.episode.actions[-1] == 0.5).all()
 
 
-def test_the_reach_of_the_hand_follows_the_resolution() -> None:
-    fine, coarse = (session(resolution=size).describe()["reach"] for size in (32, 8))
-    assert fine == {"pull": REACH, "muscles": MUSCLE_REACH} and coarse["muscles"] == pytest.approx(0.6 * 0.5 / 8)
-
-
 def test_going_back_to_a_moment_of_other_matter_is_told() -> None:
     played = session()
     played.advance()
@@ -277,16 +261,6 @@ def test_going_back_to_a_moment_of_other_matter_is_told() -> None:
     assert played.apply(protocol.Back()) == [{"type": "reset"}]
     assert played.episode.touched == ["other matter or gravity"]
     assert played.describe()["saved"] and not session().describe()["saved"]
-
-
-def test_a_policy_that_cannot_act_changes_nothing() -> None:
-    broken = Constant(resolution=4)
-    broken.attached = lambda env: int("no")
-    played = session(policies={"broken": lambda: broken})
-    env = played.env
-    with pytest.raises(ValueError, match="invalid literal"):
-        played.apply(protocol.Policy("broken"))
-    assert played.env is env and played.policy is None and played.painted.shape == env.action_shape
 
 
 def test_a_drawing_with_which_the_policy_cannot_act_changes_nothing() -> None:
@@ -353,9 +327,9 @@ def test_drawings() -> None:
     width, height = np.ptp(played.env.state.x[0].numpy(), axis=0)
     assert width / height == pytest.approx(2.0, rel=0.1) and played.env.spec.target[32, 32]
     before = played.env
-    with pytest.raises(ValueError, match="body must be a picture"):
+    with pytest.raises(ValueError, match="body must"):
         played.apply(drawing(np.zeros((64, 64)), "body"))
-    with pytest.raises(ValueError, match="robot must lie inside the window"):
+    with pytest.raises(ValueError, match="robot must"):
         session().apply(drawing(abs(y) < 2, "body"))
     assert played.env is before
     answers = played.apply(drawing(np.hypot(abs(x) - 30, y) < 20, "target"))  # two discs
@@ -406,45 +380,39 @@ GOOD = [
     '{"type": "reset"}',
     '{"type": "paint", "muscles": "both", "value": 1, "cells": [[0, 3]]}',
 ]
+#: What is wrong, and a word of the answer.
 BAD = {
     "": "truncated",
-    "[" * 100_000: "Expected `object`, got `array`",
-    "{}": "missing required field `type`",
-    '{"type": ["play"]}': "Expected `str` - at `$.type`",
-    '{"type": "message"}': "Invalid value 'message' - at `$.type`",
-    '{"type": "play"}': "missing required field `playing`",
-    '{"type": "play", "playing": 1}': "Expected `bool`, got `int` - at `$.playing`",
-    '{"type": "step", "count": 9}': "unknown field `count`",
-    '{"type": "speed", "factor": 1e99}': "Expected `float` <= 16.0 - at `$.factor`",
-    '{"type": "speed", "factor": NaN}': "invalid character",
-    '{"type": "hand", "tool": "bite"}': "Invalid enum value 'bite' - at `$.tool`",
-    '{"type": "hand", "tool": "pull", "x": "0"}': "Expected `float`, got `str` - at `$.x`",
-    '{"type": "hand", "tool": "pull", "x": 1e999}': "Number out of range - at `$.x`",
-    '{"type": "hand", "tool": "pull", "y": 1e39}': "Expected `float` <= 10000.0 - at `$.y`",
-    '{"type": "hand", "tool": "pull", "id": -1}': "Expected `int` >= 0 - at `$.id`",
-    '{"type": "reset", "seed": 1.5}': "Expected `int | null`, got `float` - at `$.seed`",
-    '{"type": "paint", "muscles": "both", "value": 1, "cells": []}': "length >= 1 - at `$.cells`",
-    '{"type": "paint", "muscles": "both", "value": 1, "cells": [[0]]}': "length 2 - at `$.cells[0]`",
-    '{"type": "paint", "muscles": "both", "value": 1, "cells": [[-1, 0]]}': "`int` >= 0 - at `$.cells[0][0]`",
-    '{"type": "policy", "name": 3}': "Expected `str | null`, got `int`",
-    '{"type": "matter", "stiffness": 0, "yield_stress": 1, "gravity": 9}': "Expected `float` > 0.0 - at `$.stiffness`",
-    '{"type": "save", "what": "../../x"}': "Invalid enum value '../../x' - at `$.what`",
-    '{"type": "draw", "what": "body", "pixels": "!"}': "Invalid base64 encoded string - at `$.pixels`",
-    '{"type": "draw", "what": "body", "pixels": "AAAA"}': "Expected `bytes` of length >= 64 - at `$.pixels`",
-    '{"type": "seen", "frame": true}': "Expected `int`, got `bool` - at `$.frame`",
+    "[" * 100_000: "object",
+    "{}": "type",
+    '{"type": "message"}': "type",
+    '{"type": "play"}': "playing",
+    '{"type": "play", "playing": 1}': "playing",
+    '{"type": "step", "count": 9}': "count",
+    '{"type": "speed", "factor": 1e99}': "factor",
+    '{"type": "speed", "factor": NaN}': "invalid",
+    '{"type": "hand", "tool": "bite"}': "tool",
+    '{"type": "hand", "tool": "pull", "x": 1e999}': "x",
+    '{"type": "hand", "tool": "pull", "y": 1e39}': "y",
+    '{"type": "reset", "seed": -1}': "seed",
+    '{"type": "paint", "muscles": "both", "value": 1, "cells": [[0]]}': "cells",
+    '{"type": "matter", "stiffness": 0, "yield_stress": 1, "gravity": 9}': "stiffness",
+    '{"type": "save", "what": "../../x"}': "what",
+    '{"type": "draw", "what": "body", "pixels": "!"}': "pixels",
+    '{"type": "draw", "what": "body", "pixels": "AAAA"}': "pixels",
 }
 
 
-@pytest.mark.parametrize("text", GOOD)
-def test_messages(text: str) -> None:
-    message = parse(text)
-    for name, value in json.loads(text).items():
-        told = type(message).__name__.lower() if name == "type" else getattr(message, name)
-        assert told == value or [list(cell) for cell in told] == value
+def test_messages() -> None:
+    for text in GOOD:
+        message = parse(text)
+        for name, value in json.loads(text).items():
+            told = type(message).__name__.lower() if name == "type" else getattr(message, name)
+            assert told == value or [list(cell) for cell in told] == value
 
 
 @pytest.mark.parametrize("text", BAD, ids=range(len(BAD)))
 def test_malformed_messages(text: str) -> None:
-    with pytest.raises(ValueError) as caught:
+    with pytest.raises(ValueError, match=BAD[text]) as caught:
         parse(text)
-    assert BAD[text] in str(caught.value) and len(str(caught.value)) < 300
+    assert len(str(caught.value)) < 300

@@ -16,21 +16,21 @@ from typing import Any
 import torch
 import uvicorn
 from starlette.applications import Starlette
-from starlette.datastructures import Headers, MutableHeaders, QueryParams
+from starlette.datastructures import Headers, QueryParams
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
-from starlette.routing import Mount, Route, WebSocketRoute
-from starlette.staticfiles import StaticFiles
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from dittogym.play import protocol
-from dittogym.play.session import Answers, Session
+from cfp.play import protocol
+from cfp.play.session import Answers, Session
+from dittogym.render.replay import SCENE
 from torchmpm import checks
 
-PAGE = Path(__file__).parent / "page"
+#: The files of the page by name.
+FILES = {path.name: path for path in (*(Path(__file__).parent / "page").iterdir(), SCENE)}
 HOSTS = ["127.0.0.1", "localhost"]
 #: Frames a second, and frames that may be on their way to a page.
 FRAMES_PER_SECOND, IN_FLIGHT = 60, 3
@@ -65,15 +65,9 @@ class Server:
     def __init__(self, new_session: Callable[[], Session], token: str, port: int) -> None:
         self.new_session, self.token = new_session, token
         self.connections: set[Connection] = set()
-        app = Starlette(
-            routes=[
-                Route("/", self.page),
-                WebSocketRoute("/ws", self.play),
-                Mount("/page", StaticFiles(directory=PAGE)),
-            ],
-            # Not under other names of this machine.
-            middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS), Middleware(WithHeaders)],
-        )
+        routes = [Route("/", self.page), Route("/page/{name}", self.file), WebSocketRoute("/ws", self.play)]
+        # Not under other names of this machine.
+        app = Starlette(routes=routes, middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS)])
         self._socket = socket.create_server((HOSTS[0], checks.whole("port", port, 0, 65535)))
         self.port: int = self._socket.getsockname()[1]
         options: dict[str, Any] = {"log_level": "warning", "ws_max_size": protocol.LARGEST_MESSAGE, "lifespan": "off"}
@@ -97,7 +91,13 @@ class Server:
         """Serve the page."""
         if not has_token(request.query_params, self.token):
             return PlainTextResponse("Open the address that the program printed; it ends in a token.", 403)
-        return FileResponse(PAGE / "index.html")
+        return FileResponse(FILES["index.html"], headers=HEADERS)
+
+    async def file(self, request: Request) -> Response:
+        """Serve what the page loads."""
+        if (path := FILES.get(request.path_params["name"])) is None:
+            return PlainTextResponse("There is no such file.", 404)
+        return FileResponse(path, headers=HEADERS)
 
     async def play(self, websocket: WebSocket) -> None:
         """Play with a page until it is closed."""
@@ -116,23 +116,6 @@ class Server:
             await connection.run(self.new_session)
         finally:
             self.connections.discard(connection)
-
-
-class WithHeaders:
-    """Middleware that adds :data:`HEADERS` to all responses."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request."""
-
-        async def send_with_headers(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(HEADERS)
-            await send(message)
-
-        await self.app(scope, receive, send_with_headers)
 
 
 def has_token(query: QueryParams, token: str) -> bool:
