@@ -142,10 +142,9 @@ class Connection:
         # Torch's threads belong to the thread that calls it. One robot gains nothing from several, and the browser
         # needs the other cores.
         executor = ThreadPoolExecutor(1, "play", torch.set_num_threads, (1,))
-        simulation = asyncio.create_task(self.simulate(new_session, executor))
-        reader = asyncio.create_task(self.read())
+        tasks = [asyncio.create_task(self.simulate(new_session, executor)), asyncio.create_task(self.read())]
         try:
-            done, _ = await asyncio.wait((simulation, reader), return_when=asyncio.FIRST_COMPLETED)
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 task.result()
         except WebSocketDisconnect:
@@ -154,9 +153,9 @@ class Connection:
             log.exception("the simulation of a page has failed")
             await self.websocket.close(1011)
         finally:
-            simulation.cancel()
-            reader.cancel()
-            await asyncio.gather(simulation, reader, return_exceptions=True)
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
             executor.shutdown(wait=False, cancel_futures=True)
 
     async def read(self) -> None:
@@ -183,8 +182,9 @@ class Connection:
         loop = asyncio.get_running_loop()
         session = await loop.run_in_executor(executor, new_session)
         await self.websocket.send_json({"type": "hello", **session.describe()})
-        terms, pace, fresh = list(session.terms), Pace(session.control_step), True
+        terms, pace = list(session.terms), Pace(session.control_step)
         while True:
+            start = time.perf_counter()
             messages, self.inbox = self.inbox, []
             due = pace.due(session.speed if session.playing else 0.0)
             answers, taken = await loop.run_in_executor(executor, work, session, messages, due)
@@ -194,33 +194,26 @@ class Connection:
             if terms != list(session.terms):
                 terms = list(session.terms)
                 await self.websocket.send_json({"type": "terms", "names": terms})
-            if taken or messages or answers or fresh:
-                fresh = False
+            if taken or messages or answers or not self.sent:
                 await self.websocket.send_bytes(session.frame(pace.rate))
                 self.sent += 1
-            await self.wait(session.playing, pace)
-
-    async def wait(self, playing: bool, pace: Pace) -> None:
-        """Wait for the next frame, for a page that lags behind, and while time is stopped for a message."""
-        await asyncio.sleep(pace.left())
-        while self.sent - self.seen >= IN_FLIGHT or (not playing and not self.inbox):
-            self.news.clear()
-            await self.news.wait()
-            if not playing:
-                pace.restart()
+            await asyncio.sleep(max(0.0, start + 1 / FRAMES_PER_SECOND - time.perf_counter()))
+            # For a page that lags behind, and while time is stopped for a message.
+            while self.sent - self.seen >= IN_FLIGHT or (not session.playing and not self.inbox):
+                self.news.clear()
+                await self.news.wait()
 
 
 class Pace:
-    """Turns passing time into control steps that are due."""
+    """Turns passing time into control steps that are due, and measures how fast they are taken.
+
+    Attributes:
+        rate: Simulated seconds per second.
+    """
 
     def __init__(self, control_step: float) -> None:
-        self.control_step, self.rate, self._owed = control_step, 0.0, 0.0
-        self._taken, self._since = 0, time.perf_counter()
-        self.restart()
-
-    def restart(self) -> None:
-        """Forget the time in which nothing could happen."""
-        self._last = self._tick = time.perf_counter()
+        self.control_step, self.rate, self._owed, self._taken = control_step, 0.0, 0.0, 0
+        self._last = self._since = time.perf_counter()
 
     def due(self, speed: float) -> int:
         """Control steps that are due at so many simulated seconds per second; what cannot be caught up is dropped."""
@@ -237,11 +230,6 @@ class Pace:
         if (passed := time.perf_counter() - self._since) > AVERAGED:
             self.rate = self._taken * self.control_step / passed
             self._taken, self._since = 0, time.perf_counter()
-
-    def left(self) -> float:
-        """Seconds until the next frame."""
-        self._tick = max(self._tick + 1 / FRAMES_PER_SECOND, time.perf_counter() - 1 / FRAMES_PER_SECOND)
-        return max(0.0, self._tick - time.perf_counter())
 
 
 def work(session: Session, messages: list[protocol.Message], due: int) -> tuple[Answers, int]:

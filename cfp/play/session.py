@@ -204,22 +204,21 @@ class Session:
         episode.recording.success = episode.success if "is_success" in info else None
 
     def frame(self, rate: float) -> bytes:
-        """The present moment for the page, at ``rate`` simulated seconds per second; see `protocol.pack_frame`."""
+        """The present moment for the page, at ``rate`` simulated seconds per second; see :data:`protocol.HEAD`."""
         self.num_frames, shot = self.num_frames + 1, self.shot
         flags = sum(getattr(self if name == "playing" else self.episode, name) << bit for bit, name in enumerate(FLAGS))
+        rows = np.array(self.rows, np.float32).reshape(len(self.rows), 1 + len(self.terms))
+        self.rows.clear()
         codes = np.full(len(shot.x), 127, np.uint8)
         own = shot.values.get(self.colour, codes)
         codes[: len(own)] = own
-        images = (
-            self.observation[0].cpu().numpy(),
-            (127 * self.action).round().astype(np.int8),
-            (255 * np.clip(self.gate, 0, 1)).round().astype(np.uint8),
-        )
-        rows = np.array(self.rows, np.float32).reshape(len(self.rows), 1 + len(self.terms))
-        self.rows.clear()
-        counters = self.num_frames, shot.step, self.hand.id, flags
-        numbers = (*shot.centre, *self._corner(), self.episode.total, rate)
-        return protocol.pack_frame(counters, numbers, rows, (shot.x, codes, *images))
+        observation, action = self.observation[0].cpu().numpy(), (127 * self.action).round().astype(np.int8)
+        gate = (255 * np.clip(self.gate, 0, 1)).round().astype(np.uint8)
+        counters = (self.num_frames, shot.step, self.hand.id, flags)
+        sizes = (*rows.shape, len(shot.x), action.shape[-1], gate.shape[-1])
+        head = protocol.HEAD.pack(*counters, *sizes, *shot.centre, *self._corner(), self.episode.total, rate)
+        arrays = (rows, shot.x, codes, observation, action, gate)
+        return b"".join((head, *(array.tobytes() for array in arrays)))
 
     def _reset(self, seed: int) -> None:
         self.observation, self.seed = self.env.reset(seed=seed, options={"physics": self.physics})[0], seed
