@@ -42,8 +42,8 @@ Answers = list[dict[str, Any]]
 
 
 @dataclass
-class Episode:
-    """What happened since the last reset."""
+class History:
+    """What has happened since the last reset."""
 
     seed: int  # Of the particles
     recording: Recording
@@ -56,7 +56,7 @@ class Episode:
     invalid: bool = False
     memory: Any = None  # Of the policy
 
-    def copy(self) -> Episode:
+    def copy(self) -> History:
         """The same, with lists that do not grow with those of an episode that goes on."""
         shots, rewards = self.recording.shots.copy(), self.recording.rewards.copy()
         recording = replace(self.recording, shots=shots, rewards=rewards)
@@ -83,14 +83,14 @@ class Session:
         TypeError: The task has no such option.
     """
 
-    episode: Episode
+    history: History
     shot: Shot
     grip: Grip | None
     terms: Mapping[str, Tensor]
     direction: Direction | None = None
     policy: Any = None
     policy_name: str | None = None
-    saved: tuple[Snapshot, Episode] | None = None
+    saved: tuple[Snapshot, History] | None = None
 
     def __init__(
         self,
@@ -143,7 +143,7 @@ class Session:
         """
         match message:
             case protocol.Play():
-                self.playing = message.playing and not self.episode.invalid
+                self.playing = message.playing and not self.history.invalid
             case protocol.Speed():
                 self.speed = message.factor
             case protocol.Step():
@@ -179,8 +179,8 @@ class Session:
         Raises:
             Exception: What a task or a policy of the user's does wrong; time is stopped.
         """
-        episode = self.episode
-        if episode.invalid:
+        history = self.history
+        if history.invalid:
             return
         playing, self.playing = self.playing, False  # until it has worked
         self.action = self._next_action()
@@ -188,25 +188,25 @@ class Session:
         with torch.no_grad():
             self.observation, reward, terminated, truncated, info = self.env.step(torch.from_numpy(self.action)[None])
         self.num_steps, self.terms = self.num_steps + 1, info["reward_terms"]
-        earned = 0.0 if episode.terminated or episode.truncated else float(reward[0])
-        episode.total += earned
-        self.rows.append([episode.total, *(float(term[0]) for term in self.terms.values())])
-        episode.terminated |= bool(terminated[0])
-        episode.truncated |= bool(truncated[0])
-        episode.success = "is_success" in info and bool(info["is_success"][0])
-        episode.invalid = not bool(info["finite"][0])
-        self.playing, self.shot = playing and not episode.invalid, self.env.shot()
-        if len(episode.actions) == LONGEST:
-            return episode.note(f"only the first {LONGEST} steps are kept")
-        episode.actions.append(self.action)
-        episode.recording.shots.append(self.shot)
-        episode.recording.rewards.append(earned)
-        episode.recording.success = episode.success if "is_success" in info else None
+        earned = 0.0 if history.terminated or history.truncated else float(reward[0])
+        history.total += earned
+        self.rows.append([history.total, *(float(term[0]) for term in self.terms.values())])
+        history.terminated |= bool(terminated[0])
+        history.truncated |= bool(truncated[0])
+        history.success = "is_success" in info and bool(info["is_success"][0])
+        history.invalid = not bool(info["finite"][0])
+        self.playing, self.shot = playing and not history.invalid, self.env.shot()
+        if len(history.actions) == LONGEST:
+            return history.note(f"only the first {LONGEST} steps are kept")
+        history.actions.append(self.action)
+        history.recording.shots.append(self.shot)
+        history.recording.rewards.append(earned)
+        history.recording.success = history.success if "is_success" in info else None
 
     def frame(self, rate: float) -> bytes:
         """The present moment for the page, at ``rate`` simulated seconds per second; see :data:`protocol.HEAD`."""
         self.num_frames, shot = self.num_frames + 1, self.shot
-        flags = sum(getattr(self if name == "playing" else self.episode, name) << bit for bit, name in enumerate(FLAGS))
+        flags = sum(getattr(self if name == "playing" else self.history, name) << bit for bit, name in enumerate(FLAGS))
         rows = np.array(self.rows, np.float32).reshape(len(self.rows), 1 + len(self.terms))
         self.rows.clear()
         codes = np.full(len(shot.x), 127, np.uint8)
@@ -216,7 +216,7 @@ class Session:
         gate = (255 * np.clip(self.gate, 0, 1)).round().astype(np.uint8)
         counters = (self.num_frames, shot.step, self.hand.id, flags)
         sizes = (*rows.shape, len(shot.x), action.shape[-1], gate.shape[-1])
-        head = protocol.HEAD.pack(*counters, *sizes, *shot.centre, *self._corner(), self.episode.total, rate)
+        head = protocol.HEAD.pack(*counters, *sizes, *shot.centre, *self._corner(), self.history.total, rate)
         arrays = (rows, shot.x, codes, observation, action, gate)
         return b"".join((head, *(array.tobytes() for array in arrays)))
 
@@ -229,7 +229,7 @@ class Session:
         self.shot = self.env.shot()
         drawn = [name for name, value in self.options.items() if isinstance(value, np.ndarray)]
         touched = [CHANGED_MATTER] * bool(self.physics) + [f"a drawn {name}" for name in drawn]
-        self.episode = Episode(seed, Recording(describe(self.env.model), [self.shot]), touched)
+        self.history = History(seed, Recording(describe(self.env.model), [self.shot]), touched)
 
     def _next_action(self) -> np.ndarray:
         """What policy, paint, waves and hand add up to, float32 (2, R, R) in [-1, 1]."""
@@ -251,8 +251,8 @@ class Session:
             chosen, gate = policy.predict_with_gate(images, deterministic)
             self.gate = self.gate if gate is None else self._as_image(gate)[0]
         else:
-            episode, start = self.episode, np.array([not self.episode.actions])
-            chosen, episode.memory = policy.predict(images, episode.memory, start, deterministic)
+            history, start = self.history, np.array([not self.history.actions])
+            chosen, history.memory = policy.predict(images, history.memory, start, deterministic)
         return self._as_image(chosen)[0]
 
     def _as_image(self, array: np.ndarray) -> np.ndarray:
@@ -269,7 +269,7 @@ class Session:
         self.grip = self.grip or Grip.take(state.particles, point)
         if self.grip is not None:
             self.env.env_state = replace(state, particles=self.grip.pull(state.particles, point))
-            self.episode.note("pulled by hand")
+            self.history.note("pulled by hand")
 
     def _corner(self) -> np.ndarray:
         """Lower left corner (2,) of the action image in the world, m."""
@@ -301,8 +301,8 @@ class Session:
             self.env = env
             self.action = self.painted = np.zeros(env.action_shape, np.float32)
         self.policy_name, self.gate = name, np.zeros((2, 0, 0), np.float32)
-        for episode in (self.episode, *(self.saved or ())[1:]):
-            episode.memory = None  # it belongs to the policy before
+        for history in (self.history, *(self.saved or ())[1:]):
+            history.memory = None  # it belongs to the policy before
         return [{"type": "policy", "name": name, "reach": reach(self.env.spec.patch / NODES, resolution)}]
 
     def _change_matter(self, message: protocol.Matter) -> None:
@@ -318,38 +318,38 @@ class Session:
         check_effect(spec, values)
         check_stability(self.env.model, values)
         if physics != self.physics:
-            self.episode.note(CHANGED_MATTER)
+            self.history.note(CHANGED_MATTER)
         self.physics, self.env.env_state = physics, replace(state, physics=values)
 
     def _save(self, what: str) -> Answers:
-        file, name, episode = io.BytesIO(), f"{self.env.spec.name}-{self.shot.step}", self.episode
+        file, name, history = io.BytesIO(), f"{self.env.spec.name}-{self.shot.step}", self.history
         if what == "moment":
-            name, self.saved = f"{name}.pt", (self.env.save(), episode.copy())
+            name, self.saved = f"{name}.pt", (self.env.save(), history.copy())
             torch.save(self.saved[0], file)
-        elif not episode.actions:
+        elif not history.actions:
             raise ValueError(f"{what} must be of at least one step, got none since the reset")
         elif what == "actions":
-            name, actions = f"{name}-actions.npz", episode.actions
+            name, actions = f"{name}-actions.npz", history.actions
             if len({action.shape for action in actions}) > 1:  # as executed, on the patch
                 actions = [bicubic(torch.from_numpy(each), self.env.spec.patch).numpy() for each in actions]
-            touched = np.array(episode.touched, str)
-            np.savez_compressed(file, actions=np.stack(actions), seed=episode.seed, touched=touched)
+            touched = np.array(history.touched, str)
+            np.savez_compressed(file, actions=np.stack(actions), seed=history.seed, touched=touched)
         else:
             name += ".html"
-            file.write(episode.recording.page().encode())
+            file.write(history.recording.page().encode())
         return [{"type": "file", "name": name, "content": base64.b64encode(file.getvalue()).decode()}]
 
     def _go_back(self) -> Answers:
         if self.saved is None:
             raise ValueError("there is no moment to go back to: save one first")
-        snapshot, episode = self.saved
-        self.episode, self.seed = episode.copy(), episode.seed  # what came after it did not happen
+        snapshot, history = self.saved
+        self.history, self.seed = history.copy(), history.seed  # what came after it did not happen
         self.observation, state = self.env.load(snapshot), self.env.env_state
         values, then = physics_values(self.physics, self.env.num_particles, state.centre[:, 0]), state.physics
         self.env.env_state = replace(state, physics=values)
         self.grip, self.shot = None, self.env.shot()
         if values.keys() != then.keys() or not all(torch.equal(values[name], then[name]) for name in values):
-            self.episode.note(CHANGED_MATTER)
+            self.history.note(CHANGED_MATTER)
         return [{"type": "reset"}]
 
     def _draw(self, message: protocol.Draw) -> Answers:

@@ -110,10 +110,10 @@ def test_keys_and_brush(played: Played) -> None:
     played.until(lambda: int(session.env.env_state.steps[0]) == 0 and not session.painted.any())
     page.keyboard.down("ArrowRight")
     page.keyboard.press(".")
-    played.until(lambda: session.direction == "right" and len(session.episode.actions) == 1)
+    played.until(lambda: session.direction == "right" and len(session.history.actions) == 1)
     page.keyboard.up("ArrowRight")
     played.until(lambda: session.direction is None)
-    assert session.episode.actions[0].any() and page.input_value("#colour") == "muscle"
+    assert session.history.actions[0].any() and page.input_value("#colour") == "muscle"
 
 
 def test_sliders_and_files(played: Played) -> None:

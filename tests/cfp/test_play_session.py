@@ -80,7 +80,7 @@ def test_every_task_can_be_played(task: str) -> None:
         played.advance()
     frame, state = shown(played), played.env.env_state
     assert frame.step == 2 and "playing" in frame.flags and len(frame.rows) == 2
-    assert frame.rows[-1, 0] == pytest.approx(frame.numbers[4]) == played.episode.total
+    assert frame.rows[-1, 0] == pytest.approx(frame.numbers[4]) == played.history.total
     assert np.array_equal(frame.positions, state.particles.x[0])
     assert np.array_equal(frame.observation, played.observation[0])
     assert len(shown(played).rows) == 0
@@ -111,7 +111,7 @@ def test_muscles_under_the_pointer() -> None:
     for tool, sign in (("contract", 1), ("expand", -1)):
         played.apply(Hand(tool, corner[0] + 5.5 * cell, corner[1] + 0.5 - 7.5 * cell))
         played.advance()
-        action = sign * played.episode.actions[-1]
+        action = sign * played.history.actions[-1]
         corner = played._corner()
         assert np.unravel_index(action[0].argmax(), (16, 16)) == (7, 5) and action.max() == pytest.approx(1, abs=0.1)
         at = (played.shot.x[:, 0] - played.hand.x) ** 2 + (played.shot.x[:, 1] - played.hand.y) ** 2
@@ -124,13 +124,13 @@ def test_paint_waves_and_policy_add_up() -> None:
     played.advance()
     expected = np.zeros((2, 4, 4))
     expected[0, 0], expected[1, 3, :2] = 0.5, -1.0
-    assert np.array_equal(played.episode.actions[-1], expected)
+    assert np.array_equal(played.history.actions[-1], expected)
     played.apply(protocol.Clear())
     played.apply(Wave("up"))
     played.advance()
     expected[1] = 0.0
-    assert np.allclose(played.episode.actions[-1], np.clip(wave("up", 1, 4) + expected, -1, 1))
-    assert played.episode.memory[0][0] == 2
+    assert np.allclose(played.history.actions[-1], np.clip(wave("up", 1, 4) + expected, -1, 1))
+    assert played.history.memory[0][0] == 2
     with pytest.raises(ValueError, match="cells must"):
         played.apply(Paint("both", 1.0, [[4, 0]]))
 
@@ -158,7 +158,7 @@ def test_policies_with_other_orientations_and_gates() -> None:
     turned = Constant(description={"environment": {"action_layout": "grid"}})
     played = session(policies={"turned": lambda: turned}, policy="turned")
     played.advance()
-    assert (played.episode.actions[-1][0, :, 0] == 0.5).all() and played.episode.actions[-1].sum() == 2.0
+    assert (played.history.actions[-1][0, :, 0] == 0.5).all() and played.history.actions[-1].sum() == 2.0
     fine = ActorPolicy(ActorSpec((8, 16), gate_bias=(0.0,)), deterministic_by_default=True)
     played = session(policies={"fine": lambda: fine}, policy="fine")
     played.advance()
@@ -178,12 +178,12 @@ def test_matter_changes_while_it_moves_and_stays_after_a_reset() -> None:
         }  # fmt: skip
         played.apply(Reset())
     played.apply(Matter(stiffness=1.0, yield_stress=1.0, gravity=9.0))
-    assert played.env.env_state.physics == {} and played.episode.touched
+    assert played.env.env_state.physics == {} and played.history.touched
     played.apply(Reset())
-    assert not played.episode.touched  # nothing but the actions decides about the episode
+    assert not played.history.touched  # nothing but the actions decides about the episode
     played.apply(Matter(stiffness=2.0, yield_stress=1.0, gravity=9.0))
     played.apply(Reset())
-    assert played.episode.touched == ["other matter or gravity"]
+    assert played.history.touched == ["other matter or gravity"]
     with pytest.raises(ValueError, match="dt must"):
         played.apply(Matter(stiffness=1e4, yield_stress=1.0, gravity=9.0))
     played.advance()
@@ -207,19 +207,19 @@ def test_moments() -> None:
 def test_going_back_restores_the_outcome_and_the_memory_of_the_same_policy() -> None:
     played = session(policies={"constant": Constant}, policy="constant")
     played.advance()
-    played.episode.success = played.episode.invalid = True
+    played.history.success = played.history.invalid = True
     played.apply(Save("moment"))
     played.apply(Reset())
     played.advance()
     played.advance()
-    assert not played.episode.success and not played.episode.invalid and played.episode.memory[0][0] == 2
+    assert not played.history.success and not played.history.invalid and played.history.memory[0][0] == 2
     played.apply(protocol.Back())
     played.apply(protocol.Play(True))
-    assert played.episode.success and played.episode.invalid and not played.playing
-    assert played.episode.memory[0][0] == 1
+    assert played.history.success and played.history.invalid and not played.playing
+    assert played.history.memory[0][0] == 1
     played.apply(protocol.Policy("constant"))
     played.apply(protocol.Back())
-    assert played.episode.memory is None  # of another policy
+    assert played.history.memory is None  # of another policy
 
 
 def test_going_back_to_a_moment_of_other_matter_is_told() -> None:
@@ -228,7 +228,7 @@ def test_going_back_to_a_moment_of_other_matter_is_told() -> None:
     played.apply(Save("moment"))
     played.apply(protocol.Matter(stiffness=2, yield_stress=1, gravity=9))
     assert played.apply(protocol.Back()) == [{"type": "reset"}]
-    assert played.episode.touched == ["other matter or gravity"]
+    assert played.history.touched == ["other matter or gravity"]
     assert played.describe()["saved"] and not session().describe()["saved"]
 
 
@@ -248,7 +248,7 @@ def test_a_drawing_with_which_the_policy_cannot_act_changes_nothing() -> None:
         played.apply(protocol.Draw("body", np.full((64, 64), 255, np.uint8).tobytes()))
     assert vars(played) is not before and all(vars(played)[name] is value for name, value in before.items())
     played.advance()
-    assert len(played.episode.actions) == 2 and played.episode.recording.rewards
+    assert len(played.history.actions) == 2 and played.history.recording.rewards
 
 
 def test_files_after_going_back_are_of_what_led_there() -> None:
@@ -259,17 +259,17 @@ def test_files_after_going_back_are_of_what_led_there() -> None:
         for _ in range(3):
             played.advance()
     played.apply(Save("moment"))
-    kept, total = played.episode.actions.copy(), played.episode.total
+    kept, total = played.history.actions.copy(), played.history.total
     for reset in (None, None, Reset(seed=8)):
         if reset is not None:
             played.apply(reset)
         for _ in range(4):
             played.advance()
         played.apply(protocol.Back())
-        assert played.episode.total == pytest.approx(total) == sum(played.episode.recording.rewards)
-        assert [shot.step for shot in played.episode.recording.shots] == list(range(7))
+        assert played.history.total == pytest.approx(total) == sum(played.history.recording.rewards)
+        assert [shot.step for shot in played.history.recording.shots] == list(range(7))
         played.advance()
-        assert played.episode.total == pytest.approx(sum(played.episode.recording.rewards))
+        assert played.history.total == pytest.approx(sum(played.history.recording.rewards))
     assert b'"rewards":[' in saved_file(played, "replay").read()
     saved = np.load(saved_file(played, "actions"))
     assert np.array_equal(saved["actions"][:6], kept) and len(saved["actions"]) == 7 and saved["seed"] == 3
@@ -310,9 +310,9 @@ def test_the_end_of_an_episode_is_told_and_failure_stops_time() -> None:
     for _ in range(31):
         played.advance()
     assert {"truncated", "playing"} <= shown(played).flags
-    total = played.episode.total
+    total = played.history.total
     played.advance()
-    assert played.episode.total == total
+    assert played.history.total == total
     played.env.state.v.fill_(torch.nan)
     played.advance()
     frame = shown(played)
@@ -339,7 +339,7 @@ def test_a_shipped_policy_acts_as_it_does_elsewhere() -> None:
     played = Session("shapematch", {"shapematch": lambda: policy}, "shapematch", particles="lite")
     for _ in range(30):
         played.advance()
-    assert played.episode.success and 350 < played.episode.total < 500
+    assert played.history.success and 350 < played.history.total < 500
 
 
 @pytest.mark.parametrize(
