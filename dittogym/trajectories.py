@@ -17,7 +17,7 @@ import numpy as np
 from dittogym.bodies.positions import MAX_SEED
 from dittogym.env import Env, as_tensor
 from dittogym.files import replacing
-from dittogym.render.recording import Act, as_function, play
+from dittogym.render.recording import as_function, play
 from dittogym.torch_env import TorchEnv
 from torchmpm import checks
 
@@ -56,7 +56,7 @@ class Episode:
     task: str
 
 
-def record(env: Any, policy: Any, *, seed: int = 0, fields: Sequence[str] = ("x", "v")) -> Episode:
+def record(env: Any, policy: Any, seed: int = 0, *, fields: Sequence[str] = ("x", "v")) -> Episode:
     """Reset an environment, play an episode, and record it as arrays.
 
     Args:
@@ -75,24 +75,20 @@ def record(env: Any, policy: Any, *, seed: int = 0, fields: Sequence[str] = ("x"
     torch_env = inner.torch_env if isinstance(inner, Env) else inner
     if not isinstance(torch_env, TorchEnv):
         raise TypeError(f"env must be a TorchEnv or a Gymnasium environment of this package, got {env!r}")
-    act = as_function(policy, torch_env.action_layout)
-    if isinstance(inner, Env):
-        return record_batch(torch_env, lambda images: as_tensor(act(images[0]), torch_env, single=True), seed, fields)
-    return record_batch(torch_env, act, seed, fields)
-
-
-def record_batch(env: TorchEnv, act: Act, seed: int, fields: Sequence[str]) -> Episode:
-    """As :func:`record`, for a batch of one: ``act`` maps observations (1, 3, 64, 64) to actions (1, 2, R, R)."""
-    if env.num_envs != 1:
-        raise ValueError(f"env must have 1 simulation, got {env.num_envs}")
+    if torch_env.num_envs != 1:
+        raise ValueError(f"env must have 1 simulation, got {torch_env.num_envs}")
     if unknown := [name for name in fields if name not in FIELDS]:
         raise ValueError(f"fields must be among {', '.join(FIELDS)}, got {', '.join(unknown)}")
+    choose, single = as_function(policy, torch_env.action_layout), isinstance(inner, Env)
+
+    def act(images: np.ndarray) -> Any:
+        return as_tensor(choose(images[0]), torch_env, single=True) if single else choose(images)
 
     def state() -> list[np.ndarray]:
-        return [getattr(env.state, name)[0].cpu().numpy().copy() for name in fields]
+        return [getattr(torch_env.state, name)[0].cpu().numpy().copy() for name in fields]
 
     observations, actions, ends, states = [], [], [], []
-    for images, chosen, end in play(env, act, seed):
+    for images, chosen, end in play(torch_env, act, seed):
         observations.append(images.copy())
         states.append(state())
         if chosen is not None:
@@ -101,7 +97,7 @@ def record_batch(env: TorchEnv, act: Act, seed: int, fields: Sequence[str]) -> E
     rewards, terminations, truncations = (np.array(values) for values in zip(*ends, strict=True))
     particles = {name: np.stack(values) for name, values in zip(fields, zip(*states, strict=True), strict=True)}
     images, done = np.concatenate(observations), (terminations, truncations)
-    return Episode(images, np.concatenate(actions), rewards, *done, particles, seed, env.spec.name)
+    return Episode(images, np.concatenate(actions), rewards, *done, particles, seed, torch_env.spec.name)
 
 
 def save_episodes(path: str | os.PathLike[str], episodes: Sequence[Episode]) -> Path:
