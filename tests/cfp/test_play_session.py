@@ -146,6 +146,16 @@ def test_a_policy_brings_its_resolution() -> None:
         played.apply(protocol.Policy("/etc/passwd"))
 
 
+def test_a_policy_that_cannot_act_changes_nothing() -> None:
+    broken = Constant()
+    broken.attached = lambda env: int("no")
+    played = session(policies={"broken": lambda: broken})
+    env = played.env
+    with pytest.raises(ValueError, match="invalid literal"):
+        played.apply(protocol.Policy("broken"))
+    assert played.env is env and played.policy is None and played.painted.shape == env.action_shape
+
+
 def test_waves_travel() -> None:
     for direction, axis, sign in (("right", 2, 1), ("left", 2, -1), ("down", 1, 1), ("up", 1, -1)):
         now, later = (wave(direction, step, 64) for step in (0, 5))  # phase 1.5
