@@ -5,9 +5,7 @@ export class Scene {
   // ``labels``: the ground has a number at every so many tenths of a metre.
   constructor(canvas, labels = 5) {
     Object.assign(this, { canvas, labels, context: canvas.getContext("2d"), discs: new Discs() });
-    const restyle = () => { this.style = getComputedStyle(document.documentElement); };
-    restyle();
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", restyle);
+    this.style = getComputedStyle(document.documentElement);  // follows changes
     new ResizeObserver(() => { this.resize(); this.redraw?.(); }).observe(canvas);
   }
 
