@@ -77,7 +77,7 @@ env.unwrapped.film(policy, "[[ spec.name ]].webp")
 ```
 
 ```bash
-python -m dittogym.play [[ spec.name ]] --policy [[ spec.name ]]   # in the browser
+python -m cfp.play [[ spec.name ]] --policy [[ spec.name ]]   # in the browser
 python -m cfp.train --task [[ spec.name ]] --out runs/[[ spec.name ]]
 ```
 

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from cfp.agent.actor import Actor
 from dittogym.observation.image import silhouette
-from dittogym.render.canvas import GROUND, TARGET
-from dittogym.render.colours import ROBOT
+from dittogym.render.frame import GROUND, TARGET
+from dittogym.render.scene import ROBOT
 
 #: Pictures of every evaluation (TensorBoard only), and what they show.
 PICTURES: dict[str, str] = {

@@ -13,7 +13,7 @@ import dittogym
 import torchmpm
 from dittogym import TorchEnv
 from dittogym.physics import NAMES
-from dittogym.render.colours import CONTRACT
+from dittogym.render.scene import CONTRACT
 
 DT = 1e-4
 OWN = {name: getattr(dittogym.make_spec("kick"), name) for name in NAMES if name != "mass"} | {"mass": 1.0}
