@@ -16,7 +16,7 @@ import tyro
 from dittogym.tasks import check_task
 
 #: Options of its training that a policy plays with, too, unless the command line says otherwise.
-FROM_POLICY = ("dt", "substeps", "dtype", "parity", "target", "variant")
+FROM_POLICY = ("dt", "substeps", "dtype", "target", "variant")
 
 #: Options that the help shows.
 EXAMPLES = ("run", "--policy runs/kick", "shapematch --target M --particles 1000", "run --body robot.png")

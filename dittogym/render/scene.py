@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from dittogym.geometry import Box
-from dittogym.model import EnvState, Model
-from dittogym.observation.image import SIZE
+from dittogym.core import EnvState, Model
+from dittogym.geometry import Box, centre_in_window
+from dittogym.observation import SIZE
 from dittogym.render.colours import (
     GROUND_BODY,
     OBJECT,
@@ -25,7 +25,6 @@ from dittogym.render.colours import (
     speed,
 )
 from dittogym.spec import TaskSpec
-from dittogym.window import centre_in_window
 from torchmpm import Snow, checks
 
 #: Names of all quantities of particles.

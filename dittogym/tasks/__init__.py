@@ -13,7 +13,7 @@ from typing import Any
 
 from dittogym.bodies.drawings import BodyLike, with_body
 from dittogym.bodies.json_values import from_values
-from dittogym.bodies.place import check_place
+from dittogym.bodies.positions import check_place
 from dittogym.geometry import Obstacle
 from dittogym.spec import TaskSpec
 from dittogym.tasks.catch import catch

@@ -100,10 +100,9 @@ def test_pulling_moves_matter_towards_the_pointer() -> None:
         assert played.grip is None
 
 
-@pytest.mark.parametrize("parity", ["clean", "reference"])
-def test_muscles_under_the_pointer(parity: str) -> None:
+def test_muscles_under_the_pointer() -> None:
     """The action has its largest value in the cell that holds the pointer, and acts there."""
-    played = session(resolution=16, parity=parity)
+    played = session(resolution=16)
     corner, cell = played._corner(), 0.5 / 16
     for tool, sign in (("contract", 1), ("expand", -1)):
         played.apply(Hand(tool, corner[0] + 5.5 * cell, corner[1] + 0.5 - 7.5 * cell))

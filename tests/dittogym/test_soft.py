@@ -9,12 +9,18 @@ from tiny import TASKS, actions, stir, tiny
 from torch import Tensor
 
 from dittogym import TorchEnv
-from dittogym.contract import measure
-from dittogym.core import observe, soft_observation
+from dittogym.core import EnvState, observe, soft_observation
 from dittogym.geometry import Box
-from dittogym.model import EnvState
-from dittogym.observation.image import OCCUPIED_COUNT, OCCUPIED_WIDTH, RASTER, SATURATION, silhouette, soft_silhouette
-from dittogym.observation.raster import box_fraction
+from dittogym.observation import (
+    OCCUPIED_COUNT,
+    OCCUPIED_WIDTH,
+    RASTER,
+    SATURATION,
+    box_fraction,
+    silhouette,
+    soft_silhouette,
+)
+from dittogym.rewards import features_of
 from torchmpm import ParticleState
 
 
@@ -32,7 +38,7 @@ def moment(env: TorchEnv, x: Tensor, v: Tensor) -> EnvState:
     """The present moment with particles at ``x`` (B, N, 2), window and centre along with them."""
     state = env.env_state
     particles = ParticleState(x, v, state.particles.C, state.particles.F, state.particles.Jp)
-    com = measure(particles, env.model.num_robot_particles).com
+    com = features_of(particles, env.model.num_robot_particles).com
     origin = env.spec.window.origin(com)
     return replace(state, particles=particles, centre=com, origin=origin)
 

@@ -9,10 +9,9 @@ import torch
 from tiny import TASKS, actions, assert_same_bits, everything, stir, tiny
 from torch import Tensor
 
-from dittogym import Outcome, TorchEnv, make_spec
-from dittogym.core import evaluate
-from dittogym.model import EnvState
-from dittogym.reward_ops import EXACT, SELECTION_WIDTH, SMOOTH, distance, nearest
+from dittogym import Reward, TorchEnv, make_spec
+from dittogym.core import EnvState, evaluate
+from dittogym.rewards import EXACT, SELECTION_WIDTH, SMOOTH, distance, nearest
 from dittogym.tasks.grow import GOAL
 from dittogym.tasks.slot import FALLEN, FAR_SIDE
 from torchmpm import ParticleState
@@ -45,7 +44,7 @@ def at_threshold(task: str) -> tuple[TorchEnv, Tensor, Tensor]:
     stir(env)
     x, v, robot = env.state.x.clone(), env.state.v.clone(), env.model.num_robot_particles
     if task == "grow":
-        x[0] += torch.tensor(GOAL) + 0.02 - x[0][env.env_state.memory["tip"][0]].mean(0)
+        x[0] += torch.tensor(GOAL) + 0.02 - x[0][env.env_state.task_state["tip"][0]].mean(0)
     elif task == "slot":
         x[0, robot:] += torch.tensor([FAR_SIDE, FALLEN]) - x[0, robot:].mean(0)
         v[0, :, 0] += 1.45
@@ -54,7 +53,7 @@ def at_threshold(task: str) -> tuple[TorchEnv, Tensor, Tensor]:
     else:
         v[0, :, 0] += 1.7
     if env.spec.split_limit is not None:
-        centre, split = x[:, :robot].mean(1, keepdim=True), env.env_state.start.split[:, None, None]
+        centre, split = x[:, :robot].mean(1, keepdim=True), env.env_state.start.radius_of_gyration[:, None, None]
         x[1, :robot] = (centre + (x[:, :robot] - centre) * env.spec.split_limit / split)[1]
     return env, x, v
 
@@ -157,10 +156,10 @@ def test_step_with_soft_rewards(task: str) -> None:
 def test_a_task_of_ones_own() -> None:
     """One that is smooth already needs nothing; one that asks gets the soft image."""
 
-    def brightness(moment, spec):
-        if moment.ops.smooth:
-            return Outcome({"brightness": moment.observation[:, 0].mean((1, 2))})
-        return Outcome({"brightness": moment.observation[:, 0].to(torch.float64).mean((1, 2))})
+    def brightness(transition, spec):
+        if transition.ops.smooth:
+            return Reward({"brightness": transition.observation[:, 0].mean((1, 2))})
+        return Reward({"brightness": transition.observation[:, 0].to(torch.float64).mean((1, 2))})
 
     action = torch.zeros(1, 2, 8, 8, dtype=torch.float64, requires_grad=True)
     env = tiny(replace(make_spec("shapematch"), reward_fn=brightness, weights={"brightness": 1.0}), resolution=8)
@@ -169,7 +168,7 @@ def test_a_task_of_ones_own() -> None:
     assert soft.item() == pytest.approx(info["true_reward"].item(), abs=0.5) and soft.requires_grad
     height = replace(
         make_spec("run"),
-        reward_fn=lambda moment, spec: Outcome({"height": moment.now.com[:, 1]}),
+        reward_fn=lambda transition, spec: Reward({"height": transition.now.com[:, 1]}),
         weights={"height": 1.0},
     )
     env = tiny(height)
