@@ -185,7 +185,7 @@ def _paper(task: str, numbers: TaskNumbers) -> SACConfig:
         alpha=numbers.alpha,
         gate_bias=(numbers.gate_bias,),
         gate_penalty=(numbers.gate_penalty,),
-        environment=EnvironmentConfig(num_envs=1, particles="full", parity="reference", variant=numbers.variant),
+        environment=EnvironmentConfig(num_envs=1, particles="full", variant=numbers.variant),
         network=NetworkConfig(interpolation="aligned", split=numbers.split, gate_scale=0.25 if numbers.split else 1.0),
         report=ReportConfig(eval_deterministic=numbers.deterministic),
     )

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias
 from cfp.agent.spec import EncoderKind, Interpolation
 from cfp.errors import ConfigError
 from cfp.validation import check_at_least, check_positive
-from dittogym.action import ActionIndexing, default_indexing
+from dittogym.action import ActionLayout
 from dittogym.spec import CONTROL_STEP, DT
 
 #: Particle count: the paper's, about 2,000, a number, or one number for the robot and one for the object.
@@ -40,7 +40,7 @@ class EnvironmentConfig:
     """Precision of the physics."""
     backend: str = "auto"
     """Backend of the physics: auto, eager, compile, ..."""
-    action_layout: ActionIndexing | None = None
+    action_layout: ActionLayout | None = None
     """Orientation of the action array: image (as the observation) or grid (the reference's); None: by parity."""
     parity: Literal["clean", "reference"] = "clean"
     """clean: without the reference's faults in observations and resets; reference: with them."""
@@ -57,9 +57,9 @@ class EnvironmentConfig:
         return {name: value for name in TASK_OPTIONS if (value := getattr(self, name)) is not None}
 
     @property
-    def action_indexing(self) -> ActionIndexing:
+    def action_indexing(self) -> ActionLayout:
         """Orientation of the action array that these options result in."""
-        return self.action_layout or default_indexing(self.parity)
+        return self.action_layout or ("grid" if self.parity == "reference" else "image")
 
     @property
     def control_step(self) -> float:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from dittogym import TorchEnv
-from dittogym.observation.image import soft_silhouette
+from dittogym.observation import soft_silhouette
 from dittogym.spec import TaskSpec
 from dittogym.tasks.shapematch import reward_fn as overlap
 

@@ -12,7 +12,7 @@ from cfp.envs.vec_env import monitored
 from cfp.errors import ConfigError
 from cfp.sections import TASK_OPTIONS
 from dittogym import TorchEnv
-from dittogym.arguments import find_device
+from dittogym.torch_env import find_device
 
 
 def choose_device(name: str) -> str:
@@ -34,7 +34,8 @@ def make_env(
 
 def make_torch_env(config: RunConfig, resolution: int, num_envs: int | None = None, **changes: Any) -> TorchEnv:
     """Create the environment of a run; ``changes`` are further options of `dittogym.TorchEnv`."""
-    options = {name: value for name, value in vars(config.environment).items() if name not in TASK_OPTIONS}
+    options = {name: value for name, value in vars(config.environment).items() if name not in (*TASK_OPTIONS, "parity")}
+    options["action_layout"] = config.environment.action_indexing
     options |= config.environment.task_options() | changes
     options |= {"num_envs": num_envs or options["num_envs"], "device": choose_device(config.device)}
     try:

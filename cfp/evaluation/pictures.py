@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cfp.agent.actor import Actor
-from dittogym.observation.image import silhouette
+from dittogym.observation import silhouette
 from dittogym.render.canvas import GROUND, TARGET
 from dittogym.render.colours import ROBOT
 

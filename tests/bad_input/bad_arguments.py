@@ -9,12 +9,11 @@ import torch
 from bad_cases import Case
 
 import dittogym
-from dittogym import Outcome, TorchEnv, make_spec
+from dittogym import Reward, TorchEnv, make_spec
 from dittogym.bodies.shapes import Disc, Figure, Rectangle
-from dittogym.geometry import Box, solid
-from dittogym.reward_ops import EXACT
+from dittogym.geometry import Box, Window, solid
+from dittogym.rewards import EXACT
 from dittogym.spec import BodySpec as RobotBody
-from dittogym.window import Window
 from torchmpm import (
     Body,
     Elastic,
@@ -332,7 +331,7 @@ ENVIRONMENT = table(
         ("task, two objects", lambda: spec(objects=(spec().robot,) * 2), "objects must be at most one body, got 2"),
         (
             "rewards for three",
-            lambda: rewarded(lambda moment, spec: Outcome({"velocity": torch.zeros(3)})),
+            lambda: rewarded(lambda transition, spec: Reward({"velocity": torch.zeros(3)})),
             ("reward_fn of task 'run' must return terms of shape (B,)", "(3,) for 'velocity'"),
         ),
         ("disc at a name", lambda: Disc("home", 0.1), "corner must be two numbers (x, y), got 'home'"),
@@ -368,7 +367,7 @@ ENVIRONMENT = table(
             ("'run' got an unexpected keyword argument 'colour'; its options", "body, obstacles"),
         ),
         ("single environment of three", lambda: single(num_envs=3), ("num_envs must not be given", "make_vec")),
-        ("reward of nothing", lambda: rewarded(lambda moment, spec: None), "must return an Outcome, got NoneType"),
+        ("reward of nothing", lambda: rewarded(lambda transition, spec: None), "must return an Reward, got NoneType"),
     ],
     TypeError,
 )

@@ -11,7 +11,7 @@ from baselines import Gradient, OpenLoop
 from baselines.trajectory.optimise import Episode
 from cfp.errors import ConfigError, NonFiniteError
 from cfp.sections import EnvironmentConfig
-from dittogym.contract import Outcome
+from dittogym.rewards import Reward
 
 
 def make(task="shapematch", **changes):
@@ -59,9 +59,9 @@ def test_descent_improves_the_true_return():
 
 
 def test_rewards_with_steps_are_replaced_by_smooth_ones(request):
-    def ahead(moment, spec):
-        x = moment.robot_x[..., 0].mean(1)
-        return Outcome(terms={"ahead": moment.ops.heaviside(x - x.detach() - 1e-3, 1e-3)})
+    def ahead(transition, spec):
+        x = transition.robot_x[..., 0].mean(1)
+        return Reward(terms={"ahead": transition.ops.heaviside(x - x.detach() - 1e-3, 1e-3)})
 
     def stepping():
         return replace(dittogym.make_spec("run"), name="stepping", reward_fn=ahead, weights={"ahead": 1.0})
