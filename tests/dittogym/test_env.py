@@ -101,15 +101,6 @@ def test_disabled_autoreset_with_a_mask() -> None:
     assert np.array_equal(seen[0], rows[0][0][0]) and np.array_equal(seen[1], rows[2][0][1])
 
 
-@pytest.mark.parametrize("batch", [(), (2,)])
-def test_actions_of_another_resolution(batch: tuple[int, ...]) -> None:
-    env = make_vec() if batch else gymnasium.make("dittogym/run-coarse-v0", **SMALL).unwrapped
-    env.reset(seed=0)
-    for size, hint in (((64, 64), "; make the environment with resolution=64"), ((8, 9), ""), ((8,), "")):
-        with pytest.raises(ValueError, match=r"got float32 of shape \(.*\)" + hint + "$"):
-            env.step(np.zeros((*batch, 2, *size), np.float32))
-
-
 def test_render_modes(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="render_mode"):
         dittogym.Env("run", render_mode="ansi")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import recordings
+import reference
 import torch
 
 import dittogym
@@ -35,16 +36,6 @@ def test_episode(name: str) -> None:
     check(name, recordings.episode_errors(recordings.load(name)), recordings.EPISODE)
 
 
-@torch.no_grad()
-def test_the_extract_without_the_complete_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recordings, "FOLDER", recordings.EXTRACT)  # no folder
-    name = "grow-coarse-small-f64"
-    data = recordings.load(name)
-    assert len(data["sub1_x"]) < 100, "not the extract"
-    check(name, recordings.substep_errors(data), recordings.SMALL)
-    check(name, recordings.episode_errors(data), recordings.EPISODE)
-
-
 @pytest.mark.skipif(not recordings.FOLDER.is_dir(), reason=f"needs the complete recordings in {recordings.FOLDER}")
 @pytest.mark.parametrize("name", [f"{task}-coarse-small-f64" for task in TASKS] + list(RECORDED))
 def test_the_extract_is_of_the_complete_recordings(name: str) -> None:
@@ -54,10 +45,16 @@ def test_the_extract_is_of_the_complete_recordings(name: str) -> None:
         np.testing.assert_array_equal(found[key], value, err_msg=key)
 
 
-@torch.no_grad()
-def test_the_comparison_can_fail() -> None:
-    """Actions one percent stronger exceed the bounds."""
-    data = recordings.load("run-coarse-small-f64")
-    data["actions"] = data["actions"] * np.float32(1.01)
-    errors = recordings.episode_errors(data)
-    assert any(error > recordings.EPISODE[quantity] for quantity, error in errors.items())
+def test_a_reset_leaves_what_the_reference_leaves() -> None:
+    """The last image, the centre of the first action, and what CATCH's hand is chosen by; particles stay unit ones."""
+    env = reference.make("catch", particles=(120, 30), substeps=4, dtype="float64")
+    first, _ = env.reset(seed=0)
+    for _ in range(3):
+        last, *_ = env.step(np.ones(env.action_space.shape, np.float32))
+    before = env.torch_env.env_state
+    again, _ = env.reset()
+    after, (robot, cube) = env.torch_env.env_state, env.torch_env.model.solver.bodies
+    assert np.array_equal(again, last) and not np.array_equal(again, first)
+    assert torch.equal(after.centre, before.centre) and not torch.equal(after.centre, after.start.com)
+    assert torch.equal(after.task_state["object_com"], before.task_state["object_com"])
+    assert (robot.volume, cube.volume, robot.mass, env.state.x.shape) == (1.0, 1.0, 2.0, (1, 150, 2))

@@ -197,18 +197,11 @@ def test_detach_cuts_the_graph() -> None:
     env.detach()
     env.step(second)[1].sum().backward()
     assert first.grad is None and second.grad is not None
-
-
-def test_a_constant_is_learned_from_one_stretch_after_the_other() -> None:
-    env, mu = small(), torch.tensor(500.0, dtype=torch.float64, requires_grad=True)
-    drive = torch.full((1, 2, 8, 8), 0.5, dtype=torch.float64)
+    mu = torch.tensor(500.0, dtype=torch.float64, requires_grad=True)
     env.reset(seed=0, options={"physics": {"mu": mu}})
-    for _ in range(3):
-        (slope,) = torch.autograd.grad(env.step(drive)[1].sum(), mu)
-        assert slope != 0
-        env.detach(physics=False)
-    env.detach()
-    assert not env.step(drive)[1].requires_grad
+    for _ in range(2):
+        assert torch.autograd.grad(env.step(first)[1].sum(), mu)[0] != 0
+        env.detach(physics=False)  # but for a constant that is learned from one stretch after the other
 
 
 @pytest.mark.parametrize("use_reentrant", [True, False])
