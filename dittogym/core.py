@@ -84,6 +84,8 @@ class Model:
 
     def solver_for(self, physics: Physics) -> Solver:
         """The solver with the constants of :func:`dittogym.physics.physics_values` in place of the task's own."""
+        if not physics:
+            return self.solver
         bodies = bodies_of(self.spec, self.camera.counts, self.camera.particle_weight, physics)
         return self.solver.with_constants(bodies, physics.get("gravity", self.spec.gravity))
 
@@ -126,7 +128,7 @@ def make_model(
 
 def check_stability(model: Model, physics: Physics) -> None:
     """Refuse matter that with its muscles needs shorter substeps, and gravity that does."""
-    solver = model.solver_for(physics) if physics else model.solver
+    solver = model.solver_for(physics)
     actuation = physics.get("max_actuation", model.spec.max_actuation)
     limit = solver.stable_dt(actuation)
     if solver.dt > limit:
@@ -184,7 +186,7 @@ def reset(model: Model, positions: Tensor, physics: Physics | None = None) -> tu
     """
     shape = model.solver.num_particles, 2
     if not isinstance(positions, Tensor) or positions.ndim != 3 or positions.shape[1:] != shape:
-        raise ValueError(f"positions must be a tensor of shape (B, {shape[0]}, 2), got {kind_of(positions)}")
+        raise ValueError(f"positions must be a tensor of shape (B, {shape[0]}, 2), got {_kind(positions)}")
     if unknown := [name for name in physics or () if name not in NAMES]:
         raise ValueError(f"physics may hold {', '.join(NAMES)}, got {', '.join(unknown)}")
     spec, particles = model.spec, ParticleState.at_rest(positions)
@@ -195,7 +197,7 @@ def reset(model: Model, positions: Tensor, physics: Physics | None = None) -> tu
     task_state = spec.initial_task_state(_transition(model, state, start, observation, EXACT), spec)
     who = f"initial_task_state of task {spec.name!r}"
     if not isinstance(task_state, Mapping):
-        raise TypeError(f"{who} must return tensors by name, got {kind_of(task_state)}")
+        raise TypeError(f"{who} must return tensors by name, got {_kind(task_state)}")
     _check_leading(who, "tensors", task_state, len(positions))
     # Of any kind of mapping, and a copy: it may hold what the state does.
     return replace(state, task_state=tree.map(Tensor.clone, dict(task_state))), observation
@@ -239,14 +241,14 @@ def advance(model: Model, state: EnvState, action: Tensor) -> tuple[EnvState, Te
     square = len(shape) == 4 and shape[2] == shape[3] <= spec.patch
     if not square or shape[:2] != (len(x), 2) or action.dtype != x.dtype:
         allowed = f"{x.dtype} of shape ({len(x)}, 2, R, R) with R at most {spec.patch}"
-        raise ValueError(f"action must be {allowed}, got {kind_of(action)}")
+        raise ValueError(f"action must be {allowed}, got {_kind(action)}")
     finite: list[Tensor] = []  # where gradients may go back, known after the step
     guarded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tree.leaves((state, action)))
     if guarded:
         guard = functools.partial(_stop_gradients, finite=finite)
         state, action = tree.map(guard, tree.without_inference((state, action)))
     physics = state.physics
-    solver = model.solver_for(physics) if physics else model.solver
+    solver = model.solver_for(physics)
     actuation = patch_field(action, spec.patch, physics.get("max_actuation", spec.max_actuation))
     centre = centre_in_window(spec.patch_centre, state.centre, state.origin)
     on_nodes = place(actuation, centre, solver.grid.resolution)
@@ -376,7 +378,7 @@ def check_rewards(model: Model, positions: Tensor) -> None:
         raise TypeError(f"{who} must return a Reward, got {type(reward).__name__}")
     for what, values in (("terms", reward.terms), ("info", reward.info), ("task_state", reward.task_state)):
         if not isinstance(values, Mapping) and (values is not None or what == "terms"):
-            raise TypeError(f"{who} must return {what} by name, got {kind_of(values)}")
+            raise TypeError(f"{who} must return {what} by name, got {_kind(values)}")
     info, weights = reward.info or {}, spec.weights
     for part, taken in (("terms", RESERVED_TERMS & reward.terms.keys()), ("info", RESERVED_INFO & info.keys())):
         if taken:
@@ -391,14 +393,14 @@ def check_rewards(model: Model, positions: Tensor) -> None:
         raise ValueError(f"weights of task {spec.name!r} must be of the terms {sorted(weighted)}, got {unknown}")
     for name, value in reward.terms.items():
         if not isinstance(value, Tensor) or value.shape != (batch,) or value.is_complex():
-            found = f"{kind_of(value)} for {name!r}"
+            found = f"{_kind(value)} for {name!r}"
             raise ValueError(f"{who} must return terms of shape (B,) in real numbers, got {found}")
     for name, flag in (("terminated", reward.terminated), ("success", reward.success)):
         if flag is not None and not (isinstance(flag, Tensor) and (flag.dtype, *flag.shape) == (torch.bool, batch)):
-            raise ValueError(f"{who} must return {name} as bool of shape (B,), got {kind_of(flag)}")
+            raise ValueError(f"{who} must return {name} as bool of shape (B,), got {_kind(flag)}")
     _check_leading(who, "info", info, batch)
     if reward.task_state is not None:
-        before, after = ({n: kind_of(v) for n, v in each.items()} for each in (state.task_state, reward.task_state))
+        before, after = ({n: _kind(v) for n, v in each.items()} for each in (state.task_state, reward.task_state))
         if before != after:
             raise ValueError(f"{who} must return task_state like initial_task_state, {before}, got {after}")
 
@@ -406,9 +408,9 @@ def check_rewards(model: Model, positions: Tensor) -> None:
 def _check_leading(who: str, what: str, values: Mapping[str, object], batch: int) -> None:
     for name, value in values.items():
         if not isinstance(value, Tensor) or value.shape[:1] != (batch,):
-            raise ValueError(f"{who} must return {what} of shape (B, ...), got {kind_of(value)} for {name!r}")
+            raise ValueError(f"{who} must return {what} of shape (B, ...), got {_kind(value)} for {name!r}")
 
 
-def kind_of(value: object) -> str:
+def _kind(value: object) -> str:
     """Type and shape of a tensor, type of anything else, for messages."""
     return f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
