@@ -22,6 +22,7 @@ import dittogym
 from dittogym import core
 from dittogym.bodies.positions import Particles, particle_counts
 from dittogym.core import EnvState
+from dittogym.env import as_numpy, first
 
 #: What CATCH remembers of the last episode.
 STALE = ("object_com",)
@@ -51,6 +52,7 @@ class ReferenceEnv(dittogym.Env):
     """A :class:`dittogym.Env` whose resets show and remember what the last episode left."""
 
     _image: np.ndarray | None = None
+    _positions: np.ndarray | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -59,12 +61,14 @@ class ReferenceEnv(dittogym.Env):
         env, image = self.torch_env, self._image
         last = None if image is None else env.env_state
         options = dict(options or {})
-        positions = options.pop("positions", None)
+        if "positions" in options or seed is not None:
+            self._positions = options.pop("positions", None)
         observation, info = super().reset(seed=seed, options=options)
-        if positions is not None:  # one recording parks particles that it does not need outside
-            given = torch.as_tensor(np.asarray(positions))[None].to(env.state.x)
+        if self._positions is not None:  # one recording parks particles that it does not need outside
+            given = torch.as_tensor(np.asarray(self._positions))[None].to(env.state.x)
             env.env_state, seen = core.reset(env.model, given, env.env_state.physics)
-            observation = seen[0].numpy()
+            described = core.info_of(env.model, env.env_state, env.env_state.start)
+            observation, info = first(as_numpy(seen)), first(as_numpy(described))
         if image is None or last is None:
             self._image = observation
             return observation, info
