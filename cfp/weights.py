@@ -25,10 +25,10 @@ from cfp.files import FORMAT, parse_json, write_policy
 from cfp.hub import download, is_address
 from cfp.validation import brief
 from dittogym import make_spec
-from dittogym.action import trained_indexing
-from dittogym.arguments import find_device
+from dittogym.action import trained_layout
 from dittogym.geometry import NODES
 from dittogym.tasks import fingerprint
+from dittogym.torch_env import find_device
 
 VERSION = 1
 KIND = "cfp"
@@ -221,7 +221,7 @@ def policy_for(config: RunConfig, path: str) -> ActorPolicy:
     """Load the policy that a run starts from, which must be for its task, physics and orientation of actions."""
     policy = load(path)
     check_trained_for("start_from", policy.description, config.task, config.environment)
-    if (found := trained_indexing(policy)) != (expected := config.action_layout):
+    if (found := trained_layout(policy)) != (expected := config.action_layout):
         raise ConfigError(f"start_from must be a policy for action_layout {expected}, got {found}")
     return policy
 

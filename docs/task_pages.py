@@ -202,7 +202,7 @@ def numbers(spec: TaskSpec) -> list[tuple[str, str]]:
             else f"{window.follow:g} m behind the robot's centre",
         ),
         ("centre of the observed region", centre(spec.view)),
-        ("centre of the action patch", centre(spec.reach)),
+        ("centre of the action patch", centre(spec.patch_centre)),
         (
             "spread limit of the robot",
             "none" if spec.split_limit is None else f"{spec.split_limit:g} m",

@@ -21,7 +21,7 @@ from cfp.hub import is_address
 from cfp.policy_protocols import Policy
 from cfp.sections import EnvironmentConfig
 from cfp.weights import check_trained_for, policy_file, shipped
-from dittogym.action import trained_indexing
+from dittogym.action import trained_layout
 
 #: Name under which the policy of the package with a task's own name is submitted.
 PRETRAINED = "pretrained"
@@ -94,7 +94,7 @@ def _trained(protocol: FixedProtocol, path: str) -> Candidate:
         training=training,
         library=torchmpm.__version__,
     )
-    return Candidate(submission, policy, replace(protocol.environment, action_layout=trained_indexing(policy)))
+    return Candidate(submission, policy, replace(protocol.environment, action_layout=trained_layout(policy)))
 
 
 def _name(path: str, task: str) -> str:

@@ -24,7 +24,7 @@ from cfp.agent.networks import initialise, perceptron
 from cfp.files import write_policy
 from cfp.weights import read_policy, report_mismatch
 from dittogym import TorchEnv
-from dittogym.action import from_grid_indexing, trained_indexing
+from dittogym.action import from_grid_layout, trained_layout
 from dittogym.spec import TaskSpec
 
 Kind = Literal["gnn", "transformer"]
@@ -167,7 +167,7 @@ class SegmentPolicy(StateBasedPolicy):
         if self.change is not None:
             values = torch.from_numpy(self.change(values.cpu().numpy()))
         action = self.nodes.to_grid(env, labels, values.to(env.device))
-        return from_grid_indexing(action, trained_indexing(self) or env.action_layout), (labels.cpu().numpy(),)
+        return from_grid_layout(action, trained_layout(self) or env.action_layout), (labels.cpu().numpy(),)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write ``path``, which must end in ``.safetensors``, and a description beside it, which ends in ``.json``."""

@@ -15,7 +15,7 @@ from cfp.agent.actor import Actor, build_actor
 from cfp.agent.spec import ActorSpec
 from cfp.files import write_policy
 from cfp.hub import Shareable
-from dittogym.observation.image import SHAPE
+from dittogym.observation import SHAPE
 
 # Arguments of `predict` in stable-baselines3.
 Observation: TypeAlias = np.ndarray | dict[str, np.ndarray]

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from cfp.agent import fused
 from cfp.agent.spec import Interpolation
 from dittogym.action import bicubic
-from dittogym.observation.image import SIZE
+from dittogym.observation import SIZE
 
 #: Rows and columns of the observation, and of actions as input of the paper's encoders.
 IMAGE_SIZE = SIZE

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cfp.agent.actor import Actor
-from dittogym.observation.image import silhouette
+from dittogym.observation import silhouette
 from dittogym.render.frame import GROUND, TARGET
 from dittogym.render.scene import ROBOT
 

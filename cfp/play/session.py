@@ -16,15 +16,15 @@ from torch import Tensor
 
 from cfp.play import protocol
 from cfp.play.hand import Direction, Grip, press, reach, wave
-from dittogym.action import bicubic, from_grid_indexing, patch_corner, to_grid_indexing, trained_indexing
-from dittogym.geometry import NODES
-from dittogym.model import Snapshot, check_stability
+from dittogym.action import bicubic, from_grid_layout, patch_corner, to_grid_layout, trained_layout
+from dittogym.core import check_stability
+from dittogym.geometry import NODES, centre_in_window
 from dittogym.physics import check_effect, physics_values
 from dittogym.render.recording import Recording
 from dittogym.render.scene import Shot, describe
+from dittogym.snapshots import Snapshot
 from dittogym.tasks import TASKS, headline, task_name
 from dittogym.torch_env import TorchEnv
-from dittogym.window import centre_in_window
 
 #: Names of the bits of a frame's flags.
 FLAGS = ("playing", "terminated", "truncated", "success", "invalid")
@@ -257,8 +257,8 @@ class Session:
 
     def _as_image(self, array: np.ndarray) -> np.ndarray:
         """What a policy returns (B, 2, R, R), oriented as the page shows it."""
-        layout = trained_indexing(self.policy) or "image"
-        return from_grid_indexing(to_grid_indexing(torch.as_tensor(array), layout), "image").numpy()
+        layout = trained_layout(self.policy) or "image"
+        return from_grid_layout(to_grid_layout(torch.as_tensor(array), layout), "image").numpy()
 
     def _pull(self) -> None:
         """Let the hand pull at matter, which it takes hold of the first time."""
@@ -274,7 +274,7 @@ class Session:
     def _corner(self) -> np.ndarray:
         """Lower left corner (2,) of the action image in the world, m."""
         state, spec = self.env.env_state, self.env.spec
-        corner = patch_corner(centre_in_window(spec.reach, state.centre, state.origin), spec.patch, NODES)
+        corner = patch_corner(centre_in_window(spec.patch_centre, state.centre, state.origin), spec.patch, NODES)
         return (state.origin[0] + corner[0] / NODES).cpu().double().numpy()
 
     def _paint(self, message: protocol.Paint | protocol.Clear) -> None:

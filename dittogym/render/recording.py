@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from dittogym.action import ActionIndexing, trained_indexing
+from dittogym.action import ActionLayout, trained_layout
 from dittogym.files import replacing
 from dittogym.render.film import UNITS, check_available, possible_rate, write_film
 from dittogym.render.frame import frame, pace
@@ -298,7 +298,7 @@ def seed_noise(seed: int, step: int) -> None:
         torch.cuda.manual_seed_all(number)
 
 
-def as_function(policy: Any, layout: ActionIndexing) -> Act:
+def as_function(policy: Any, layout: ActionLayout) -> Act:
     """A policy as a function of observations.
 
     Args:
@@ -311,7 +311,7 @@ def as_function(policy: Any, layout: ActionIndexing) -> Act:
         TypeError: It is neither.
         ValueError: It was trained with another ``action_layout``.
     """
-    if (trained := trained_indexing(policy)) not in (None, layout):
+    if (trained := trained_layout(policy)) not in (None, layout):
         raise ValueError(f"policy must be one for action_layout {layout!r} of the environment, got one for {trained!r}")
     if not hasattr(policy, "predict"):
         if not callable(policy):

@@ -13,11 +13,10 @@ import torch
 from torch import Tensor
 
 from dittogym.action import place
-from dittogym.geometry import NODES, Box
-from dittogym.model import EnvState, Model
-from dittogym.observation.image import SIZE
+from dittogym.core import EnvState, Model
+from dittogym.geometry import NODES, Box, centre_in_window
+from dittogym.observation import SIZE
 from dittogym.spec import TaskSpec
-from dittogym.window import centre_in_window
 from torchmpm import Snow, checks
 
 #: Red, green and blue, 0 to 255.
@@ -227,7 +226,7 @@ def muscle_activity(model: Model, state: EnvState, index: int, actuation: Tensor
         actuation: (B, 2, P, P) on the patch, Pa.
     """
     spec, one = model.spec, slice(index, index + 1)
-    centre = centre_in_window(spec.reach, state.centre[one], state.origin[one])
+    centre = centre_in_window(spec.patch_centre, state.centre[one], state.origin[one])
     nodes = place(actuation[one], centre, NODES)[0].cpu().numpy().sum(0, dtype=np.float64)
     robot_x, origin = state.particles.x[index, : model.num_robot_particles], state.origin[index]
     relative = robot_x.detach().cpu().numpy().astype(np.float64) - origin.detach().cpu().numpy()

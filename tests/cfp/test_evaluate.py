@@ -155,7 +155,7 @@ def test_baselines_are_played_once_for_the_same_conditions(short, tmp_path, monk
     assert steps_of(replace(tiny(), environment=replace(tiny().environment, num_envs=7))) == (0, results)
     assert steps_of(tiny(), 3)[0] == 2 * 6  # a further layout each
     assert steps_of(replace(tiny(), seed=1))[0] == 0  # which are among those
-    for other in (tiny("kick"), tiny(particles=300), tiny(substeps=3), tiny(parity="reference")):
+    for other in (tiny("kick"), tiny(particles=300), tiny(substeps=3)):
         assert steps_of(other)[0] == 24
     for file in tmp_path.glob("*.json"):
         file.write_text("{")
