@@ -15,7 +15,7 @@ from dittogym.bodies.images import read_mask
 from dittogym.bodies.positions import particle_counts
 from dittogym.bodies.shapes import Disc, Figure, Lattice, Rectangle
 from dittogym.geometry import ceiling, floor, solid
-from dittogym.render.canvas import SOLID
+from dittogym.render.frame import SOLID
 from dittogym.spec import BodySpec
 from torchmpm import sampling
 
