@@ -15,7 +15,6 @@ PROGRAMS = {
     "compare": ("baselines.compare.__main__", "train and evaluate several algorithms, and report about them"),
     "leaderboard": ("baselines.leaderboard.__main__", "check and rank submissions of policies under a fixed protocol"),
     "distill": ("baselines.distill", "let an image policy learn from a teacher that observes more"),
-    "gradlab": ("baselines.gradlab.__main__", "measure up to which horizon gradients are useful"),
 }
 EXAMPLES = """Examples:
   torchmpm train --task run --out runs/run

@@ -109,7 +109,7 @@ MODULES = (
     *(f"cfp.{name}" for name in ("train", "evaluate", "robustness")),
     *(f"baselines.{name}" for name in ("train", "evaluate", "replay", "robustness")),
     *(f"baselines.{name}" for name in ("distill", "compare", "leaderboard")),
-    *("baselines.gradlab", "dittogym.play"),
+    "dittogym.play",
 )
 
 
