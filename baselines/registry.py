@@ -4,7 +4,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from baselines.common.reference_policies import REFERENCE_POLICIES, ReferenceConfig, reference_preset
+from baselines.common.reference_policies import REFERENCE_POLICIES
 from cfp.analytic.config import AnalyticConfig
 from cfp.config import RunConfig
 from cfp.errors import ConfigError
@@ -41,7 +41,7 @@ def find(name: str) -> type[Algorithm]:
     if name in REFERENCE_POLICIES:
         raise ConfigError(
             f"algo: {name!r} is a reference policy, which is not trained; evaluate it with: "
-            f"python -m baselines.compare --algos {name}"
+            f"torchmpm compare --algos {name}"
         )
     if name not in ALGORITHMS:
         raise ConfigError(f"algo must be one of {', '.join(ALGORITHMS)}, got {name!r}")
@@ -72,18 +72,11 @@ def configure(values: dict[str, Any]) -> RunConfig:
     if isinstance(algo, str) and algo in ALIASES:
         algo = ALIASES[algo]
         values = {**values, "algo": algo}
-    reference = isinstance(algo, str) and algo in REFERENCE_POLICIES
-    if not reference and preset not in (allowed := find(algo).presets):
+    if preset not in (allowed := find(algo).presets):
         raise ConfigError(f"preset must be {' or '.join(allowed)} for {algo}, got {preset!r}")
-    base = reference_preset(algo, task, preset) if reference else find(algo).preset(task, preset)
+    base = find(algo).preset(task, preset)
     config: RunConfig = update_from_dict(like_start(base, values), values)
     return config
-
-
-def reference_policy(config: RunConfig) -> Policy:
-    """The reference policy that the options of `configure` name."""
-    assert isinstance(config, ReferenceConfig)
-    return REFERENCE_POLICIES[config.algo](config)
 
 
 def load(path: str | Path, device: str = "cpu") -> Policy:
