@@ -12,7 +12,6 @@ from baselines.compare.evaluation import Protocol
 from baselines.compare.plan import Run, make_runs, read_plan
 from baselines.compare.processes import LocalExecutor, Outcome, RayExecutor, Resources, execute
 from baselines.compare.report import read_result, write_report
-from baselines.registry import ALIASES
 from cfp.config import Preset
 from cfp.errors import ConfigError
 from cfp.experiment.cli import read_command, run_command
@@ -159,8 +158,7 @@ def compare(command: Command) -> int:
 def _report(command: Command, runs: Sequence[Run], protocol: Protocol) -> int:
     """Write the report; returns 0 if all runs are finished and evaluated, else 1."""
     results = [read_result(run, protocol) for run in runs]
-    first = ALIASES.get(command.algos[0], command.algos[0])
-    print(f"report: {write_report(command.out, results, first, protocol)}")
+    print(f"report: {write_report(command.out, results, command.algos[0], protocol)}")
     return 0 if all(result.state == "finished" for result in results) else 1
 
 

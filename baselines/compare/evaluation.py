@@ -56,7 +56,7 @@ def evaluate_run(run: Run, protocol: Protocol) -> None:
     """
     device = choose_device(run.options["device"])
     if run.reference:
-        config = configure(reference_config(run))
+        config = configure(reference_config(run.options))
         policy, observes = REFERENCE_POLICIES[run.options["algo"]](config), "nothing"
     else:
         there = baselines.Run(run.folder)

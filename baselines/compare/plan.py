@@ -12,7 +12,7 @@ from typing import Any
 
 from baselines import train
 from baselines.common.reference_policies import REFERENCE_POLICIES
-from baselines.registry import ALGORITHMS, ALIASES
+from baselines.registry import ALGORITHMS
 from cfp.config import EVALUATION_SEED
 from cfp.errors import ConfigError
 from cfp.files import read_json, write_json
@@ -126,10 +126,10 @@ def resolved(options: Options) -> dict[str, Any]:
     return config
 
 
-def reference_config(run: Run) -> dict[str, Any]:
+def reference_config(options: Options) -> dict[str, Any]:
     """The configuration in whose environment a reference policy acts, that of a single stage of learning."""
-    kept = {name: value for name, value in run.options.items() if name in ("task", *TASK_OPTIONS)}
-    preset = "paper" if run.options["preset"] == "paper" else "quick"
+    kept = {name: value for name, value in options.items() if name in ("task", *TASK_OPTIONS)}
+    preset = "paper" if options["preset"] == "paper" else "quick"
     return resolved({"algo": "coarse", "preset": preset, **kept})
 
 
@@ -151,7 +151,6 @@ def read_plan(path: Path | None) -> dict[str, Any]:
         _check_section(f"algos.{label}", options, (*GIVEN, *TASK_OPTIONS))
         for task, own in _check_section(f"algos.{label}.tasks", options.get("tasks", {})).items():
             _check_section(f"algos.{label}.tasks.{task}", own, (*GIVEN, *TASK_OPTIONS))
-    plan["algos"] = {ALIASES.get(name, name): options for name, options in plan["algos"].items()}
     return plan
 
 
@@ -191,7 +190,6 @@ def make_runs(
     Raises:
         ConfigError: A name, a seed or an option of a training is wrong.
     """
-    labels = [ALIASES.get(label, label) for label in labels]
     for name, values in (("tasks", tasks), ("algos", labels), ("seeds", seeds)):
         if not values or len(set(values)) < len(values):
             raise ConfigError(
@@ -200,18 +198,21 @@ def make_runs(
     for seed in seeds:
         if not 0 <= seed <= LARGEST_SEED:
             raise ConfigError(f"seeds must be between 0 and {LARGEST_SEED}, got {seed}")
+    for part, names, given in (("tasks", plan["tasks"], tasks), ("algos", plan["algos"], labels)):
+        if unused := sorted(names.keys() - set(given)):
+            print(f"plan: {part} {', '.join(unused)} are not in this comparison")
     found: dict[tuple[str, str], Options] = {}
     for task in tasks:
         for label in labels:
             options = _options(plan, label, task, {"preset": preset, "device": device})
-            run = Run(label, task, seeds[0], options, folder)
             try:
-                config = reference_config(run) if run.reference else resolved(options)
+                if options["algo"] in REFERENCE_POLICIES:
+                    reference_config(options)
+                elif "steps" in resolved(options) and steps is not None:
+                    options.setdefault("steps", steps)
+                    resolved(options)
             except ConfigError as error:
                 raise ConfigError(f"{label} on {task}: {error}") from error
-            if steps is not None and not run.reference and "steps" in config:
-                options.setdefault("steps", steps)
-                resolved(options)
             found[task, label] = options
     return [
         Run(label, task, seed, options | {"seed": seed}, folder / f"{label}-{task.split(':')[-1]}-{preset}-{seed}")

@@ -14,7 +14,7 @@ import pytest
 import scipy.stats
 from filelock import FileLock
 
-from baselines.compare import paper, processes
+from baselines.compare import paper, processes, worker
 from baselines.compare.__main__ import Command, main
 from baselines.compare.evaluation import Protocol, evaluate_run
 from baselines.compare.plan import Run, make_runs, read_plan, to_words
@@ -106,7 +106,7 @@ def test_what_is_finished_is_left_alone_and_listed(finished, capsys):
     before = contents(finished / "runs")
     for more in ([], ["--report-only"], ["--dry-run"]):
         assert compare(finished, *ALGOS, *more) == 0
-    lines = capsys.readouterr().out.splitlines()[2:]
+    lines = capsys.readouterr().out.splitlines()[-3:]
     assert [line.split()[:3] for line in lines] == [[str(k), name, "finished"] for k, name in enumerate(NAMES)]
     assert "torchmpm train --algo shac --task shapematch" in lines[1] and "torchmpm" not in lines[0]
     assert contents(finished / "runs") == before
@@ -246,8 +246,8 @@ def test_a_folder_in_use_is_left_alone(finished):
     options = json.loads((folder / "comparison.json").read_text())["options"]
     before = (folder / "comparison.json").read_bytes()
     with FileLock(folder / ".comparison.lock"):
-        outcome = carry_out(Run("zero", "shapematch", 0, options, folder), Protocol(9, 100), Resources(wait=0.0))
-    assert outcome == "in use" and (folder / "comparison.json").read_bytes() == before
+        code = worker.carry_out(Run("zero", "shapematch", 0, options, folder), Protocol(9, 100), wait=0.0)
+    assert code == worker.IN_USE and (folder / "comparison.json").read_bytes() == before
 
 
 def test_missing_ray_names_the_extra(tmp_path, monkeypatch, capsys):
@@ -280,6 +280,14 @@ def test_the_narrower_section_of_a_plan_wins():
     assert (shac["algo"], shac["num_envs"], shac["eval_every"], shac["steps"]) == ("shac", 4, 600, 480)
     assert (long["algo"], long["num_envs"], long["alpha"], long["steps"]) == ("coarse", 2, 1, 96000)
     assert "steps" not in runs_of({}, "gradient", steps=960)[0].options
+
+
+def test_names_in_a_plan_that_mean_nothing_are_reported(capsys):
+    runs_of({"tasks": {"rnu": {}}, "algos": {"shca": {"steps": 480}}}, "shac")
+    assert capsys.readouterr().out.splitlines() == [
+        "plan: tasks rnu are not in this comparison",
+        "plan: algos shca are not in this comparison",
+    ]
 
 
 def test_options_become_words():
