@@ -1,7 +1,7 @@
 """Returns of the paper (DittoGym, ICLR 2024).
 
-They were measured from the drawn curves: mean and half the width of the band over the last tenth of
-the steps, three seeds, training returns. A resting robot was measured in the reference environment with full particles.
+They were measured from the drawn curves of training returns: mean and half the width of the band over the last tenth of
+the steps, three seeds. A resting robot was measured in the reference environment with full particles.
 """
 
 from cfp.presets import TASKS
