@@ -13,7 +13,7 @@ PROGRAMS = {
     "robustness": ("baselines.robustness", "returns of a policy in disturbed simulations"),
     "play": ("baselines.play", "play with a robot on a page in the browser"),
     "compare": ("baselines.compare.__main__", "train and evaluate several algorithms, and report about them"),
-    "leaderboard": ("baselines.leaderboard.__main__", "check and rank submissions of policies under a fixed protocol"),
+    "leaderboard": ("baselines.leaderboard", "evaluate and rank policies under a fixed protocol"),
     "distill": ("baselines.distill", "let an image policy learn from a teacher that observes more"),
 }
 EXAMPLES = """Examples:

@@ -7,7 +7,8 @@ this is faster where a policy succeeds early or never, as the recorded plan of G
 import argparse
 from dataclasses import replace
 
-from baselines.compare.stats import wilson_interval
+from scipy.stats import binomtest
+
 from baselines.train import PROGRAM
 from cfp.envs.disturbances import Case, Disturbed
 from cfp.envs.make import make_torch_env
@@ -53,7 +54,7 @@ def main() -> None:
         if result.success is None:
             parser.error(f"policy must be for a task that defines success, got one for {config.task}")
         done, successes = done + count, successes + round(result.success * count)
-        low, high = wilson_interval(successes, done)
+        low, high = binomtest(successes, done).proportion_ci(method="wilson")
         print(f"{successes} of {done} episodes, 95 % interval {low:.0%} to {high:.0%}", flush=True)
 
 

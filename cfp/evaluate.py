@@ -89,7 +89,7 @@ class FilmOptions:
 
 @dataclass(frozen=True)
 class Command(Selection):
-    """Evaluate the policies of a run, or a single policy, beside zero and random actions, in the same episodes.
+    """Evaluate the policies of a run, or a single policy, in the same episodes, beside zero and random actions.
 
     They are evaluated in the task that they were trained for.
     """

@@ -11,9 +11,6 @@ from result_tables import OBSERVES, read, shipped
 from task_pages import PAGES
 
 from baselines.compare import paper
-from baselines.compare.final_evaluation import FinalEvaluation
-from baselines.compare.plots import final_returns
-from baselines.compare.results import Group
 from dittogym.tasks import headline
 
 #: Colours of the paper's returns, of this package's, and of zero and random actions.
@@ -28,16 +25,20 @@ def save(drawing: Figure, path: Path) -> None:
 
 
 def comparison_figure(path: Path) -> None:
-    """Draw the final returns of all algorithms on SHAPE MATCH, as the report of a comparison does."""
+    """Draw the final returns of all algorithms on SHAPE MATCH: the mean of the seeds, and their range."""
     rows = sorted(read("compare-shapematch.csv"), key=lambda row: OBSERVES.index(row["sees"]))
-    groups = []
-    for row in rows:
-        both = row["lowest seed"], row["highest seed"]
-        scores = both if all(both) else (row["return, lite (mean of seeds)"],)
-        found = [FinalEvaluation((float(score),), None, None, {}, True) for score in scores]
-        groups.append(Group(headline("shapematch")[0], row["sees"], row["algorithm"], None, found, [], []))
-    drawing = final_returns(groups)
-    drawing.savefig(path, metadata={"Date": None})
+    drawing = Figure(figsize=(7.2, 0.9 + 0.3 * len(rows)), layout="constrained")
+    axis = drawing.subplots()
+    for place, row in enumerate(rows):
+        colour, both = f"C{OBSERVES.index(row['sees'])}", (row["lowest seed"], row["highest seed"])
+        if all(both):
+            axis.plot([float(value) for value in both], (place, place), color=colour, lw=2)
+        axis.plot(float(row["return, lite (mean of seeds)"]), place, "o", ms=8, color=colour)
+    axis.set_yticks(range(len(rows)), [f"{row['algorithm']} ({row['sees']})" for row in rows], fontsize=8)
+    axis.invert_yaxis()
+    axis.set_xlabel("return in SHAPE MATCH")
+    axis.grid(alpha=0.3)
+    save(drawing, path)
 
 
 def normalised(task: str, name: str, key: str) -> float:

@@ -11,8 +11,7 @@ from task_pages import PAGES, write
 
 import dittogym
 from baselines.compare import paper
-from baselines.leaderboard.__main__ import rankings
-from baselines.leaderboard.submission import read_submissions
+from baselines.leaderboard import rankings, read_results
 from cfp import weights
 from dittogym.tasks import headline
 
@@ -163,9 +162,9 @@ def of_task(task: str) -> str:
 
 
 def leaderboard() -> str:
-    """The rankings of the committed submissions."""
-    submissions = read_submissions(sorted((DOCS / "leaderboard").glob("*.json")))
-    tables = (replace(table, title=headline(table.name)[0], description="") for table in rankings(submissions))
+    """The rankings of the committed results."""
+    results = [read_results(path) for path in sorted((DOCS / "leaderboard").glob("*.json"))]
+    tables = (replace(table, title=headline(table.name)[0], description="") for table in rankings(results))
     return "\n\n".join(table.to_markdown() for table in tables) + "\n"
 
 

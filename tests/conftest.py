@@ -15,7 +15,6 @@ settings.load_profile("torchmpm")
 
 
 os.environ["NO_PROXY"] = os.environ["no_proxy"] = "127.0.0.1,localhost"  # servers of the tests
-os.environ["TORCHMPM_EPISODES"] = ""  # tests keep no episodes in the user's folders; programs that they start neither
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -1,44 +1,29 @@
 """Reference policies: zero actions, random actions and a travelling wave. Nothing is learned."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from baselines.common.grid import GridConfig
+from baselines.common.grid import find_grid
 from baselines.common.open_loop import OpenLoop
+from cfp.config import RunConfig
 from cfp.evaluation.untrained import UntrainedPolicy
 from cfp.policy_protocols import Policy
-from cfp.presets import sac_preset
 from dittogym import make_spec
 from dittogym.action import ActionLayout, from_grid_layout
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReferenceConfig(GridConfig):
-    """Options of the evaluation of a reference policy."""
-
-    def ends(self) -> tuple[int, ...]:
-        """One stage, without learning."""
-        return (1,)
+def _scripted(config: RunConfig) -> OpenLoop:
+    size = find_grid("grid", config.task, "coarse")
+    return OpenLoop(wave(make_spec(config.task).horizon, size, config.action_layout))
 
 
-def reference_preset(algo: str, task: str, name: str) -> ReferenceConfig:
-    """Default options: ``quick`` evaluates with few particles, ``paper`` in the paper's environment."""
-    base = sac_preset(task, name)
-    own = {"algo": algo, "task": task, "preset": base.preset, "eval_every": 1, "checkpoint_every": 1, "log_every": 1}
-    return ReferenceConfig(**(vars(base.environment) | own | {"num_envs": 1}))
-
-
-def _scripted(config: ReferenceConfig) -> OpenLoop:
-    return OpenLoop(wave(make_spec(config.task).horizon, config.resolution(1), config.action_layout))
-
-
-REFERENCE_POLICIES: dict[str, Callable[[ReferenceConfig], Policy]] = {
-    "zero": lambda config: UntrainedPolicy("zero", config.resolution(1)),
-    "random": lambda config: UntrainedPolicy("random", config.resolution(1)),
+#: From the options of a run, in whose environment they act; they act on the task's coarse grid.
+REFERENCE_POLICIES: dict[str, Callable[[RunConfig], Policy]] = {
+    "zero": lambda config: UntrainedPolicy("zero", find_grid("grid", config.task, "coarse")),
+    "random": lambda config: UntrainedPolicy("random", find_grid("grid", config.task, "coarse")),
     "scripted": _scripted,
 }
 

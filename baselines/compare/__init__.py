@@ -1,1 +1,1 @@
-"""``python -m baselines.compare``: algorithms, tasks and seeds in one table, with intervals."""
+"""Comparisons: a plan of trainings is carried out, and its policies are evaluated on the same episodes."""

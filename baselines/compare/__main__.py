@@ -1,38 +1,38 @@
-"""``python -m baselines.compare``: several algorithms, tasks and seeds, and one report about them."""
+"""``torchmpm compare``: several algorithms, tasks and seeds, and one report about them."""
 
+import os
+import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from baselines.common.reference_policies import REFERENCE_POLICIES
-from baselines.compare.executor import Executor, InProcessExecutor, LocalExecutor, RayExecutor, Resources, execute
-from baselines.compare.final_evaluation import Protocol, ProtocolNoise, Robustness
-from baselines.compare.jobs import Job, Plan, check_folder, make_jobs
-from baselines.compare.report import write_report
-from baselines.compare.results import RunResult, read_result
-from baselines.compare.worker import Outcome
-from baselines.leaderboard.evaluation import submit
-from baselines.leaderboard.protocol import PROTOCOLS
-from baselines.registry import ALGORITHMS, ALIASES
-from cfp.config import Preset, RunConfig
+from baselines.compare.evaluation import Protocol
+from baselines.compare.plan import Run, make_runs, read_plan
+from baselines.compare.processes import LocalExecutor, Outcome, RayExecutor, Resources, execute
+from baselines.compare.report import read_result, write_report
+from cfp.config import Preset
 from cfp.errors import ConfigError
-from cfp.experiment.cli import program_name, read_options, run_command
-from cfp.experiment.folder import Folder, make_folder
-from cfp.experiment.process import Stopped, StopSignals
-from cfp.sections import Particles
+from cfp.experiment.cli import read_command, run_command
+from cfp.experiment.folder import Folder
 from cfp.validation import check_at_least
 
-#: Options that the help shows first.
-BASIC = ("tasks", "algos", "seeds", "preset", "steps", "device", "workers", "episodes", "out", "report_only")
-#: Seconds to wait for another process that holds a run folder; file servers take a while to give up a lost machine.
-LOCK_TIMEOUT, CLUSTER_LOCK_TIMEOUT = 30.0, 300.0
+EXAMPLES = (
+    "--tasks shapematch --algos zero cfp-analytic shac --seeds 0 1 2",
+    "--tasks run kick --algos zero gradient --out runs/gradient --workers 2",
+    "--tasks run kick --algos zero gradient --out runs/gradient --report-only",
+)
+#: Seconds to wait for another process that holds a run; file servers take a while to give up a lost machine.
+WAIT, CLUSTER_WAIT = 30.0, 300.0
 
 
 @dataclass(frozen=True)
 class Command:
-    """Train what is missing, reuse what is finished, resume what was interrupted, evaluate all, and write a report.
+    """Train what is missing, resume what was interrupted, evaluate all policies on the same episodes, and report.
+
+    Algorithms are those of train --algo, the reference policies zero, random and scripted, and variants that the plan
+    file defines. The report shows differences to the first one.
 
     Ctrl-C stops all runs with a checkpoint; the same command resumes them. Exit code 0: every run is finished and
     evaluated; 1: some are not, and the report says why; 2: an option is wrong.
@@ -40,41 +40,37 @@ class Command:
 
     tasks: tuple[str, ...] = ("shapematch",)
     """Tasks."""
-    algos: tuple[str, ...] = ("zero", "cfp")
-    """Algorithms, or variants that the plan names; include zero, relative to which sample efficiency is measured."""
+    algos: tuple[str, ...] = ("zero", "cfp-analytic")
+    """Algorithms."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds of the runs; the reference policies zero, random and scripted have one run, with the first seed."""
+    """Seeds of the runs; the reference policies have one run, with the first seed."""
     out: Folder = Path("runs/compare")
     """Folder of the report, with the run folders in runs/."""
-    plan: Path | None = None
-    """JSON file with options of runs, under common, tasks and algos."""
     preset: Preset = "quick"
     """Preset of all runs."""
     steps: int | None = None
     """Environment steps of every algorithm with this option, unless the plan gives it."""
+    plan: Path | None = None
+    """JSON file with options of train, under common, tasks and algos."""
     device: str = "auto"
     """cpu, cuda, or auto."""
     episodes: int = 10
     """Episodes of the final evaluation of each policy."""
-    particles: Particles = "lite"
+    particles: Literal["full", "lite"] | int = "lite"
     """Particles of the final evaluation, for all policies."""
-    noise: ProtocolNoise = "paper"
+    noise: Literal["paper", "with", "without"] = "paper"
     """Action noise of all policies in the final evaluation: with, without, or as in the paper, that is without in
     SHAPE MATCH and with it in all other tasks."""
-    slot_episodes: int = 100
-    """Minimum number of episodes in SLOT, summed over the seeds of an algorithm, for its success rate."""
-    robustness: Robustness = "paper"
-    """Disturbed cases that are evaluated."""
-    executor: Literal["local", "ray"] = "local"
-    """Processes of this machine, or tasks of a Ray cluster."""
     workers: int = 1
-    """Local: runs at a time, each in a process of its own; 0: one after the other in this process."""
+    """Runs at a time, each in a process of its own."""
     cpus_per_run: int | None = None
     """Cores of a run; if not given, an equal share of this machine's for each worker, or 1 on a cluster."""
     gpus_per_run: float = 0.0
     """Ray: GPUs of a run, also a fraction of one."""
     retries: int = 2
     """Number of times that a run is restarted after its process or node was lost."""
+    executor: Literal["local", "ray"] = "local"
+    """Processes of this machine, or tasks of a Ray cluster."""
     address: str | None = None
     """Ray: address of the cluster; if not given, RAY_ADDRESS, else one on this machine, new if there is none."""
     only: int | None = None
@@ -82,144 +78,93 @@ class Command:
     report_only: bool = False
     """Only write the report from the existing results; train and evaluate nothing."""
     dry_run: bool = False
-    """Only list the runs and their states."""
-    protocol: Literal["v1"] | None = None
-    """Fixed protocol of the leaderboard, under which each finished run is also evaluated; its submission is written to
-    submissions/ in the folder of the report."""
-    policies: tuple[str, ...] = ()
-    """With a protocol: carry out no runs and evaluate these policies instead: names of pretrained ones, run folders,
-    policy files, hf://OWNER/NAME, or zero, random and scripted, which act in each of the tasks."""
+    """Only list the runs, their states and the command lines of their trainings."""
 
     def check(self) -> None:
         """Check what the types cannot."""
-        check_at_least(1, episodes=self.episodes, slot_episodes=self.slot_episodes)
+        check_at_least(1, episodes=self.episodes, workers=self.workers)
+        check_at_least(0, gpus_per_run=self.gpus_per_run, retries=self.retries)
         if self.cpus_per_run is not None:
             check_at_least(1, cpus_per_run=self.cpus_per_run)
-        check_at_least(0, workers=self.workers, gpus_per_run=self.gpus_per_run, retries=self.retries)
-        if self.gpus_per_run and self.executor == "local":
-            raise ConfigError(f"gpus_per_run must be 0 without --executor ray, got {self.gpus_per_run}")
-        if self.address is not None and self.executor == "local":
-            raise ConfigError(f"address requires --executor ray, got {self.address}")
+        if not isinstance(self.particles, str):
+            check_at_least(1, particles=self.particles)
+        for name, value in (("gpus_per_run", self.gpus_per_run), ("address", self.address)):
+            if value and self.executor == "local":
+                raise ConfigError(f"{name} requires --executor ray, got {value}")
         if self.only is not None and self.report_only:
             raise ConfigError(f"only cannot be combined with --report-only, got {self.only}")
-        if self.protocol is not None and (self.only is not None or self.report_only):
-            raise ConfigError(f"protocol cannot be combined with --only or --report-only, got {self.protocol}")
-        if self.policies and (self.protocol is None or self.report_only or self.dry_run or self.only is not None):
-            names = " ".join(self.policies)
-            raise ConfigError(f"policies requires protocol, and none of only, report_only and dry_run, got {names}")
-        if self.protocol is not None:
-            for task in self.tasks:
-                PROTOCOLS[self.protocol].check_task(task)
 
-    @property
-    def final_protocol(self) -> Protocol:
-        """How policies are evaluated."""
-        return Protocol(self.episodes, self.particles, self.robustness, self.noise)
-
-    def protocol_of(self, config: RunConfig) -> Protocol:
-        """How the policy of a run is evaluated: SLOT has more episodes."""
-        if config.task != "slot":
-            return self.final_protocol
-        runs = 1 if config.algo in REFERENCE_POLICIES else len(self.seeds)
-        return replace(self.final_protocol, episodes=max(self.episodes, -(-self.slot_episodes // runs)))
-
-    def make_executor(self, signals: StopSignals) -> Executor:
+    def make_executor(self) -> LocalExecutor | RayExecutor:
         """What carries out the runs."""
-        one_machine = self.executor == "local" and self.only is None
-        lock_timeout = LOCK_TIMEOUT if one_machine else CLUSTER_LOCK_TIMEOUT
-        resources = Resources(self.cpus_per_run, self.gpus_per_run, self.retries, lock_timeout)
         if self.executor == "ray":
-            return RayExecutor(self.address, resources)
-        return LocalExecutor(self.workers, resources) if self.workers else InProcessExecutor(signals, resources)
+            return RayExecutor(
+                self.address, Resources(self.cpus_per_run or 1, self.gpus_per_run, self.retries, CLUSTER_WAIT)
+            )
+        available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        threads = self.cpus_per_run or max(1, available // self.workers)
+        wait = WAIT if self.only is None else CLUSTER_WAIT
+        return LocalExecutor(self.workers, Resources(threads, retries=self.retries, wait=wait))
 
 
 def compare(command: Command) -> int:
     """Carry out a comparison; returns the exit code."""
     command.check()
-    command = replace(command, algos=tuple(ALIASES.get(name, name) for name in command.algos))  # as the report names it
-    if command.policies:
-        _submit(command, command.policies)
-        return 0
-    plan = Plan.read(command.plan)
-    for part, names in plan.unused(command.tasks, command.algos).items():
-        print(f"plan: {part} {', '.join(names)} are not in this comparison")
-    jobs = make_jobs(
-        plan,
+    runs = make_runs(
+        read_plan(command.plan),
         command.tasks,
         command.algos,
         command.seeds,
         command.out / "runs",
-        command.protocol_of,
         preset=command.preset,
         steps=command.steps,
         device=command.device,
     )
-    for job in jobs:
-        check_folder(job)
-    if command.only is not None and not 0 <= command.only < len(jobs):
-        raise ConfigError(f"only must be between 0 and {len(jobs) - 1}, got {command.only}")
+    protocol = Protocol(command.episodes, command.particles, command.noise)
+    for run in runs:
+        run.check_folder()
+    if command.only is not None and not 0 <= command.only < len(runs):
+        raise ConfigError(f"only must be between 0 and {len(runs) - 1}, got {command.only}")
     if command.dry_run:
-        print("\n".join(f"{number:>4}  {job.name:<40} {job.state}" for number, job in enumerate(jobs)))
+        for number, run in enumerate(runs):
+            words = "" if run.reference else f"  torchmpm train {shlex.join(run.words)}"
+            print(f"{number:>4}  {run.name:<40} {read_result(run, protocol).state:<13}{words}".rstrip())
         return 0
     if command.report_only:
-        return 0 if all(run.state == "finished" for run in _report(command, jobs)) else 1
-    chosen = jobs if command.only is None else [jobs[command.only]]
-    make_folder(command.out)
-    with StopSignals() as signals:
-        outcomes = _carry_out(command, chosen, signals)
-    if command.only is None:
-        _report(command, jobs)
-    if command.protocol and not signals.number:
-        names = [job.config.algo if job.untrained else str(job.folder) for job in jobs if job.trained]
-        _submit(command, list(dict.fromkeys(names)))  # a reference policy has a run in each task
-    if signals.number:
-        raise Stopped(signals.number, "the same command resumes the comparison")
-    return 0 if set(outcomes) == {"finished"} else 1
-
-
-def _carry_out(command: Command, jobs: Sequence[Job], signals: StopSignals) -> list[Outcome]:
-    """Carry out runs and print how each ended."""
+        return _report(command, runs, protocol)
+    chosen = runs if command.only is None else [runs[command.only]]
+    chosen = [run for run in chosen if read_result(run, protocol).state != "finished"]
     outcomes: list[Outcome] = []
 
-    def on_outcome(job: Job, outcome: Outcome) -> None:
+    def on_outcome(run: Run, outcome: Outcome) -> None:
         outcomes.append(outcome)
-        reason = f" ({job.error})" if outcome == "failed" and job.error else ""
-        ending = "not begun" if outcome == "stopped" and job.state == "missing" else outcome
-        print(f"[{len(outcomes)}/{len(jobs)}] {job.name}: {ending}{reason}", flush=True)
+        print(f"[{len(outcomes)}/{len(chosen)}] {run.name}: {outcome} {run.error}".rstrip(), flush=True)
 
-    execute(command.make_executor(signals), jobs, signals, on_outcome)
-    return outcomes
+    command.out.mkdir(parents=True, exist_ok=True)
+    executor = command.make_executor()
+    try:
+        execute(chosen, protocol, executor, on_outcome)
+    except KeyboardInterrupt:
+        print("stopped; the same command resumes the comparison")
+        return 130
+    finally:
+        code = (
+            _report(command, runs, protocol)
+            if command.only is None
+            else int(any(each != "finished" for each in outcomes))
+        )
+    return code
 
 
-def _submit(command: Command, policies: Sequence[str]) -> None:
-    """Write the submissions of policies under the protocol."""
-    assert command.protocol is not None
-    submit(PROTOCOLS[command.protocol], policies, command.tasks, command.out / "submissions")
-
-
-def _report(command: Command, jobs: Sequence[Job]) -> list[RunResult]:
-    description = (
-        f"{', '.join(command.algos)} on {', '.join(command.tasks)}, preset {command.preset}, seeds "
-        f"{', '.join(map(str, command.seeds))}."
-    )
-    runs = [read_result(job) for job in jobs]
-    print(f"report: {write_report(command.out, runs, command.final_protocol, description)}")
-    return runs
+def _report(command: Command, runs: Sequence[Run], protocol: Protocol) -> int:
+    """Write the report; returns 0 if all runs are finished and evaluated, else 1."""
+    results = [read_result(run, protocol) for run in runs]
+    print(f"report: {write_report(command.out, results, command.algos[0], protocol)}")
+    return 0 if all(result.state == "finished" for result in results) else 1
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line entry point; returns the exit code."""
-    names = f"Algorithms: {', '.join(ALGORITHMS)}. Reference policies: {', '.join(REFERENCE_POLICIES)}."
-    program = program_name("baselines.compare", arguments)
-    examples = (
-        "--tasks shapematch --algos cfp shac --seeds 0 1",
-        "--tasks run kick --algos zero gradient --out runs/reach --workers 2",
-        "--out runs/reach --report-only",
-        "--protocol v1 --policies run runs/mine/policy.safetensors --out runs/mine",
-    )
-    return run_command(
-        lambda: compare(read_options(Command(), BASIC, prog=program, about=names, examples=examples, args=arguments))
-    )
+    return run_command(lambda: compare(read_command(Command, "baselines.compare", EXAMPLES, arguments)))
 
 
 if __name__ == "__main__":

@@ -1,17 +1,13 @@
-"""The numbers of the paper (DittoGym, ICLR 2024): Figures 5 to 8, Tables 4 and 5.
+"""Returns of the paper (DittoGym, ICLR 2024).
 
-Values of figures were measured from the drawn curves: mean and half the width of the band over the last tenth of
-the steps, three seeds, training returns. A resting robot was measured in the reference environment with full particles.
+They were measured from the drawn curves of training returns: mean and half the width of the band over the last tenth of
+the steps, three seeds. A resting robot was measured in the reference environment with full particles.
 """
 
-from cfp.presets import TASKS
-from cfp.sections import Particles
-
-#: Particles of the paper's figures.
-PARTICLES: Particles = "full"
+from cfp.presets import PAPER, PUBLISHED
 
 #: Names that the paper's methods have here, in the order of ``CURVES``.
-COLUMNS = ("cfp", "coarse", "fine", "gnn-16", "gnn-64", "transformer-16", "transformer-64")
+COLUMNS = ("cfp-sac", "coarse", "fine", "gnn-16", "gnn-64", "transformer-16", "transformer-64")
 
 #: Task to return and band of every method.
 CURVES: dict[str, tuple[tuple[float, float], ...]] = {
@@ -26,49 +22,14 @@ CURVES: dict[str, tuple[tuple[float, float], ...]] = {
 }
 
 #: Task to environment steps of its curves.
-STEPS = {task: TASKS[task].steps for task in CURVES}
-
-#: Task to action grid to the best return of "expert policies" and its error bar. Grids of SHAPE MATCH are doubtful.
-EXPERTS: dict[str, dict[int, tuple[float, float]]] = {
-    "shapematch": {4: (255, 6), 8: (297, 7), 16: (317, 5)},
-    "run": {4: (4940, 1070), 8: (9210, 890), 16: (9790, 430)},
-    "grow": {4: (5810, 780), 8: (5620, 690), 16: (5930, 40)},
-    "kick": {4: (3070, 570), 8: (9690, 200), 16: (18800, 820)},
-    "dig": {4: (1880, 980), 8: (3970, 480), 16: (4750, 40)},
-    "obstacle": {4: (12300, 6300), 8: (11000, 2900), 16: (14600, 490)},
-    "catch": {4: (8150, 1150), 8: (11300, 680), 16: (9720, 530)},
-    "slot": {4: (15100, 2600), 8: (53800, 8600), 16: (73200, 1500)},
-}
-
-#: Seconds of an average training episode in RUN, and memory (MB), on an RTX 4090.
-COST: dict[str, tuple[float, float]] = {"cfp": (54, 4053), "transformer-64": (104, 6895), "gnn-64": (83, 4199)}
-
-#: Share of successful episodes in SLOT; of how many is not said.
-SUCCESS: dict[str, float] = {"cfp": 0.154, "transformer-64": 0.059, "gnn-64": 0.0}
-
-#: Ratio to the unperturbed return of CFP when 20 % of the observation, of the action are set to zero.
-DROPOUT_RATIOS: dict[str, tuple[float, float]] = {
-    "shapematch": (0.932, 0.911),
-    "run": (0.877, 0.954),
-    "grow": (0.891, 0.892),
-    "kick": (0.083, 0.985),
-    "dig": (0.675, 0.730),
-    "obstacle": (0.326, 0.936),
-    "catch": (0.915, 0.989),
-    "slot": (0.941, 0.970),
-}
+STEPS = {task: (PUBLISHED | PAPER[task])["steps"] for task in CURVES}
 
 _REST = (21, 2500, 3100, 890, -1500, 2400, -1900, 7000)
 #: Task to the return of a robot that does not move (SHAPE MATCH: 12 to 30, by the particles).
 REST: dict[str, float] = dict(zip(CURVES, _REST, strict=True))
 
 #: Tasks in which the paper evaluates policies without action noise; in all others they act with it.
-WITHOUT_NOISE = tuple(task for task, numbers in TASKS.items() if numbers.deterministic)
-
-
-def curve(algo: str, task: str) -> tuple[float, float] | None:
-    """The paper's return and band of a method, None where it has none."""
-    return CURVES[task][COLUMNS.index(algo)] if task in CURVES and algo in COLUMNS else None
+WITHOUT_NOISE = tuple(task for task, options in PAPER.items() if options.get("eval_deterministic"))
 
 
 def normalised(task: str, value: float) -> float:

@@ -1,140 +1,221 @@
-"""The report of a comparison: tables as CSV files, all of them in one Markdown file and one page, and figures."""
+"""The report of a comparison: raw rows, one table, one picture, and a page that shows both."""
 
+from __future__ import annotations
+
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from typing import Any, get_args
 
+import numpy as np
+import scipy.stats
 from matplotlib.figure import Figure
 
-from baselines.compare import paper, plots, tables
-from baselines.compare.final_evaluation import Protocol
-from baselines.compare.results import Group, RunResult, group_results
+from baselines.compare.evaluation import Protocol, read_evaluation
+from baselines.compare.plan import Run
 from cfp.evaluation.page import STYLE
 from cfp.evaluation.plots import write_figure
-from cfp.evaluation.table import Table
+from cfp.evaluation.table import Table, columns
 from cfp.files import write_text
-from cfp.sections import Particles
+from cfp.learner import Sees
+from cfp.tables import csv_text, read_table
 
-TABLE_STYLE = """
-body { max-width: 76rem; } table { font-size: 14px; } th { vertical-align: bottom; }
-td { font-variant-numeric: tabular-nums; white-space: nowrap; }
-"""
+#: Steps (N,), increasing, and mean returns (N,) of the evaluations during a training.
+Curve = tuple[np.ndarray, np.ndarray]
+SEES = get_args(Sees)
+LINES = dict(zip(SEES, ("-", "--", ":", "-."), strict=True))
+RAW = ("task", "observes", "algorithm", "seed", "layout", "return", "success")
+
+
+def t_interval(values: Sequence[float]) -> float | None:
+    """Half the width of the 95 % confidence interval of a mean (Student's t); None for fewer than two values."""
+    count = len(values)
+    if count < 2:
+        return None
+    return float(scipy.stats.t.ppf(0.975, count - 1) * np.std(values, ddof=1) / math.sqrt(count))
+
+
+def paired_differences(ours: dict[int, float], theirs: dict[int, float]) -> list[float]:
+    """Differences between the scores of two algorithms, by seed, in the seeds that both have."""
+    return [ours[seed] - theirs[seed] for seed in sorted(ours.keys() & theirs.keys())]
+
+
+def align(curves: Sequence[Curve]) -> Curve:
+    """Interpolate curves linearly onto the steps (T,) that all of them cover, if any: values (runs, T)."""
+    first, last = max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves)
+    grid = np.unique(np.concatenate([steps for steps, _ in curves]))
+    grid = grid[(grid >= first) & (grid <= last)]
+    return grid, np.stack([np.interp(grid, steps, values) for steps, values in curves])
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A figure of the report, with the name of its file, a title, and a caption that explains it."""
+class Result:
+    """What the folder of a run holds."""
 
-    file: str
-    title: str
-    caption: str
-    figure: Figure
+    run: Run
+    evaluation: dict[str, Any] | None  # None if it is not complete
+    curve: Curve
+
+    @property
+    def state(self) -> str:
+        """One of finished, failed, not evaluated, not finished, not begun."""
+        if self.run.error:
+            return "failed"
+        if self.run.trained and self.run.record:
+            return "finished" if self.evaluation else "not evaluated"
+        return "not finished" if self.run.record else "not begun"
+
+    @property
+    def score(self) -> float:
+        """Mean return of the evaluated policy."""
+        assert self.evaluation is not None
+        return float(np.mean(self.evaluation["returns"]))
 
 
-def write_report(folder: Path, runs: Sequence[RunResult], protocol: Protocol, description: str) -> Path:
-    """Write all files of the report, over those of an earlier one; another process may do the same."""
-    groups = group_results(runs)
-    complete = make_tables(runs, groups, protocol)
-    for table in complete:
-        write_text(folder / f"{table.name}.csv", table.to_csv(), shared=True)
-    shown = {table.name: table for table in complete if table.rows}
-    shown["runs"] = replace(complete[0], rows=tables.unfinished(complete[0].rows))
-    pictures = _make_pictures(groups)
-    for picture in pictures.values():
-        write_figure(folder / picture.file, picture.figure, shared=True)
-    head = f"{description} {_describe_protocol(protocol)} {_describe_observations(groups)}"
-    write_text(folder / "report.md", _markdown(shown, pictures, head), shared=True)
-    page = _page(shown, pictures, head, [table.name for table in complete])
+def read_result(run: Run, protocol: Protocol) -> Result:
+    """Read the folder of a run; of two evaluations at the same step, as at a handover, the later one counts."""
+    rows = read_table(run.folder / "evaluations.csv", ("step", "mean"))
+    values = sorted({float(row["step"]): float(row["mean"]) for row in rows}.items())
+    steps, means = np.array(values).reshape(-1, 2).T
+    return Result(run, read_evaluation(run, protocol), (steps, means))
+
+
+def raw_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
+    """A row for each episode of the evaluations."""
+    rows = []
+    for result in results:
+        found, run = result.evaluation, result.run
+        if found is not None:
+            about = {"task": run.task, "observes": found["observes"], "algorithm": run.label, "seed": run.seed}
+            episodes = zip(found["layouts"], found["returns"], found["successes"], strict=True)
+            rows += [about | dict(zip(RAW[4:], episode, strict=True)) for episode in episodes]
+    return rows
+
+
+def grouped(results: Sequence[Result]) -> dict[tuple[str, str], list[Result]]:
+    """Evaluated runs by task and algorithm: tasks in their order, in each those that observe the same together."""
+    groups: dict[tuple[str, str], list[Result]] = {}
+    for result in results:
+        if result.evaluation is not None:
+            groups.setdefault((result.run.task, result.run.label), []).append(result)
+    tasks = list(dict.fromkeys(task for task, _ in groups))
+
+    def place(group: tuple[tuple[str, str], list[Result]]) -> tuple[int, int, float]:
+        (task, _), members = group
+        mean = float(np.mean([member.score for member in members]))
+        return tasks.index(task), SEES.index(observes(members)), -mean
+
+    return dict(sorted(groups.items(), key=place))
+
+
+def observes(group: Sequence[Result]) -> str:
+    """What the policies of an algorithm observe."""
+    assert group[0].evaluation is not None
+    return str(group[0].evaluation["observes"])
+
+
+def make_table(results: Sequence[Result], first: str, protocol: Protocol) -> Table:
+    """The table: an algorithm on a task in each row, with its difference to the ``first`` algorithm."""
+    rows, groups = [], grouped(results)
+    for (task, label), group in groups.items():
+        scores = {result.run.seed: result.score for result in group}
+        row: dict[str, Any] = {"task": task, "observes": observes(group), "algorithm": label, "seeds": len(group)}
+        row |= {"mean": float(np.mean([*scores.values()])), "interval": t_interval([*scores.values()])}
+        if label != first and (task, first) in groups:
+            theirs = {result.run.seed: result.score for result in groups[task, first]}
+            mine = dict.fromkeys(theirs, *scores.values()) if group[0].run.reference else scores
+            if groups[task, first][0].run.reference:
+                theirs = dict.fromkeys(mine, *theirs.values())
+            if differences := paired_differences(mine, theirs):
+                row |= {"difference": float(np.mean(differences)), "difference_interval": t_interval(differences)}
+        found = [result.evaluation for result in group if result.evaluation is not None]
+        successes = [success for each in found for success in each["successes"] if success is not None]
+        own = [each["own_layout"] for each in found if each["own_layout"] is not None]
+        ends = [result.curve[0][-1] for result in group if len(result.curve[0])]
+        minutes = [result.run.record["seconds"] / 60 for result in group if "seconds" in result.run.record]
+        row |= {"episodes": sum(len(each["returns"]) for each in found)}
+        for name, values in (("success", successes), ("own", own), ("minutes", minutes)):
+            row[name] = float(np.mean(values)) if values else None
+        rows.append(row | {"steps": int(max(ends)) if ends else None})
+    noise = {
+        "paper": "with action noise as in the paper (none in SHAPE MATCH, that of the policy elsewhere)",
+        "with": "with action noise",
+        "without": "without action noise",
+    }[protocol.noise]
+    description = (
+        f"Each policy plays the same {protocol.episodes} episodes with {protocol.particles} particles, {noise}, on "
+        "layouts that neither trained nor selected it. Return: mean over seeds of the mean over episodes, ± half its "
+        f"95 % confidence interval (Student's t over seeds). Difference: to {first}, in pairs of equal seeds; one run "
+        "of a reference policy stands for all seeds. Compare only policies that observe the same. Own layout: the "
+        "return on the only layout that a policy is made for. Minutes: of a training with all its evaluations."
+    )
+    shown = (
+        *columns(task="task", observes="observes", algorithm="algorithm"),
+        *columns("d", seeds="seeds", episodes="episodes"),
+        *columns(",.1f", mean="return", interval="± 95 %"),
+        *columns("+,.1f", difference="difference"),
+        *columns(",.1f", difference_interval="± 95 %"),
+        *columns(".0%", success="success"),
+        *columns(",.1f", own="own layout"),
+        *columns(",d", steps="steps"),
+        *columns(",.1f", minutes="minutes"),
+    )
+    return Table("returns", "Returns", description, shown, rows)
+
+
+def draw(results: Sequence[Result]) -> Figure:
+    """For each task: curves of the evaluations during training, and the returns of the evaluated policies."""
+    groups = grouped(results)
+    tasks, labels = list(dict.fromkeys(task for task, _ in groups)), list(dict.fromkeys(label for _, label in groups))
+    figure = Figure(figsize=(11, 3.6 * max(len(tasks), 1)), dpi=130, layout="constrained")
+    panels = figure.subplots(max(len(tasks), 1), 2, squeeze=False)
+    for (curves, returns), task in zip(panels, tasks, strict=False):
+        own = [(label, group) for (other, label), group in groups.items() if other == task]
+        for place, (label, group) in enumerate(own):
+            colour, style = f"C{labels.index(label) % 10}", LINES[observes(group)]
+            if lines := [result.curve for result in group if len(result.curve[0])]:
+                steps, values = align(lines)
+                curves.plot(steps, values.mean(0), style, color=colour, marker="o", markersize=3, label=label)
+                if len(lines) > 1:
+                    half = np.array([t_interval(column) for column in values.T])
+                    curves.fill_between(
+                        steps, values.mean(0) - half, values.mean(0) + half, color=colour, alpha=0.15, linewidth=0
+                    )
+            scores = [result.score for result in group]
+            returns.plot(scores, [place] * len(scores), "o", color=colour, alpha=0.4)
+            returns.errorbar(np.mean(scores), place, xerr=t_interval(scores), fmt="D", color=colour, capsize=4)
+        returns.set_yticks(range(len(own)), [f"{label} ({observes(group)})" for label, group in own])
+        returns.invert_yaxis()
+        curves.set(title=f"{task}: evaluations during training", xlabel="environment steps", ylabel="return")
+        returns.set(title=f"{task}: final evaluation", xlabel="return: seeds, their mean, ± 95 %")
+        for axes in (curves, returns):
+            axes.grid(alpha=0.3)
+        if curves.lines:
+            curves.legend(fontsize=8)
+    return figure
+
+
+def write_report(folder: Path, results: Sequence[Result], first: str, protocol: Protocol) -> Path:
+    """Write ``episodes.csv``, ``report.md``, ``returns.png`` and ``index.html``; another process may do the same."""
+    table, others = make_table(results, first, protocol), [each for each in results if each.state != "finished"]
+    state = f"{len(results) - len(others)} of {len(results)} runs are finished and evaluated{':' if others else '.'}"
+    if others:
+        state = state.replace(":", "; the others:")
+    lines = [f"{each.run.name}: {each.state}{f' ({each.run.error})' if each.run.error else ''}" for each in others]
+    write_text(folder / "episodes.csv", csv_text(raw_rows(results), RAW), shared=True)
+    write_figure(folder / "returns.png", draw(results), shared=True)
+    parts = ["# Comparison", state, "\n".join(f"- {line}" for line in lines), table.to_markdown()]
+    text = "\n\n".join(part for part in [*parts, "![Learning curves and returns](returns.png)"] if part) + "\n"
+    write_text(folder / "report.md", text, shared=True)
+    page = f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>Comparison</title>
+<style>{STYLE} body {{ max-width: 76rem; }}</style></head><body>
+<h1>Comparison</h1><p>{state}</p><ul>{"".join(f"<li>{escape(line)}</li>" for line in lines)}</ul>
+{table.to_html()}
+<p><img src="returns.png" alt="Learning curves and returns"></p>
+<p>Every episode: <a href="episodes.csv">episodes.csv</a></p></body></html>
+"""
     write_text(folder / "index.html", page, shared=True)
     return folder / "index.html"
-
-
-def make_tables(runs: Sequence[RunResult], groups: Sequence[Group], protocol: Protocol) -> list[Table]:
-    """All tables, in the order of the report; those with the paper's returns have rows at its size only."""
-    comparable = groups if protocol.particles == paper.PARTICLES else []
-    return [
-        tables.runs_table(runs),
-        tables.returns_table(groups, protocol.episodes),
-        tables.aggregate_table(comparable),
-        tables.efficiency_table(groups, protocol.particles),
-        tables.cost_table(groups),
-        tables.success_table(groups),
-        tables.robustness_table(groups),
-        tables.paper_table(comparable),
-    ]
-
-
-def _describe_protocol(protocol: Protocol) -> str:
-    rule = f"action noise as in the paper: none in {', '.join(paper.WITHOUT_NOISE)}, that of the policy elsewhere"
-    noise = {"paper": rule, "with": "action noise", "without": "no action noise"}[protocol.noise]
-    text = f"Final evaluations with {protocol.particles} particles and {noise}."
-    if protocol.particles != paper.PARTICLES:
-        text += (
-            " They are not compared with the paper's returns, which were measured with full particles "
-            "(--particles full evaluates the same policies with as many)."
-        )
-    return text
-
-
-def _describe_observations(groups: Sequence[Group]) -> str:
-    labels: dict[str, list[str]] = {}
-    for group in groups:
-        labels.setdefault(group.sees, []).append(group.label)
-    parts = (f"{sees}: {', '.join(dict.fromkeys(names))}" for sees, names in labels.items())
-    return f"What the policies observe – {'; '.join(parts)}."
-
-
-def _make_pictures(groups: Sequence[Group]) -> dict[str, Picture]:
-    """Figures that have something to show, by the table that each stands above."""
-    pictures: dict[str, Picture] = {}
-    if any(group.scores for group in groups):
-        caption = "Interquartile mean over seeds with its 95 % bootstrap interval; pale marks are single seeds."
-        pictures["returns"] = Picture("returns.png", "Returns", caption, plots.final_returns(groups))
-    if any(group.curves for group in groups):
-        figure = plots.learning_curves(groups)
-        pictures["efficiency"] = Picture("curves.png", "Learning curves", _curve_caption(groups), figure)
-    if any(group.curves and group.speed for group in groups):
-        caption = "The same over the time of training, without that of evaluations, at the mean speed over seeds."
-        figure = plots.learning_curves(groups, minutes=True)
-        pictures["cost"] = Picture("minutes.png", "Learning curves over time", caption, figure)
-    return pictures
-
-
-def _curve_caption(groups: Sequence[Group]) -> str:
-    text = (
-        "The runs' own evaluations during training: interquartile mean over seeds and its 95 % bootstrap band, on "
-        "steps where all seeds have values. The style of a line tells what is observed."
-    )
-    particles: dict[str, Particles] = {group.label: group.particles for group in groups}
-    if len(set(particles.values())) > 1:
-        listed = ", ".join(f"{label} {value}" for label, value in particles.items())
-        text += f" The numbers of particles differ: {listed}."
-    if own := sorted({group.label for group in groups if group.job.config.evaluation(1)[0] == group.job.config.seed}):
-        text += f" On the one layout they are made for: {', '.join(own)}."
-    return text
-
-
-def _markdown(shown: dict[str, Table], pictures: dict[str, Picture], head: str) -> str:
-    parts = ["# Comparison", head]
-    for name, table in shown.items():
-        if picture := pictures.get(name):
-            parts.append(f"![{picture.title}]({picture.file})\n\n{picture.caption}")
-        parts.append(table.to_markdown())
-    return "\n\n".join(parts) + "\n"
-
-
-def _page(shown: dict[str, Table], pictures: dict[str, Picture], head: str, files: Sequence[str]) -> str:
-    parts = [
-        "<!doctype html>",
-        '<html lang="en"><head><meta charset="utf-8"><title>Comparison</title>',
-        f"<style>{STYLE}{TABLE_STYLE}</style></head><body><h1>Comparison</h1><p>{escape(head)}</p>",
-    ]
-    for name, table in shown.items():
-        if picture := pictures.get(name):
-            image = f'<img src="{picture.file}" alt="{picture.title}">'
-            parts.append(f"<figure>{image}<figcaption>{escape(picture.caption)}</figcaption></figure>")
-        parts.append(table.to_html())
-    links = ", ".join(f'<a href="{name}.csv">{name}.csv</a>' for name in files)
-    parts.append(f"<h2>Files</h2><p>The tables with all columns: {links}.</p></body></html>")
-    return "\n".join(parts) + "\n"

@@ -24,7 +24,6 @@ from tqdm import tqdm
 from cfp.agent.actor_policy import Memory
 from cfp.envs.disturbances import Disturbed
 from cfp.envs.vec_env import TorchVecEnv
-from cfp.evaluation.cache import Episode, EpisodeCache
 from cfp.policy_protocols import DisturbablePolicy, SeesState
 from dittogym.render.recording import seed_noise
 
@@ -70,6 +69,14 @@ class SeededPolicy:
                 torch.set_num_threads(threads)
 
 
+@dataclass(frozen=True)
+class Episode:
+    """How an episode went."""
+
+    total: float  # its undiscounted return
+    success: bool | None  # None where the task does not define success
+
+
 @dataclass(frozen=True, eq=False)
 class Trial:
     """Some episodes of one policy, on the layouts from ``seed`` on."""
@@ -82,19 +89,12 @@ class Trial:
     deterministic: bool
     seed: int
     batch: int = 1  # episodes in one environment; more only on devices that are faster that way
-    cache: EpisodeCache | None = None
 
     def spans(self) -> list[tuple[int, int]]:
         """First layout and number of layouts of each environment."""
         return [
             (self.seed + first, min(self.batch, self.episodes - first)) for first in range(0, self.episodes, self.batch)
         ]
-
-    def known(self, first: int, count: int) -> list[Episode] | None:
-        """Episodes that were played before; None unless all of a span were."""
-        found = [self.cache.read(layout) if self.cache else None for layout in range(first, first + count)]
-        episodes = [episode for episode in found if episode is not None]
-        return episodes if len(episodes) == count else None
 
     def play(self, first: int, count: int, before_step: Callable[[], None]) -> list[Episode]:
         """Play the episodes of a span, that of the first layout first."""
@@ -112,11 +112,7 @@ class Trial:
         )
         assert isinstance(returns, list)
         ended = dict(zip(played, returns, strict=True))  # both in the order in which the episodes ended
-        episodes = [Episode(float(ended[i]), played[i]) for i in range(count)]
-        if self.cache:
-            for layout, episode in enumerate(episodes, first):
-                self.cache.write(layout, episode)
-        return episodes
+        return [Episode(float(ended[i]), played[i]) for i in range(count)]
 
 
 class EpisodesStopped(Exception):
@@ -133,11 +129,10 @@ def play(
         steps: Steps of an episode at most, to show a progress bar on a terminal; None shows none.
         should_stop: Asked before each step; once it is true, the episodes end in `EpisodesStopped`.
     """
-    known = {(trial, *span): trial.known(*span) for trial in trials for span in trial.spans()}
-    missing = [key for key, episodes in known.items() if episodes is None]
+    spans = [(trial, *span) for trial in trials for span in trial.spans()]
     threads, stop = torch.get_num_threads(), Event()
-    workers = min(threads, len(missing)) if all(trial.batch == 1 for trial in trials) else 1
-    total = (steps or 0) * sum(count for *_, count in missing)
+    workers = min(threads, len(spans)) if all(trial.batch == 1 for trial in trials) else 1
+    total = (steps or 0) * sum(count for *_, count in spans)
     bar = tqdm(total=total, unit="step", disable=None if total else True)  # None: only a terminal shows it
 
     def play_span(trial: Trial, first: int, count: int) -> list[Episode]:
@@ -156,7 +151,7 @@ def play(
         return episodes
 
     with bar, torch.random.fork_rng(devices=range(torch.cuda.device_count())), ThreadPoolExecutor(workers or 1) as pool:
-        futures = {key: pool.submit(partial(play_span, *key)) for key in missing}
+        futures = {key: pool.submit(partial(play_span, *key)) for key in spans}
         try:
             for future in wait(futures.values(), return_when=FIRST_EXCEPTION).done:
                 future.result()
@@ -164,5 +159,6 @@ def play(
             stop.set()
             pool.shutdown(cancel_futures=True)
             torch.set_num_threads(threads)
-    known |= {key: future.result() for key, future in futures.items()}
-    return [[each for first, count in trial.spans() for each in known[trial, first, count] or ()] for trial in trials]
+    return [
+        [each for first, count in trial.spans() for each in futures[trial, first, count].result()] for trial in trials
+    ]

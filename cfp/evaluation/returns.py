@@ -5,20 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from scipy.special import stdtrit  # scipy.stats takes a second to import
 
-from cfp.config import EVALUATION_SEED, RunConfig
-from cfp.envs.make import batch_size, make_env, on_cpu
-from cfp.evaluation.cache import EpisodeCache
+from cfp.config import EVALUATION_SEED, EnvironmentConfig, RunConfig
+from cfp.envs.make import batch_size, make_env
 from cfp.evaluation.episodes import Trial, play
 from cfp.evaluation.untrained import UntrainedPolicy
+from cfp.files import read_json
 from cfp.policy_protocols import Policy
 
 #: With action noise or without; default: as the run that trained a policy evaluates it.
 Noise = Literal["default", "with", "without", "both"]
+#: Returns of zero and random action by task, as committed in ``docs/leaderboard``; none of them succeeds.
+REFERENCE_RETURNS = Path(__file__).with_name("reference_returns.json")
 
 
 @dataclass(frozen=True)
@@ -61,9 +64,7 @@ def decision_grid(policy: Policy) -> int:
 
 def make_trial(config: RunConfig, name: str, policy: Policy, episodes: int, *, deterministic: bool, seed: int) -> Trial:
     """Episodes of a policy in the environment of a run."""
-    size, batch, cache = policy.resolution, batch_size(config, episodes), None
-    if isinstance(policy, UntrainedPolicy) and on_cpu(config):  # on a GPU episodes do not repeat
-        cache = EpisodeCache.of(config, policy.kind, size)
+    size = policy.resolution
     return Trial(
         name=name,
         resolution=decision_grid(policy),
@@ -72,8 +73,7 @@ def make_trial(config: RunConfig, name: str, policy: Policy, episodes: int, *, d
         episodes=episodes,
         deterministic=deterministic,
         seed=seed,
-        batch=batch,
-        cache=cache,
+        batch=batch_size(config, episodes),
     )
 
 
@@ -97,13 +97,25 @@ def evaluate(
     return results
 
 
+def untrained(config: RunConfig, episodes: int) -> list[Result]:
+    """Returns of zero and random action: those of `REFERENCE_RETURNS` where they hold, else of episodes played now.
+
+    They hold in the tasks of the package with lite particles and default physics; the table has eight layouts of each.
+    """
+    table = read_json(REFERENCE_RETURNS).get(config.task)
+    without_influence = {name: getattr(config, name) for name in ("num_envs", "backend", "action_layout")}
+    kinds: tuple[Literal["zero", "random"], ...] = ("zero", "random")
+    if table and config.environment == EnvironmentConfig(**without_influence):
+        return [Result(f"{kind} action", table["resolution"], tuple(table[kind][:episodes]), 0.0) for kind in kinds]
+    options: dict[str, Any] = {"deterministic": True, "seed": evaluation_seed(config)}
+    policies = {f"{kind} action": UntrainedPolicy(kind, config.resolution(1)) for kind in kinds}
+    trials = [make_trial(config, name, policy, episodes, **options) for name, policy in policies.items()]
+    return evaluate(trials, config.make_spec().horizon)
+
+
 def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, noise: Noise = "default") -> list[Result]:
-    """Evaluate policies beside zero and random action on the same layouts; one made for a single layout also there."""
-    coarsest, seed = config.resolution(1), evaluation_seed(config)
-    trials = [
-        make_trial(config, f"{kind} action", UntrainedPolicy(kind, coarsest), episodes, deterministic=True, seed=seed)
-        for kind in ("zero", "random")
-    ]
+    """Evaluate policies, beside zero and random action; one made for a single layout also there."""
+    trials, seed = [], evaluation_seed(config)
     for name, trained in policies.items():
         default = without_noise(trained, noise)
         for deterministic in (False, True) if noise == "both" else (default,):
@@ -112,7 +124,7 @@ def compare(config: RunConfig, policies: Mapping[str, Policy], episodes: int, no
         if "layout" in trained.description:
             own = trained.description["layout"]
             trials.append(make_trial(config, "  own layout", trained, 1, deterministic=default, seed=own))
-    return evaluate(trials, config.make_spec().horizon)
+    return untrained(config, episodes) + evaluate(trials, config.make_spec().horizon)
 
 
 def without_noise(policy: Policy, noise: Noise) -> bool:

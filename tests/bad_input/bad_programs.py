@@ -7,7 +7,7 @@ from bad_cases import TINY, Case, Refused, command, prepared
 import baselines.compare.__main__ as compare
 import baselines.distill
 import baselines.evaluate
-import baselines.leaderboard.__main__ as leaderboard
+import baselines.leaderboard
 import baselines.robustness
 import baselines.train
 import cfp.evaluate
@@ -37,6 +37,10 @@ def evaluating(name, options, *words, main=cfp.evaluate.main):
 
 def comparing(name, options, *words):
     return Case(f"compare {name}", command(compare.main, options + NEW), words, Refused)
+
+
+def ranking(name, options, *words):
+    return Case(f"rank {name}", command(baselines.leaderboard.main, options + NEW), words, Refused)
 
 
 def planned(name, plan, *words):
@@ -141,7 +145,7 @@ OTHERS = [
     ),
     learning("gradient", "a blur of rewards", "--task run --blur 1", "blur requires ", "the reward of shapematch"),
     distilling("plans of no planner", "--iterations 9", "iterations requires teacher mpc"),
-    learning("zero", "training", "", "'zero' is a reference policy", "python -m baselines.compare --algos zero"),
+    learning("zero", "training", "", "'zero' is a reference policy", "torchmpm compare --algos zero"),
     distilling("a teacher of another task", "--teacher run", "teacher must be a policy for shapematch, got one for"),
     learning("coarse", "another learner", "--learner analytic", "learner must be sac for algo coarse, got analytic"),
     learning("analytic", "another learner", "--learner sac", "learner must be analytic for algo analytic, got sac"),
@@ -189,19 +193,18 @@ OTHERS = [
     Case("compare into an unset variable", command(compare.main, "--out ''"), ("must name a folder, got ''",), Refused),
     evaluating("disturbed, into an unset variable", "--policy run --out ''", "must name a folder", main=ROBUSTNESS),
     comparing("unknown tasks", "--tasks swim", "task must be one of catch"),
-    comparing("unknown algorithms", "--algos alchemy", "algo must be one of cfp"),
+    comparing("unknown algorithms", "--algos alchemy", "alchemy on shapematch: algo must be one of"),
     comparing("a seed twice", "--seeds 1 1", "seeds must be one or more different values, got 1 1"),
-    comparing("parts of a GPU at home", "--gpus-per-run 0.5", "gpus_per_run must be 0 without --executor ray, got 0.5"),
-    comparing("policies without a protocol", "--policies run", "policies requires protocol", "got run"),
-    comparing("under an unknown protocol", "--protocol v9", "--protocol", "'v1'", "'v9'"),
-    comparing("a policy that is not there", "--protocol v1 --policies none", "none.safetensors: there is no policy"),
-    Case("rank a folder", command(leaderboard.main, "{folder}"), ("cannot be read as JSON", "not a file"), Refused),
+    comparing("parts of a GPU at home", "--gpus-per-run 0.5", "gpus_per_run requires --executor ray, got 0.5"),
+    ranking("a policy that is not there", "none", "none.safetensors: there is no policy"),
+    ranking("a file that is not there", "none.json", "none.json: cannot be read as JSON"),
     comparing("a plan that is not there", "--plan none.json", "plan: none.json cannot be read"),
     planned("of a list", [1], "plan: plan.json cannot be read as JSON (it must hold an object, got list"),
     planned("of other parts", {"colour": 1}, "must hold common, tasks and algos only, got colour"),
     planned("with a seed of its own", {"common": {"seed": 5}}, "plan: common must not hold seed"),
     planned("with a device in a task", {"algos": {"cfp": {"tasks": {"run": {"device": "cpu"}}}}}, "plan: algos.cfp.t"),
-    planned("with unknown options", {"common": {"colour": 1}}, "zero on shapematch: colour is not an option"),
+    planned("with unknown options", {"common": {"colour": 1}}, "analytic on shapematch", "--colour"),
+    planned("with a task of its own", {"algos": {"mpc": {"target": "T"}}}, "plan: algos.mpc must not hold target"),
 ]
 
 CASES = [*TRAIN, *OTHERS]

@@ -1,237 +1,418 @@
-"""``python -m baselines.compare`` on robots of a hundred particles that move one substep at a time."""
+"""Comparisons: tiny plans in processes of their own, interrupted ones among them, and the report about them."""
 
+import csv
 import json
 import os
 import signal
-from dataclasses import replace
+import subprocess
+import sys
+import time
+from pathlib import Path
 
+import numpy as np
 import pytest
+import scipy.stats
+from filelock import FileLock
 
-from baselines.compare import final_evaluation as evaluations
-from baselines.compare.__main__ import main
-from baselines.compare.final_evaluation import Protocol, Record, evaluation_config
-from baselines.compare.jobs import Job
-from baselines.compare.worker import carry_out
-from baselines.registry import configure, load
-from cfp.envs.disturbances import make_cases
-from cfp.errors import CheckpointError
-from cfp.experiment.process import StopSignals
-from cfp.experiment.run_lock import run_lock
+from baselines.compare import paper, processes, worker
+from baselines.compare.__main__ import Command, main
+from baselines.compare.evaluation import Protocol, evaluate_run
+from baselines.compare.plan import Run, make_runs, read_plan, to_words
+from baselines.compare.processes import LocalExecutor, Resources, carry_out
+from baselines.compare.report import align, make_table, paired_differences, read_result, t_interval, write_report
+from cfp.errors import ConfigError
+from cfp.files import write_json, write_text
+from cfp.tables import read_table
 
-ENVIRONMENT = {"particles": 100, "substeps": 1, "num_envs": 1}
-MPC = {"grid": 8, "planner": {"horizon": 3, "commit": 2, "iterations": 1}}
+ROOT = Path(__file__).resolve().parents[2]
+MPC = {"grid": 8, "horizon": 3, "commit": 2, "iterations": 1, "eval_every": 12, "checkpoint_every": 3}
 SHAC = {"train_particles": 100, "steps": 48, "window": 6, "grid": 8, "max_episode_steps": 20, "critic_updates": 2}
 PLAN = {
-    "common": {"environment": ENVIRONMENT, "report": {"eval_episodes": 1}},
+    "common": {"particles": 100, "substeps": 1, "num_envs": 1, "eval_episodes": 1},
     "algos": {
-        "mpc": {**MPC, "report": {"eval_every": 12, "checkpoint_every": 3}},
-        "shac-image": {"algo": "shac", "sees": "image", **SHAC, "report": {"eval_every": 24, "checkpoint_every": 12}},
-        "broken": {"algo": "mpc", **MPC, "environment": {"particles": -3}},
+        "mpc": MPC,
+        "shac-image": {"algo": "shac", "sees": "image", **SHAC, "eval_every": 24, "checkpoint_every": 12},
     },
 }
-COMMON = "--device cpu --episodes 2 --particles 100 --robustness none --workers 0".split()
+COMMON = "--device cpu --episodes 2 --particles 100 --cpus-per-run 1".split()
+ALGOS = "--algos zero shac-image --seeds 0 1".split()
+NAMES = [f"{name}-shapematch-quick-{seed}" for name, seed in (("zero", 0), ("shac-image", 0), ("shac-image", 1))]
+
+
+@pytest.fixture(autouse=True)
+def packages_of_this_folder(monkeypatch):
+    """Also in the processes of the runs."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+
+
+def words(out, *more, plan=PLAN):
+    path = out.parent / f"{out.name}.json"
+    path.write_text(json.dumps(plan))
+    return [*COMMON, "--out", str(out), "--plan", str(path), *more]
 
 
 def compare(out, *more, plan=PLAN):
-    path = out.parent / f"{out.name}.json"
-    path.write_text(json.dumps(plan))
-    return main([*COMMON, "--out", str(out), "--plan", str(path), *more])
+    return main(words(out, *more, plan=plan))
+
+
+def rows(folder):
+    with open(folder / "episodes.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def contents(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file() and path.name != "log.txt"}
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
+    """A comparison of a reference policy and trainings with two seeds."""
     out = tmp_path_factory.mktemp("compare") / "whole"
-    assert compare(out, "--algos", "mpc", "shac-image", "--seeds", "0", "1") == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+        assert compare(out, *ALGOS) == 0
     return out
 
 
-def contents(folder):
-    return {path: path.stat().st_mtime_ns for path in (folder / "runs").rglob("*") if path.is_file()}
+def test_every_policy_plays_the_same_episodes_and_all_are_reported(finished):
+    assert sorted(path.name for path in (finished / "runs").iterdir()) == sorted(NAMES)
+    table = rows(finished)
+    layouts = {(row["algorithm"], row["seed"]): [] for row in table}
+    for row in table:
+        layouts[row["algorithm"], row["seed"]].append(row["layout"])
+    assert len(layouts) == 3 and {tuple(each) for each in layouts.values()} == {("20000", "20001")}
+    assert {(row["algorithm"], row["observes"]) for row in table} == {("zero", "nothing"), ("shac-image", "image")}
+    report, page = (finished / "report.md").read_text(), (finished / "index.html").read_text()
+    for text in (report, page):
+        assert "3 of 3 runs are finished and evaluated." in text and "shac-image" in text
+    assert "http" not in page and (finished / "returns.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def sessions(out, name):
-    return json.loads((out / "runs" / name / "sessions.json").read_text())["sessions"]
+def test_evaluation_is_that_of_the_policy_alone(finished):
+    """Each episode can be asked for by itself and is the same to the last bit."""
+    options = json.loads((finished / "runs" / NAMES[1] / "comparison.json").read_text())["options"]
+    run = Run("shac-image", "shapematch", 0, options, finished / "runs" / NAMES[1])
+    found = run.record["evaluation"]
+    run.update_record(evaluation={})
+    for episodes in (1, 2):
+        evaluate_run(run, Protocol(episodes, 100))
+    assert run.record["evaluation"] == found
+    evaluate_run(run, Protocol(1, 100, "with"))
+    assert run.record["evaluation"]["noise"] and len(run.record["evaluation"]["returns"]) == 1
+    run.update_record(evaluation=found)
 
 
-def test_runs_are_made_once(finished, capsys):
-    names = {path.name for path in (finished / "runs").iterdir()}
-    assert names == {f"{algo}-shapematch-quick-{seed}" for algo in ("mpc", "shac-image") for seed in (0, 1)}
-    before = contents(finished)
-    assert compare(finished, "--algos", "mpc", "shac-image", "--seeds", "0", "1") == 0
-    assert contents(finished) == before
-    assert compare(finished, "--algos", "mpc", "--seeds", "0", "--dry-run") == 0
-    assert capsys.readouterr().out.split()[-3:] == ["0", "mpc-shapematch-quick-0", "finished"]
+def test_what_is_finished_is_left_alone_and_listed(finished, capsys):
+    before = contents(finished / "runs")
+    for more in ([], ["--report-only"], ["--dry-run"]):
+        assert compare(finished, *ALGOS, *more) == 0
+    lines = capsys.readouterr().out.splitlines()[-3:]
+    assert [line.split()[:3] for line in lines] == [[str(k), name, "finished"] for k, name in enumerate(NAMES)]
+    assert "torchmpm train --algo shac --task shapematch" in lines[1] and "torchmpm" not in lines[0]
+    assert contents(finished / "runs") == before
 
 
 def test_other_options_are_refused_and_named(finished, capsys):
-    before = contents(finished)
-    plan = {
-        **PLAN,
-        "algos": {"mpc": {**MPC, "planner": {**MPC["planner"], "horizon": 4}, "report": {"eval_every": 12}}},
-    }
-    assert compare(finished, "--algos", "mpc", "--seeds", "0", plan=plan) == 2
-    error = capsys.readouterr().err
-    assert "planner.horizon must be 3 as in the run in" in error and "mpc-shapematch-quick-0, got 4" in error
-    assert contents(finished) == before
+    plan = {**PLAN, "algos": {"shac-image": {**PLAN["algos"]["shac-image"], "window": 8}}}
+    assert compare(finished, *ALGOS, plan=plan) == 2
+    assert "window must be 6 as in the run in" in capsys.readouterr().err
+    without_influence = {**PLAN, "common": {**PLAN["common"], "log_every": 7}}
+    assert compare(finished, *ALGOS, "--dry-run", plan=without_influence) == 0
 
 
-@pytest.mark.parametrize("content", ['{"finished": fal', '{"sessions": []}', "[]"])
-def test_damaged_notes_are_named(tmp_path, capsys, content):
-    folder = tmp_path / "out" / "runs" / "mpc-shapematch-quick-0"
-    folder.mkdir(parents=True)
-    (folder / "sessions.json").write_text(content)
-    assert compare(tmp_path / "out", "--algos", "mpc", "--seeds", "0", "--dry-run") == 2
-    assert "mpc-shapematch-quick-0/sessions.json: cannot be read (" in capsys.readouterr().err
-    (folder / "policy.safetensors").touch()
-    (folder / "final_evaluation.json").write_text(content)
-    with pytest.raises(CheckpointError, match=r"final_evaluation\.json: cannot be read \("):
-        Record(configure({"algo": "mpc"}), folder)
-
-
-def test_options_that_change_no_result_may_differ(finished):
-    plan = {**PLAN, "common": {**PLAN["common"], "report": {"eval_episodes": 1, "log_every": 7}}}
-    assert compare(finished, "--algos", "mpc", "--seeds", "0", "--dry-run", plan=plan) == 0
-
-
-def test_variant_that_sees_the_image_is_labelled_so(finished):
-    text = (finished / "report.md").read_text()
-    assert "image: shac-image; simulator: mpc." in text and "action noise as in the paper: none in shapematch" in text
-
-
-def test_more_episodes_are_added_to_those_that_are_there(finished, monkeypatch):
-    record = finished / "runs" / "mpc-shapematch-quick-0" / "final_evaluation.json"
-    before = json.loads(record.read_text())
-    monkeypatch.setattr("baselines.compare.final_evaluation.BATCH", 2)
-    assert compare(finished, "--algos", "mpc", "--seeds", "0", "--episodes", "3") == 0
-    after = json.loads(record.read_text())
-    assert after["policy"] == before["policy"]
-    assert set(after["entries"]) - set(before["entries"]) == {"layouts 2 to 2, particles 100, without noise"}
-    returns = [value for entry in after["entries"].values() for value in entry["returns"]]
-    assert len(set(returns)) == 4  # three layouts and its own
-
-
-def test_disturbed_cases_are_played_and_kept_in_the_same_parts(finished, monkeypatch):
-    counts, report = [], evaluations.report
-
-    def count(*arguments, **options):
-        counts.append(arguments[-1])
-        return report(*arguments, **options)
-
-    monkeypatch.setattr(evaluations, "report", count)
-    monkeypatch.setattr(evaluations, "BATCH", 2)
-    options = ["--algos", "shac-image", "--seeds", "1", "--robustness", "paper"]
-    for episodes, played in (("2", [2, 2]), ("3", [1, 1])):
-        counts.clear()
-        assert compare(finished, *options, "--episodes", episodes) == 0
-        assert counts == played
-    folder, case = finished / "runs" / "shac-image-shapematch-quick-1", make_cases()[1]
-    entries = json.loads((folder / "final_evaluation.json").read_text())["entries"]
-    last = entries[f"{case.name}, layouts 2 to 2, particles 100, without noise"]
-    config = replace(evaluation_config(configure(json.loads((folder / "config.json").read_text())), 100), seed=2)
-    assert last["returns"] == list(report(config, load(folder), [case], 1, deterministic=True)[0].returns)
-
-
-def test_interrupted_comparison_goes_on(finished, tmp_path, monkeypatch, capsys, stop_at):
-    stop_at(30)
-    out, arguments = tmp_path / "out", ["--algos", "shac-image", "mpc", "--seeds", "0"]
-    assert compare(out, *arguments) == 128 + signal.SIGINT
-    output = capsys.readouterr().out
-    assert "the same command resumes" in output
-    assert "shac-image-shapematch-quick-0: stopped" in output and "mpc-shapematch-quick-0: not begun" in output
-    assert [path.name for path in (out / "runs").iterdir()] == ["shac-image-shapematch-quick-0"]
-    monkeypatch.undo()
-    assert compare(out, *arguments) == 0
-    steps = [(session["from"], session["to"]) for session in sessions(out, "shac-image-shapematch-quick-0")]
-    assert steps == [(0, 30), (30, 48)]
-    for name in ("returns.csv", "efficiency.csv", "success.csv"):
-        assert (out / name).read_text().splitlines()[0] == (finished / name).read_text().splitlines()[0]
-    same = "runs/shac-image-shapematch-quick-0/final_evaluation.json"
-    assert json.loads((out / same).read_text()) == json.loads((finished / same).read_text())
-
-
-def test_failing_run_is_reported_and_stops_no_other(tmp_path, capsys):
-    assert compare(tmp_path / "out", "--algos", "broken", "mpc", "--seeds", "0") == 1
-    output = capsys.readouterr().out
-    assert "[1/2] broken-shapematch-quick-0: failed (ConfigError: particles" in output
-    assert "[2/2] mpc-shapematch-quick-0: finished" in output
-    assert "ConfigError: particles" in (tmp_path / "out" / "report.md").read_text()
-
-
-def test_runs_of_the_paper_are_evaluated_in_the_same_environment_at_every_tier():
-    for tier in ("full", "lite", 100):
-        configs = [configure({"algo": algo, "preset": "paper"}) for algo in ("zero", "cfp")]
-        configs.append(replace(configs[0], environment=replace(configs[0].environment, particles=tier)))
-        environments = [evaluation_config(config, tier).environment for config in configs]
-        assert {(each.particles, each.action_indexing) for each in environments} == {(tier, "image")}
-
-
-def test_all_policies_are_evaluated_with_the_same_noise(finished, monkeypatch):
-    """Whatever the run that trained a policy does by default."""
-    used = []
-
-    def evaluate(trials):
-        used.extend(trial.deterministic for trial in trials)
-        return [result]
-
-    result = evaluations.Result("", 8, (1.0,))
-    monkeypatch.setattr(evaluations, "evaluate", evaluate)
-    folder = finished / "runs" / "shac-image-shapematch-quick-0"
-    config = configure(json.loads((folder / "config.json").read_text()))
-    for noise, deterministic in (("paper", True), ("with", False), ("without", True)):
-        (folder / "final_evaluation.json").unlink()
-        evaluations.evaluate_run(config, folder, Protocol(1, 100, "none", noise), lambda: None)
-        assert used == [deterministic]
-        used.clear()
-    assert [Protocol(1).deterministic(task) for task in ("shapematch", "run", "slot", "module:own")] == [1, 0, 0, 0]
-
-
-def test_evaluations_with_other_noise_do_not_count(finished):
-    folder = finished / "runs" / "mpc-shapematch-quick-0"
-    config = configure(json.loads((folder / "config.json").read_text()))
-    for noise, found in (("without", True), ("paper", True), ("with", False)):
-        protocol = Protocol(2, 100, "none", noise)
-        assert (evaluations.read_evaluation(config, folder, protocol) is not None) == found
-
-
-def test_reference_policies_are_evaluated_without_training(tmp_path):
+def test_an_array_job_does_one_run_and_several_fill_one_folder(finished, tmp_path):
     out = tmp_path / "out"
-    assert compare(out, "--algos", "zero", "random", "--seeds", "3", "4") == 0
-    folders = {name: out / "runs" / f"{name}-shapematch-quick-3" for name in ("zero", "random")}
-    assert sorted((out / "runs").iterdir()) == sorted(folders.values())
-    assert {path.name for path in folders["zero"].iterdir()} == {"config.json", "final_evaluation.json"}
-    found = {name: json.loads((folder / "final_evaluation.json").read_text()) for name, folder in folders.items()}
-    assert found["zero"]["policy"] == "zero" and found["zero"]["entries"] != found["random"]["entries"]
-    before = contents(out)
-    assert compare(out, "--algos", "zero", "random", "--seeds", "3", "4") == 0
-    assert contents(out) == before
+    for number in (0, 1):
+        assert compare(out, "--algos", "zero", "mpc", "--seeds", "0", "--only", str(number)) == 0
+        assert [path.name for path in out.iterdir()] == ["runs"] and len(list((out / "runs").iterdir())) == number + 1
+    assert compare(out, "--algos", "zero", "mpc", "--seeds", "0", "--report-only") == 0
+    zero, mpc = (
+        [row for row in rows(out) if (row["algorithm"], row["observes"]) == pair]
+        for pair in (("zero", "nothing"), ("mpc", "simulator"))
+    )
+    assert zero == [row for row in rows(finished) if row["algorithm"] == "zero"] and len(mpc) == 2
+    own = json.loads((out / "runs" / "mpc-shapematch-quick-0" / "comparison.json").read_text())["evaluation"]
+    assert own["own_layout"] not in own["returns"]  # on the only layout that it is made for
+
+
+def test_failed_run_is_reported_and_stops_no_other(tmp_path, capsys):
+    damaged = tmp_path / "out" / "runs" / "mpc-shapematch-quick-0" / "checkpoint" / "state.pt"
+    write_text(damaged, "no checkpoint")
+    assert compare(tmp_path / "out", "--algos", "mpc", "zero", "--seeds", "0") == 1
+    output = capsys.readouterr().out
+    assert "mpc-shapematch-quick-0: failed error: " in output and "zero-shapematch-quick-0: finished" in output
+    for name in ("report.md", "index.html"):
+        text = (tmp_path / "out" / name).read_text()
+        assert "1 of 2 runs are finished and evaluated; the others:" in text and "state.pt" in text
+
+
+@pytest.fixture
+def killed(tmp_path):
+    """A comparison in a process of its own, with a run that has a checkpoint and much to do."""
+    slow = {**MPC, "commit": 1, "iterations": 10, "checkpoint_every": 1}
+    plan, out = {**PLAN, "algos": {"mpc": slow}}, tmp_path / "out"
+    arguments = words(out, "--algos", "mpc", "--seeds", "0", plan=plan)
+    process = subprocess.Popen([sys.executable, "-m", "baselines.compare", *arguments], cwd=ROOT)
+    folder, end = out / "runs" / "mpc-shapematch-quick-0", time.monotonic() + 120
+    while not (folder / "checkpoint" / "state.pt").exists():
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.05)
+    return process, folder, arguments
 
 
 @pytest.mark.slow
-def test_task_of_a_module_is_compared_in_processes_of_their_own(tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_comparison_that_is_stopped_or_killed_goes_on(killed, number):
+    """Also where the parent dies without a word, its run stops with a checkpoint."""
+    process, folder, arguments = killed
+    process.send_signal(number)
+    assert process.wait(60) == (130 if number != signal.SIGKILL else -signal.SIGKILL)
+    assert main(arguments) == 0
+    assert "resuming" in (folder / "log.txt").read_text()
+    assert [row["step"] for row in read_table(folder / "progress.csv")][-1] == "30"
+    assert not (folder / "error.txt").exists()
+
+
+@pytest.mark.slow
+def test_task_of_a_module_is_compared(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(tmp_path), os.environ.get("PYTHONPATH", ""))))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(tmp_path), os.environ["PYTHONPATH"])))
     (tmp_path / "rolling.py").write_text(
         "import dataclasses, dittogym\n"
         "def roll(): return dataclasses.replace(dittogym.make_spec('run'), name='roll', horizon=12)\n"
         "dittogym.register('roll', roll)"
     )
-    out = tmp_path / "out"
-    assert compare(out, "--tasks", "rolling:roll", "--algos", "mpc", "--seeds", "0", "--workers", "1") == 0
-    assert (out / "runs" / "mpc-roll-quick-0" / "policy.safetensors").exists()
-    assert "rolling:roll" in (out / "report.md").read_text()
+    assert compare(tmp_path / "out", "--tasks", "rolling:roll", "--algos", "mpc", "--seeds", "0") == 0
+    assert (tmp_path / "out" / "runs" / "mpc-roll-quick-0" / "policy.safetensors").exists()
 
 
-def test_array_job_does_one_run_and_no_report(tmp_path):
-    out = tmp_path / "out"
-    assert compare(out, "--algos", "shac-image", "mpc", "--seeds", "0", "--only", "1") == 0
-    assert [path.name for path in out.iterdir()] == ["runs"]
-    assert [path.name for path in (out / "runs").iterdir()] == ["mpc-shapematch-quick-0"]
+# Processes: short programs stand for the real worker.
+
+PATIENT = "import os, sys; open('ready', 'w').close(); os.read(0, 1); open('ended', 'w').close(); sys.exit(143)"
 
 
-def test_folder_in_use_is_left_alone(finished):
-    folder = finished / "runs" / "mpc-shapematch-quick-0"
-    before = (folder / "final_evaluation.json").read_bytes()
-    config = configure(json.loads((folder / "config.json").read_text()))
-    with run_lock(folder):
-        assert carry_out(Job("mpc", config, folder, Protocol(9, 100, "none")), StopSignals(), 0.0) == "busy"
-    assert (folder / "final_evaluation.json").read_bytes() == before
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return Run("zero", "run", 0, {"algo": "zero"}, tmp_path / "run")
+
+
+@pytest.fixture
+def use_program(monkeypatch):
+    return lambda program: monkeypatch.setattr(processes, "WORKER", (sys.executable, "-c", program))
+
+
+@pytest.mark.parametrize(
+    ("program", "outcome", "reason"),
+    [
+        ("", "finished", ""),
+        ("import sys; sys.exit(3)", "in use", ""),
+        ("raise ImportError('no such module')", "failed", "ImportError: no such module (exit code 1; see log.txt)"),
+        ("import os; os._exit(7)", "failed", "no output (exit code 7; see log.txt)"),
+        (
+            "import os; open('count', 'a').write('x'); os.kill(os.getpid(), 9)",
+            "failed",
+            "killed by SIGKILL (exit code -9; see log.txt)",
+        ),
+    ],
+)
+def test_a_process_that_fails_leaves_a_reason_and_a_killed_one_is_started_again(
+    run, use_program, program, outcome, reason
+):
+    use_program(program)
+    run.folder.mkdir()
+    for name in ("error.txt", "log.txt"):
+        (run.folder / name).write_text("of an earlier attempt\n")
+    assert carry_out(run, Protocol(), Resources(retries=2)) == outcome and run.error == reason
+    if "SIGKILL" in reason:
+        assert Path("count").read_text() == "xxx"
+
+
+@pytest.mark.parametrize("urgency", [1, 2])
+def test_a_process_is_asked_to_stop_before_it_is_killed(run, use_program, urgency):
+    use_program(PATIENT)
+    executor = LocalExecutor(1, Resources())
+    futures = [executor.submit(run, Protocol()) for _ in range(2)]
+    while not Path("ready").exists():
+        time.sleep(0.01)
+    executor.stop(urgency)
+    executor.shutdown()
+    assert [future.result() for future in futures] == ["stopped", "stopped"] and not run.error
+    assert urgency == 2 or Path("ended").exists()
+
+
+def test_a_folder_in_use_is_left_alone(finished):
+    folder = finished / "runs" / NAMES[0]
+    options = json.loads((folder / "comparison.json").read_text())["options"]
+    before = (folder / "comparison.json").read_bytes()
+    with FileLock(folder / ".comparison.lock"):
+        code = worker.carry_out(Run("zero", "shapematch", 0, options, folder), Protocol(9, 100), wait=0.0)
+    assert code == worker.IN_USE and (folder / "comparison.json").read_bytes() == before
+
+
+def test_missing_ray_names_the_extra(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert compare(tmp_path / "out", "--algos", "zero", "--executor", "ray") == 2
+    assert "pip install 'torchmpm[ray]'" in capsys.readouterr().err
+
+
+def test_workers_share_the_cores(monkeypatch):
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(4)), raising=False)
+    assert Command(workers=2).make_executor().resources.threads == 2
+    assert Command(workers=2, cpus_per_run=3).make_executor().resources.threads == 3
+
+
+# The plan.
+
+
+def runs_of(plan, *labels, task="run", **options):
+    file = {"common": {}, "tasks": {}, "algos": {}} | plan
+    return make_runs(file, [task], labels, [0], Path("runs"), device="cpu", **options)
+
+
+def test_the_narrower_section_of_a_plan_wins():
+    plan = {
+        "common": {"algo": "coarse", "num_envs": 2, "eval_every": 500},
+        "tasks": {"run": {"eval_every": 600}},
+        "algos": {"shac": {"num_envs": 4, "tasks": {"run": {"steps": 480}}}, "long": {"tasks": {"run": {"alpha": 1}}}},
+    }
+    shac, long = (run.options for run in runs_of(plan, "shac", "long", steps=96000))
+    assert (shac["algo"], shac["num_envs"], shac["eval_every"], shac["steps"]) == ("shac", 4, 600, 480)
+    assert (long["algo"], long["num_envs"], long["alpha"], long["steps"]) == ("coarse", 2, 1, 96000)
+    assert "steps" not in runs_of({}, "gradient", steps=960)[0].options
+
+
+def test_names_in_a_plan_that_mean_nothing_are_reported(capsys):
+    runs_of({"tasks": {"rnu": {}}, "algos": {"shca": {"steps": 480}}}, "shac")
+    assert capsys.readouterr().out.splitlines() == [
+        "plan: tasks rnu are not in this comparison",
+        "plan: algos shca are not in this comparison",
+    ]
+
+
+def test_options_become_words():
+    options = {"eval_every": 5, "video": False, "resample": True, "handover": [], "resolutions": [4, 8], "clip": None}
+    assert to_words(options) == (
+        "--eval-every 5 --no-video --resample --handover --resolutions 4 8 --clip None".split()
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--seeds 9500 --algos mpc", "seeds must be between 0 and 8999, got 9500"),
+        ("--only 0 --report-only", "only cannot be combined with --report-only"),
+        ("--address head:6379", "address requires --executor ray, got head:6379"),
+        ("--algos mpc other", "plan: algos.other must not hold target"),
+    ],
+)
+def test_wrong_options_are_named(tmp_path, capsys, options, message):
+    plan = {"algos": {"other": {"algo": "mpc", "target": "M"}}} if "other" in options else PLAN
+    assert compare(tmp_path / "out", *options.split(), plan=plan) == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "docs").glob("compare-plan*.json")), ids=lambda path: path.stem)
+def test_plans_of_the_documentation_hold(path):
+    plan = read_plan(path)
+    assert make_runs(plan, ["run"], list(plan["algos"]), [0], Path("runs"))
+
+
+def test_a_folder_that_is_no_comparison_s_is_refused(tmp_path):
+    (run,) = runs_of({}, "zero")
+    run = Run("zero", "run", 0, run.options, tmp_path)
+    write_text(tmp_path / "config.json", "{}")
+    with pytest.raises(ConfigError, match="no comparison has begun"):
+        run.check_folder()
+    write_text(tmp_path / "comparison.json", '{"options": {')
+    with pytest.raises(ConfigError, match=r"comparison\.json"):
+        run.check_folder()
+
+
+# Statistics and the report.
+
+
+def test_t_interval_is_student_s():
+    values = [3.0, 5.0, 10.0, 2.0]
+    low, high = scipy.stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+    assert t_interval(values) == pytest.approx((high - low) / 2)
+    assert t_interval([0.0, 2.0]) == pytest.approx(12.7062, abs=1e-4)  # t(1) times sqrt(2) / sqrt(2)
+    assert t_interval([3.0]) is None
+
+
+def test_differences_are_paired_by_seed():
+    assert paired_differences({0: 5.0, 1: 7.0, 2: 1.0}, {1: 4.0, 0: 3.0}) == [2.0, 3.0]
+
+
+def test_curves_are_aligned_where_all_have_values():
+    one = np.array([0.0, 10.0, 20.0]), np.array([0.0, 10.0, 20.0])
+    two = np.array([5.0, 15.0]), np.array([1.0, 3.0])
+    steps, values = align([one, two])
+    assert steps.tolist() == [5, 10, 15]
+    assert values.tolist() == [[5, 10, 15], [1, 2, 3]]
+    apart = np.array([30.0]), np.array([1.0])
+    assert align([one, apart])[1].shape == (2, 0)
+
+
+def written(folder, label, seed, returns, observes="image", curve=None):
+    """A run as it lies in its folder."""
+    run = Run(label, "run", seed, {"algo": label, "device": "cpu"}, folder / f"{label}-{seed}")
+    layouts, successes = list(range(20000, 20000 + len(returns))), [value > 5 for value in returns]
+    evaluation = {
+        "policy": label if label == "zero" else "",
+        "particles": "lite",
+        "noise": True,
+        "observes": observes,
+        "layouts": layouts,
+    }
+    evaluation |= {"returns": returns, "successes": successes, "own_layout": None}
+    record = {"options": run.options, "evaluation": evaluation}
+    write_json(run.folder / "comparison.json", record | ({"seconds": 120.0} if curve else {}))
+    if curve:
+        write_text(run.folder / "results.json", "[]")
+        write_text(run.folder / "evaluations.csv", "step,mean\n" + "".join(f"{s},{v}\n" for s, v in curve.items()))
+    return run
+
+
+def test_table_against_values_worked_out_by_hand(tmp_path):
+    runs = [
+        written(tmp_path, "zero", 0, [1.0, 3.0], "nothing"),
+        written(tmp_path, "shac", 0, [4.0, 6.0], "state", {500: 1, 1000: 2}),
+        written(tmp_path, "shac", 1, [7.0, 7.0], "state", {500: 1, 1000: 2}),
+        written(tmp_path, "coarse", 0, [8.0, 8.0], curve={500: 1}),
+        Run("coarse", "run", 1, {"algo": "coarse"}, tmp_path / "coarse-1"),
+    ]
+    write_text(runs[-1].folder / "error.txt", "NonFiniteError: a loss | is not finite\n")
+    results = [read_result(run, Protocol(2)) for run in runs]
+    assert [result.state for result in results] == [*["finished"] * 4, "failed"]
+    coarse, shac, zero = make_table(results, "zero", Protocol(2)).rows
+    assert [row["algorithm"] for row in (coarse, shac, zero)] == ["coarse", "shac", "zero"]
+    assert (shac["mean"], shac["seeds"], shac["episodes"], shac["success"]) == (6.0, 2, 4, 0.75)
+    assert shac["interval"] == pytest.approx(12.7062, abs=1e-4)  # of 5 and 7
+    assert (shac["difference"], shac["steps"], shac["minutes"]) == (4.0, 1000, 2.0)
+    assert shac["difference_interval"] == pytest.approx(12.7062, abs=1e-4)
+    assert (coarse["interval"], coarse["difference"], "difference" in zero) == (None, 6.0, False)
+    against_shac = {row["algorithm"]: row for row in make_table(results, "shac", Protocol(2)).rows}
+    assert against_shac["coarse"]["difference"] == 3.0 and against_shac["zero"]["difference"] == -4.0
+    write_report(tmp_path, results, "zero", Protocol(2))
+    for name in ("report.md", "index.html"):
+        text = (tmp_path / name).read_text()
+        assert "coarse-1: failed (NonFiniteError" in text and "+4.0" in text and "4 of 5 runs" in text
+    assert len(rows(tmp_path)) == 8
+
+
+def test_evaluations_under_another_protocol_do_not_count(tmp_path):
+    run = written(tmp_path, "shac", 0, [4.0, 6.0], "state", {500: 1})
+    protocols = (Protocol(1), Protocol(3), Protocol(2, "full"), Protocol(2, "lite", "without"))
+    found = [read_result(run, protocol).state for protocol in protocols]
+    assert found == ["finished", "not evaluated", "not evaluated", "not evaluated"]
+    write_text(run.folder / "policy.safetensors", "another")
+    assert read_result(run, Protocol(2)).state == "not evaluated"
+    assert [Protocol().deterministic(task) for task in ("shapematch", "run", "module:own")] == [True, False, False]
+
+
+def test_numbers_of_the_paper_are_complete():
+    assert paper.CURVES.keys() == paper.REST.keys() == paper.STEPS.keys()
+    assert all(len(values) == len(paper.COLUMNS) for values in paper.CURVES.values())
+    assert paper.normalised("run", 2500) == 0 and paper.normalised("run", 8650) == 1
+    assert paper.WITHOUT_NOISE == ("shapematch",) and paper.STEPS["slot"] == 600_000

@@ -50,7 +50,6 @@ def test_every_program_is_started_under_its_name_with_examples(name, capsys):
     [
         ("train", "task target algo preset learner steps seed device out resume"),
         ("distill", "task target algo preset steps seed device out resume"),
-        ("compare", "tasks algos seeds preset steps device workers episodes out report-only"),
     ],
 )
 def test_help_shows_basic_options_first(words, basic, capsys):

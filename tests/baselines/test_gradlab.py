@@ -1,7 +1,6 @@
-"""The gradient laboratory: against functions whose gradients are known, and as a command."""
+"""The benchmark of gradients at growing horizons: against functions whose gradients are known, and as a script."""
 
-import json
-import math
+import csv
 from dataclasses import dataclass, replace
 
 import pytest
@@ -9,9 +8,7 @@ import torch
 
 import dittogym
 from baselines import train
-from baselines.gradlab import __main__ as command
-from baselines.gradlab.measure import COLUMNS, STEP_SIZES, finite_difference_errors, measure
-from baselines.gradlab.report import conclude, objections, write
+from benchmarks.gradlab import COLUMNS, STEP_SIZES, conclude, finite_difference_errors, main, measure, objections
 
 GOOD = dict(zip(COLUMNS, (8, 2.0, 1.0, 1e-8, 1e-5, 1.0, 1e-6, 0.1, 30.0, 4.0, 3.0, 0.5, 0), strict=True))
 SHAPE = (4, 2, 3, 3)
@@ -98,48 +95,18 @@ def test_conclusion_stops_at_the_first_objection(change: dict) -> None:
     assert "inf times smaller" in conclude("run", [GOOD | {"first_variance": 0.0}])[1]  # a linear return
 
 
-def test_report_without_a_finite_sample_is_valid_json(tmp_path) -> None:
-    nothing = dict.fromkeys(COLUMNS, math.nan) | {"horizon": 8, "failed": 32}
-    write(tmp_path, {"task": "run"}, [nothing], [[math.nan] * len(STEP_SIZES)])
-    text = (tmp_path / "report.json").read_text()
-    report = json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is not valid JSON"))
-    assert report["horizons"][0] == dict.fromkeys(nothing) | {"horizon": 8, "failed": 32}
-    assert {row["error"] for row in report["differences"]} == {None}
-
-
-def test_command_is_reproducible(tmp_path, capsys) -> None:
+def test_command_is_reproducible_and_ends_with_the_episode(tmp_path, capsys) -> None:
+    arguments = ["--quick", "--task", "shapematch", "--resolution", "4", "--warmup", "27"]
     for name in ("one", "two"):
-        assert command.main(["--quick", "--task", "kick", "--out", str(tmp_path / name)]) == 0
+        main([*arguments, "--out", str(tmp_path / name)])
     assert "the gradient helps" in capsys.readouterr().out
     for name in ("horizons.csv", "differences.csv"):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
-    report = json.loads((tmp_path / "one" / "report.json").read_text())
-    assert [row["horizon"] for row in report["horizons"]] == [1, 2, 4]
-    assert all(row["difference_error"] < 1e-6 and row["cosine"] > 0.999 for row in report["horizons"])
+    with (tmp_path / "one" / "horizons.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["horizon"] for row in rows] == ["1", "2"]  # of an episode of 30 steps
+    assert all(float(row["difference_error"]) < 1e-6 and float(row["cosine"]) > 0.999 for row in rows)
     assert (tmp_path / "one" / "gradients.png").read_bytes()[:4] == b"\x89PNG"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        ("--task fly", "task"),
-        ("--samples 5", "samples"),
-        ("--horizons 4 2", "horizons"),
-        ("--warmup -1", "warmup"),
-        ("--task shapematch --warmup 30", "warmup"),
-        ("--device tpu", "device"),
-    ],
-)
-def test_bad_options_are_named(arguments: str, named: str, tmp_path, capsys) -> None:
-    assert command.main(["--quick", *arguments.split(), "--out", str(tmp_path / "run")]) == 2
-    assert named in capsys.readouterr().err and not (tmp_path / "run").exists()
-
-
-def test_folder_is_made_before_the_measurement(tmp_path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(command, "measure", lambda *_: pytest.fail("measured although the folder cannot be made"))
-    (tmp_path / "file").touch()
-    assert command.main(["--quick", "--out", str(tmp_path / "file")]) == 2
-    assert "file" in capsys.readouterr().err
 
 
 def test_task_without_a_gradient_is_named(tmp_path, capsys, monkeypatch) -> None:
@@ -147,16 +114,7 @@ def test_task_without_a_gradient_is_named(tmp_path, capsys, monkeypatch) -> None
     weights = {"n": 1.0, "action": 2e-4, "split": 1.0}  # whose costs have a gradient
     counts = replace(dittogym.make_spec("run"), name="count", reward_fn=outcome, weights=weights)
     monkeypatch.setitem(dittogym.TASKS, "count", lambda: counts)
-    assert command.main(["--quick", "--task", "count", "--out", str(tmp_path)]) == 2
-    assert "'count' has no gradient" in capsys.readouterr().err
     options = "--task count --particles 300 --substeps 4 --no-video --out".split()
     for algo in ("gradient --train-particles 300", "mpc"):
         assert train.main(["--algo", *algo.split(), *options, str(tmp_path / algo[:3])]) == 2
         assert "'count' has no gradient" in capsys.readouterr().err
-
-
-def test_horizons_end_with_the_episode(tmp_path) -> None:
-    arguments = ["--quick", "--task", "shapematch", "--resolution", "4", "--warmup", "27"]
-    assert command.main([*arguments, "--out", str(tmp_path)]) == 0
-    report = json.loads((tmp_path / "report.json").read_text())
-    assert [row["horizon"] for row in report["horizons"]] == [1, 2]

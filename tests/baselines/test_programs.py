@@ -277,7 +277,7 @@ def test_what_acts_without_looking_is_said_to_see_nothing():
 @pytest.mark.parametrize("algo", ["zero", "random", "scripted"])
 def test_reference_policy_is_not_trained_and_the_error_says_how_to_evaluate_it(algo, capsys):
     assert train.main(["--algo", algo]) == 2
-    assert f"python -m baselines.compare --algos {algo}" in capsys.readouterr().err
+    assert f"torchmpm compare --algos {algo}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("given, name", [("gnn16", "gnn-16"), ("transformer64", "transformer-64"), ("cfp", "cfp")])

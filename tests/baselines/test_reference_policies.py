@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from baselines import train
-from baselines.common.reference_policies import wave
-from baselines.registry import configure, find, reference_policy
+from baselines.common.reference_policies import REFERENCE_POLICIES, wave
+from baselines.registry import configure, find
 from cfp.agent.actor import build_actor
 from cfp.config import to_json
 from cfp.errors import ConfigError
@@ -28,7 +28,7 @@ def trained(algo, folder, *more):
 
 
 def reference(algo, **values):
-    return reference_policy(configure({"algo": algo, "task": "shapematch", **values}))
+    return REFERENCE_POLICIES[algo](configure({"algo": "coarse", "task": "shapematch", **values}))
 
 
 def test_zero_leaves_every_muscle_slack():
@@ -56,11 +56,11 @@ def test_wave_is_the_one_of_the_reference_figures():
 
 
 def test_scripted_drives_the_whole_episode_in_the_layout_of_the_environment():
-    policy = reference("scripted", grid=4, environment={"action_layout": "grid"})
+    policy = reference("scripted", environment={"action_layout": "grid"})
     memory = None
     for step in range(30):
         actions, memory = policy.predict(IMAGES, memory)
-        assert np.allclose(actions[1], wave(30, 4, "grid")[step])
+        assert np.allclose(actions[1], wave(30, 32, "grid")[step])
 
 
 LEARNING = (

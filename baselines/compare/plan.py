@@ -1,0 +1,232 @@
+"""A plan: which algorithms are trained on which tasks with which seeds, each as one command line of a training."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from baselines import train
+from baselines.common.reference_policies import REFERENCE_POLICIES
+from baselines.registry import ALGORITHMS
+from cfp.config import EVALUATION_SEED
+from cfp.errors import ConfigError
+from cfp.files import read_json, write_json
+
+#: Options of a command line by name, with underscores.
+Options = dict[str, Any]
+
+#: The layouts of training count on from the seed, and those of evaluations during it from ``EVALUATION_SEED``.
+LARGEST_SEED = EVALUATION_SEED - 1001
+#: What the command line of the comparison gives to every run.
+GIVEN = ("device", "preset", "seed", "task")
+#: Options that define the task, which must be the same for all algorithms on it.
+TASK_OPTIONS = ("dt", "dtype", "resample", "substeps", "target", "variant")
+#: Options that change neither what a run learns nor which policy it keeps.
+WITHOUT_INFLUENCE = ("backend", "checkpoint_every", "device", "log_every", "video")
+#: What a comparison keeps in the folder of a run: its options, its training time and its evaluation.
+RECORD = "comparison.json"
+
+
+@dataclass(frozen=True)
+class Run:
+    """One element of a plan."""
+
+    label: str  # the algorithm, or the variant of one that the plan names
+    task: str
+    seed: int
+    options: Options  # of the training
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """Name of the folder, for messages."""
+        return self.folder.name
+
+    @property
+    def reference(self) -> bool:
+        """Whether this is a reference policy, which is evaluated only."""
+        return self.options["algo"] in REFERENCE_POLICIES
+
+    @property
+    def words(self) -> list[str]:
+        """The command line of the training: arguments of ``torchmpm train``."""
+        return [*to_words(self.options), "--resume", "--out", str(self.folder)]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """What `RECORD` holds; nothing before the run has begun. A `ConfigError` if it cannot be read."""
+        path = self.folder / RECORD
+        try:
+            record = json.loads(path.read_text()) if path.exists() else {}
+            if not isinstance(record, dict):
+                raise ValueError(f"it must hold an object, got {record!r}")
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{path}: cannot be read ({error})") from error
+        return record
+
+    def update_record(self, **values: Any) -> None:
+        """Put values into the record."""
+        write_json(self.folder / RECORD, self.record | values)
+
+    @property
+    def error(self) -> str:
+        """Why the last attempt failed; empty if it did not."""
+        path = self.folder / "error.txt"
+        return path.read_text().strip() if path.exists() else ""
+
+    @property
+    def trained(self) -> bool:
+        """Whether the training is finished, if there is one."""
+        return self.reference or (self.folder / "results.json").exists()
+
+    def check_folder(self) -> None:
+        """Refuse a folder whose run has other options or was not made by a comparison."""
+        there = self.record.get("options")
+        if there is None:
+            if (self.folder / "config.json").exists():
+                raise ConfigError(f"out: {self.folder} holds a run that no comparison has begun; name another --out")
+            return
+        mine = json.loads(json.dumps(self.options))
+        for name in sorted({*mine, *there} - {*WITHOUT_INFLUENCE}):
+            if mine.get(name) != there.get(name):
+                raise ConfigError(
+                    f"{name} must be {there.get(name)!r} as in the run in {self.folder}, got {mine.get(name)!r}; "
+                    "or name another --out"
+                )
+
+
+def to_words(options: Options) -> list[str]:
+    """Options as the arguments of a command line."""
+    words = []
+    for name, value in options.items():
+        option = name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{option}" if value else f"--no-{option}")
+        else:
+            words += [f"--{option}", *map(str, value if isinstance(value, list | tuple) else [value])]
+    return words
+
+
+def resolved(options: Options) -> dict[str, Any]:
+    """The whole configuration of a training, as its ``--dry-run`` prints it; `ConfigError` with what it objects to."""
+    output, errors = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
+        try:
+            code = train.main([*to_words(options), "--dry-run"])
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+    if code:
+        raise ConfigError(" ".join(errors.getvalue().split()).removeprefix("error: "))
+    config: dict[str, Any] = json.loads(output.getvalue())
+    return config
+
+
+def reference_config(options: Options) -> dict[str, Any]:
+    """The configuration in whose environment a reference policy acts, that of a single stage of learning."""
+    kept = {name: value for name, value in options.items() if name in ("task", *TASK_OPTIONS)}
+    preset = "paper" if options["preset"] == "paper" else "quick"
+    return resolved({"algo": "coarse", "preset": preset, **kept})
+
+
+def read_plan(path: Path | None) -> dict[str, Any]:
+    """Read a plan file; it has options of trainings under ``common``, ``tasks`` and ``algos``."""
+    plan: dict[str, Any] = {}
+    if path is not None:
+        try:
+            plan = read_json(path)
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"plan: {path} cannot be read as JSON ({error})") from error
+    if not plan.keys() <= {"common", "tasks", "algos"}:
+        raise ConfigError(f"plan: {path} must hold common, tasks and algos only, got {', '.join(plan)}")
+    plan = {"common": {}, "tasks": {}, "algos": {}} | plan
+    _check_section("common", plan["common"], GIVEN)
+    for task, options in _check_section("tasks", plan["tasks"]).items():
+        _check_section(f"tasks.{task}", options, GIVEN)
+    for label, options in _check_section("algos", plan["algos"]).items():
+        _check_section(f"algos.{label}", options, (*GIVEN, *TASK_OPTIONS))
+        for task, own in _check_section(f"algos.{label}.tasks", options.get("tasks", {})).items():
+            _check_section(f"algos.{label}.tasks.{task}", own, (*GIVEN, *TASK_OPTIONS))
+    return plan
+
+
+def _check_section(name: str, section: Any, refused: Sequence[str] = ()) -> dict[str, Any]:
+    if not isinstance(section, dict):
+        raise ConfigError(f"plan: {name} must be a JSON object, got {section!r}")
+    for option in refused:
+        if option in section:
+            instead = "which the command line gives" if option in GIVEN else "which must be under common or tasks"
+            raise ConfigError(f"plan: {name} must not hold {option}, {instead}")
+    return section
+
+
+def make_runs(
+    plan: dict[str, Any],
+    tasks: Sequence[str],
+    labels: Sequence[str],
+    seeds: Sequence[int],
+    folder: Path,
+    *,
+    preset: str = "quick",
+    steps: int | None = None,
+    device: str = "auto",
+) -> list[Run]:
+    """All runs of a plan, by seed, so that a comparison that is stopped early has something to compare.
+
+    Args:
+        plan: What `read_plan` returns.
+        tasks: Tasks.
+        labels: Algorithms, reference policies, or variants that the plan names.
+        seeds: Seeds; reference policies have one run, with the first.
+        folder: Where the folders of the runs are.
+        preset: Preset of all runs.
+        steps: Environment steps of the algorithms that have this option, unless the plan gives them.
+        device: cpu, cuda, or auto.
+
+    Raises:
+        ConfigError: A name, a seed or an option of a training is wrong.
+    """
+    for name, values in (("tasks", tasks), ("algos", labels), ("seeds", seeds)):
+        if not values or len(set(values)) < len(values):
+            raise ConfigError(
+                f"{name} must be one or more different values, got {' '.join(map(str, values)) or 'none'}"
+            )
+    for seed in seeds:
+        if not 0 <= seed <= LARGEST_SEED:
+            raise ConfigError(f"seeds must be between 0 and {LARGEST_SEED}, got {seed}")
+    for part, names, given in (("tasks", plan["tasks"], tasks), ("algos", plan["algos"], labels)):
+        if unused := sorted(names.keys() - set(given)):
+            print(f"plan: {part} {', '.join(unused)} are not in this comparison")
+    found: dict[tuple[str, str], Options] = {}
+    for task in tasks:
+        for label in labels:
+            options = _options(plan, label, task, {"preset": preset, "device": device})
+            try:
+                if options["algo"] in REFERENCE_POLICIES:
+                    reference_config(options)
+                elif "steps" in resolved(options) and steps is not None:
+                    options.setdefault("steps", steps)
+                    resolved(options)
+            except ConfigError as error:
+                raise ConfigError(f"{label} on {task}: {error}") from error
+            found[task, label] = options
+    return [
+        Run(label, task, seed, options | {"seed": seed}, folder / f"{label}-{task.split(':')[-1]}-{preset}-{seed}")
+        for seed in seeds
+        for (task, label), options in found.items()
+        if seed == seeds[0] or options["algo"] not in REFERENCE_POLICIES
+    ]
+
+
+def _options(plan: dict[str, Any], label: str, task: str, given: Options) -> Options:
+    """Options of a run; of common, task, algorithm, and algorithm in a task the later ones win."""
+    own = dict(plan["algos"].get(label, {}))
+    own |= own.pop("tasks", {}).get(task, {})
+    options = {"video": False, **plan["common"], **plan["tasks"].get(task, {}), **own}
+    # An algo under common or tasks is that of variants; an algorithm keeps its own.
+    algo = own.get("algo", label if label in {*ALGORITHMS, *REFERENCE_POLICIES} else options.get("algo", label))
+    return {"algo": algo, "task": task, **given, **{name: options[name] for name in options if name != "algo"}}

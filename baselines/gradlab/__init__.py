@@ -1,1 +1,0 @@
-"""How far gradients through a task reach: ``python -m baselines.gradlab``."""

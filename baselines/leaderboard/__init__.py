@@ -1,1 +1,0 @@
-"""The leaderboard: fixed protocols, submissions of single policies, and their ranking."""
