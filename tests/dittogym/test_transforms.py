@@ -6,11 +6,10 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from tiny import TASKS, actions, forget, set_particles, tiny
+from tiny import TASKS, actions, set_particles, tiny
 from torch import Tensor
 
 from dittogym import core
-from dittogym.action import bicubic_matrix
 from torchmpm import tree
 
 
@@ -52,14 +51,6 @@ def test_an_environment_refuses_transforms_and_is_as_it_was() -> None:
     with pytest.raises(RuntimeError, match=r"TorchEnv\.env_state"):
         torch.func.grad(lambda x: set_particles(env, x=x) or x.sum())(positions)
     assert torch.equal(env.step(drive)[1], before)
-
-
-def test_nothing_is_kept_from_a_transform() -> None:
-    forget(bicubic_matrix)
-    reward, drive = reward_of("run")
-    torch.func.grad(reward)(drive[0])
-    kept = bicubic_matrix(8, 64, False, torch.float64, torch.device("cpu"))
-    assert kept.data_ptr()  # a tensor of its own, no wrapper of one
 
 
 @pytest.mark.parametrize("backend", ["eager", "native"])
