@@ -17,7 +17,7 @@ from tables import DOCS, constants, evaluation, geometry, name_of, read
 import cfp
 import dittogym
 from baselines.compare import paper
-from dittogym.action import patch_field, place, to_grid_indexing
+from dittogym.action import patch_field, place, to_grid_layout
 
 IMAGES = DOCS / "images"
 NODES = 128
@@ -92,7 +92,7 @@ def draw_windows() -> None:
         env = robot(task, steps)
         window(axes, env)
         square(axes, env, env.spec.view, 64, VIEW)
-        square(axes, env, env.spec.reach, env.spec.patch, PATCH, "--")
+        square(axes, env, env.spec.patch_centre, env.spec.patch, PATCH, "--")
         axes.set_title(name_of(task))
         axes.set_xlabel("x, m")
     lines = [Line2D([], [], color=colour, lw=2, ls=ls) for colour, ls in (("0", "-"), (VIEW, "-"), (PATCH, "--"))]
@@ -108,7 +108,7 @@ def draw_step() -> None:
     image = env.observation()[0]
     action = torch.as_tensor(policy.predict(image[None].numpy(), deterministic=True)[0])
     centre = env.env_state.centre - env.env_state.origin
-    stress = patch_field(to_grid_indexing(action, "image"), env.spec.patch, env.spec.max_actuation)
+    stress = patch_field(to_grid_layout(action, "image"), env.spec.patch, env.spec.max_actuation)
     field = place(stress, centre, NODES)[0, 0].T.numpy()
     figure = Figure(figsize=(10.5, 2.75), layout="constrained")
     first, second, third, fourth, fifth = figure.subplots(1, 5)

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import dittogym
 from baselines.compare import paper
-from cfp import weights
 from dittogym.bodies.positions import particle_counts
 from dittogym.geometry import Obstacle
 from dittogym.spec import BodySpec
@@ -57,7 +56,7 @@ def name_of(task: str) -> str:
 
 def policies() -> list[Row]:
     """Rows of `policies.csv` in the form of `returns.csv`: zero and random actions, and trained policies."""
-    rows, shipped = [], weights.shipped()
+    rows, shipped = [], {path.stem for path in (ROOT / "cfp/pretrained").glob("*.safetensors")}
     for row in read("policies.csv"):
         name = row["policy"]
         observes = "nothing" if name in ("zero", "random") else "image"
@@ -272,7 +271,7 @@ def constants(task: str) -> str:
         ("gravity; damping factor per 0.1 ms", f"{spec.gravity[1]:g} m/s²; {spec.damping:g}"),
         ("simulation window", left),
         ("centre of the observed region", centre(spec.view)),
-        ("action patch", f"{spec.patch} nodes; centre {centre(spec.reach)}"),
+        ("action patch", f"{spec.patch} nodes; centre {centre(spec.patch_centre)}"),
         ("spread limit of the robot", "none" if spec.split_limit is None else f"{spec.split_limit:g} m"),
     ]
     if spec.goal is not None:
