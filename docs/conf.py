@@ -98,8 +98,10 @@ class LinkNames(SphinxTransform):
         """Turn them into references, which stay plain code where the reference has no such name."""
         for node in list(self.document.findall(nodes.literal)):
             name = node.astext().removesuffix("()")
-            linked = isinstance(node.parent, nodes.reference | nodes.title) or not NAME.fullmatch(name)
-            if not linked:
+            linked = isinstance(node.parent, nodes.reference | nodes.title | addnodes.pending_xref)
+            if (
+                NAME.fullmatch(name) and not linked and self.env.docname != "changelog"
+            ):  # that one has names of the past
                 reference = addnodes.pending_xref("", refdomain="py", reftype="obj", reftarget=name, refwarn=False)
                 node.replace_self(reference)
                 reference += node
