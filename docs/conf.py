@@ -99,10 +99,8 @@ class LinkNames(SphinxTransform):
         for node in list(self.document.findall(nodes.literal)):
             name = node.astext().removesuffix("()")
             linked = isinstance(node.parent, nodes.reference | nodes.title | addnodes.pending_xref)
-            if (
-                NAME.fullmatch(name) and not linked and self.env.docname != "changelog"
-            ):  # that one has names of the past
-                reference = addnodes.pending_xref("", refdomain="py", reftype="obj", reftarget=name, refwarn=False)
+            if NAME.fullmatch(name) and not linked and self.env.docname != "changelog":  # names of the past
+                reference = addnodes.pending_xref("", refdomain="py", reftype="obj", reftarget=name)
                 node.replace_self(reference)
                 reference += node
 
