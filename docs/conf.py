@@ -18,9 +18,6 @@ import torchmpm
 ROOT = Path(__file__).resolve().parents[1]
 #: Names of the packages in code.
 NAME = re.compile(r"(torchmpm|dittogym|cfp|baselines)(\.\w+)+")
-sys.path.insert(0, str(Path(__file__).parent))
-
-from media import write_replays  # noqa: E402
 
 project = "torchmpm"
 author = "The torchmpm authors"
@@ -142,8 +139,7 @@ def drop_links_back(app: Sphinx, page: str, template: str, context: dict[str, ob
 
 
 def setup(app: Sphinx) -> None:
-    """Register the extensions of this file, and write the replays, which pages of tasks link to."""
-    app.connect("builder-inited", lambda app: write_replays(Path(app.outdir) / "replays"), priority=100)
+    """Register the extensions of this file."""
     app.connect("html-page-context", drop_links_back)
     app.connect("missing-reference", accept_undocumented)
     KeepColons(app)

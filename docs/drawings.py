@@ -110,7 +110,7 @@ def draw_step() -> None:
     centre = env.env_state.centre - env.env_state.origin
     stress = patch_field(to_grid_layout(action, "image"), env.spec.patch, env.spec.max_actuation)
     field = place(stress, centre, NODES)[0, 0].T.numpy()
-    figure = Figure(figsize=(10.5, 2.75), layout="constrained")
+    figure = Figure(figsize=(8.6, 2.4), layout="constrained")
     first, second, third, fourth, fifth = figure.subplots(1, 5)
     first.imshow(image[0], cmap="gray_r")
     first.set_title("observation\n3 × 64 × 64, here occupancy")
@@ -140,7 +140,7 @@ def draw_step() -> None:
     fifth.set_title("... and grid to particles:\nvelocity, deformation")
     for axes in (first, second, third, fourth, fifth):
         axes.set(xticks=[], yticks=[])
-        axes.title.set_fontsize(8)
+        axes.title.set_fontsize(7.5)
     save(figure, "step.png")
 
 

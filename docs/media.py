@@ -38,14 +38,6 @@ def record_policy(name: str) -> Recording:
     return env.film(policy, seed=seed)
 
 
-def write_replays(folder: Path) -> None:
-    """Write `TASK.html`, an episode of each task, unless it is newer than the policy."""
-    for task in dittogym.TASKS:
-        path, policy = folder / f"{task}.html", SHIPPED / f"{task}.safetensors"
-        if not path.exists() or path.stat().st_mtime < policy.stat().st_mtime:
-            record_policy(task).save(path)
-
-
 def policy_hash(name: str) -> str:
     """Hash of a policy that comes with the package."""
     return hashlib.sha256((SHIPPED / f"{name}.safetensors").read_bytes()).hexdigest()
