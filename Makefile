@@ -98,5 +98,5 @@ test-wheel: wheel  ## install the wheel elsewhere, train and evaluate without a 
 	PYTHON=$(BIN)/python .ci/wheel
 
 clean:  ## remove what was built, keep .venv and runs
-	rm -rf build dist docs/_build docs/gallery docs/generated *.egg-info .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf build dist docs/_build docs/gallery *.egg-info .benchmarks .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find . -path ./.venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +

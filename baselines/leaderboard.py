@@ -32,6 +32,7 @@ from cfp.experiment.folder import Folder
 from cfp.files import read_json, write_json
 from cfp.hub import is_address
 from cfp.policy_protocols import Policy
+from cfp.registry import algo_of
 from cfp.weights import check_trained_for, policy_file, shipped
 from dittogym import make_spec
 from dittogym.action import trained_layout
@@ -129,7 +130,7 @@ def candidates(name: str, tasks: Sequence[str]) -> list[tuple[dict[str, Any], Po
         about = {
             "policy": _shown_name(name, task),
             "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-            "sees": description.get("sees", sees(description["kind"])),
+            "sees": description.get("sees", sees(algo_of(description))),
             "training": {"steps": description["steps"], "minutes": _minutes(file.parent)},
         }
     for task in found:

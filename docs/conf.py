@@ -1,6 +1,5 @@
 """Sphinx configuration. Build with ``make docs``."""
 
-import importlib
 import os
 import pkgutil
 import re
@@ -9,20 +8,16 @@ import sys
 from pathlib import Path
 
 from docutils import nodes
+from sphinx import addnodes
 from sphinx.application import Sphinx
+from sphinx.transforms import SphinxTransform
 from sphinx.util.docutils import SphinxDirective
 
 import torchmpm
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(Path(__file__).parent))
-
-import architecture  # noqa: E402
-from drawings import write_drawings  # noqa: E402
-from media import write_replays  # noqa: E402
-from result_figures import write_figures  # noqa: E402
-from result_tables import write_tables  # noqa: E402
-from task_pages import write_pages  # noqa: E402
+#: Names of the packages in code.
+NAME = re.compile(r"(torchmpm|dittogym|cfp|baselines)(\.\w+)+")
 
 project = "torchmpm"
 author = "The torchmpm authors"
@@ -35,21 +30,10 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
-    "sphinx_design",
     "sphinx_gallery.gen_gallery",
     "sphinx-mathjax-offline",  # formulas without a network; the site opens from disk
 ]
-exclude_patterns = [
-    "_build",
-    "generated/ablation.md",
-    "generated/leaderboard.md",
-    "generated/planning.md",
-    "generated/returns*.md",
-    "generated/summary.md",
-    "generated/targets.md",
-    "sg_execution_times.rst",
-    "tasks",
-]
+exclude_patterns = ["_build", "sg_execution_times.rst"]
 sphinx_gallery_conf = {
     "examples_dirs": "../examples/tutorials",
     "gallery_dirs": "gallery",
@@ -102,44 +86,20 @@ class CommandHelp(SphinxDirective):
         return [nodes.literal_block(text=done.stdout)]
 
 
-class NamesTable(SphinxDirective):
-    """A table of names and their meanings, read from dictionaries ``package.module.NAME``."""
+class LinkNames(SphinxTransform):
+    """Links names in code, such as ``dittogym.TorchEnv``, to the reference, so that pages need no roles."""
 
-    required_arguments = 1
-    final_argument_whitespace = True
+    default_priority = 5  # before references are resolved
 
-    def names(self) -> dict[str, str]:
-        """Read the dictionaries."""
-        names: dict[str, str] = {}
-        for path in self.arguments[0].split():
-            module, _, name = path.rpartition(".")
-            names |= getattr(importlib.import_module(module), name)
-        return names
-
-    def run(self) -> list[nodes.Node]:
-        """Write a row for each name."""
-        self.env.note_reread()
-        lines = [".. list-table::", "   :header-rows: 1", "", "   * - Name", "     - Meaning"]
-        for key, meaning in self.names().items():
-            lines += [f"   * - ``{key}``", f"     - {meaning}"]
-        return self.parse_text_to_nodes("\n".join(["```{eval-rst}", *lines, "```"]))
-
-
-class ModuleTable(NamesTable):
-    """A table of the folders and modules of a package."""
-
-    def names(self) -> dict[str, str]:
-        """Read the first lines of their docstrings."""
-        return architecture.module_table(self.arguments[0])
-
-
-class PackageDiagram(SphinxDirective):
-    """The packages and what they import, see `architecture.diagram`."""
-
-    def run(self) -> list[nodes.Node]:
-        """Draw them."""
-        self.env.note_reread()
-        return [nodes.raw(text=architecture.diagram(), format="html")]
+    def apply(self) -> None:
+        """Turn them into references, which stay plain code where the reference has no such name."""
+        for node in list(self.document.findall(nodes.literal)):
+            name = node.astext().removesuffix("()")
+            linked = isinstance(node.parent, nodes.reference | nodes.title | addnodes.pending_xref)
+            if NAME.fullmatch(name) and not linked and self.env.docname != "changelog":  # names of the past
+                reference = addnodes.pending_xref("", refdomain="py", reftype="obj", reftarget=name)
+                node.replace_self(reference)
+                reference += node
 
 
 class KeepColons:
@@ -178,22 +138,10 @@ def drop_links_back(app: Sphinx, page: str, template: str, context: dict[str, ob
         context["body"] = re.sub(r'<a class="viewcode-back".*?</a>', "", str(context["body"]))
 
 
-def write_generated(app: Sphinx) -> None:
-    """Write the pages of the tasks, the tables of results and drawings, and replays."""
-    write_pages()
-    write_tables()
-    write_figures()
-    write_drawings()
-    write_replays(Path(app.outdir) / "replays")
-
-
 def setup(app: Sphinx) -> None:
-    """Register the directives, and write what is generated before any page is read."""
-    app.connect("builder-inited", write_generated, priority=100)  # before tutorials register tasks
+    """Register the extensions of this file."""
     app.connect("html-page-context", drop_links_back)
     app.connect("missing-reference", accept_undocumented)
     KeepColons(app)
     app.add_directive("command-help", CommandHelp)
-    app.add_directive("names-table", NamesTable)
-    app.add_directive("package-diagram", PackageDiagram)
-    app.add_directive("module-table", ModuleTable)
+    app.add_transform(LinkNames)

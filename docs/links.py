@@ -1,16 +1,12 @@
-"""Checks the internal links of the built site, and of the Markdown files that are read in the repository."""
+"""Checks the internal links of the built site; a test checks those of the Markdown files."""
 
 from __future__ import annotations
 
 import argparse
-import re
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
-
-ROOT = Path(__file__).resolve().parents[1]
-STANDALONE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "benchmarks/README.md")
 
 
 class Page(HTMLParser):
@@ -51,24 +47,13 @@ def broken_in_site(site: Path, pages: dict[Path, Page]) -> list[str]:
     return broken
 
 
-def broken_in_repository() -> list[str]:
-    """Relative links from standalone Markdown files to files that do not exist."""
-    broken = []
-    for name in STANDALONE:
-        file = ROOT / name
-        for target in filter(is_relative, re.findall(r"\]\(([^)\s]+)\)", file.read_text())):
-            if urlsplit(target).path and not (file.parent / urlsplit(target).path).exists():
-                broken.append(f"{name}: {target}")
-    return broken
-
-
 def main() -> int:
     """Print the broken links of the site in the folder that the command names; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("site", type=Path, help="folder of the built site")
     site = parser.parse_args().site.resolve()
     pages = {file: Page(file) for file in site.rglob("*.html")}
-    broken = broken_in_site(site, pages) + broken_in_repository()
+    broken = broken_in_site(site, pages)
     count = sum(len(page.targets) for page in pages.values())
     print("\n".join(broken) or f"{count} links on {len(pages)} pages, none broken")
     return int(bool(broken))

@@ -13,14 +13,15 @@ import numpy as np
 
 import cfp
 import dittogym
-from cfp.weights import SHIPPED, shipped
 from dittogym.render.film import write_film
 from dittogym.render.recording import Recording
 from dittogym.tasks import headline
 
 IMAGES = Path(__file__).resolve().parent / "images"
+SHIPPED = Path(cfp.__file__).parent / "pretrained"
 FILMS = IMAGES / "films"
 SOURCES = FILMS / "sources.json"
+POLICIES = sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
 #: Pixels of a task's own film and of a cell of the grid, and cells in a row.
 SIZE, CELL, COLUMNS = 360, 240, 4
 #: Duration of a film, s, and pictures per second.
@@ -35,14 +36,6 @@ def record_policy(name: str) -> Recording:
     policy = cfp.load(name)
     env = dittogym.TorchEnv(policy.description["task"], particles="lite", resolution=policy.resolution)
     return env.film(policy, seed=seed)
-
-
-def write_replays(folder: Path) -> None:
-    """Write `TASK.html`, an episode of each task, unless it is newer than the policy."""
-    for task in dittogym.TASKS:
-        path, policy = folder / f"{task}.html", SHIPPED / f"{task}.safetensors"
-        if not path.exists() or path.stat().st_mtime < policy.stat().st_mtime:
-            record_policy(task).save(path)
 
 
 def policy_hash(name: str) -> str:
@@ -68,10 +61,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("policies", nargs="*", metavar="POLICY", help="all by default")
     names = parser.parse_args().policies
-    if unknown := [name for name in names if name not in shipped()]:
-        parser.error(f"policy must be one of {', '.join(shipped())}, got {unknown[0]}")
+    if unknown := [name for name in names if name not in POLICIES]:
+        parser.error(f"policy must be one of {', '.join(POLICIES)}, got {unknown[0]}")
     sources = json.loads(SOURCES.read_text()) if SOURCES.exists() else {}
-    recordings = {name: record_policy(name) for name in shipped()}
+    recordings = {name: record_policy(name) for name in POLICIES}
     for name in names or recordings:
         speed = max(0.1, round(recordings[name].duration / SECONDS, 1))
         recordings[name].save(FILMS / f"{name}.webp", size=SIZE, rate=RATE, speed=speed)

@@ -17,6 +17,7 @@ from cfp.envs.make import choose_device
 from cfp.evaluation.episodes import Episode, play
 from cfp.evaluation.returns import evaluation_seed, make_trial
 from cfp.policy_protocols import Policy
+from cfp.registry import algo_of
 
 #: Episodes after which an evaluation is written down, so that one that is stopped goes on from there.
 BATCH = 10
@@ -61,7 +62,7 @@ def evaluate_run(run: Run, protocol: Protocol) -> None:
     else:
         there = baselines.Run(run.folder)
         config, policy, about = there.config, there.policy, there.policy.description
-        observes = about.get("sees", sees(about["kind"]))
+        observes = about.get("sees", sees(algo_of(about)))
     config = replace(config, seed=0, device=device, particles=protocol.particles)
     deterministic = protocol.deterministic(run.task)
     conditions = {"policy": identity(run), "particles": protocol.particles, "noise": not deterministic}

@@ -4,7 +4,7 @@ Match a shape by gradient
 
 In SHAPE MATCH a disc must take the shape of a star. An episode has 30 actions with 2 x 16 x 16 values each. Random
 search over these 15,360 values is impractical, but gradient descent works. This tutorial is a short version of the
-method of ``python -m baselines.train --algo gradient``, and takes half a minute.
+method of ``torchmpm train --algo gradient``, and takes half a minute.
 """
 
 # %%

@@ -114,7 +114,7 @@ recording
 
 # %%
 # To train a policy on it, put ``reward_fn``, ``hop`` and the line that registers it into a file ``hop.py``:
-# ``python -m cfp.train --task hop:hop --out runs/hop``.
+# ``torchmpm train --task hop:hop --out runs/hop``.
 
 assert heights[-1] > heights[0] + 0.005
 assert heights[-1] > 2 * found[1e-2][2][-1]

@@ -11,7 +11,7 @@ options below, as in ``make demo``, training takes a few minutes and leads to a 
 # -----
 #
 # The policy sees a 64 x 64 image of the robot and answers with an image of 2 x 32 x 32 muscle actions. By default it
-# learns by gradients through the simulation; ``--learner sac`` learns from rewards alone, as in the paper.
+# learns by gradients through the simulation; ``--algo cfp-sac`` learns from rewards alone, as in the paper.
 
 import csv
 import subprocess

@@ -43,8 +43,7 @@ def throughput(num_envs: int, gradient: bool = False) -> float:
 
 # %%
 # A batch of robots can be divided among many cores; a single robot uses only a few. On a GPU, double the batch
-# size until the curve is flat or the memory is full. `torchmpm.estimate_memory` predicts the memory that gradients
-# need.
+# size until the curve is flat or the memory is full.
 
 sizes = (1, 2, 4, 8, 16, 32)
 forward = [throughput(size) for size in sizes]
@@ -60,8 +59,8 @@ figure.tight_layout()
 # On the command line
 # -------------------
 #
-# ``python -m cfp.train --task run --device cuda --num-envs 256`` simulates and trains on the GPU. A single run uses
-# one device. Several runs can use several GPUs and machines: ``python -m baselines.compare --executor ray``
+# ``torchmpm train --task run --device cuda --num-envs 256`` simulates and trains on the GPU. A single run uses
+# one device. Several runs can use several GPUs and machines: ``torchmpm compare --executor ray``
 # distributes them over a Ray cluster, and a Slurm array starts one command for each run.
 
 for size, alone, both in zip(sizes, forward, backward, strict=True):

@@ -3,7 +3,7 @@ Reading the training metrics
 ============================
 
 A run writes its metrics to ``progress.csv`` and TensorBoard. This tutorial trains a small policy and explains the
-most important ones. :doc:`/scalars` lists all of them.
+most important ones. :doc:`/commands` lists all of them.
 """
 
 # %%
@@ -20,7 +20,7 @@ import matplotlib.pyplot as plt
 folder = tempfile.TemporaryDirectory()
 out = Path(folder.name) / "run"
 options = """
-    --task shapematch --learner sac --seed 0 --particles 500 --num-envs 8 --steps 1200 --handover 800
+    --task shapematch --learner sac --seed 0 --particles 500 --num-envs 8 --steps 1200 --handover 0.667
     --batch-size 64 --gradient-steps 1 --update-start 64 --random-steps 120 40
     --log-every 40 --eval-every 400 --eval-episodes 2 --no-video
 """

@@ -131,6 +131,6 @@ print(f"root mean square error {error:.3f}, with zero actions about {untrained:.
 #
 # Memory and the size of gradients grow with the number of steps. In long episodes, cut the graph with ``env.detach()``
 # after every few steps, and estimate the rest of the return by a critic:
-# :doc:`the learner analytic </concepts/analytic>` works in this way.
+# :doc:`Learning by gradients </concepts/learning>` works in this way.
 
 assert error < 0.5 * untrained

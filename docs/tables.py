@@ -1,0 +1,353 @@
+"""Writes the tables of the documents into their pages, from committed results and from the code.
+
+A table stands between the comments ``<!-- table: NAME ARGUMENTS -->`` and ``<!-- end of table -->``. Run
+``python docs/tables.py`` after results or the code have changed; a test checks that all tables are current.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import pkgutil
+import re
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import dittogym
+from baselines.compare import paper
+from dittogym.bodies.positions import particle_counts
+from dittogym.geometry import Obstacle
+from dittogym.spec import BodySpec
+from dittogym.tasks import headline
+from torchmpm import Snow
+
+DOCS = Path(__file__).resolve().parent
+ROOT = DOCS.parent
+OBSERVES = ("image", "state", "simulator", "nothing")
+BLOCK = re.compile(r"(<!-- table: ([^\n]+) -->\n)(?:\|.*\n)*(<!-- end of table -->)")
+WAYS = {"+x": "right", "-x": "left", "+y": "up", "-y": "down"}
+Row = dict[str, str]
+
+
+def read(name: str) -> list[Row]:
+    """Rows of a CSV file of this folder."""
+    with (DOCS / name).open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def markdown(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table."""
+    return "\n".join(f"| {' | '.join(line)} |" for line in (columns, ["---"] * len(columns), *rows))
+
+
+def number(text: str) -> str:
+    """A return or a count, with thousands separated."""
+    return f"{float(text.replace(',', '')):,.0f}" if text else ""
+
+
+def name_of(task: str) -> str:
+    """Name of a task as it is written in texts."""
+    return headline(task)[0]
+
+
+# Results
+
+
+def policies() -> list[Row]:
+    """Rows of `policies.csv` in the form of `returns.csv`: zero and random actions, and trained policies."""
+    rows, shipped = [], {path.stem for path in (ROOT / "cfp/pretrained").glob("*.safetensors")}
+    for row in read("policies.csv"):
+        name = row["policy"]
+        observes = "nothing" if name in ("zero", "random") else "image"
+        label = f"{name} actions" if observes == "nothing" else f'`cfp.load("{name}")`' if name in shipped else name
+        rows.append(row | {"algorithm": label, "observes": observes, "name": name})
+    return rows
+
+
+def evaluation(task: str, name: str) -> Row:
+    """The evaluation with full particles of a task's own policy, or of `zero` or `random`, with the most episodes."""
+    found = [row for row in policies() if (row["task"], row["name"], row["particles"]) == (task, name, "full")]
+    return max(found, key=lambda row: int(row["episodes"]))
+
+
+def spread(row: Row) -> str:
+    """What is known about the spread of the episodes: lowest and highest, or the standard deviation."""
+    if row.get("lowest") and row["lowest"] != row["highest"]:
+        return f" ({number(row['lowest'])} to {number(row['highest'])})"
+    return f" ± {number(row['std'])}" if float(row.get("std") or 0) else ""
+
+
+def success(row: Row) -> str:
+    """Share of successful episodes."""
+    count, _, total = (row.get("success") or "").partition(" of ")
+    return f"{float(count) / float(total or 1):.0%}" if count else ""
+
+
+def exceeds(row: Row, value: float) -> bool:
+    """Whether the lower end of the 95 % interval of a mean, or else the lowest episode, is above a value."""
+    if not row["std"]:
+        return float(row["lowest"]) > value
+    return float(row["mean"]) - 1.96 * float(row["std"]) / int(row["episodes"]) ** 0.5 > value
+
+
+def results() -> str:
+    """All tasks: zero and random actions, the policy of the package, and the paper's."""
+    rows = []
+    for training in read("training.csv"):
+        task = training["task"]
+        ours, (theirs, _) = evaluation(task, task), paper.CURVES[task][0]
+        mean = number(ours["mean"])
+        rows.append(
+            [
+                name_of(task),
+                *(number(evaluation(task, name)["mean"]) for name in ("zero", "random")),
+                f"**{mean}**" if exceeds(ours, theirs) else mean,
+                success(ours),
+                f"{theirs:,}",
+                training["minutes"],
+                f"{number(training['steps'])} / {paper.STEPS[task]:,}",
+            ]
+        )
+    ours = ("this package", "success", "paper's CFP", "minutes on one core", "steps, here / in the paper")
+    return markdown(("", "zero actions", "random actions", *ours), rows)
+
+
+def planning() -> str:
+    """Returns of planners and of optimised action sequences with full particles."""
+    rows = [row for row in read("returns.csv") if row["particles"] == "full" and row["minutes"]]
+    return markdown(
+        ("Task", "Algorithm", "Episodes", "Return", "Paper's CFP", "Steps", "Minutes"),
+        (
+            [
+                name_of(row["task"]),
+                row["algorithm"],
+                row["episodes"],
+                number(row["mean"]) + spread(row),
+                f"{paper.CURVES[row['task']][0][0]:,}",
+                number(row["steps"]),
+                row["minutes"],
+            ]
+            for row in rows
+            if row["observes"] in ("simulator", "nothing")
+        ),
+    )
+
+
+def returns(particles: str) -> str:
+    """Mean returns of all algorithms in all tasks with some particles, from the evaluations with the most episodes."""
+    cells: dict[tuple[str, str], dict[str, list[Row]]] = {}
+    for row in (*policies(), *read("returns.csv")):
+        label = re.sub(r" --learning-rate.*`|, .*", "`", row["algorithm"]).replace(f'("{row["task"]}")', "(task)")
+        label = "`distill`" if "distill" in row["algorithm"] else label.replace("``", "`").strip()
+        if row["particles"] == particles and "target" not in row["algorithm"]:
+            cells.setdefault((row["observes"], label), {}).setdefault(row["task"], []).append(row)
+
+    def cell(rows: list[Row]) -> str:
+        most = max((int(row["episodes"] or 0) for row in rows), default=0)
+        return " / ".join(number(row["mean"]) for row in rows if int(row["episodes"] or 0) == most)
+
+    return markdown(
+        ("Observes", "Algorithm", *map(name_of, dittogym.TASKS)),
+        (
+            [*key, *(cell(cells[key].get(task, [])) for task in dittogym.TASKS)]
+            for key in sorted(cells, key=lambda key: OBSERVES.index(key[0]))
+        ),
+    )
+
+
+def published() -> str:
+    """The paper's training returns with full particles."""
+    rows = (
+        [f"`{name}`", *(f"{paper.CURVES[task][i][0]:,}" for task in paper.CURVES)]
+        for i, name in enumerate(paper.COLUMNS)
+    )
+    return markdown(("Algorithm", *map(name_of, paper.CURVES)), rows)
+
+
+def leaderboard() -> str:
+    """Mean returns under the fixed protocol, with half their 95 % interval, best first."""
+    rows: dict[str, list[str]] = {task: [] for task in dittogym.TASKS}
+    entries = [json.loads(path.read_text()) for path in (DOCS / "leaderboard").glob("*.json")]
+    for entry in sorted(entries, key=lambda entry: -entry["scores"]["mean"]):
+        scores = entry["scores"]
+        good = f", success {scores['success']:.0%}" if scores["success"] else ""
+        rows[entry["task"]].append(f"{entry['policy']} {scores['mean']:,.0f} ± {scores['interval']:,.0f}{good}")
+    return markdown(("Task", "Policies"), ([name_of(task), "; ".join(found)] for task, found in rows.items() if found))
+
+
+def ablation_gradients() -> str:
+    """Final returns of the learner from gradients while one option is changed at a time, on SHAPE MATCH."""
+    rows = [row for row in read("analytic-shapematch.csv") if row["final"]]
+    found = {(row["part"], row["value"], row["seed"]): row for row in rows}
+    names = [(row["part"], row["value"]) for row in sorted(rows, key=lambda row: -int(row["final"]))]
+    return markdown(
+        ("Changed", "To", "Return, seed 0", "Return, seed 1"),
+        (
+            [part, value]
+            + [found[key]["final"] if (key := (part, value, seed)) in found else "" for seed in ("0", "1")]
+            for part, value in dict.fromkeys(names)
+        ),
+    )
+
+
+def ablation_rewards() -> str:
+    """Returns of the learner from rewards with each option left out, over ten episodes."""
+    rows = [row for row in read("rewards-ablation.csv") if row["episodes"]]
+    found = {(row["change"], row["task"], row["seed"]): number(row["mean"]) for row in rows}
+    columns = [(task, seed) for task in ("run", "shapematch") for seed in sorted({row["seed"] for row in rows})]
+    columns = [column for column in columns if any((row["task"], row["seed"]) == column for row in rows)]
+    return markdown(
+        ("Left out or changed", *(f"{name_of(task)}, seed {seed}" for task, seed in columns)),
+        (
+            [change, *(found.get((change, *column), "") for column in columns)]
+            for change in dict.fromkeys(row["change"] for row in rows)
+        ),
+    )
+
+
+def best_rewards() -> str:
+    """Best policies of the coarse stage of the learner from rewards, over ten episodes, by seed."""
+    rows = [row for row in read("rewards-tasks.csv") if row["episodes"]]
+    tasks = list(dict.fromkeys(row["task"] for row in rows))
+    return markdown(
+        ("", *map(name_of, tasks)),
+        [["return, seeds 0, 1, ...", *(", ".join(number(r["mean"]) for r in rows if r["task"] == t) for t in tasks)]],
+    )
+
+
+def from_csv(name: str) -> str:
+    """A CSV file as it is."""
+    rows = read(name)
+    return markdown(list(rows[0]), (list(row.values()) for row in rows))
+
+
+def names(*paths: str) -> str:
+    """Names and their meanings, from dictionaries ``package.module.NAME``."""
+    found = {key: meaning for path in paths for key, meaning in pkgutil.resolve_name(path).items()}
+    return markdown(("Name", "Meaning"), ([f"`{key}`", meaning] for key, meaning in found.items()))
+
+
+# Tasks
+
+
+def tasks() -> str:
+    """A table of all tasks."""
+    rows = []
+    for task in dittogym.TASKS:
+        spec, (_, what) = dittogym.make_spec(task), headline(task)
+        link = f"[`{task}`](tasks/{task}.md)"
+        grids = f"{spec.coarse}, {spec.fine}"
+        rows.append([link, what, f"{spec.horizon}", grids, ", ".join(map(matter, spec.objects))])
+    return markdown(("Task", "Goal", "Steps", "Action resolution: coarse, fine", "Objects"), rows)
+
+
+def matter(body: BodySpec) -> str:
+    """Material of an object."""
+    return "soil" if isinstance(body.material, Snow) else "elastic"
+
+
+def centre(place: tuple[float | None, float | None]) -> str:
+    """A centre in window coordinates."""
+    x, y = ("the robot's" if value is None else f"{value:g} m" for value in place)
+    return f"x: {x}, y: {y}"
+
+
+def constants(task: str) -> str:
+    """Constants of a task."""
+    spec = dittogym.make_spec(task)
+    full, lite = (particle_counts(spec, tier) for tier in ("full", "lite"))
+    window = spec.window
+    bodies = [("robot", spec.robot), *((f"object ({matter(body)})", body) for body in spec.objects)]
+    left = f"from x = {window.left:g} m" if window.follow is None else f"{window.follow:g} m behind the robot's centre"
+    rows = [
+        ("steps per episode; action resolution", f"{spec.horizon}; coarse {spec.coarse}, fine {spec.fine}"),
+        *(
+            (f"particles of the {name}, full and lite", f"{one:,} and {other:,}; {body.mass:g} kg each with full")
+            for (name, body), one, other in zip(bodies, full, lite, strict=True)
+        ),
+        ("Lamé parameters μ, λ; yield stress", f"{spec.mu:g}, {spec.lam:g}; {spec.yield_stress:g} Pa"),
+        ("muscle stress for an action of 1", f"{spec.max_actuation:g} Pa"),
+        ("gravity; damping factor per 0.1 ms", f"{spec.gravity[1]:g} m/s²; {spec.damping:g}"),
+        ("simulation window", left),
+        ("centre of the observed region", centre(spec.view)),
+        ("action patch", f"{spec.patch} nodes; centre {centre(spec.patch_centre)}"),
+        ("spread limit of the robot", "none" if spec.split_limit is None else f"{spec.split_limit:g} m"),
+    ]
+    if spec.goal is not None:
+        rows.append(("goal, drawn in the observation", f"({spec.goal[0]:g}, {spec.goal[1]:g}) m"))
+    return markdown(("Constant", "Value"), rows)
+
+
+def geometry(task: str) -> str:
+    """Obstacles of a task: name, visibility and velocity rules."""
+    return markdown(
+        ("Obstacle", "In the observation", "Matter cannot move"),
+        (
+            [obstacle.name, "yes" if obstacle.observed_boxes else "no", "; ".join(rules(obstacle))]
+            for obstacle in dittogym.make_spec(task).obstacles
+        ),
+    )
+
+
+def rules(obstacle: Obstacle) -> list[str]:
+    """What an obstacle does to matter, in words."""
+    ways: dict[str, list[str]] = {}
+    for rule in obstacle.velocity_rules:
+        place = ", ".join(
+            f"{axis} {extent(*ends)}" for axis, ends in (("i", rule.i), ("j", rule.j)) if ends != (None, None)
+        )
+        friction = " without slip" if math.isinf(rule.friction) else f" with friction {rule.friction:g}"
+        where = f"{place or 'anywhere'}{' of the window' * (rule.frame == 'window')}"
+        way = WAYS[rule.direction] + (friction if rule.friction else "")
+        ways.setdefault(where, [])
+        ways[where] += [way] * (way not in ways[where])
+    return [f"{'at all' if len(found) == 4 else ' or '.join(found)} at {where}" for where, found in ways.items()]
+
+
+def extent(low: int | None, high: int | None) -> str:
+    """An inclusive range of nodes."""
+    if low is None:
+        return f"≤ {high}"
+    if high is None:
+        return f"≥ {low}"
+    return f"{low}" if low == high else f"{low} … {high}"
+
+
+TABLES: dict[str, Callable[..., str]] = {
+    "ablation-gradients": ablation_gradients,
+    "ablation-rewards": ablation_rewards,
+    "best-rewards": best_rewards,
+    "constants": constants,
+    "csv": from_csv,
+    "geometry": geometry,
+    "leaderboard": leaderboard,
+    "names": names,
+    "planning": planning,
+    "published": published,
+    "results": results,
+    "returns": returns,
+    "tasks": tasks,
+}
+
+
+def pages() -> list[Path]:
+    """Pages that contain tables."""
+    built = {"_build", "gallery"}
+    found = [ROOT / "README.md", *(path for path in DOCS.rglob("*.md") if not built & set(path.parts))]
+    return [path for path in sorted(found) if BLOCK.search(path.read_text())]
+
+
+def refreshed(text: str) -> str:
+    """A page with its tables written anew."""
+
+    def write(block: re.Match[str]) -> str:
+        name, *arguments = block[2].split()
+        return f"{block[1]}{TABLES[name](*arguments)}\n{block[3]}"
+
+    return BLOCK.sub(write, text)
+
+
+if __name__ == "__main__":
+    for page in pages():
+        page.write_text(refreshed(page.read_text()))
